@@ -18,7 +18,7 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from sasgeo_bench import cli, progress
-from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.experiments import pipeline, pipeline_plan
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.publishing import archive
@@ -236,6 +236,6 @@ def few_figures() -> Iterator[None]:
 def few_controls() -> Iterator[None]:
     """Pipelines draw their controls at one site of one town: what these find is tested beside their suite."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pipeline, "CONTROL_REGIONS", ("town-suburb",))
-        patch.setattr(pipeline, "CONTROL_SITES", 1)
+        patch.setattr(pipeline_plan, "CONTROL_REGIONS", ("town-suburb",))
+        patch.setattr(pipeline_plan, "CONTROL_SITES", 1)
         yield

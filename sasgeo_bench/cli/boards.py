@@ -13,7 +13,8 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED, print_table, read_day, s
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_tables import Book, summary
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file

@@ -2,320 +2,47 @@
 """A pipeline file -> queries, runs and a board; steps that are up to date are skipped."""
 
 import datetime as dt
-from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pandas as pd
 
-from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.experiments.paper.board import paper_extra
-from sasgeo_bench.experiments.paper.task import region_name
-from sasgeo_bench.experiments.sealed import Seal, open_seal, seal_of
-from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
+from sasgeo_bench.experiments.pipeline_plan import (
+    MOST_LINES,
+    PipelinePlan,
+    Run,
+    board_folder,
+    count_queries,
+    is_train,
+    plan_runs,
+    silent,
+)
+from sasgeo_bench.experiments.sealed import open_seal
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.matching.plugins import YARDSTICK, check_names
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive import contrast_of, pack_board
 from sasgeo_bench.publishing.archive_folder import check_results
-from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
-from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures, log_beside
-from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.contestants import read_scored_task, rows_to_rank
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
-from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.scoring.score import score_task
-from sasgeo_bench.tasks.build import carry_out, is_of_region, made_tasks, why_to_draw
-from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
-from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
-from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.suites.base import Choice
-from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
+from sasgeo_bench.tasks.build import carry_out
+from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.tasks.task_plan import Request
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
-CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
-CONTROL_SPLIT: Final = "crossfit"
-CONTROL_SITES: Final = 8
-CONTROL_MATCHERS: Final = ("oracle_pose", "prior_centre")  # on all queries of every board
-MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is counted
-
-
-@dataclass(frozen=True, kw_only=True)
-class PipelinePlan:
-    """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
-
-    With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
-    cluster to run on instead. `seal` tells of sealed places, None without any.
-    """
-
-    spec: PipelineFile
-    requests: tuple[Request, ...]
-    controls: tuple[Request, ...]
-    out: Path
-    jobs: int = 1
-    dask: str | None = None
-    private: PrivateSeed | None = None
-    seal: Seal | None = None
-
-    @property
-    def split(self) -> Split | None:
-        """Return the split of the tasks; None for the paper's experiment alone."""
-        return self.requests[0].split if self.requests else None
-
-    @property
-    def training_groups(self) -> TrainingGroups | None:
-        """Return the groups that learn from the same places; None without learning."""
-        if self.split is None or self.spec.learning is None:
-            return None
-        return TrainingGroups(split=self.split, controls=self.controls[0].split, learning=self.spec.learning)
-
-    @property
-    def seed_files(self) -> tuple[Path, ...]:
-        """Return the files of seeds, which no matcher may see."""
-        seeds = (self.private, None if self.seal is None else self.seal.seed)
-        return tuple(seed.file for seed in seeds if seed is not None and seed.file is not None)
-
-    def to_text(self) -> str:
-        """Return which parts of each stage are up to date; every matcher is loaded to find out.
-
-        Raise `MatchError` or `StoreError` as the run would.
-        """
-        queries, controls = _stage("queries", self.requests), _stage("controls", self.controls)
-        stages = [stage for stage in (queries, _paper_stage(self), controls) if stage.made or stage.lacking]
-        lines = [f"{self.spec.id}: {self.spec.title}"]
-        lines += [line for stage in stages for line in stage.lines()]
-        lines += [] if self.training_groups is None else self.training_groups.lines(self.requests)
-        lines += [] if self.seal is None else self.seal.lines()
-        lines += _run_lines(self, stages, controls)
-        lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
-        lines.append(f"  board: {board_folder(self)}")
-        return "\n".join(lines)
-
-    @property
-    def matchers(self) -> tuple[str, ...]:
-        """Return the matchers of the file, and those of every board."""
-        return tuple(dict.fromkeys((*CONTROL_MATCHERS, *self.spec.matchers)))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Lacking:
-    """A task to be drawn, and why."""
-
-    suite: str
-    region: str
-    why: str
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Stage:
-    """Tasks of one kind: folders of those that are up to date, request by request, and tasks to be drawn."""
-
-    name: str
-    made: tuple[tuple[Path, ...], ...]
-    lacking: tuple[_Lacking, ...]
-
-    def lines(self) -> list[str]:
-        """Report how many are up to date, why the others are not, and the first of these by name."""
-        state = f"{len(self.made)} of {counted(len(self.made) + len(self.lacking), 'task')} up to date"
-        if self.lacking:
-            reasons = Counter(item.why for item in self.lacking)
-            causes = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
-            state = f"{state}, {len(self.lacking)} to be drawn ({causes})"
-        lines = [f"  {self.name}: {state}"]
-        lines += [f"    to be drawn: {item.suite} on {item.region}" for item in self.lacking[:MOST_LINES]]
-        more = len(self.lacking) - MOST_LINES
-        return [*lines, f"    and {more} more"] if more > 0 else lines
-
-
-def _stage(name: str, requests: Sequence[Request]) -> _Stage:
-    """Sort requests into those that are up to date and those to be drawn."""
-    found = [(request, made_tasks(request)) for request in requests]
-    return _Stage(
-        name=name,
-        made=tuple(made for _, made in found if made is not None),
-        lacking=tuple(
-            _Lacking(suite=request.suite, region=request.region.id, why=why_to_draw(request))
-            for request, made in found
-            if made is None
-        ),
-    )
-
-
-def _paper_stage(plan: PipelinePlan) -> _Stage:
-    """Return which tasks of the paper's experiment are up to date, one for each seed."""
-    paper = plan.spec.paper
-    if paper is None:
-        return _Stage(name="", made=(), lacking=())
-    made = partial(made_paper_task, trials=paper.trials, out=plan.out, private=plan.private)
-    asked = list(product(paper.crops.items(), paper.seeds))
-    found = {(suite, seed): made(seed=seed, crop=crop) for (suite, crop), seed in asked}
-    there = {(suite, seed): (plan.out / "tasks" / suite / region_name(seed)).is_dir() for (suite, _), seed in asked}
-    return _Stage(
-        name=f"the paper's experiment, {counted(paper.trials, 'trial')} of each seed",
-        made=tuple((made,) for made in found.values() if made is not None),
-        lacking=tuple(
-            _Lacking(
-                suite=suite,
-                region=region_name(seed),
-                why="drawn otherwise or damaged" if there[suite, seed] else "not there yet",
-            )
-            for (suite, seed), made in found.items()
-            if made is None
-        ),
-    )
-
-
-def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -> list[str]:
-    """Report, by matcher, answered and open queries, and answers to tasks that are drawn anew."""
-    asked = [(spec, list(stages)) for spec in plan.matchers]
-    asked += [] if REFERENCE in plan.matchers else [(REFERENCE, [controls])]
-    lines, all_done, all_left, all_behind = [], 0, 0, 0
-    for spec, own_stages in asked:
-        try:
-            runs = _plan_runs(plan, spec, [task for stage in own_stages for made in stage.made for task in made])
-        except (MatchError, StoreError) as error:
-            lines.append(f"    {spec}: cannot be asked ({error})")
-            continue
-        left, done = _count(runs)
-        planned = runs[0].plan
-        lacking = [
-            item for stage in own_stages for item in stage.lacking if _is_asked(plan, spec, item.suite, item.region)
-        ]
-        run_folder = plan.out / "runs" / planned.card.name / planned.hash
-        behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
-        more = f", and what is drawn; {behind} answered there before" if lacking else ""
-        where = " (controls alone)" if own_stages == [controls] and len(stages) > 1 else ""
-        lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
-        lines += [f"      {one.name}: {line}" for one in runs for line in one.lines()]
-        all_done, all_left, all_behind = all_done + done, all_left + left, all_behind + behind
-    lines.insert(0, f"  run: {counted(len(asked), 'matcher')}, {all_done} answered, {all_left} to ask")
-    if all_behind:
-        lines.append(
-            f"    drawing anew leaves {counted(all_behind, 'answer')} where they are: those to the same queries "
-            "count again, the others are set aside"
-        )
-    return lines
-
-
-def _count_rows(run: Path, suite: str, region: str) -> int:
-    """Count the answers in a matcher's runs to queries of a suite on a region, whenever drawn."""
-    folders = [path for path in (run / suite).glob(f"{region}*") if path.is_dir() and is_of_region(path.name, region)]
-    return sum(len({(tie.query_id, tie.asked) for tie in prediction_files.read_ties(folder)}) for folder in folders)
-
-
-def board_folder(plan: PipelinePlan) -> Path:
-    """Return the folder of the board."""
-    return plan.out / "boards" / plan.spec.id
-
-
-def plan_pipeline(
-    spec: PipelineFile,
-    *,
-    out: Path,
-    tell: Tell,
-    extract_folders: tuple[Path, ...] = (),
-    region_folders: tuple[Path, ...] = (),
-    private: PrivateSeed | None = None,
-    sealed: PrivateSeed | None = None,
-) -> PipelinePlan:
-    """Turn a pipeline file into requests; only files of settings are read.
-
-    `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
-    serve regions that are not built yet, and files of one's own. `private` draws all queries instead of the file's
-    seed, below `out/private`. `sealed` draws the sealed places of the split, which are left out without it. Raise
-    `ConfigError` for an unknown suite, region or split, or if no region can be built here, or learned from, or ranked;
-    `MatchError` for an unknown matcher or rejector.
-    """
-    check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
-    out, seed = root_of(out, private), private or spec.seed
-    requests: list[Request] = []
-    for number, task in enumerate(spec.task):
-        asked = Wanted(
-            suites=tuple(task.suites),
-            regions=tuple(spec.regions),
-            split=str(spec.split),  # a file with tasks names one
-            count=task.sites,
-            seed=seed,
-            out=out,
-            group=None if task.prior is None else PriorGroup.parse(task.prior),
-            extract_folders=extract_folders,
-            region_folders=region_folders,
-            sealed_seed=sealed,
-            may_be_fewer=True,
-            choice=Choice(
-                views_cells=tuple(task.views_cells),
-                kinds=tuple(task.kinds),
-                tracks=tuple(task.tracks),
-                detectors=tuple(task.detectors),
-            ),
-        )
-        try:
-            requests += plan_requests(asked, tell=tell if number == 0 else _silent)
-        except ConfigError as error:
-            message = f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}"
-            raise ConfigError(message) from error
-    if spec.task and not requests:
-        message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
-        raise ConfigError(message)
-    kept = needed(requests, spec.learning) if requests else ()
-    left = {item.region.id for item in requests} - {item.region.id for item in kept}
-    if left:
-        tell(f"nothing learns, so train places are left out: {', '.join(sorted(left))}")
-    split = requests[0].split if requests else None
-    return PipelinePlan(
-        spec=spec,
-        requests=kept,
-        controls=_plan_controls(seed, out, split),
-        out=out,
-        private=private,
-        seal=None if split is None else seal_of(split, kept, sealed, private, out=out),
-    )
-
-
-def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request, ...]:
-    """Plan the controls of every board, in towns that the split neither trains on nor seals."""
-    regions = [name for name in CONTROL_REGIONS if _may_control(name, split)]
-    if not regions:
-        specs = {name: read_region_file(path) for name, path in list_region_files().items()}
-        towns = [name for name, spec in specs.items() if spec.pick(None).town is not None]
-        regions = [name for name in towns if _may_control(name, split)][:1]
-    if split is not None and not regions:
-        message = f"split {split.spec.id!r} trains on every embedded town or seals it, and controls need one: free one"
-        raise ConfigError(message)
-    controls = Wanted(
-        suites=(CONTROLS,),
-        regions=tuple(regions),
-        split=CONTROL_SPLIT,
-        count=CONTROL_SITES,
-        seed=seed,
-        out=out,
-        may_be_fewer=True,
-    )
-    return plan_requests(controls, tell=_silent)
-
-
-def _may_control(region: str, split: Split | None) -> bool:
-    """Return whether controls may be drawn on an embedded town."""
-    return split is None or not (trains(split, region) or split.sealed_place(region))
-
-
-def _silent(line: str) -> None:
-    """Report nothing: what is left out is reported once, not for every group of suites."""
-    del line
 
 
 def run_pipeline(
@@ -341,7 +68,7 @@ def run_pipeline(
         check_results(stored, board_folder(plan))
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored, tell=tell)
     tasks = [*_draw(plan.requests, tell, jobs=plan.jobs), *_draw_paper(plan, tell)]
-    asked = [task for task in tasks if not _is_train(plan, base_of(task.name))]
+    asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
     if not asked:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
@@ -399,10 +126,10 @@ def _run_all(
     progress: Progress | None,
 ) -> list[Path]:
     """Run every matcher, and return the folders of all runs; raise the first failure if all fail."""
-    runs: dict[str, list[_Run]] = {}
+    runs: dict[str, list[Run]] = {}
     for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
         with failures.of(spec, but=(ConfigError,)):
-            runs[spec] = _plan_runs(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
+            runs[spec] = plan_runs(plan, spec, [*tasks, *controls] if spec in plan.matchers else controls)
     folders: list[Path] = []
     for spec, found in runs.items():
         with failures.of(spec, but=(ConfigError,)):
@@ -412,87 +139,18 @@ def _run_all(
     return folders
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Run:
-    """One run of a matcher; a matcher that learns has one for each group, which its name states."""
-
-    name: str
-    plan: RunPlan
-
-    def lines(self) -> list[str]:
-        """Report the training for it."""
-        if self.name and self.plan.training_set is None:
-            return ["nothing to learn from, asked untaught"]
-        return self.plan.training_lines()
-
-
-def _run(spec: str, runs: Sequence[_Run], tell: Tell, progress: Progress | None) -> list[Path]:
+def _run(spec: str, runs: Sequence[Run], tell: Tell, progress: Progress | None) -> list[Path]:
     """Run one matcher on all queries without a row, and return the folders of its runs."""
     folders: list[Path] = []
     for one in runs:
-        left, done = _count([one])
+        left, done = count_queries([one])
         label = f"{spec}, {one.name}" if one.name else spec
         tell(f"{label}: {left} queries to ask, {done} answered before")
         for line in () if one.plan.training_set is not None else one.lines():
             tell(f"{label}: {line}")
-        run(one.plan, tell=tell if left else _silent, progress=progress)
+        run(one.plan, tell=tell if left else silent, progress=progress)
         folders += [part.folder for part in one.plan.parts]
     return folders
-
-
-def _count(runs: Sequence[_Run]) -> tuple[int, int]:
-    """Count open and answered queries."""
-    parts = [part for one in runs for part in one.plan.parts]
-    return sum(len(part.left) for part in parts), sum(part.done for part in parts)
-
-
-def _plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[_Run]:
-    """Plan the runs of a matcher: one, or with learning one for each group."""
-    own = [task for task in tasks if _is_asked(plan, spec, task.parent.name, base_of(task.name))]
-    learning, groups = plan.spec.learning, plan.training_groups
-    is_oracle = learning is not None and spec in learning.oracles
-    whole = plan_run(
-        RunRequest(
-            spec=spec,
-            tasks=own,
-            out=plan.out,
-            top_k=plan.spec.top_k,
-            limits=Limits(match_s=plan.spec.match_s),
-            jobs=plan.jobs,
-            dask=plan.dask,
-            is_oracle=is_oracle,
-            hidden=plan.seed_files,
-        )
-    )
-    if is_oracle and not is_unranked(whole.card.name):
-        message = (
-            f"learning names {spec!r} among its oracles, and its card is named {whole.card.name!r}: the names of "
-            f"oracles begin with {YARDSTICK}, so that no board ranks them"
-        )
-        raise ConfigError(message)
-    if groups is None or not whole.learns or not own:
-        return [_Run(name="", plan=whole)]
-    learning = groups.learning
-    request = replace(whole.request, most_trained=learning.most, detector=learning.detector, split=groups.split)
-    return [
-        _Run(name=group.name, plan=plan_run(replace(request, tasks=group.asked, train=group.train)))
-        for group in groups.of(own, tasks, is_oracle=is_oracle)
-    ]
-
-
-def _is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
-    """Return whether a matcher is asked on a task: controls on all, all on the controls, else by the file.
-
-    Nobody is asked on a train place of a hold-out.
-    """
-    if suite in {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}:
-        return True
-    return not _is_train(plan, region) and (spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec))
-
-
-def _is_train(plan: PipelinePlan, region: str) -> bool:
-    """Return whether a region only trains, in a hold-out."""
-    return plan.split is not None and trains(plan.split, region)
 
 
 def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:

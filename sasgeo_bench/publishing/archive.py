@@ -149,7 +149,7 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
 
 def contrast_of(record: Mapping[str, Any]) -> Contrast:
     """Return a registered contrast from its record in a file."""
-    return Contrast(**{**record, **{name: tuple(record[name]) for name in ("suites", "kinds", "detectors")}})
+    return Contrast(**{**record, **{name: tuple(record.get(name, ())) for name in ("suites", "kinds", "detectors")}})
 
 
 def request_of(

@@ -12,7 +12,7 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_tables import Book, cost_table, sections_of
+from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
@@ -205,30 +205,11 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "navigation": [(name, _NAMES[name]) for name in there],
         "note": NOTE.format(draws=source.about.get("draws", "?")),
     }
-    controls = _verdicts(source)
-    special: dict[str, dict[str, Any]] = {
-        "index.html": {
-            "sections": sections,
-            "ranks_note": RANKS_NOTE,
-            "contrasts": contrasts_of(source),
-            "control_lines": control_lines(controls),
-            "controls_state": _controls_state(controls),
-            "has_controls": bool(controls),
-            "seed_line": seed_lines(source.about)[0],
-            "sealed_lines": sealed_lines(source.about),
-            "seeds": seed_table(source.about),
-            "warnings": warnings_of(source.board),
-            "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
-            "counts": _counts(source, book),
-        },
+    special = {
+        "index.html": _index(source, book, sections),
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
-        "rejection.html": {
-            "tables": rejection,
-            "acceptance": acceptance,
-            "protection": protection,
-            "kinds": kinds,
-        },
+        "rejection.html": {"tables": rejection, "acceptance": acceptance, "protection": protection, "kinds": kinds},
         "figures.html": {"kinds": kinds},
         "failures.html": {"groups": groups_of(source.pictures.cases), "total": len(source.pictures.cases)},
         "regions.html": {"table": region_table(source)},
@@ -245,6 +226,25 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     for matcher in matchers:
         pages[matcher.page] = _render(templates, "matcher.html", matcher.page, common | {"matcher": matcher})
     return pages | {name: templates.get_template(name).render() for name in ASSETS}
+
+
+def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
+    """Return what the first page shows."""
+    controls = _verdicts(source)
+    return {
+        "sections": sections,
+        "ranks_note": RANKS_NOTE,
+        "contrasts": contrasts_of(source),
+        "control_lines": control_lines(controls),
+        "controls_state": _controls_state(controls),
+        "has_controls": bool(controls),
+        "seed_line": seed_lines(source.about)[0],
+        "sealed_lines": sealed_lines(source.about),
+        "seeds": seed_table(source.about),
+        "warnings": warnings_of(source.board),
+        "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
+        "counts": _counts(source, book),
+    }
 
 
 def _environment() -> Environment:

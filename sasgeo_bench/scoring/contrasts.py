@@ -358,6 +358,7 @@ def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame)
     drawn = _drawn(contrast, first, SLOW_DRAWS)
 
     def gaps_of(one: ClusterDraws) -> Floats:
+        """Return the difference of the areas in every draw."""
         parts = (areas(both[0], row, contrast.metric) - areas(both[1], row, contrast.metric) for row in one.weights())
         return np.concatenate(list(parts))
 

@@ -10,8 +10,9 @@ import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError
-from sasgeo_bench.experiments import pipeline
-from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.experiments import pipeline, pipeline_plan
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.leaderboard.pipeline_spec import (
     PipelineFile,
     find_pipeline_file,
@@ -564,7 +565,7 @@ def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, mo
 
 def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch):
     plan, board, _ = made
-    work = pipeline.plan_run
+    work = pipeline_plan.plan_run
 
     def broken(request):
         if request.spec == "random":
@@ -572,7 +573,7 @@ def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch
             raise KeyError(message)
         return work(request)
 
-    monkeypatch.setattr(pipeline, "plan_run", broken)
+    monkeypatch.setattr(pipeline_plan, "plan_run", broken)
     beside = run_pipeline(plan, tell=lambda _: None)
     assert set(beside.scores) == set(board.scores) - {"random"}
     assert [item.verdict for item in beside.findings] == ["not decided: random failed"]

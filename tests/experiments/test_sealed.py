@@ -11,7 +11,8 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments import sealed
-from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.experiments.sealed import open_seal
 from sasgeo_bench.experiments.training_groups import TrainingGroups
 from sasgeo_bench.leaderboard.board_files import read_board

@@ -12,7 +12,7 @@ import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.experiments.pipeline import plan_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import read_board
 from sasgeo_bench.leaderboard.build import make_board

@@ -14,7 +14,8 @@ import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.files import folders
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame

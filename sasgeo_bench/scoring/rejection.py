@@ -317,7 +317,7 @@ def evaluate_rejectors(
                 continue
             judged[task.matcher, name] = frame
             rows.append(figures)
-            accepted.append(taken)
+            accepted += [taken] if len(taken) else []  # columns of an empty one have no type
             if not len(frame):
                 tell(f"{name} on {task.matcher}: not applied, {why_not(task.scores, is_taught=task.is_taught)}")
             elif name != OWN:

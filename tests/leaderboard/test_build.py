@@ -668,6 +668,7 @@ def test_the_program_prints_the_board_and_where_it_is(out, monkeypatch, capsys):
     assert re.search(r"oracle_pose  1\.000 \[0\.\d\d, 1\.00\] \(control\)", told.out)
     assert "fewer than 36 in 12" in told.err
     assert sorted(path.name for path in Path(told.out.splitlines()[-1]).iterdir()) == [
+        "acceptance.parquet",
         "board.json",
         "contrasts.parquet",
         "controls.parquet",

@@ -73,10 +73,11 @@ def _rows(pool: _Pool, text: str) -> Iterator[dict[str, Any]]:
     part = pool.rows
     place, block, site = (np.unique(part[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
     drawn = BoardDraws.of(place, block, site, seed=seed_of_text(text), draws=SLOW_DRAWS)
+    plain = answers_of(part)
     cases = [
         (mixture, cost_ratio, _shares(answers, mass, cost_ratio))
-        for mixture, mass in mixtures_of(answers_of(part), is_pooled=True)
-        if not np.isnan((answers := answers_of(part, mixture)).confidence[answers.is_answered]).all()
+        for mixture, mass in mixtures_of(plain, is_pooled=True)
+        if _is_complete(plain, answers := answers_of(part, mixture))
         for cost_ratio in COST_RATIOS
     ]
     intervals = share_intervals([share for *_, shares in cases for share in shares], site, drawn)
@@ -87,6 +88,12 @@ def _rows(pool: _Pool, text: str) -> Iterator[dict[str, Any]]:
             one = next(intervals)
             found |= {name: one.value, f"{name}_lo": one.lo, f"{name}_hi": one.hi}
         yield {"mixture": mixture, "absence": pool.absence, "cost_ratio": cost_ratio, **counts, **found}
+
+
+def _is_complete(plain: Answers, shifted: Answers) -> bool:
+    """Return whether no answer lost its chance to the correction, as where one calibration place lacks absent ones."""
+    lost = np.isnan(shifted.confidence) & ~np.isnan(plain.confidence)
+    return not lost.any() and not np.isnan(plain.confidence[plain.is_answered]).all()
 
 
 def _shares(answers: Answers, mass: Floats, cost_ratio: float) -> list[Share]:

@@ -34,7 +34,7 @@ from sasgeo_bench.texts import message_of
 JUDGED: Final = "rejectors"  # what progress is shown of
 OWN: Final = "own"  # name of a matcher's own confidence on a board; reserved
 _NUMBER: Final = r"\d+(?:\.\d+)?"
-_PARTS: Final = 5  # folds of the calibration blocks: thresholds need answers that the rejector was not fitted on
+_PARTS: Final = 5  # folds of the calibration places: thresholds need answers that the rejector was not fitted on
 
 Make = Callable[[], Rejector]
 
@@ -226,11 +226,15 @@ def _are_chances(answers: Answers) -> bool:
 
 
 def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
-    """Return probabilities on calibration blocks, each from a fit on the others; a single block uses its own fit."""
-    names = sorted(set(calibration["block"]))
+    """Return probabilities on calibration places, each from a fit on others: a tested place is in no fit, either.
+
+    A single place is divided into its blocks; a single block uses its own fit.
+    """
+    unit = "place" if calibration["place"].nunique() > 1 else "block"
+    names = sorted(set(calibration[unit]))
     if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
         return _fit_and_apply(make, calibration, calibration, predictions)[0]
-    fold = calibration["block"].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
+    fold = calibration[unit].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
     found = np.full(len(calibration), np.nan)
     for part in sorted(set(fold)):
         rest, mine = calibration[fold != part], calibration[fold == part]

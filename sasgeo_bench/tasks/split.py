@@ -258,10 +258,13 @@ class Split:
 
 
 def _fold(spec: SplitFile, held_out: str) -> Fold:
-    """Hold one place out: the rest of its half calibrates, the other half trains; sealed places do neither."""
-    own = next(place.half for place in spec.place if place.name == held_out)
-    others = [place for place in spec.place if not place.sealed]
-    parts: dict[str, Part] = {place.name: "calibration" if place.half == own else "train" for place in others}
+    """Hold one place out: the rest of its half calibrates, the other half trains.
+
+    Sealed places do neither, nor do other places of its country, whose mappers it shares.
+    """
+    own = next(place for place in spec.place if place.name == held_out)
+    others = [place for place in spec.place if not place.sealed and (not own.country or place.country != own.country)]
+    parts: dict[str, Part] = {place.name: "calibration" if place.half == own.half else "train" for place in others}
     return Fold(held_out=held_out, part_of=parts | {held_out: "test"})
 
 

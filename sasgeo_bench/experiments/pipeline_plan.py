@@ -20,6 +20,7 @@ from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
+from sasgeo_bench.running.training_tasks import Lessons
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.rows import is_unranked
@@ -349,7 +350,8 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
     if groups is None or not whole.learns or not own:
         return [Run(name="", plan=whole)]
     learning = groups.learning
-    request = replace(whole.request, most_trained=learning.most, detector=learning.detector, split=groups.split)
+    lessons = Lessons(detector=learning.detector, kinds=tuple(learning.kinds))
+    request = replace(whole.request, most_trained=learning.most, lessons=lessons, split=groups.split)
     return [
         Run(name=group.name, plan=plan_run(replace(request, tasks=group.asked, train=group.train)))
         for group in groups.of(own, tasks, is_oracle=is_oracle)

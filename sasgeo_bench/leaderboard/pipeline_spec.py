@@ -32,7 +32,7 @@ _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
     "contrast": {"pilot": None, "detectors": []},
     "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR},
     "paper": {"crop_readings": []},
-    "learning": {"detector": PUBLISHED},
+    "learning": {"detector": PUBLISHED, "kinds": []},
 }
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
@@ -128,7 +128,8 @@ class LearningSpec(Document):
     """Queries that matchers with a `learn` are trained on: suites, number, on the other half.
 
     `oracles` learn from the half that they are asked on: yardsticks of what rates known in advance would be worth.
-    Matchers learn from views of one `detector`, so that views of another one show what a shift costs.
+    Matchers learn from views of one `detector`, so that views of another one show what a shift costs; and under stress
+    only from `kinds`, as they begin, all if empty. Views without stress always count.
 
     >>> LearningSpec(suites=["clean"]).most
     200
@@ -138,6 +139,7 @@ class LearningSpec(Document):
     most: Annotated[int, Field(ge=1, le=2000)] = 200
     oracles: list[str] = []
     detector: Detector = PUBLISHED
+    kinds: list[Short] = []
 
 
 class PipelineFile(NamedDocument):
@@ -253,6 +255,9 @@ class PipelineFile(NamedDocument):
             raise ValueError(message)
         for item in self.contrast:
             _check_asked(item, self.task)
+            _check_drawn(item, self.task)
+        if self.learning is not None:
+            _check_learned(self.learning, self.task)
         return self
 
     def suites_of(self, matcher: str) -> frozenset[str]:
@@ -265,6 +270,34 @@ class PipelineFile(NamedDocument):
         """
         asked = (task for task in self.task if not task.matchers or matcher in task.matchers)
         return frozenset(name for task in asked for name in task.suites)
+
+
+def _check_drawn(contrast: ContrastSpec, tasks: list[TaskSpec]) -> None:
+    """Refuse a contrast that could count no query: Holm's adjustment would count it all the same."""
+    own = [task for task in tasks if set(task.suites) & set(contrast.suites)]
+    if not own:  # of the paper's trials
+        return
+    named, drawn = set(contrast.detectors), {name for task in own for name in task.detectors}
+    if named and not named & drawn:
+        message = (
+            f"contrast {contrast.name!r} counts views of {' and '.join(sorted(named))} alone, and its suites are drawn "
+            f"with {' and '.join(sorted(drawn))}: add the detector to their [[task]]"
+        )
+        raise ValueError(message)
+    if all(task.tracks and contrast.track not in task.tracks for task in own):
+        message = f"contrast {contrast.name!r} is of {contrast.track}, and no [[task]] of its suites draws that track"
+        raise ValueError(message)
+
+
+def _check_learned(learning: LearningSpec, tasks: list[TaskSpec]) -> None:
+    """Refuse a detector of learning with which no suite that is learned from is drawn."""
+    drawn = {name for task in tasks if set(task.suites) & set(learning.suites) for name in task.detectors}
+    if learning.detector not in drawn:
+        message = (
+            f"learning is from views of {learning.detector!r}, and its suites are drawn with "
+            f"{' and '.join(sorted(drawn))}: add it to the detectors of their [[task]]"
+        )
+        raise ValueError(message)
 
 
 def _check_apart(contrasts: list[ContrastSpec]) -> None:

@@ -15,10 +15,9 @@ from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_po
 from sasgeo_bench.matching.results import STATUSES, Status, matcher_hash
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import CARD
-from sasgeo_bench.running.training_tasks import TrainingSet, map_of, plan_training, root_of, truth_of
+from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, map_of, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import PUBLISHED, Detector
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_rows import asked_under
 
@@ -42,7 +41,7 @@ class RunRequest:
     `is_shut_in`, trusted code runs without isolation, and `run.json` says so.
 
     `train` are tasks with truths, of places that are not asked, for a matcher with a `learn`; `most_trained` bounds
-    their queries, evenly over places, then suites, then sites; only those of `detector` are used. `split` defines
+    their queries, evenly over places, then suites, then sites; only what `lessons` hold is used. `split` defines
     places and how far apart training and test places must lie. An oracle (`is_oracle`) may train on what it is asked,
     and is never ranked. `hidden` are files that the matcher must not see besides truths and the like, such as that of a
     private seed.
@@ -61,7 +60,7 @@ class RunRequest:
     is_shut_in: bool = True
     train: Sequence[Path] = ()
     most_trained: int = 200
-    detector: Detector = PUBLISHED
+    lessons: Lessons = field(default_factory=Lessons)
     split: Split | None = None
     is_oracle: bool = False
     hidden: Sequence[Path] = ()
@@ -193,7 +192,7 @@ def plan_run(request: RunRequest) -> RunPlan:
             asked=asked,
             split=request.split,
             most=request.most_trained,
-            detector=request.detector,
+            lessons=request.lessons,
         )
         text = read_learned(learned_path(_run_folder(request, card, found), training_set.sha256))
         result = None if text is None else TrainingResult(text=text)

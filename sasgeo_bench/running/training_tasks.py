@@ -62,18 +62,40 @@ class _Pair:
     hashes: tuple[str, str]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lessons:
+    """The views that may be learned from: of one detector, and under stress only of some kinds, as they begin; or all.
+
+    >>> Lessons(kinds=("S1",)).kinds
+    ('S1',)
+    """
+
+    detector: Detector = PUBLISHED
+    kinds: tuple[str, ...] = ()
+
+    def hold(self, truth: Truth) -> bool:
+        """Return whether a view may be learned from; views without stress are of every kind."""
+        return truth.detector == self.detector and (truth.role != "stress" or truth.kind.startswith(self.kinds or ""))
+
+    def to_text(self) -> str:
+        """Name the views."""
+        kinds = f" and kinds {', '.join(self.kinds)}" if self.kinds else ""
+        return f"of detector {self.detector!r}{kinds}"
+
+
 def plan_training(
     train: Sequence[Path],
     *,
     asked: Sequence[Path],
     split: Split | None,
     most: int,
-    detector: Detector = PUBLISHED,
+    lessons: Lessons | None = None,
 ) -> TrainingSet:
     """Choose at most `most` pairs, evenly over places, then suites, then sites, by a hash of their names.
 
     `train` and `asked` are task folders. `split` defines places and how far apart they must lie; without one, regions
-    are places. Only views of one `detector` are used.
+    are places. Only views that `lessons` hold are used, those of the
+    published detector unless given.
 
     Raises
     ------
@@ -83,6 +105,7 @@ def plan_training(
     StoreError
         If a task, its map or its truths are missing, damaged or do not belong together.
     """
+    chosen_by = lessons or Lessons()
     tasks = {folder.resolve(): folder for folder in train}
     abouts = {folder: task_files.read_task(folder) for folder in tasks.values()}
     regions = {base_of(about["region"]): folder for folder, about in abouts.items()}
@@ -90,10 +113,10 @@ def plan_training(
     check_apart(regions, others, split)
     maps = {folder: map_of(folder, about) for folder, about in abouts.items()}
     _check_names(maps)
-    pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split, detector)]
+    pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split, chosen_by)]
     if not pairs:
         first = next(iter(tasks.values()))
-        message = f"--train {first} holds no queries of detector {detector!r}: there is nothing to learn from"
+        message = f"--train {first} holds no queries {chosen_by.to_text()}: there is nothing to learn from"
         raise ConfigError(message)
     chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
     order = sorted({pair.task for pair in chosen}, key=lambda task: (abouts[task]["region"], abouts[task]["suite"]))
@@ -179,8 +202,8 @@ def _check_names(maps: Mapping[Path, Path]) -> None:
             raise ConfigError(message)
 
 
-def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None, detector: Detector) -> Iterator[_Pair]:
-    """Yield every query of a task that one detector has seen, with what decides whether it is used."""
+def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None, lessons: Lessons) -> Iterator[_Pair]:
+    """Yield every query of a task that may be learned from, with what decides whether it is used."""
     truth = truth_of(task, about)
     if not (truth / task_files.TRUTH).is_file():
         message = f"{truth} holds no truths of {task}, which training needs: make the queries here, or leave it out"
@@ -189,7 +212,7 @@ def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None, detecto
     task_files.check_truths(task, truth)
     asked, place_of = task_files.read_asked(task), {} if split is None else split.place_of
     for item in task_files.read_truths(truth):
-        if item.detector != detector:
+        if not lessons.hold(item):
             continue
         yield _Pair(
             place=place_of.get(item.block, base_of(about["region"])),

@@ -235,7 +235,8 @@ def _tally(query: Query, truth: Truth, region: Region, switches: Switches) -> Ta
     """Count cells seen against the map at the true place."""
     seen = switches.seen(query.evidence)
     under = _Footprint.of(region.grid, _pose(truth), seen).rings(region)
-    return tally(region.classes, _on_map(region, seen), under, age_years=age_years(query, region), block=truth.block)
+    age = age_years(query, region) if switches.knows_age else 0.0  # who cannot tell ages learns none
+    return tally(region.classes, _on_map(region, seen), under, age_years=age, block=truth.block)
 
 
 def _stamps(region: Region, views: Sequence[tuple[Query, Truth]], switches: Switches) -> list[StampTally]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final, Self
 
 import cv2
 import numpy as np
+import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 THIN: Final = frozenset(
     {"road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"}
 )
+BRIDGE: Final = "bridge"
 REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
 DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
@@ -117,7 +119,8 @@ def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
     """Burn perceived vectors on the cells of a view, in the classes that both have; None where they share none.
 
     Lines have the width of their class (`line_width_m`), areas are areas, and a cell holds what covers its centre, as
-    on a map. Cells that are unknown in the view stay unknown.
+    on a map. Cells that are unknown in the view stay unknown, but for bridges: where a line runs, it says whether it is
+    on one.
 
     Examples
     --------
@@ -128,18 +131,23 @@ def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
     >>> burnt(house, Evidence(classes=("building",), cells=cells, cell_size_m=1.0)).cells.tolist()
     [[[1, 1, 0, 2], [1, 1, 0, 2]]]
     """
-    names = tuple(name for name in evidence.classes if (vectors["class"] == name).any())
+    features = as_features(vectors)
+    is_line = features["width_m"].notna().to_numpy()
+    seen = {*vectors["class"], *((BRIDGE,) if is_line.any() else ())}
+    names = tuple(name for name in evidence.classes if name in seen)
     if not names:
         return None
     (rows, cols), (width_m, height_m) = evidence.shape, evidence.size_m
     cell_m = evidence.cell_size_m
     grid = Grid(epsg=0, west_m=-width_m / 2, north_m=height_m / 2, cell_size_m=cell_m, rows=rows, cols=cols)
-    features = as_features(vectors)
-    is_line = features["width_m"].notna().to_numpy()
     features.loc[is_line, "width_m"] = [line_width_m(name) for name in features.loc[is_line, "class"]]
-    view = shapely.box(*grid.bounds_m)
-    cells = burn_layers(make_paint(features, names, view), grid)
+    on_bridges = features[is_line & features["is_bridge"].to_numpy(bool)].assign(**{"class": BRIDGE})
+    paint = make_paint(pd.concat([features, on_bridges], ignore_index=True), names, shapely.box(*grid.bounds_m))
+    cells = burn_layers(paint, grid)
     unknown = np.stack([evidence.layer(name) == UNKNOWN for name in names])
+    if BRIDGE in names:
+        lines = [at for at, name in enumerate(names) if name in THIN and name != BRIDGE]
+        unknown[names.index(BRIDGE)] = ~cells[lines].any(axis=0)
     return Evidence(classes=names, cells=np.where(unknown, np.uint8(UNKNOWN), cells), cell_size_m=cell_m)
 
 

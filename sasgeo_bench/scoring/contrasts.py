@@ -33,7 +33,7 @@ from sasgeo_bench.scoring.intervals import (
 from sasgeo_bench.scoring.metrics import THRESHOLDS, primary_of
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.verdicts import COLUMNS, LEAST_PLACES, OF_MATCHERS, ContrastMetric, Finding
-from sasgeo_bench.tasks.query import Detector
+from sasgeo_bench.tasks.query import UNRIVALLED, Detector
 
 PRIMARY: Final = "primary"
 INTERACTION: Final = "interaction"
@@ -213,12 +213,16 @@ def chosen_rows(contrast: Contrast, frame: pd.DataFrame) -> pd.DataFrame:
 def _rows_of(
     contrast: Contrast, frame: pd.DataFrame, chosen: Callable[[pd.DataFrame], "pd.Series[bool]"]
 ) -> pd.DataFrame:
-    """Return chosen rows of a contrast: suites, track, detectors and kinds; without stress rows belong to all kinds."""
+    """Return chosen rows of a contrast: suites, track, detectors and kinds; without stress rows belong to all kinds.
+
+    Twins and lures that no search lists count for no contrast.
+    """
     rows = frame[frame["suite"].isin(contrast.suites) & (frame["track"] == contrast.track)]
     if contrast.detectors:
         rows = rows[rows["detector"].isin(contrast.detectors)]
     rows = rows[chosen(rows).to_numpy(bool)]
-    is_kind = (rows["role"] != "stress") | rows["kind"].str.startswith(contrast.kinds or "")
+    is_kind = rows["kind"].str.startswith(contrast.kinds or "") & ~rows["kind"].str.startswith(UNRIVALLED)
+    is_kind |= rows["role"] != "stress"
     return rows[is_kind.to_numpy(bool)]
 
 

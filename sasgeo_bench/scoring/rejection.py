@@ -230,7 +230,7 @@ def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, 
 
     A single place is divided into its blocks; a single block uses its own fit.
     """
-    unit = "place" if calibration["place"].nunique() > 1 else "block"
+    unit = "place" if len(set(calibration["place"])) > 1 else "block"
     names = sorted(set(calibration[unit]))
     if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
         return _fit_and_apply(make, calibration, calibration, predictions)[0]

@@ -104,9 +104,18 @@ class Finding:
         return self.least > self.attainable + _NOTHING and not is_lost
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """Return the ends that decide: by countries where places share some and they are enough, else by places."""
+        return (self.lo, self.hi) if math.isnan(self.lo_countries) else (self.lo_countries, self.hi_countries)
+
+    @property
     def is_shown(self) -> bool:
-        """Return whether a difference is shown: the interval by places leaves out 0, after Holm's adjustment, too."""
-        return self.p_holm <= ALPHA and (self.lo > 0 or self.hi < 0)
+        """Return whether a difference is shown: the interval by places leaves out 0, after Holm's adjustment, too.
+
+        Where places share countries, and there are enough of these, the interval by countries leaves out 0, too.
+        """
+        lo, hi = self.ends
+        return self.p_holm <= ALPHA and (lo > 0 or hi < 0)
 
     @property
     def winner(self) -> str:
@@ -121,10 +130,10 @@ class Finding:
         if self.places < LEAST_PLACES or self.is_out_of_reach:
             return "not decided"
         if self.is_shown:
-            if max(abs(self.lo), abs(self.hi)) < self.least:
+            if max(map(abs, self.ends)) < self.least:
                 return "decided, small"
             return "cause open" if self.gains_without_stress and self.winner == self.first else "decided"
-        return "null" if -self.least < self.lo and self.hi < self.least else "not decided"
+        return "null" if -self.least < self.ends[0] and self.ends[1] < self.least else "not decided"
 
     @property
     def verdict(self) -> str:
@@ -145,18 +154,26 @@ class Finding:
             return f"not decided: at most {self.attainable:.3f} can be gained, and {self.least:.3f} was to matter"
         if not self.is_shown:
             return self._unshown()
-        nearest, farthest = sorted((abs(self.lo), abs(self.hi)))
+        nearest, farthest = sorted(map(abs, self.ends))
         size = "; whether by as much as matters is not decided"
         if nearest >= self.least:
             size = ", by as much as matters"
         elif farthest < self.least:
             size = ", by less than would matter"
         cause = "; cause open: it gains without the stress, too" if self.outcome == "cause open" else ""
-        return f"{self.winner} is better{size}{cause}"
+        return f"{self.winner} is better{size}{cause}{self._reach}"
+
+    @property
+    def _reach(self) -> str:
+        """Return which countries a verdict is of, where they are too few to speak for others."""
+        is_few = 0 < self.countries < min(self.places, LEAST_PLACES)
+        return f"; of {counted(self.countries, 'country', 'countries')} alone" if is_few else ""
 
     def _unshown(self) -> str:
         if self.outcome == "null":
-            return "null: any difference is smaller than would matter"
+            return f"null: any difference is smaller than would matter{self._reach}"
+        if self.p_holm <= ALPHA and (self.lo > 0 or self.hi < 0):
+            return "not decided: a difference is shown by places, none by countries"
         if self.lo > 0 or self.hi < 0:
             return "not decided: no difference shown after Holm's adjustment"
         return "not decided: no difference shown, and one that matters is not ruled out"

@@ -173,8 +173,8 @@ def blocks_of(region: str, grid: Grid, *, block_m: float = 1000.0) -> tuple[Bloc
 class Fold:
     """One use of a split: every place in one part; sealed places are in none but the test part.
 
-    `held_out` is the test place of a cross-fit fold. The rest of its half calibrates and the other half trains, so that
-    one training serves a whole half, on places that neither test nor calibrate it.
+    `held_out` is the test place of a cross-fit fold. The rest of its half calibrates, but for its country, and the
+    other half trains, so that one training serves a whole half, on places that neither test nor calibrate it.
     """
 
     held_out: str | None

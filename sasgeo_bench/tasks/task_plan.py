@@ -171,7 +171,8 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
     """Return the region for views of a wrong place: the next place of the split of the same kind, synthetic or real.
 
     It depends on the split alone, so that asking for more regions changes no query. In a hold-out it is of the same
-    part, so that nobody learns from views of a test place. No view is of a sealed place.
+    part, so that nobody learns from views of a test place; and of another country, whose places calibrate others. No
+    view is of a sealed place.
     """
     places = [[name for name in place.region_ids if name in known] for place in split.spec.place]
     at = next((index for index, names in enumerate(places) if region.id in names), None)
@@ -180,7 +181,8 @@ def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile
     own, is_town = split.spec.place[at], region.pick(None).town is not None
     for step in range(1, len(places)):
         other = (at + step) % len(places)
-        if split.spec.place[other].sealed or split.spec.place[other].part != own.part:
+        place = split.spec.place[other]
+        if place.sealed or place.part != own.part or (own.country and place.country == own.country):
             continue
         for name in places[other]:
             if (known[name].pick(None).town is not None) == is_town:

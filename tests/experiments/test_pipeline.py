@@ -246,6 +246,11 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ({'name = "nothing"': 'name = "a|b"'}, "'contrast.0.name': String should match pattern"),
         ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
         ({"sites = 1": "sites = 1\ndetectors = []"}, "at least 1 item"),
+        (
+            {"[[contrast]]": '[[contrast]]\ndetectors = ["measured"]'},
+            "counts views of measured alone, and its suites",
+        ),
+        ({"sites = 1": 'sites = 1\ntracks = ["retrieval"]'}, "is of localization, and no .* draws that track"),
         ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "'published' or 'measured'"),
         ({"sites = 1": 'sites = 1\ndetectors = ["measured", "measured"]'}, "detector 'measured' is listed twice"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
@@ -486,7 +491,7 @@ def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
 @pytest.mark.parametrize(
     ("small", "large", "may_differ"),
     [
-        ("towns", "claims", {"id", "title", "regions"}),
+        ("towns", "leaderboard", {"id", "title", "regions"}),
         ("paper-poc", "paper-poc-20", {"id", "title", "paper"}),
     ],
 )

@@ -19,7 +19,7 @@ from sasgeo_bench.matching.matcher import check_learned
 from sasgeo_bench.running import prediction_files, sandbox, training
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.running.training_tasks import _Pair, check_apart, plan_training, spread
+from sasgeo_bench.running.training_tasks import Lessons, _Pair, check_apart, plan_training, spread, truth_of
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.validate import set_aside, validate
 from sasgeo_bench.tasks import task_files
@@ -217,6 +217,17 @@ def test_a_training_set_is_the_same_whatever_order_its_tasks_are_named_in(tasks)
     assert plan_training(train, asked=[], split=None, most=8).sha256 != found[0].sha256
 
 
+def test_matchers_learn_under_stress_from_some_kinds_alone(tasks):
+    (task,) = (tasks / "tasks" / "alias").glob("town-grid*")
+    truths = list(task_files.read_truths(truth_of(task, task_files.read_task(task))))
+    kind = next(truth.kind for truth in truths if truth.role == "stress")
+    count = sum(truth.role != "stress" or truth.kind.startswith(kind) for truth in truths)
+    found = plan_training([task], asked=[], split=None, most=2000, lessons=Lessons(kinds=(kind,)))
+    assert found.count == count
+    calm = plan_training([task], asked=[], split=None, most=2000, lessons=Lessons(kinds=("no such kind",)))
+    assert calm.count == sum(truth.role != "stress" for truth in truths)
+
+
 def test_matchers_learn_from_the_views_of_one_detector(tasks, tmp_path):
     out = Path(shutil.copytree(tasks, tmp_path / "other"))
     task, truths = out / "tasks" / CLEAN, out / "truth" / CLEAN / task_files.TRUTH
@@ -226,7 +237,7 @@ def test_matchers_learn_from_the_views_of_one_detector(tasks, tmp_path):
     pq.write_table(table.set_column(at, "detector", pa.array(detectors)), truths)
     counts = Counter(detectors)
     for detector, count in counts.items():
-        found = plan_training([task], asked=[], split=None, most=2000, detector=detector)
+        found = plan_training([task], asked=[], split=None, most=2000, lessons=Lessons(detector=detector))
         assert found.count == count
     assert plan_training([task], asked=[], split=None, most=2000).count == counts["published"]
     pq.write_table(table.set_column(at, "detector", pa.array(["measured"] * len(table))), truths)

@@ -9,7 +9,7 @@ import shapely
 from affine import Affine
 from rasterio.features import rasterize
 
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.raster import RasterView, burnt, doubted, likeness_by_hand, line_width_m, read_field
 from sasgeo_bench.sasgeo.rates import hand_rates
 from sasgeo_bench.sasgeo.weights import even_gains, likelihood_gains
@@ -138,6 +138,22 @@ def test_burnt_vectors_say_nothing_where_the_view_is_unknown_or_lacks_their_clas
     water = Evidence(classes=("water",), cells=BLANK.cells[:1].copy(), cell_size_m=1.0)
     assert burnt(VECTORS, water) is None
     assert burnt(vector_table([]), BLANK) is None
+
+
+def test_lines_say_whether_they_are_on_a_bridge_where_the_view_does_not():
+    lines = [shapely.LineString([(-9, 0), (9, 0)]), shapely.LineString([(0, -9), (0, 9)])]
+    cells = np.stack([np.zeros((20, 20), dtype=np.uint8), np.full((20, 20), UNKNOWN, dtype=np.uint8)])
+    view = Evidence(classes=("road_minor", "bridge"), cells=cells, cell_size_m=1.0)
+    level, over = (
+        burnt(vector_table([("road_minor", 0, False, lines[0]), ("road_minor", up, up > 0, lines[1])]), view)
+        for up in (0, 1)
+    )
+    roads = level.layer("road_minor") == PRESENT
+    assert (over.layer("road_minor") == level.layer("road_minor")).all()
+    assert (level.layer("bridge") == np.where(roads, ABSENT, UNKNOWN)).all()
+    assert (over.layer("bridge") == PRESENT).sum() > 50
+    assert (over.layer("bridge")[~roads] == UNKNOWN).all()
+    assert (over.layer("bridge")[9:11, 1:5] == ABSENT).all()  # the road below it
 
 
 def test_a_view_beside_itself_weighs_as_much_as_alone(tiny, asked):

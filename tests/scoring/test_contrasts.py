@@ -83,9 +83,9 @@ def test_a_difference_over_few_blocks_has_the_doubts_of_its_sites():
 
 
 def test_countries_are_drawn_where_places_share_some_and_widen_the_interval():
-    # Sixty places, six to a country. In half of the countries the first side is right everywhere, in the other nowhere.
+    # Sixty places, six to a country: in three countries the first side is right everywhere, in the others nowhere.
     country = [f"country {at % 10}" for at in range(600)]
-    is_won = np.arange(600) % 10 < 5
+    is_won = np.arange(600) % 10 < 3
     ours, theirs = scores(np.where(is_won, 1.0, 99.0), blocks=60), scores(99 * np.ones(600), blocks=60)
     apart = held(CONTRAST, **{"with": ours, "without": theirs})
     assert apart.countries == apart.places == 60
@@ -97,9 +97,14 @@ def test_countries_are_drawn_where_places_share_some_and_widen_the_interval():
     assert (shared.lo, shared.hi) == (apart.lo, apart.hi)
     assert shared.lo_countries < shared.lo - 0.05
     assert shared.hi_countries > shared.hi + 0.05
+    assert (apart.outcome, shared.outcome) == ("decided", "not decided")
+    assert shared.verdict == "not decided: a difference is shown by places, none by countries"
+    few = [f"country {at % 5}" for at in range(600)]
+    alike = held(CONTRAST, **{"with": ours.assign(country=few), "without": theirs.assign(country=few)})
+    assert alike.verdict == "with is better, by as much as matters; of 5 countries alone"
     title = {column.name: at for at, column in enumerate(contrast_table([shared]).columns)}
     cells = contrast_table([shared]).rows[0].cells
-    assert cells[title["by countries"]].text.startswith("[0.")
+    assert cells[title["by countries"]].text.startswith("[0.000, 0.")
     assert cells[title["n"]].text == "600 in 60 blocks, 60 places, 10 countries"
     assert "by countries" not in [column.name for column in contrast_table([apart]).columns]
 
@@ -116,6 +121,8 @@ def test_kinds_choose_and_controls_and_falsifiers_do_not_count():
     found = held(replace(CONTRAST, kinds=("U2",)), **{"with": table, "without": table})
     assert found.n == 60
     assert held(CONTRAST, **{"with": table, "without": table}).n == 120
+    far = table.assign(kind="unrivalled U2")
+    assert held(CONTRAST, **{"with": far, "without": far}).n == 0
     assert held(replace(CONTRAST, kinds=("U9",)), **{"with": table, "without": table}).verdict == "not tested: no query"
 
 

@@ -20,7 +20,7 @@ from sasgeo_bench.regions.evidence import ABSENT, PRESENT, Evidence
 from sasgeo_bench.search.field import FULL, Field, Template, squares
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Mode, place_m
-from sasgeo_bench.tasks.query import Role
+from sasgeo_bench.tasks.query import UNRIVALLED, Role
 from sasgeo_bench.tasks.suites.base import State
 
 # Of `Truth.measured`: how many rivals a place has, how many of them lie in the disc of the prior and in the list, and
@@ -30,7 +30,6 @@ IN_DISC: Final = "rivals_in_disc"
 LISTED: Final = "rivals_listed"
 TRUTH_LISTED: Final = "truth_listed"
 LEAD: Final = "rival_lead"  # score of the best rival minus that of the true place, -2..2; where both are listed
-UNRIVALLED: Final = "unrivalled"  # begins the kind of a stress whose list lacks one of them
 
 CELL_M: Final = 2.0
 MODES: Final = 20
@@ -82,7 +81,7 @@ class RivalCheck:
 def kind_of(role: Role, kind: str, measured: dict[str, float]) -> str:
     """Return the kind of a query: another one for a stress whose list lacks the true place or a rival.
 
-    Contrasts choose kinds by their beginning, so they leave it out.
+    Contrasts leave it out.
 
     Examples
     --------

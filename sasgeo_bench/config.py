@@ -99,7 +99,10 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
     if item["type"] == "list_type" and not isinstance(item["input"], dict):
         return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
     text = str(item["msg"]).removeprefix("Value error, ")
-    return f"{where!r}: {text}, got {_short(item['input'])}" if where and "got " not in text else text
+    if not where or "got " in text:
+        return text
+    # A whole table says nothing of what is wrong in it.
+    return f"{where!r}: {text}" + ("" if isinstance(item["input"], dict) else f", got {_short(item['input'])}")
 
 
 def _short(value: object) -> str:

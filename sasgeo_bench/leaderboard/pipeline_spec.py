@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a file in `pipelines/` says: an experiment as data, read before anything is run."""
 
+import difflib
 import hashlib
 import json
 from collections.abc import Mapping
@@ -332,7 +333,9 @@ def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]
     lost = next((name for name in (item.first, item.second) if name not in known), None)
     if lost is not None:
         kind = "matcher x rejector" if is_of_rejectors else "matcher"
-        message = f"contrast {item.name!r} names the unknown {kind} {lost!r}"
+        near = difflib.get_close_matches(lost, sorted(known), n=1, cutoff=0.4)
+        hint = f", did you mean {near[0]!r}?" if near else ""
+        message = f"contrast {item.name!r} names the unknown {kind} {lost!r}{hint}"
         raise ValueError(message)
 
 

@@ -130,7 +130,7 @@ def _read(file: Path) -> str:
     try:
         status, text = file.stat(), file.read_bytes()[: _MOST_BYTES + 1].decode("ascii", errors="replace")
     except OSError as error:
-        message = f"{file} cannot be read ({error.strerror or error}): name the file of the private seed"
+        message = f"{file} cannot be read ({error.strerror or error}): name a file with a seed that you can read"
         raise StoreError(message) from error
     if status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
         message = f"{file} can be read by others (mode {stat.S_IMODE(status.st_mode):03o}): chmod 600 {file}"

@@ -95,20 +95,27 @@ class SplitFile(NamedDocument):
             wrong = next((place.name for place in self.place if (getattr(place, name) is not None) != is_needed), None)
             if wrong is not None:
                 kinds = {"part": "a cross-fit", "half": "a hold-out"}
-                fault = f"needs a {name}" if is_needed else f"must not have a {name} in {kinds[name]}"
+                needed = "part: train, calibration or test" if name == "part" else "half: a or b"
+                fault = f"needs a {needed}" if is_needed else f"must not have a {name} in {kinds[name]}: leave it out"
                 message = f"place {wrong!r} {fault}"
                 raise ValueError(message)
         sides: dict[str, str] = {}
         for place in self.place:
             side = place.part or f"half {place.half}"
             if place.country and sides.setdefault(place.country, side) != side:
-                message = f"country {place.country!r} is in {sides[place.country]} and, with {place.name!r}, in {side}"
+                message = (
+                    f"country {place.country!r} is in {sides[place.country]} and, with {place.name!r}, in {side}: put "
+                    "all its places on one side"
+                )
                 raise ValueError(message)
         for half in HALVES if self.kind == "crossfit" else ():
             own = [place for place in self.place if place.half == half]
             if sum(not place.sealed for place in own) < _LEAST_PLACES:
                 open_ones = "two places that are not sealed" if any(place.sealed for place in own) else "two places"
                 message = f"half {half!r} needs {open_ones} at least: one is tested, and another one calibrates"
+                raise ValueError(message)
+            if len({place.country or place.name for place in own if not place.sealed}) == 1:
+                message = f"half {half!r} needs places of two countries: those of one do not calibrate each other"
                 raise ValueError(message)
         return self
 
@@ -279,7 +286,8 @@ def make_split(spec: SplitFile, grids: Mapping[str, Grid]) -> Split:
     """
     unknown = [region for region in spec.region_ids if region not in grids]
     if unknown:
-        message = f"split {spec.id!r} names the unknown region {unknown[0]!r}: list-regions shows all there are"
+        mend = "a block stands under 'blocks'" if "/" in unknown[0] else "list-regions shows all there are"
+        message = f"split {spec.id!r} names the unknown region {unknown[0]!r}: {mend}"
         raise ConfigError(message)
     blocks = {place.name: _blocks_of_place(spec, place, grids) for place in spec.place}
     split = Split(spec=spec, blocks=blocks)

@@ -136,6 +136,11 @@ def test_a_split_file_with_a_fault_is_refused(text, fault):
         (TWO, "crossfit", "must not have a part"),
         ([*halved("aabb")[:3], {"name": "d", "regions": ["d"]}], "crossfit", "place 'd' needs a half"),
         (halved("aaab"), "crossfit", "half 'b' needs two places at least: one is tested, and another one calibrates"),
+        (
+            [place | {"country": f"land-{place['half']}"} for place in halved("aabb")],
+            "crossfit",
+            "half 'a' needs places of two countries",
+        ),
         ([TWO[0], TWO[1] | {"half": "a"}], "holdout", "place 'b' must not have a half in a hold-out"),
         ([TWO[0], {"name": "b", "part": "test"}], "holdout", "needs regions or blocks"),
     ],

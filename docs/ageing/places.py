@@ -22,11 +22,8 @@ LEAST_YEARS: Final = (8.0, 5.0, 2.0)
 HEAD: Final = f"""\
 # Places with maps of several dates
 
-Made by
-
-```bash
-.venv/bin/python docs/ageing/places.py    # reads SASGEO_EXTRACTS; ten minutes if no region is built
-```
+Made by `.venv/bin/python docs/ageing/places.py`, which reads SASGEO_EXTRACTS and takes ten minutes if no region is
+built.
 
 Places of the split `{SPLIT}` whose region has more than one date. Buildings and kilometres of road (major and minor)
 are those within the blocks of the place, on its first and on its last map. A first map without buildings is one of

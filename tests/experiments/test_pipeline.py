@@ -440,8 +440,13 @@ def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
     assert spec.sha256 == hashlib.sha256(spec.model_dump_json(exclude=newer).encode()).hexdigest()
     for key in ("views_cells = [192]", 'detectors = ["published", "measured"]'):
         assert small(**{"sites = 1": f"sites = 1\n{key}"}).sha256 != spec.sha256
-    taught = [taught_by(line).sha256 for line in ("", 'detector = "published"', 'detector = "measured"')]
-    assert taught[0] == taught[1] != taught[2]
+    both = LEARNING.replace("[[task]]", '[[task]]\ndetectors = ["published", "measured"]')
+    lines = ("", 'detector = "published"', "kinds = []", 'detector = "measured"', 'kinds = ["S1"]')
+    taught = [taught_by(line, both).sha256 for line in lines]
+    assert taught[0] == taught[1] == taught[2]
+    assert len(set(taught)) == 3  # another detector, and other kinds
+    with pytest.raises(ConfigError, match="from views of 'measured', and its suites are drawn with published"):
+        taught_by('detector = "measured"')
 
 
 def taught_by(line, text=LEARNING):

@@ -73,6 +73,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "method": "How the level is computed",
     "absence": "Kind of absent places, suite: kind; all: all of them",
     "absent": "Absent places among the queries",
+    "coverage": "Share of queries with an accepted fix, where absent places have the share named",
     "risk of fixes": "Share of false fixes among the accepted ones, where absent places have the share named",
     "risk": "How often the error may exceed the level, as was promised",
     "available": "Share of queries whose level is within the alert limit, with its 95 % interval",

@@ -98,11 +98,11 @@ def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table
     for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
         by_mixture = {str(row["mixture"]): row for row in mine.to_dict("records")}
         some = next(iter(by_mixture.values()))
-        counts = (plain_cell(int(some["n"])), plain_cell(int(some["absent"])))
+        absent = plain_cell(int(some["absent"]))
         cells = [_cell(by_mixture.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")]
-        rows.append(Row(cells=(*text_cells(*map(str, key)), *counts, *cells)))
+        rows.append(Row(cells=(*text_cells(*map(str, key)), absent, *cells)))
     titles = [
-        (term, f"{term}, {mixture if mixture == AS_DRAWN else f'{100 * (1 - share):.0f} % absent'}")
+        (term, f"{term.split()[0]}, {mixture if mixture == AS_DRAWN else f'{100 * (1 - share):.0f} % absent'}")
         for mixture, share in zip(_MIXTURES, (math.nan, *PRESENT_SHARES), strict=True)
         for term in ("risk of fixes", "coverage")
     ]
@@ -111,7 +111,6 @@ def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table
         title=f"Risk and coverage by kind of absence: {track}, {prior_words(prior_group)}",
         columns=(
             *words("matcher", "rejector", "absence"),
-            column("n"),
             column("absent"),
             *(column(term, title=title) for term, title in titles),
         ),

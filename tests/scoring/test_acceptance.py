@@ -90,9 +90,9 @@ def test_the_table_shows_one_cost_and_no_control():
     (table,) = acceptance_tables(found)
     assert [row.cells[2].text for row in table.rows] == ["absent: removed", "absent: wrong place", "all"]
     assert [column.name for column in table.columns][-4:] == [
-        *("risk of fixes, 30 % absent", "coverage, 30 % absent"),
-        *("risk of fixes, 50 % absent", "coverage, 50 % absent"),
+        *("risk, 30 % absent", "coverage, 30 % absent"),
+        *("risk, 50 % absent", "coverage, 50 % absent"),
     ]
-    assert table.rows[-1].cells[5].text.startswith("0.200")
+    assert table.rows[-1].cells[4].text.startswith("0.200")
     assert table.rows[-1].cells[-1].text == "-"
     assert acceptance_tables(found.assign(matcher="random")) == ()

@@ -226,6 +226,9 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         sealed=sealed_seed(options.sealed_seed_file, tell=tell),
     )
     plan = replace(plan, jobs=options.jobs, dask=options.dask)
+    if opened is not None and (plan.seal is None or plan.seal.seed is None):
+        message = "--opened is the day on which sealed places are opened: give --sealed-seed-file, too, or leave it out"
+        raise ConfigError(message)
     if options.dry_run:
         say(plan.to_text())
         return

@@ -148,9 +148,9 @@ class Worker:
             answer, _ = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
             came = time.perf_counter()
             reply = read_reply(message["kind"], answer, nonce=nonce)
-        except wire.Late:
+        except wire.Late as late:
             self.end()
-            return Reply(status="timeout", message=f"no answer within {timeout_s:g} s")
+            return Reply(status="timeout", message=str(late) or f"no answer within {timeout_s:g} s")
         except wire.TooLong as error:
             self.end()
             return Reply(status="crash", message=one_line(str(error)))
@@ -192,12 +192,21 @@ class Worker:
         self.starts += 1
         if self.reach.is_shut_in:
             wire.send(ours, self._policy(str(self._scratch)))
-            started, _ = wire.receive(ours, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
+            started = self._heard_of_start(ours)
             self.isolation = {str(name): one_line(str(text)) for name, text in dict(started["isolation"]).items()}
         self.isolation["memory"] = _memory_words(self.limits, self._group)
         paths = [os.getcwd(), *filter(None, sys.path)]  # noqa: PTH109
         wire.send(ours, {"spec": self.spec, "scratch": str(self._scratch), "paths": paths})
         return ours
+
+    @staticmethod
+    def _heard_of_start(channel: socket.socket) -> dict[str, Any]:
+        """Wait until the sandbox stands; a late one is no fault of the matcher, and its message says so."""
+        try:
+            return wire.receive(channel, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)[0]
+        except wire.Late:
+            message = f"the sandbox did not stand within {_START_S:g} s: is a folder of sys.path very large?"
+            raise wire.Late(message) from None
 
     def _begin_watch(self, process: subprocess.Popen[bytes], scratch: Path) -> None:
         """Put the process into a control group if possible, and measure its memory in any case."""

@@ -155,6 +155,9 @@ def test_the_command_opens_by_a_file_that_its_owner_alone_can_read(split, tmp_pa
     assert SEED.text not in told + err
     code, _, err = program(*asked, "--opened", "yesterday")
     assert (code, err.strip()) == (2, "sasgeo-bench: --opened must be a date as in 2021-10-28, got 'yesterday'")
+    code, _, err = program("leaderboard", "closed.toml", "--dry-run", "--opened", "2026-11-23")
+    assert code == 2
+    assert "give --sealed-seed-file, too, or leave it out" in err
 
 
 def test_a_hold_out_whose_test_places_are_all_sealed_can_be_planned_and_not_run(tmp_path):

@@ -92,6 +92,12 @@ def test_a_map_that_takes_too_long_is_a_timeout(place, task):
     assert (reply.status, reply.message) == ("timeout", "no answer within 1 s")
 
 
+def test_a_sandbox_that_does_not_stand_in_time_is_not_said_to_be_a_slow_answer(place, task, monkeypatch):
+    monkeypatch.setattr(worker, "_START_S", -1.0)
+    (reply,), _ = ask(place, task, "Plain")
+    assert (reply.status, reply.message.split(":")[0]) == ("timeout", "the sandbox did not stand within -1 s")
+
+
 def test_after_a_crash_the_next_query_has_a_fresh_process(place, task):
     replies, worker = ask(place, task, "Exits", times=3)
     assert [reply.status for reply in replies] == ["crash"] * 3

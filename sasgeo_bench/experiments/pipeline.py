@@ -108,9 +108,9 @@ def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: S
     """Report what the registered contrasts could show on the drawn queries; refuse one that cannot be reached."""
     if not contrasts:
         return
-    place_of = {} if plan.split is None else plan.split.place_of
+    of_split = {} if plan.split is None else {"place_of": plan.split.place_of, "country_of": plan.split.country_of}
     read = [read_scored_task(folder, plan.out / "truth") for folder in tasks]
-    frames = [score_task(task.heads, task.truths, {}, place_of=place_of) for task in read]
+    frames = [score_task(task.heads, task.truths, {}, **of_split) for task in read]
     design = rows_to_rank({plan.spec.id: pd.concat(frames, ignore_index=True)}, plan.split)[plan.spec.id]
     pilots = {item.name: Pilot(**item.pilot.model_dump()) for item in plan.spec.contrast if item.pilot is not None}
     check_contrasts(contrasts, pilots, design, tell=tell)

@@ -5,7 +5,7 @@ The classes, in the order in which they are tried; every failure is in the first
 
 absent accepted
     The place is absent, and the answer is accepted.
-right but withheld
+right but not accepted
     The fix is right, and is not accepted.
 aged
     Under a stress whose view differs more from the map than that of its control does (`changed_share`, by at least
@@ -38,7 +38,7 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.rejection import OWN
 
 BOTH: Final = "also without the stress"
-FAILURES: Final = ("aliased", "aged", "occluded", "absent accepted", "right but withheld", BOTH, "other")
+FAILURES: Final = ("aliased", "aged", "occluded", "absent accepted", "right but not accepted", BOTH, "other")
 OPERATING: Final = "accepted_0.05"  # column of judged rows
 COLUMNS: Final = ("query_id", "matcher", "failure", "suite", "region", "kind")
 MOST_CASES: Final = 60  # of a board
@@ -89,7 +89,7 @@ def find_cases(scores: pd.DataFrame, matcher: str, judged: pd.DataFrame | None =
     has_double = (alias >= _ALIAS) | scores["suite"].isin(_COPIES).to_numpy(bool)
     rules = (
         ("absent accepted", ~is_present & is_answered & taken & is_asked),
-        ("right but withheld", is_present & is_right & has_threshold & ~taken & is_asked),
+        ("right but not accepted", is_present & is_right & has_threshold & ~taken & is_asked),
         ("aged", is_paired & (changed >= control["changed_share"].to_numpy(float) + _CHANGED_MORE)),
         ("occluded", is_paired & (unknown >= control["unknown_share"].to_numpy(float) + _UNKNOWN_MORE)),
         ("aliased", is_wrong & is_answered & taken & has_double),

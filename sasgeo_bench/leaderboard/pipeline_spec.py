@@ -31,6 +31,7 @@ ONE_DETECTOR: Final = [PUBLISHED]
 # hash that their boards were made under.
 _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
     "contrast": {"pilot": None, "detectors": []},
+    "pilot": {"control": None},
     "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR},
     "paper": {"crop_readings": []},
     "learning": {"detector": PUBLISHED, "kinds": []},
@@ -42,7 +43,8 @@ Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a fold
 class PilotSpec(Document):
     """What is known of a contrast from train places; see `scoring.registration.Pilot`."""
 
-    second: Annotated[float, Field(ge=0, le=1)] | None = None
+    second: Annotated[float, Field(ge=-1, le=1)] | None = None  # of an interaction it may be below 0
+    control: Annotated[float, Field(ge=0, le=1)] | None = None
     false_share: Annotated[float, Field(ge=0, le=1)] | None = None
     discordant: Annotated[float, Field(ge=0, le=1)] | None = None
     correlation: Annotated[float, Field(ge=0, le=1)] = 0.05
@@ -71,6 +73,10 @@ class ContrastSpec(Document):
                 f"contrast {self.name!r} by aurc needs a pilot with second and false_share, from train places: where "
                 'many answers are false a perfect order gains little; metric = "e_aurc" needs none'
             )
+            raise ValueError(message)
+        pilot = self.pilot or PilotSpec()
+        if self.metric != "interaction" and (pilot.control is not None or (pilot.second or 0) < 0):
+            message = f'contrast {self.name!r}: a pilot with control, or second below 0, is for metric = "interaction"'
             raise ValueError(message)
         return self
 
@@ -170,8 +176,9 @@ class PipelineFile(NamedDocument):
     def sha256(self) -> str:
         """Hash of all that it says, defaults among it, as `board.json` names it."""
         fields = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
+        pilots = [item["pilot"] for item in fields["contrast"] if item["pilot"] is not None]
         for name, newer in _NEWER.items():
-            tables = fields.get(name) or []
+            tables = pilots if name == "pilot" else fields.get(name) or []
             for table in tables if isinstance(tables, list) else [tables]:
                 for key in [key for key, unsaid in newer.items() if table[key] == unsaid]:
                     del table[key]

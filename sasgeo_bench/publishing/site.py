@@ -154,7 +154,7 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
 
 ASSETS: Final = ("site.css", "site.js")
 FAILURES: Final = (  # in the order they are shown; others follow
-    *("aliased", "aged", "occluded", "absent accepted", "right but withheld", "also without the stress"),
+    *("aliased", "aged", "occluded", "absent accepted", "right but not accepted", "also without the stress"),
 )
 _NAMES: Final = {  # pages that every site has or may have, in the order of the navigation
     "index.html": "Board",

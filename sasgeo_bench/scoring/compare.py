@@ -133,8 +133,9 @@ def swap_places(first: Answers, second: Answers, place: Ints, name: str) -> floa
     """Return the p-value of swapping two sides at random places, for an area, which is no sum over places.
 
     `first` and `second` are answers to the same N queries, `place` the number of the place of each, shape (N,), `name`
-    the area. As `sign_flip`, but with all of a place swapped; NaN for fewer than two places. Confidences become ranks
-    among the side's own answers, so that both sides share one scale; this changes no area.
+    the area. As `sign_flip`, but with all of a place swapped; NaN for fewer than two places, and where the area is not
+    defined. Confidences become ranks among the side's own answers, so that both sides share one scale; this changes no
+    area.
     """
     count = int(place.max(initial=-1)) + 1
     if count < 2:  # noqa: PLR2004 - one place cannot differ from itself
@@ -149,6 +150,8 @@ def swap_places(first: Answers, second: Answers, place: Ints, name: str) -> floa
             for part in np.array_split(swapped, 16)
         ]
     )
+    if math.isnan(gaps[0]):  # as of AUROC without a false answer: no comparison holds, and p would be 0
+        return math.nan
     return float((np.abs(gaps) >= abs(gaps[0]) - _NOTHING).mean())
 
 
@@ -263,8 +266,7 @@ def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
     )
 
 
-_Z_LEVEL: Final = float(norm.isf(0.05 / 2))  # deviates of a two-sided level of 5 % and a power of 80 %
-_Z_POWER: Final = float(norm.ppf(0.8))
+_Z_POWER: Final = float(norm.ppf(0.8))  # the deviate of a power of 80 %
 
 
 def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> float:
@@ -317,12 +319,13 @@ def design_effect(sizes: ArrayLike, correlation: float) -> float:
     return 1.0 + (size - 1.0) * max(correlation, 0.0)
 
 
-def detectable_difference(pairs: float, discordant_share: float) -> float:
-    """Return the least difference of two shares that McNemar's test finds at 5 % (two-sided) with a power of 80 %.
+def detectable_difference(pairs: float, discordant_share: float, *, level: float = 0.05) -> float:
+    """Return the least difference of two shares that McNemar's test finds with a power of 80 %.
 
     `pairs` are independent pairs: queries divided by the design effect. `discordant_share`, in [0, 1], is the share of
     queries that just one of the two methods gets right; the result is infinite if even that difference would be missed.
-    Raise MetricError if a number is out of range.
+    The test is two-sided at `level`; among m contrasts Holm's adjustment asks for 0.05 / m of the first. Raise
+    MetricError if a number is out of range.
 
     Connor, Biometrics 1987: n = (z_a sqrt(p) + z_b sqrt(p - d^2))^2 / d^2, solved for the difference d:
     d = sqrt(p) (z_a sqrt(n) + z_b sqrt(n + z_b^2 - z_a^2)) / (n + z_b^2).
@@ -333,11 +336,12 @@ def detectable_difference(pairs: float, discordant_share: float) -> float:
     if not pairs >= 0 or not 0 <= discordant_share <= 1:
         message = f"expected pairs >= 0 and a discordant share in [0, 1], got {pairs!r} and {discordant_share!r}"
         raise MetricError(message)
+    z_level = float(norm.isf(level / 2))
     # Even if all discordant pairs point one way, d = p: n p^2 must reach (z_a sqrt(p) + z_b sqrt(p - p^2))^2.
-    least = _Z_LEVEL + _Z_POWER * math.sqrt(1.0 - discordant_share)
+    least = z_level + _Z_POWER * math.sqrt(1.0 - discordant_share)
     if pairs * discordant_share < least**2:
         return math.inf
-    root = _Z_LEVEL * math.sqrt(pairs) + _Z_POWER * math.sqrt(pairs + _Z_POWER**2 - _Z_LEVEL**2)
+    root = z_level * math.sqrt(pairs) + _Z_POWER * math.sqrt(pairs + _Z_POWER**2 - z_level**2)
     return math.sqrt(discordant_share) * root / (pairs + _Z_POWER**2)
 
 

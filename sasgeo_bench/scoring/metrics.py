@@ -372,8 +372,8 @@ COSTS: Final = (
     *(
         _cost(
             name=f"latency_p{100 * share:g}",
-            meaning=f"Seconds of `match` alone that {100 * share:g} % of the answers do not exceed; a time-out counts "
-            "as infinite",
+            meaning=f"Seconds from sending a query until its answer is read; {100 * share:g} % of the answers take no "
+            "longer. A time-out counts as infinite",
             unit="s",
             compute=partial(cost.latency_quantile, share=share),
             is_by_track=True,

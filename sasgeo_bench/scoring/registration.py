@@ -16,7 +16,7 @@ from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.scoring.base import block_codes
 from sasgeo_bench.scoring.compare import design_effect, detectable_difference
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
-from sasgeo_bench.scoring.verdicts import LEAST_PLACES
+from sasgeo_bench.scoring.verdicts import ALPHA, LEAST_PLACES, attainable
 
 CORRELATION: Final = 0.05  # of the differences of two queries of one place, unless a pilot says otherwise
 
@@ -25,12 +25,14 @@ CORRELATION: Final = 0.05  # of the differences of two queries of one place, unl
 class Pilot:
     """What is known of a contrast from train places, before it is registered.
 
-    `second` is the metric of the second side, `false_share` the share of its answers that are false, `discordant` the
-    share of queries that just one side gets right, `correlation` how much more alike differences of one place are than
-    those of two. None where nothing is known.
+    `second` is the metric of the second side, `control` of an interaction the share that the first side reaches on the
+    controls, `false_share` the share of the second side's answers that are false, `discordant` the share of queries
+    that just one side gets right, `correlation` how much more alike differences of one place are than those of two.
+    None where nothing is known.
     """
 
     second: float | None = None
+    control: float | None = None
     false_share: float | None = None
     discordant: float | None = None
     correlation: float = CORRELATION
@@ -40,36 +42,56 @@ class Pilot:
 class Registration:
     """What a contrast could show: its queries, the best attainable value and gain, and the power of its places.
 
-    `attainable` is the most that the first side can gain on the second, `least` what is to matter; `detectable` the
-    least difference that so many places show at 5 % with a power of 80 %, NaN for areas.
+    `attainable` is the most that the first side can gain on the second, NaN if not known, `least` what is to matter;
+    `detectable` the least difference that so many places show at 5 % with a power of 80 %, `detectable_first` at 5 %
+    divided by the number of contrasts, as Holm's adjustment asks of the first; both NaN for areas.
     """
 
     name: str
     queries: int
     blocks: int
     places: int
+    countries: int
     best: float
     second: float | None
     attainable: float
     least: float
     detectable: float
+    detectable_first: float
 
     def to_text(self) -> str:
         """Return the registration in a line.
 
-        >>> print(Registration(name="graph", queries=285, blocks=95, places=18, best=1.0, second=0.6, attainable=0.4,
-        ...     least=0.03, detectable=0.06).to_text())  # doctest: +NORMALIZE_WHITESPACE
-        graph: 285 queries in 95 blocks, 18 places; at most 0.400 can be gained (best 1.000, second 0.600), 0.030 is to
-        matter; so many places show 0.060 or more
+        >>> print(Registration(name="graph", queries=285, blocks=95, places=18, countries=9, best=1.0, second=0.6,
+        ...     attainable=0.4, least=0.03, detectable=0.06, detectable_first=0.08).to_text())
+        ... # doctest: +NORMALIZE_WHITESPACE
+        graph: 285 queries in 95 blocks, 18 places of 9 countries; at most 0.400 can be gained (best 1.000, second
+        0.600), 0.030 is to matter; so many places show 0.060, or 0.080 if it comes first in Holm's order
         """
-        known = "not known" if self.second is None else f"{self.second:.3f}"
-        power = "" if math.isnan(self.detectable) else f"; so many places show {self.detectable:.3f} or more"
+        of = f" of {counted(self.countries, 'country', 'countries')}" if self.countries < self.places else ""
         few = "" if self.places >= LEAST_PLACES else f"; too few to decide anything, at least {LEAST_PLACES} are needed"
         return (
             f"{self.name}: {counted(self.queries, 'query', 'queries')} in {counted(self.blocks, 'block')}, "
-            f"{counted(self.places, 'place')}; at most {self.attainable:.3f} can be gained (best {self.best:.3f}, "
-            f"second {known}), {self.least:.3f} is to matter{power}{few}"
+            f"{counted(self.places, 'place')}{of}; {self._gain()}, {self.least:.3f} is to matter{self._power()}{few}"
         )
+
+    def _gain(self) -> str:
+        """Say what can be gained, if it is known."""
+        if math.isnan(self.attainable):
+            return "what can be gained is not known"
+        second = "not known" if self.second is None else f"{self.second:.3f}"
+        return f"at most {self.attainable:.3f} can be gained (best {self.best:.3f}, second {second})"
+
+    def _power(self) -> str:
+        """Say which difference the places show, at both ends of Holm's order."""
+        if math.isnan(self.detectable):
+            return ""
+        last, first = (
+            "no difference at all" if math.isinf(least) else f"{least:.3f}"
+            for least in (self.detectable, self.detectable_first)
+        )
+        more = "" if first == last else f", or {first} if it comes first in Holm's order"
+        return f"; so many places show {last}{more}"
 
 
 def check_contrasts(
@@ -84,7 +106,9 @@ def check_contrasts(
     `design` holds a row for each drawn query, as `score.score_task` returns them without predictions. Raise ConfigError
     for the first contrast whose least difference cannot be reached.
     """
-    found = tuple(registered(item, pilots.get(item.name, Pilot()), design) for item in contrasts)
+    found = tuple(
+        registered(item, pilots.get(item.name, Pilot()), design, contrasts=len(contrasts)) for item in contrasts
+    )
     for one in found:
         tell(one.to_text())
         if one.queries and one.least > one.attainable + 1e-9:
@@ -96,18 +120,18 @@ def check_contrasts(
     return found
 
 
-def registered(contrast: Contrast, pilot: Pilot, design: pd.DataFrame) -> Registration:
-    """Return what one contrast could show.
+def registered(contrast: Contrast, pilot: Pilot, design: pd.DataFrame, *, contrasts: int = 1) -> Registration:
+    """Return what one of so many contrasts could show.
 
-    For "aurc" the best is the area of a perfect order where a share r of many answers is false, r + (1 - r) ln(1 - r)
-    (Geifman et al., ICLR 2019); without a pilot, the least share that absent places force, and a blind order for the
-    second side.
+    For an interaction the best is the ceiling less what the first side reaches on the controls. For "aurc" the best is
+    the area of a perfect order where a share r of many answers is false, r + (1 - r) ln(1 - r) (Geifman et al., ICLR
+    2019); without a pilot, the least share that absent places force, and a blind order for the second side.
 
     Three quarters of the places are absent, so a perfect order has most of the area already:
 
     >>> names = {"suite": "absent", "track": "localization", "role": "stress", "kind": "outside"}
     >>> some = pd.DataFrame([{**names, "is_present": at == 0, "ceiling": float(at == 0), "place": str(at),
-    ...     "block": str(at)} for at in range(4)])
+    ...     "block": str(at), "country": str(at)} for at in range(4)])
     >>> contrast = Contrast(name="r", first="a x b", second="a x c", suites=("absent",), metric="aurc", min_effect=0.2)
     >>> found = registered(contrast, Pilot(second=0.45, false_share=0.75), some)
     >>> round(found.best, 3), round(found.attainable, 3), round(found.least, 3)
@@ -117,17 +141,19 @@ def registered(contrast: Contrast, pilot: Pilot, design: pd.DataFrame) -> Regist
     best, blind = _best_and_blind(contrast, pilot, rows)
     second = pilot.second
     value = blind if second is None else second
-    is_relative = contrast.metric in {"aurc", "e_aurc"}
+    is_relative = contrast.metric in {"aurc", "e_aurc"}  # of which less is better
     return Registration(
         name=contrast.name,
         queries=len(rows),
         blocks=int(rows["block"].nunique()),
         places=int(rows["place"].nunique()),
+        countries=int(rows["country"].nunique()),
         best=best,
         second=second,
-        attainable=abs(best - value),
+        attainable=attainable(best, value, is_lower_better=is_relative),
         least=contrast.min_effect * (value if is_relative else 1.0),
-        detectable=_detectable(contrast, pilot, rows),
+        detectable=_detectable(contrast, pilot, rows, ALPHA),
+        detectable_first=_detectable(contrast, pilot, rows, ALPHA / contrasts),
     )
 
 
@@ -142,13 +168,21 @@ def _best_and_blind(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> tup
         false = absent if pilot.false_share is None else pilot.false_share
         least = false + (1.0 - false) * math.log1p(-false) if false < 1 else 1.0
         return (least, false) if contrast.metric == "aurc" else (0.0, false - least)
-    return float(rows["ceiling"].mean()), 0.0
+    ceiling = float(rows["ceiling"].mean())
+    if contrast.metric == "interaction":
+        return math.nan if pilot.control is None else ceiling - pilot.control, math.nan
+    return ceiling, 0.0
 
 
-def _detectable(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> float:
-    """Return the least difference that the places show; the discordant queries are twice the least difference."""
+def _detectable(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame, level: float) -> float:
+    """Return the least difference that the places show; the discordant queries are twice the least difference.
+
+    Infinite where too few places have a discordant query: the sign-flip test over k of them has no p below 2 / 2^k.
+    """
     if contrast.metric in {"aurc", "e_aurc", "auroc"} or not len(rows):
         return math.nan
     sizes, _ = block_codes(rows["place"].tolist(), len(rows))
     share = min(1.0, 2 * contrast.min_effect) if pilot.discordant is None else pilot.discordant
-    return detectable_difference(len(rows) / design_effect(sizes, pilot.correlation), share)
+    if min(len(sizes), share * len(rows)) < math.log2(2 / level):
+        return math.inf
+    return detectable_difference(len(rows) / design_effect(sizes, pilot.correlation), share, level=level)

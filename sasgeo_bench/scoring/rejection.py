@@ -228,9 +228,10 @@ def _are_chances(answers: Answers) -> bool:
 def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Floats:
     """Return probabilities on calibration places, each from a fit on others: a tested place is in no fit, either.
 
-    A single place is divided into its blocks; a single block uses its own fit.
+    What is left out is a country, as that of a tested place is; of a single country a place, of a single place a block.
+    A single block uses its own fit.
     """
-    unit = "place" if len(set(calibration["place"])) > 1 else "block"
+    unit = next((name for name in ("country", "place") if len(set(calibration[name])) > 1), "block")
     names = sorted(set(calibration[unit]))
     if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
         return _fit_and_apply(make, calibration, calibration, predictions)[0]

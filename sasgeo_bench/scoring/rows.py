@@ -45,7 +45,7 @@ class RowKey:
     suite, track, prior_group, stratum : str
         Set of queries. Values of two prior groups are never ranked against each other.
     n : int
-        Queries in the denominator; the same for every matcher.
+        Queries in the denominator: all that the matcher was asked.
     answered, missing : int
         Of these: with an answer, and without any row.
     blocks, places : int

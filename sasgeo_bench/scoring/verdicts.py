@@ -20,6 +20,16 @@ _NOTHING: Final = 1e-9  # a smaller excess is a rounding error
 Outcome = Literal["decided", "decided, small", "cause open", "null", "not decided", "not tested"]
 
 
+def attainable(best: float, second: float, *, is_lower_better: bool) -> float:
+    """Return the most by which a best value is better than a second one: 0 if it is worse, NaN if one is not known.
+
+    >>> attainable(0.25, 0.75, is_lower_better=True), attainable(0.25, 0.75, is_lower_better=False)
+    (0.5, 0.0)
+    """
+    gain = second - best if is_lower_better else best - second
+    return gain if math.isnan(gain) else max(0.0, gain)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """Result of a contrast.
@@ -88,8 +98,8 @@ class Finding:
 
     @property
     def attainable(self) -> float:
-        """Return the most by which the first side could be better than the second."""
-        return abs(self.best - self.second_value)
+        """Return the most by which the first side could be better than the second, 0 if it could not."""
+        return attainable(self.best, self.second_value, is_lower_better=self.is_lower_better)
 
     @property
     def gained_share(self) -> float:

@@ -81,7 +81,7 @@ def test_an_answer_of_an_absent_place_is_a_failure_unless_it_is_rejected():
 def test_a_right_answer_is_a_failure_only_where_a_threshold_rejects_it():
     table = asked(row(1.0), row(1.0), row(1.0))
     assert classes(table) == {}
-    assert classes(table, said(table, [False, True, np.nan])) == {"q0": "right but withheld"}
+    assert classes(table, said(table, [False, True, np.nan])) == {"q0": "right but not accepted"}
 
 
 def test_falsifiers_are_no_cases():

@@ -163,6 +163,17 @@ def test_rejectors_are_compared_by_the_area_under_risk_against_coverage():
     assert same.outcome == "null"
 
 
+def test_an_area_that_is_not_defined_decides_nothing_and_loosens_no_other_test():
+    right = scores(np.zeros(60), blocks=60)  # without a false answer there is no AUROC
+    judged = {("mine", name): right.assign(p_right=share) for name, share in (("logistic", 0.9), ("margin", 0.5))}
+    sides = {"first": "mine x logistic", "second": "mine x margin"}
+    undefined = replace(CONTRAST, name="rejection", metric="auroc", **sides)
+    tables = {"with": scores(errors(0.62), blocks=60), "without": scores(errors(0.58), blocks=60)}
+    area, graph = hold_contrasts([undefined, CONTRAST], tables, judged, draws=400)
+    assert (area.outcome, area.p_holm) == ("not decided", 1.0)
+    assert graph.p_holm == pytest.approx(min(1.0, 2 * graph.p_places))
+
+
 def test_holm_is_over_all_that_were_registered():
     better, worse = errors(0.62), errors(0.58)
     tables = {"with": scores(better, blocks=60), "without": scores(worse, blocks=60)}

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.scoring import rejection
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.draws import ClusterDraws
 from sasgeo_bench.scoring.integrity_metric import aurc
@@ -139,6 +140,22 @@ def test_thresholds_of_a_split_are_chosen_on_other_places():
     assert held["risk_reached_at_0.01"]["value"] == 1.0
     one_place = table.assign(place="place0")
     assert "coverage_at_risk_0.05" not in pooled(one_place, split_of("crossfit"))
+
+
+def test_a_threshold_is_set_on_countries_that_its_fit_has_not_seen(monkeypatch):
+    def fitted(make, rest, mine, predictions):  # noqa: ARG001
+        seen.append((set(rest["country"]), set(mine["country"])))
+        return np.full(len(mine), 0.5), ""
+
+    seen = []
+    monkeypatch.setattr(rejection, "_fit_and_apply", fitted)
+    places = [f"place{at % 4}" for at in range(120)]
+    table = scores(ERRORS).assign(place=places, country=[f"land{at % 2}" for at in range(120)])
+    assert (rejection._held_back(None, table, {}) == 0.5).all()
+    assert seen == [({"land1"}, {"land0"}), ({"land0"}, {"land1"})]
+    seen.clear()
+    rejection._held_back(None, table.assign(country="land0"), {})
+    assert len(seen) == 4  # of one country, places are left out
 
 
 def test_what_the_test_place_taught_calibrates_nobody():

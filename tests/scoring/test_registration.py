@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.scoring.compare import detectable_difference
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts, registered
 from tests.scoring.test_tables import scores
@@ -38,6 +39,34 @@ def test_identical_places_lower_what_can_be_gained():
         check_contrasts([GRAPH], {"graph": Pilot(second=0.48)}, twins, tell=str)
     assert registered(GRAPH, Pilot(second=0.3), twins).attainable == pytest.approx(0.2)
     assert registered(replace(GRAPH, suites=("alias",)), Pilot(), twins).queries == 0
+
+
+def test_an_interaction_can_gain_what_its_control_leaves_and_no_more():
+    stability = replace(GRAPH, metric="interaction", min_effect=0.05)
+    assert "what can be gained is not known" in registered(stability, Pilot(), design()).to_text()
+    pilot = Pilot(second=-0.3, control=0.9)
+    assert registered(stability, pilot, design()).attainable == pytest.approx(0.4)
+    with pytest.raises(ConfigError, match=r"at most 0\.030 can be gained"):
+        check_contrasts([stability], {"graph": replace(pilot, second=0.07)}, design(), tell=str)
+    assert registered(stability, replace(pilot, second=0.2), design()).attainable == 0.0
+
+
+def test_power_is_told_for_both_ends_of_the_order_of_holm():
+    def apart(count):
+        names = [f"p{at}" for at in range(count)]
+        return design(count, place=names, block=names)
+
+    told = []
+    others = [replace(GRAPH, name=f"other-{at}") for at in range(12)]
+    pilot = Pilot(discordant=0.25, correlation=0.0)
+    found = check_contrasts([GRAPH, *others], {"graph": pilot}, apart(80), tell=told.append)[0]
+    assert found.detectable == pytest.approx(detectable_difference(80, 0.25))
+    assert found.detectable < found.detectable_first < np.inf
+    both = f"show {found.detectable:.3f}, or {found.detectable_first:.3f} if it comes first in Holm's order"
+    assert told[0].endswith(both)
+    # 30 places have 7.5 discordant ones, and 2 / 2^7.5 exceeds 0.05 / 13: the test cannot show anything.
+    few = registered(GRAPH, pilot, apart(30), contrasts=13).to_text()
+    assert few.endswith("or no difference at all if it comes first in Holm's order")
 
 
 def test_power_counts_places_not_blocks():

@@ -20,7 +20,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",
     "detectable": "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf "
     "if none, - where nobody is ranked",
-    "n": "Queries in the denominator. Do not compare rows with different n: those matchers were asked other queries",
+    "n": "Queries in the denominator. Rows with different n do not compare: they are of different queries",
     "missing": "Queries without a row; they count as misses",
     "blocks": "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
     "places, then blocks in them",
@@ -120,7 +120,7 @@ def column(term: str, *, is_number: bool = True, order: str = "none", title: str
     """Return the column of a term with its meaning; `title` where it is shown under another name.
 
     >>> column("n").meaning
-    'Queries in the denominator. Do not compare rows with different n: those matchers were asked other queries'
+    'Queries in the denominator. Rows with different n do not compare: they are of different queries'
     """
     meaning = MEANINGS.get(term, _UNKNOWN)
     return Column(term=term, name=title or term, meaning=meaning, is_number=is_number, order=order)

@@ -177,8 +177,9 @@ class PipelineFile(NamedDocument):
         """Hash of all that it says, defaults among it, as `board.json` names it."""
         fields = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
         pilots = [item["pilot"] for item in fields["contrast"] if item["pilot"] is not None]
+        named = {**fields, "pilot": pilots}
         for name, newer in _NEWER.items():
-            tables = pilots if name == "pilot" else fields.get(name) or []
+            tables = named.get(name) or []
             for table in tables if isinstance(tables, list) else [tables]:
                 for key in [key for key, unsaid in newer.items() if table[key] == unsaid]:
                     del table[key]

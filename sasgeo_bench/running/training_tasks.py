@@ -94,8 +94,7 @@ def plan_training(
     """Choose at most `most` pairs, evenly over places, then suites, then sites, by a hash of their names.
 
     `train` and `asked` are task folders. `split` defines places and how far apart they must lie; without one, regions
-    are places. Only views that `lessons` hold are used, those of the
-    published detector unless given.
+    are places. Only views that `lessons` hold are used, those of the published detector unless given.
 
     Raises
     ------

@@ -250,6 +250,8 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
             {"[[contrast]]": '[[contrast]]\ndetectors = ["measured"]'},
             "counts views of measured alone, and its suites",
         ),
+        ({"[[contrast]]": "[[contrast]]\npilot = { control = 0.9 }"}, "is for metric = .interaction"),
+        ({"[[contrast]]": "[[contrast]]\npilot = { second = -0.3 }"}, "is for metric = .interaction"),
         ({"sites = 1": 'sites = 1\ntracks = ["retrieval"]'}, "is of localization, and no .* draws that track"),
         ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "'published' or 'measured'"),
         ({"sites = 1": 'sites = 1\ndetectors = ["measured", "measured"]'}, "detector 'measured' is listed twice"),
@@ -441,6 +443,15 @@ def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
     for key in ("views_cells = [192]", 'detectors = ["published", "measured"]'):
         assert small(**{"sites = 1": f"sites = 1\n{key}"}).sha256 != spec.sha256
     both = LEARNING.replace("[[task]]", '[[task]]\ndetectors = ["published", "measured"]')
+    metric = '[[contrast]]\nmetric = "interaction"'
+    one, other = (
+        small(**{"[[contrast]]": f"{metric}\npilot = {{ {said} }}"}) for said in ("second = -0.3", "control = 1")
+    )
+    assert one.sha256 != other.sha256
+    before = one.model_dump(
+        mode="json", exclude=newer | {"contrast": {"__all__": {"pilot": {"control"}, "detectors": True}}}
+    )
+    assert one.sha256 == hashlib.sha256(json.dumps(before, separators=(",", ":")).encode()).hexdigest()
     lines = ("", 'detector = "published"', "kinds = []", 'detector = "measured"', 'kinds = ["S1"]')
     taught = [taught_by(line, both).sha256 for line in lines]
     assert taught[0] == taught[1] == taught[2]

@@ -15,6 +15,7 @@ from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, seale
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
+from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_tables import Book, summary
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
@@ -226,9 +227,13 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         sealed=sealed_seed(options.sealed_seed_file, tell=tell),
     )
     plan = replace(plan, jobs=options.jobs, dask=options.dask)
-    if opened is not None and (plan.seal is None or plan.seal.seed is None):
-        message = "--opened is the day on which sealed places are opened: give --sealed-seed-file, too, or leave it out"
-        raise ConfigError(message)
+    if opened is not None:
+        if plan.seal is None or plan.seal.seed is None:
+            message = (
+                "--opened is the day on which sealed places are opened: give --sealed-seed-file, too, or leave it out"
+            )
+            raise ConfigError(message)
+        check_day(opened, plan.seal, plan.seal.openings)
     if options.dry_run:
         say(plan.to_text())
         return

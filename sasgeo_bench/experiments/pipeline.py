@@ -2,7 +2,8 @@
 """A pipeline file -> queries, runs and a board; steps that are up to date are skipped."""
 
 import datetime as dt
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -76,7 +77,8 @@ def run_pipeline(
     _check_contrasts(plan, contrasts, asked, tell)
     controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
-    folders = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
+    folders, names = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
+    contrasts = tuple(named_on_board(item, names) for item in contrasts)
     split = plan.split
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
     pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, has_cases=has_cases)
@@ -124,8 +126,11 @@ def _run_all(
     *,
     tell: Tell,
     progress: Progress | None,
-) -> list[Path]:
-    """Run every matcher, and return the folders of all runs; raise the first failure if all fail."""
+) -> tuple[list[Path], dict[str, str]]:
+    """Run every matcher, and return the folders of all runs, and by matcher of the file the name of its card.
+
+    Raise the first failure if all fail.
+    """
     runs: dict[str, list[Run]] = {}
     for spec in dict.fromkeys((*plan.matchers, REFERENCE)):  # all cards are read before the first query is asked
         with failures.of(spec, but=(ConfigError,)):
@@ -136,7 +141,23 @@ def _run_all(
             folders += _run(spec, found, tell, progress)
     if not folders and failures.first is not None:
         raise failures.first
-    return folders
+    return folders, {spec: found[0].plan.card.name for spec, found in runs.items()}
+
+
+def named_on_board(contrast: Contrast, names: Mapping[str, str]) -> Contrast:
+    """Return a contrast whose sides are named by the cards of their matchers, as a board names its rows.
+
+    >>> side = {"name": "mine", "suites": ("clean",)}
+    >>> found = named_on_board(Contrast(first="my:Own x margin", second="fft_vote", **side), {"my:Own": "own"})
+    >>> found.first, found.second
+    ('own x margin', 'fft_vote')
+    """
+
+    def shown(side: str) -> str:
+        matcher, *rejector = side.split(" x ", maxsplit=1)
+        return " x ".join((names.get(matcher, matcher), *rejector))
+
+    return replace(contrast, first=shown(contrast.first), second=shown(contrast.second))
 
 
 def _run(spec: str, runs: Sequence[Run], tell: Tell, progress: Progress | None) -> list[Path]:

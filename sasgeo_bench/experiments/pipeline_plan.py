@@ -28,6 +28,7 @@ from sasgeo_bench.tasks.build import is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
@@ -256,6 +257,7 @@ def plan_pipeline(
     if spec.task and not requests:
         message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
         raise ConfigError(message)
+    _check_kinds(spec)
     kept = needed(requests, spec.learning) if requests else ()
     left = {item.region.id for item in requests} - {item.region.id for item in kept}
     if left:
@@ -269,6 +271,25 @@ def plan_pipeline(
         private=private,
         seal=None if split is None else seal_of(split, kept, sealed, private, out=out),
     )
+
+
+def _check_kinds(spec: PipelineFile) -> None:
+    """Refuse a kind of stress that a contrast counts, or learning uses, and no [[task]] draws on its suites."""
+    asking = [(f"contrast {item.name!r}", item.suites, item.kinds) for item in spec.contrast]
+    if spec.learning is not None:
+        asking.append(("[learning]", spec.learning.suites, spec.learning.kinds))
+    for who, suites, kinds in asking:
+        drawn = {
+            variant.kind
+            for task in spec.task
+            for name in set(task.suites) & set(suites)
+            for variant in find_suite(name).variants
+            if variant.role == "stress" and variant.kind.startswith(tuple(task.kinds) or "")
+        }
+        lost = next((kind for kind in kinds if not any(one.startswith(kind) for one in drawn)), None)
+        if lost is not None:
+            message = f"{who} names the kind {lost!r}, which is not drawn: its suites have {', '.join(sorted(drawn))}"
+            raise ConfigError(message)
 
 
 def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request, ...]:

@@ -76,7 +76,8 @@ def open_seal(
     """Record that sealed places are opened, before anything is drawn, and return the entry of `board.json` on them.
 
     `opened` is the day, today (UTC) unless given. `stored` is the folder of stored results of this very pipeline,
-    whose openings count, too. Raise `ConfigError` if every test place of a hold-out is sealed and stays closed.
+    whose openings count, too, and came before those recorded here. Raise `ConfigError` if every test place of a
+    hold-out is sealed and stays closed, or the day is in the future or before an opening that is recorded.
     """
     split = seal.split
     places = {place for item in requests for place in split.places_in(item.region.id)}
@@ -86,13 +87,34 @@ def open_seal(
             "opens them"
         )
         raise ConfigError(message)
-    openings = seal.openings if stored is None else joined_openings(seal.openings, _stored_openings(stored))
+    openings = seal.openings if stored is None else joined_openings(_stored_openings(stored), seal.openings)
     if seal.seed is not None:
-        day = opened or dt.datetime.now(tz=dt.UTC).date()
-        opening = Opening.of(seal.seed, day)
+        if opened is not None:
+            check_day(opened, seal, openings)
+        opening = Opening.of(seal.seed, opened or _today())
         now = record_openings(seal.out, split.spec.id, seal.drawn, opening, tell=tell)
         openings = joined_openings(openings, now)
     return sealed_record(openings, split.sealed, seal.drawn, seal.seed)
+
+
+def check_day(opened: dt.date, seal: Seal, openings: Openings) -> None:
+    """Raise `ConfigError` for a day to come, or before an opening by another seed: days are stated, records are not."""
+    if opened > _today():
+        message = f"--opened {opened.isoformat()} has not come yet: leave it out, which takes today (UTC)"
+        raise ConfigError(message)
+    for place in seal.drawn:
+        before = openings.get(place, ())
+        is_known = seal.seed is not None and seal.seed.commitment in {item.commitment for item in before}
+        if before and not is_known and opened < before[-1].opened:
+            message = (
+                f"--opened {opened.isoformat()} is before the recorded opening of sealed place {place}, on "
+                f"{before[-1].to_text()}: leave it out, which takes today (UTC)"
+            )
+            raise ConfigError(message)
+
+
+def _today() -> dt.date:
+    return dt.datetime.now(tz=dt.UTC).date()
 
 
 def _stored_openings(stored: Path) -> Openings:

@@ -20,7 +20,8 @@ from sasgeo_bench.config import (
     list_documents,
     read_document,
 )
-from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric
+from sasgeo_bench.matching.plugins import YARDSTICK
+from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric, attainable, best_value, unreachable
 from sasgeo_bench.tasks.query import CONTROLS, PUBLISHED, Detector, PriorGroup, Track
 
 PAPER_SUITE: Final = "paper-poc"
@@ -78,7 +79,24 @@ class ContrastSpec(Document):
         if self.metric != "interaction" and (pilot.control is not None or (pilot.second or 0) < 0):
             message = f'contrast {self.name!r}: a pilot with control, or second below 0, is for metric = "interaction"'
             raise ValueError(message)
+        if pilot.second is not None:
+            self._check_reach(pilot, pilot.second)
         return self
+
+    def _check_reach(self, pilot: PilotSpec, second: float) -> None:
+        """Refuse what no query could make reachable, and a pilot whose second side is better than the best."""
+        is_area = self.metric in {"aurc", "e_aurc"}
+        best = best_value(self.metric, control=pilot.control, false_share=pilot.false_share)
+        if self.metric == "aurc" and second < best:
+            message = (
+                f"contrast {self.name!r}: where {pilot.false_share} of the answers are false a perfect order has an "
+                f"area of {best:.3f}, so the pilot's second cannot be {second}"
+            )
+            raise ValueError(message)
+        gain, least = attainable(best, second, is_lower_better=is_area), self.min_effect * (second if is_area else 1.0)
+        message = unreachable(self.name, self.metric, gain=gain, least=least) or ""
+        if message:
+            raise ValueError(message)
 
 
 class TaskSpec(Document):
@@ -212,6 +230,7 @@ class PipelineFile(NamedDocument):
         suites += [] if self.paper is None else [PAPER_SUITE, *map(paper_suite, self.paper.crop_readings)]
         for what, listed in (
             ("suite", suites),
+            ("region", self.regions),
             *(("detector", [str(name) for name in task.detectors]) for task in self.task),
             ("matcher", self.matchers),
             ("rejector", self.rejectors),
@@ -257,6 +276,10 @@ class PipelineFile(NamedDocument):
         strange = next((name for name in oracles if name not in self.matchers), None)
         if strange is not None:
             message = f"learning names the oracle {strange!r}, which is not among 'matchers': name it there, too"
+            raise ValueError(message)
+        plain = next((name for name in oracles if ":" not in name and not name.startswith(YARDSTICK)), None)
+        if plain is not None:
+            message = f"learning names the oracle {plain!r}: names of oracles begin with {YARDSTICK}"
             raise ValueError(message)
         idle = next((name for name in self.matchers if self.task and not self.suites_of(name)), None)
         if idle is not None and self.paper is None:
@@ -337,13 +360,17 @@ def _check_asked(item: ContrastSpec, tasks: list[TaskSpec]) -> None:
 def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:
     """Refuse a contrast of methods that are not run."""
     is_of_rejectors = item.metric not in OF_MATCHERS
+    plain = next((name for name in (item.first, item.second) if is_of_rejectors and " x " not in name), None)
+    if plain is not None:
+        message = f"contrast {item.name!r} by {item.metric} is of rejectors: name {plain!r} as matcher x rejector"
+        raise ValueError(message)
     known = {f"{one} x {two}" for one in matchers for two in rejectors} if is_of_rejectors else set(matchers)
     lost = next((name for name in (item.first, item.second) if name not in known), None)
     if lost is not None:
-        kind = "matcher x rejector" if is_of_rejectors else "matcher"
+        where = "'matchers' x 'rejectors'" if is_of_rejectors else "'matchers'"
         near = difflib.get_close_matches(lost, sorted(known), n=1, cutoff=0.4)
         hint = f", did you mean {near[0]!r}?" if near else ""
-        message = f"contrast {item.name!r} names the unknown {kind} {lost!r}{hint}"
+        message = f"contrast {item.name!r} names {lost!r}, which is not among {where}{hint}"
         raise ValueError(message)
 
 

@@ -15,8 +15,8 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.scoring.base import block_codes
 from sasgeo_bench.scoring.compare import design_effect, detectable_difference
-from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
-from sasgeo_bench.scoring.verdicts import ALPHA, LEAST_PLACES, attainable
+from sasgeo_bench.scoring.contrasts import INTERACTION, Contrast, chosen_rows
+from sasgeo_bench.scoring.verdicts import ALPHA, LEAST_PLACES, attainable, best_value, unreachable
 
 CORRELATION: Final = 0.05  # of the differences of two queries of one place, unless a pilot says otherwise
 
@@ -66,7 +66,8 @@ class Registration:
         ...     attainable=0.4, least=0.03, detectable=0.06, detectable_first=0.08).to_text())
         ... # doctest: +NORMALIZE_WHITESPACE
         graph: 285 queries in 95 blocks, 18 places of 9 countries; at most 0.400 can be gained (best 1.000, second
-        0.600), 0.030 is to matter; so many places show 0.060, or 0.080 if it comes first in Holm's order
+        0.600), 0.030 is to matter; the least difference that so many places can show is 0.060, or 0.080 if it comes
+        first in Holm's order
         """
         of = f" of {counted(self.countries, 'country', 'countries')}" if self.countries < self.places else ""
         few = "" if self.places >= LEAST_PLACES else f"; too few to decide anything, at least {LEAST_PLACES} are needed"
@@ -86,12 +87,13 @@ class Registration:
         """Say which difference the places show, at both ends of Holm's order."""
         if math.isnan(self.detectable):
             return ""
+        if math.isinf(self.detectable):
+            return "; so few places cannot show any difference"
         last, first = (
-            "no difference at all" if math.isinf(least) else f"{least:.3f}"
-            for least in (self.detectable, self.detectable_first)
+            "none" if math.isinf(least) else f"{least:.3f}" for least in (self.detectable, self.detectable_first)
         )
         more = "" if first == last else f", or {first} if it comes first in Holm's order"
-        return f"; so many places show {last}{more}"
+        return f"; the least difference that so many places can show is {last}{more}"
 
 
 def check_contrasts(
@@ -109,13 +111,10 @@ def check_contrasts(
     found = tuple(
         registered(item, pilots.get(item.name, Pilot()), design, contrasts=len(contrasts)) for item in contrasts
     )
-    for one in found:
+    for item, one in zip(contrasts, found, strict=True):
         tell(one.to_text())
-        if one.queries and one.least > one.attainable + 1e-9:
-            message = (
-                f"contrast {one.name!r} cannot be reached: at most {one.attainable:.3f} can be gained, and "
-                f"{one.least:.3f} is to matter: lower min_effect, or take another metric (e_aurc for aurc) or queries"
-            )
+        message = unreachable(one.name, item.metric, gain=one.attainable, least=one.least)
+        if one.queries and message is not None:
             raise ConfigError(message)
     return found
 
@@ -123,9 +122,8 @@ def check_contrasts(
 def registered(contrast: Contrast, pilot: Pilot, design: pd.DataFrame, *, contrasts: int = 1) -> Registration:
     """Return what one of so many contrasts could show.
 
-    For an interaction the best is the ceiling less what the first side reaches on the controls. For "aurc" the best is
-    the area of a perfect order where a share r of many answers is false, r + (1 - r) ln(1 - r) (Geifman et al., ICLR
-    2019); without a pilot, the least share that absent places force, and a blind order for the second side.
+    Without a pilot the share of false answers is the least one, which absent places force, and the second side orders
+    blindly.
 
     Three quarters of the places are absent, so a perfect order has most of the area already:
 
@@ -161,17 +159,16 @@ def _best_and_blind(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> tup
     """Return the best value, and the one that the second side reaches blindly, where nothing else is known of it."""
     if not len(rows):
         return math.nan, math.nan
-    if contrast.metric == "auroc":
-        return 1.0, 0.5
-    if contrast.metric in {"aurc", "e_aurc"}:
-        absent = 1.0 - float(rows["is_present"].mean())
-        false = absent if pilot.false_share is None else pilot.false_share
-        least = false + (1.0 - false) * math.log1p(-false) if false < 1 else 1.0
-        return (least, false) if contrast.metric == "aurc" else (0.0, false - least)
-    ceiling = float(rows["ceiling"].mean())
-    if contrast.metric == "interaction":
-        return math.nan if pilot.control is None else ceiling - pilot.control, math.nan
-    return ceiling, 0.0
+    ceiling, absent = float(rows["ceiling"].mean()), 1.0 - float(rows["is_present"].mean())
+    false = absent if pilot.false_share is None else pilot.false_share
+    best = best_value(contrast.metric, ceiling=ceiling, control=pilot.control, false_share=false)
+    blind = {
+        "auroc": 0.5,
+        "aurc": false,
+        "e_aurc": false - best_value("aurc", false_share=false),
+        INTERACTION: math.nan,
+    }
+    return best, blind.get(contrast.metric, 0.0)
 
 
 def _detectable(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame, level: float) -> float:

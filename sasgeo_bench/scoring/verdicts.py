@@ -30,6 +30,49 @@ def attainable(best: float, second: float, *, is_lower_better: bool) -> float:
     return gain if math.isnan(gain) else max(0.0, gain)
 
 
+def best_value(
+    metric: ContrastMetric, *, ceiling: float = 1.0, control: float | None = None, false_share: float | None = None
+) -> float:
+    """Return the best value that a first side can have; NaN where it is not known.
+
+    `ceiling` is the share of right answers that nobody can exceed. For an interaction it is less what the first side
+    reaches on the `control`. For "aurc" the best is the area of a perfect order where a share r of many answers is
+    false, r + (1 - r) ln(1 - r) (Geifman et al., ICLR 2019).
+
+    >>> best_value("interaction", control=0.9).__round__(9), best_value("aurc", false_share=0.75).__round__(3)
+    (0.1, 0.403)
+    """
+    if metric == "auroc":
+        return 1.0
+    if metric == "e_aurc":
+        return 0.0
+    if metric == "aurc":
+        if false_share is None:
+            return math.nan
+        return false_share + (1.0 - false_share) * math.log1p(-false_share) if false_share < 1 else 1.0
+    if metric == "interaction":
+        return math.nan if control is None else ceiling - control
+    return ceiling
+
+
+def unreachable(name: str, metric: ContrastMetric, *, gain: float, least: float) -> str | None:
+    """Return why a contrast cannot be registered, if its least difference exceeds what can be gained, and the mend.
+
+    >>> unreachable("graph", "primary", gain=0.3, least=0.5)
+    "contrast 'graph' cannot be reached: at most 0.300 can be gained, and 0.500 is to matter: lower min_effect"
+    """
+    if not least > gain + _NOTHING:  # false where the gain is not known
+        return None
+    more = {
+        "aurc": ', or take metric = "e_aurc"',
+        "interaction": " (second of its pilot is a difference, the share under stress less that on the controls)",
+    }.get(metric, "")
+    return (
+        f"contrast {name!r} cannot be reached: at most {gain:.3f} can be gained, and {least:.3f} is to matter: lower "
+        f"min_effect{more}"
+    )
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """Result of a contrast.

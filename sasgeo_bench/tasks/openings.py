@@ -67,11 +67,14 @@ def parse_openings(content: object, path: Path) -> Openings:
 
 
 def joined_openings(first: Openings, second: Openings) -> Openings:
-    """Return the openings of both by place, each seed once, by its first day."""
+    """Return the openings of both by place, each seed once: those of `first` as recorded, then what `second` adds.
+
+    The order is that of the records, never that of the days: anyone may state an earlier day.
+    """
     found: dict[str, dict[str, Opening]] = {}
     for place in dict.fromkeys((*first, *second)):
         own = found.setdefault(place, {})
-        for item in sorted((*first.get(place, ()), *second.get(place, ())), key=lambda item: item.opened):
+        for item in (*first.get(place, ()), *second.get(place, ())):
             own.setdefault(item.commitment, item)
     return {place: tuple(own.values()) for place, own in found.items()}
 

@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
@@ -19,6 +20,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import (
     list_pipeline_files,
     read_pipeline_file,
 )
+from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks
@@ -88,6 +90,30 @@ def test_a_pipeline_ends_with_a_board(made):
     assert [item.name for item in board.findings] == ["nothing"]
     assert (plan.out / "boards" / "small" / "leaderboard.parquet").is_file()
     assert "Registered contrasts" in (plan.out / "boards" / "small" / "leaderboard.md").read_text(encoding="utf-8")
+
+
+class Middle(PriorCentre):
+    """A matcher that is installed nowhere."""
+
+    card = replace(PriorCentre.card, name="middle")
+
+
+def test_a_contrast_may_name_a_matcher_by_module_and_class(made):
+    plan, board, _ = made
+    spec = small(**{'id = "small"': 'id = "by-class"', "prior_centre": f"{__name__}:Middle"})
+    again = run_pipeline(plan_pipeline(spec, out=plan.out, tell=lambda _: None), tell=lambda _: None)
+    (before,), (found,) = board.findings, again.findings
+    assert (found.first, found.second) == ("random", "middle")
+    assert (found.n, found.difference) == (before.n, before.difference)
+
+
+@pytest.mark.parametrize("where", ["contrast", "learning"])
+def test_a_kind_that_nobody_draws_is_refused_before_anything_is_drawn(where, tmp_path):
+    learning = '[learning]\nsuites = ["clean"]\nkinds = ["nope"]\n\n[[task]]'
+    change = {"[[contrast]]": '[[contrast]]\nkinds = ["nope"]'} if where == "contrast" else {"[[task]]": learning}
+    with pytest.raises(ConfigError, match=rf"{where}.* names the kind 'nope', which is not drawn: its suites have "):
+        plan_pipeline(small(**change), out=tmp_path, tell=lambda _: None)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_every_board_has_controls_and_figures_without_them(made):
@@ -229,7 +255,10 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
     ("changes", "words"),
     [
         ({"title": "titel"}, "unknown key 'titel', did you mean 'title'"),
-        ({'second = "prior_centre"': 'second = "nobody"'}, "contrast 'nothing' names the unknown matcher 'nobody'"),
+        (
+            {'second = "prior_centre"': 'second = "nobody"'},
+            "contrast 'nothing' names 'nobody', which is not among 'matchers'",
+        ),
         (
             {'matchers = ["random", "prior_centre"]': 'matchers = ["random", "random"]'},
             "matcher 'random' is listed twice",
@@ -252,6 +281,18 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ),
         ({"[[contrast]]": "[[contrast]]\npilot = { control = 0.9 }"}, "is for metric = .interaction"),
         ({"[[contrast]]": "[[contrast]]\npilot = { second = -0.3 }"}, "is for metric = .interaction"),
+        (
+            {"[[contrast]]": "[[contrast]]\nmin_effect = 0.4\npilot = { second = 0.7 }"},
+            r"'nothing' cannot be reached: at most 0\.300 can be gained, and 0\.400 is to matter",
+        ),
+        (
+            {"[[contrast]]": '[[contrast]]\nmetric = "interaction"\npilot = { second = 0.2, control = 0.9 }'},
+            r"at most 0\.000 can be gained, .*\(second of its pilot is a difference",
+        ),
+        (
+            {"[[contrast]]": '[[contrast]]\nmetric = "aurc"\npilot = { second = 0.3, false_share = 0.78 }'},
+            r"a perfect order has an area of 0\.447, so the pilot's second cannot be 0\.3",
+        ),
         ({"sites = 1": 'sites = 1\ntracks = ["retrieval"]'}, "is of localization, and no .* draws that track"),
         ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "'published' or 'measured'"),
         ({"sites = 1": 'sites = 1\ndetectors = ["measured", "measured"]'}, "detector 'measured' is listed twice"),
@@ -259,7 +300,7 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),
         (
             {'second = "prior_centre"': 'second = "prior_centre"\nmetric = "e_aurc"'},
-            "unknown matcher x rejector 'random'",
+            "'nothing' by e_aurc is of rejectors: name 'random' as matcher x rejector",
         ),
     ],
 )

@@ -20,7 +20,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import LearningSpec, PipelineFile
 from sasgeo_bench.leaderboard.private_board import sealed_lines
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks
-from sasgeo_bench.tasks.openings import Opening, openings_file, read_openings, record_openings
+from sasgeo_bench.tasks.openings import Opening, joined_openings, openings_file, read_openings, record_openings
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.split import find_split
 from tests.handmade import split_file
@@ -98,6 +98,23 @@ def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_
     (line,) = sealed_lines({"sealed": record})
     assert line.startswith(f"Sealed place {SEALED}: opened on 2026-04-01")
     assert "this is opening 2, after 2026-03-01" in line
+    assert record == open_seal(again.seal, again.requests, opened=SECOND, stored=None, tell=lambda _: None)
+
+
+@pytest.mark.parametrize(
+    ("day", "words"),
+    [
+        ("2026-02-28", "is before the recorded opening of sealed place town-grid, on 2026-03-01"),
+        ("2999-01-01", "not come"),
+    ],
+)
+def test_no_opening_is_dated_before_an_earlier_one_or_into_the_future(split, tmp_path, day, words):
+    record_openings(tmp_path, "towns-alone", [SEALED], Opening.of(SEED, FIRST), tell=lambda _: None)
+    before = openings_file(tmp_path, "towns-alone").read_bytes()
+    plan = plan_of(split, tmp_path, sealed=OTHER)
+    with pytest.raises(ConfigError, match=words):
+        open_seal(plan.seal, plan.requests, opened=dt.date.fromisoformat(day), stored=None, tell=lambda _: None)
+    assert openings_file(tmp_path, "towns-alone").read_bytes() == before
 
 
 def test_the_queries_of_a_sealed_place_depend_on_its_seed_alone(split, tmp_path, lay_towns):
@@ -155,6 +172,8 @@ def test_the_command_opens_by_a_file_that_its_owner_alone_can_read(split, tmp_pa
     assert SEED.text not in told + err
     code, _, err = program(*asked, "--opened", "yesterday")
     assert (code, err.strip()) == (2, "sasgeo-bench: --opened must be a date as in 2021-10-28, got 'yesterday'")
+    code, _, err = program(*asked, "--opened", "2999-01-01")
+    assert (code, "2999-01-01 has not come yet" in err) == (2, True)
     code, _, err = program("leaderboard", "closed.toml", "--dry-run", "--opened", "2026-11-23")
     assert code == 2
     assert "give --sealed-seed-file, too, or leave it out" in err
@@ -179,6 +198,11 @@ def test_stored_results_keep_the_openings_of_another_root(split, tmp_path, monke
     plan = plan_of(split, tmp_path / "out", sealed=OTHER)
     found = open_seal(plan.seal, plan.requests, opened=SECOND, stored=tmp_path / "stored", tell=lambda _: None)
     assert [item["commitment"] for item in found[SEALED]["openings"]] == [SEED.commitment, OTHER.commitment]
+
+
+def test_the_order_of_openings_is_that_of_their_records():
+    early, late = Opening.of(SEED, FIRST), Opening.of(OTHER, SECOND)
+    assert joined_openings({"porto": (late,)}, {"porto": (early,)}) == {"porto": (late, early)}
 
 
 def test_openings_are_kept_in_order_each_seed_once_and_a_damaged_file_is_refused(tmp_path):

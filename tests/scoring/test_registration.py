@@ -62,11 +62,11 @@ def test_power_is_told_for_both_ends_of_the_order_of_holm():
     found = check_contrasts([GRAPH, *others], {"graph": pilot}, apart(80), tell=told.append)[0]
     assert found.detectable == pytest.approx(detectable_difference(80, 0.25))
     assert found.detectable < found.detectable_first < np.inf
-    both = f"show {found.detectable:.3f}, or {found.detectable_first:.3f} if it comes first in Holm's order"
+    both = f"can show is {found.detectable:.3f}, or {found.detectable_first:.3f} if it comes first in Holm's order"
     assert told[0].endswith(both)
     # 30 places have 7.5 discordant ones, and 2 / 2^7.5 exceeds 0.05 / 13: the test cannot show anything.
     few = registered(GRAPH, pilot, apart(30), contrasts=13).to_text()
-    assert few.endswith("or no difference at all if it comes first in Holm's order")
+    assert few.endswith("or none if it comes first in Holm's order")
 
 
 def test_power_counts_places_not_blocks():

@@ -98,7 +98,11 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         return f"{where!r} is missing"
     if item["type"] == "list_type" and not isinstance(item["input"], dict):
         return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
-    text = str(item["msg"]).removeprefix("Value error, ")
+    if item["type"] == "list_type":
+        return f"{where!r} is a list, got a table: if it is a list of tables write [[{where}]]"
+    if item["type"] == "model_type":
+        return f"{where!r} is a table of keys, got {_short(item['input'])}"
+    text = str(item["msg"]).removeprefix("Value error, ").replace(" after validation", "")
     if not where or "got " in text:
         return text
     # A whole table says nothing of what is wrong in it.
@@ -188,7 +192,7 @@ def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[]
             known = {name: name for name in list_known()} | {
                 other.stem: str(other) for other in sorted(path.parent.glob("*.toml"))
             }
-            message = f"there is no {noun} file {id_or_path}{_hint(path.stem, known)} ({mend})"
+            message = f"there is no {noun} file {id_or_path}{_hint(path.stem, known)}: check the path"
             raise ConfigError(message)
         return path
     files = list_known()

@@ -53,8 +53,21 @@ def test_one_thing_where_a_list_is_wanted_is_shown_as_a_list():
 
     with pytest.raises(ConfigError, match=r"a\.toml: 'sizes' is a list: write \[192\]$"):
         parse_toml("sizes = 192", Sizes, source="a.toml")
-    with pytest.raises(ConfigError, match=r"'sizes': Input should be a valid list"):
+    with pytest.raises(
+        ConfigError, match=r"'sizes' is a list, got a table: if it is a list of tables write \[\[sizes\]\]$"
+    ):
         parse_toml("[sizes]\nx = 1", Sizes, source="a.toml")
+
+
+def test_a_number_where_a_table_is_wanted_is_shown():
+    class Inner(Document):
+        a: int
+
+    class Outer(Document):
+        inner: Inner
+
+    with pytest.raises(ConfigError, match=r"'inner' is a table of keys, got 0\.5$"):
+        parse_toml("inner = 0.5", Outer, source="a.toml")
 
 
 def test_a_missing_key_is_named():

@@ -96,10 +96,14 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         return f"unknown key {where!r}, {hint}"
     if item["type"] == "missing":
         return f"{where!r} is missing"
-    if item["type"] == "list_type" and not isinstance(item["input"], dict):
-        return f"{where!r} is a list: write [{json.dumps(item['input'], default=str)}]"
     if item["type"] == "list_type":
-        return f"{where!r} is a list, got a table: if it is a list of tables write [[{where}]]"
+        is_table = isinstance(item["input"], dict)
+        more = (
+            f"for a list of tables write [[{where}]]"
+            if is_table
+            else f"write [{json.dumps(item['input'], default=str)}]"
+        )
+        return f"{where!r} is a list: {more}"
     if item["type"] == "model_type":
         return f"{where!r} is a table of keys, got {_short(item['input'])}"
     text = str(item["msg"]).removeprefix("Value error, ").replace(" after validation", "")
@@ -107,6 +111,10 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         return text
     # A whole table says nothing of what is wrong in it.
     return f"{where!r}: {text}" + ("" if isinstance(item["input"], dict) else f", got {_short(item['input'])}")
+
+
+def _json(value: object) -> str:
+    return json.dumps(value, default=str)
 
 
 def _short(value: object) -> str:

@@ -53,9 +53,7 @@ def test_one_thing_where_a_list_is_wanted_is_shown_as_a_list():
 
     with pytest.raises(ConfigError, match=r"a\.toml: 'sizes' is a list: write \[192\]$"):
         parse_toml("sizes = 192", Sizes, source="a.toml")
-    with pytest.raises(
-        ConfigError, match=r"'sizes' is a list, got a table: if it is a list of tables write \[\[sizes\]\]$"
-    ):
+    with pytest.raises(ConfigError, match=r"'sizes' is a list: for a list of tables write \[\[sizes\]\]$"):
         parse_toml("[sizes]\nx = 1", Sizes, source="a.toml")
 
 

@@ -16,6 +16,7 @@ Record = Mapping[str, Any]  # a row of the leaderboard
 Key = tuple[str, str, str]  # suite, track, prior group
 
 DAGGER: Final = "†"  # of an interval that Wilson's reaches beyond the draws
+_LEAST_P: Final = 5e-4  # less would read as nought
 _PLAIN: Final = re.compile(r"[^a-z0-9]+")
 _MOST_LETTERS: Final = 60  # of a part of a file name
 
@@ -184,6 +185,20 @@ def number_cell(value: float, unit: str = "") -> Cell:
     if math.isnan(value):
         return Cell(text="-")
     return Cell(text=f"{number_text(value)} {unit}".strip(), key=value)
+
+
+def p_text(p: float) -> str:
+    """Return a p value with three digits, never 0.000; "-" for NaN.
+
+    >>> p_text(0.0001), p_text(0.04), p_text(math.nan)
+    ('< 0.001', '0.040', '-')
+    """
+    return "< 0.001" if p < _LEAST_P else number_text(p)
+
+
+def p_cell(p: float) -> Cell:
+    """Return a cell of a p value."""
+    return Cell(text=p_text(p), key=sort_key(p))
 
 
 def figure_cell(row: Record | None, *, has_bar: bool = False) -> Cell:

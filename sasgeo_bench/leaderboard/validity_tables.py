@@ -17,11 +17,13 @@ from sasgeo_bench.leaderboard.tables import (
     interval_text,
     number_cell,
     number_text,
+    p_cell,
     plain_cell,
     sort_key,
     tally_text,
     text_cells,
 )
+from sasgeo_bench.scoring.contrasts import AREAS
 from sasgeo_bench.scoring.controls import Falsifier
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.verdicts import Finding
@@ -80,7 +82,7 @@ def control_table(controls: pd.DataFrame) -> Table | None:
                 plain_cell(int(row["n"])),
                 Cell(text=tally_text(float(row["found"])), key=float(row["found"])),
                 Cell(text=tally_text(float(row["expected"])), key=float(row["expected"])),
-                number_cell(float(row["p"])),
+                p_cell(float(row["p"])),
                 Cell(text="held" if row["holds"] else "FAILED"),
             )
         )
@@ -103,8 +105,8 @@ def contrast_table(findings: Sequence[Finding]) -> Table:
                 *((Cell(text=_ends_text(item.lo_countries, item.hi_countries)),) if has_countries else ()),
                 number_cell(item.attainable),
                 number_cell(item.least),
-                number_cell(item.p_holm),
-                Cell(text=f"{item.first_only} and {item.second_only}"),
+                p_cell(item.p_holm),
+                Cell(text="-" if item.metric in AREAS else f"{item.first_only} and {item.second_only}"),
                 number_cell(item.detectable),
                 Cell(text=_counts_text(item), key=float(item.n)),
                 Cell(text=item.verdict),

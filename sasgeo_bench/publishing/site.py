@@ -16,7 +16,7 @@ from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sec
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
-from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text
+from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.publishing.site_pages import (
@@ -33,7 +33,6 @@ from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.texts import plain
 
 OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided", "not tested")  # as on the page
-_LEAST_P: Final = 5e-4  # less would read as nought
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,8 +133,7 @@ def _unstressed(row: Record) -> str:
 def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) -> Iterator[str]:
     p = float(row["p_holm"])
     if not math.isnan(p):
-        shown = "below 0.001" if p < _LEAST_P else number_text(p)
-        yield f"adjusted p {shown} (Holm, {counted(len(source.contrasts), 'contrast')})"
+        yield f"adjusted p {p_text(p)} (Holm, {counted(len(source.contrasts), 'contrast')})"
     yield f"n = {counted(int(row['n']), 'query', 'queries')}"
     yield counted(int(row["blocks"]), "block")
     yield counted(int(row["places"]), "place")
@@ -145,9 +143,9 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
         yield f"right by the first alone {row['first_only']}, by the second alone {row['second_only']}"
     detectable = float(row["detectable"])
     if math.isinf(detectable):
-        yield "so few places would show no difference, however large"
+        yield "so few places cannot show any difference"
     elif not math.isnan(detectable):
-        yield f"least difference so many places would show {number_text(detectable)}"
+        yield f"least difference that so many places can show {number_text(detectable)}"
     if contrast is not None:
         yield contrast.queries_text()
 

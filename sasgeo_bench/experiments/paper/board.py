@@ -27,6 +27,7 @@ from sasgeo_bench.experiments.paper.task import DATA, SUITE
 from sasgeo_bench.experiments.paper.tiles import CANDIDATES
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
+from sasgeo_bench.leaderboard.tables import p_text
 from sasgeo_bench.leaderboard.text import markdown_table
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.scoring.verdicts import Finding
@@ -34,8 +35,6 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.sheet import Panel
-
-_LEAST_P: Final = 0.001
 
 
 def paper_markdown(
@@ -185,7 +184,7 @@ def _steps(findings: Sequence[Finding]) -> pd.DataFrame:
                     "ours, paired": f"{one.difference:+.3f}"
                     + ("" if math.isnan(one.lo) else f" [{one.lo:+.3f}, {one.hi:+.3f}]"),
                     "won and lost": f"{one.first_only} and {one.second_only} of {one.n}",
-                    "p (Holm)": "< 0.001" if one.p_holm < _LEAST_P else f"{one.p_holm:.3f}",
+                    "p (Holm)": p_text(one.p_holm),
                     "verdict": one.verdict,
                 }
             )

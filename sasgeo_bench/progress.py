@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Spread long work over processes, and show its progress: as a line now and then, or as a terminal shows it."""
 
+import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import wait
 from signal import SIG_DFL, SIGINT, signal
+from threading import Thread
 from typing import Protocol, TypeVar
 
 EVERY_S = 10.0  # read when progress begins to be shown, so that a test can silence it on a slow machine
@@ -69,7 +72,22 @@ def spread(work: Callable[[Item], Found], items: Sequence[Item], *, jobs: int = 
     if jobs == 1 or len(items) < 2:  # noqa: PLR2004 - one item is no work to share
         yield from map(work, items)
         return
-    # An interrupt ends the processes at once: files are written whole or not at all, and the next run resumes.
-    spawn = get_context("spawn")
-    with ProcessPoolExecutor(jobs, mp_context=spawn, initializer=signal, initargs=(SIGINT, SIG_DFL)) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
         yield from pool.map(work, items)
+
+
+def _end_with_parent() -> None:
+    """End this process at once on an interrupt, or when the program that it works for has gone.
+
+    Files are written whole or not at all, and the next run resumes. Without this a killed program leaves its processes
+    waiting for work for ever: each of them holds the other end of the pipe that the others read.
+    """
+    signal(SIGINT, SIG_DFL)
+    parent = parent_process()
+    if parent is not None:
+        Thread(target=_exit_after, args=(parent.sentinel,), daemon=True).start()
+
+
+def _exit_after(sentinel: int) -> None:
+    wait([sentinel])
+    os._exit(1)  # from a thread nothing gentler ends the process

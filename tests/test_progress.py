@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Work that is spread over processes ends with the program that spreads it."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+
+from sasgeo_bench.progress import spread
+
+PROGRAM = """
+from pathlib import Path
+from sasgeo_bench.progress import spread
+from tests.test_progress import note_and_wait
+
+if __name__ == "__main__":
+    list(spread(note_and_wait, [Path(name) for name in ("one", "two", "three")], jobs=2))
+"""
+LONG_S = 600.0  # a process that is left over sleeps as long
+
+
+def note_and_wait(path: Path) -> None:
+    path.with_suffix(".part").write_text(str(os.getpid()), encoding="ascii")
+    path.with_suffix(".part").replace(path)
+    time.sleep(LONG_S)
+
+
+def test_results_come_in_order_from_several_processes():
+    assert list(spread(abs, [-3, 2, -1], jobs=2)) == [3, 2, 1]
+
+
+def test_a_killed_program_leaves_no_process_behind(tmp_path):
+    """As `kill -9` or a lack of memory ends it: nothing of its own can run any more."""
+    (tmp_path / "program.py").write_text(PROGRAM, encoding="utf-8")
+    root = Path(__file__).parents[1]
+    program = subprocess.Popen(
+        [sys.executable, "program.py"], cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(root)}
+    )
+    notes = [tmp_path / "one", tmp_path / "two"]
+    while not all(path.exists() for path in notes):
+        assert program.poll() is None
+        time.sleep(0.05)
+    left = [psutil.Process(int(path.read_text(encoding="ascii"))) for path in notes]
+    program.kill()
+    program.wait()
+    _, alive = psutil.wait_procs(left, timeout=LONG_S / 2)
+    assert alive == []

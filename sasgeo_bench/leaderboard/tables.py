@@ -191,9 +191,9 @@ def p_text(p: float) -> str:
     """Return a p value with three digits, never 0.000; "-" for NaN.
 
     >>> p_text(0.0001), p_text(0.04), p_text(math.nan)
-    ('< 0.001', '0.040', '-')
+    ('below 0.001', '0.040', '-')
     """
-    return "< 0.001" if p < _LEAST_P else number_text(p)
+    return "below 0.001" if p < _LEAST_P else number_text(p)
 
 
 def p_cell(p: float) -> Cell:

@@ -548,7 +548,7 @@ def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
 @pytest.mark.parametrize(
     ("small", "large", "may_differ"),
     [
-        ("towns", "leaderboard", {"id", "title", "regions"}),
+        ("towns", "claims", {"id", "title", "regions"}),
         ("paper-poc", "paper-poc-20", {"id", "title", "paper"}),
     ],
 )

@@ -87,7 +87,9 @@ def test_the_claims_on_a_page_are_the_differences_and_intervals_of_its_board(pag
 
 
 def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
-    outcomes = {board: pd.read_parquet(RESULTS / board / "contrasts.parquet").set_index("name")["outcome"] for board in BOARDS}
+    outcomes = {
+        board: pd.read_parquet(RESULTS / board / "contrasts.parquet").set_index("name")["outcome"] for board in BOARDS
+    }
     said = {
         FIRST: {"graph": "decided", "stability": "cause open", "rejection-absent": "not decided"},
         "claims": {

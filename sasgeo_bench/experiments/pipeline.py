@@ -152,12 +152,9 @@ def named_on_board(contrast: Contrast, names: Mapping[str, str]) -> Contrast:
     >>> found.first, found.second
     ('own x margin', 'fft_vote')
     """
-
-    def shown(side: str) -> str:
-        matcher, *rejector = side.split(" x ", maxsplit=1)
-        return " x ".join((names.get(matcher, matcher), *rejector))
-
-    return replace(contrast, first=shown(contrast.first), second=shown(contrast.second))
+    sides = (side.split(" x ", maxsplit=1) for side in (contrast.first, contrast.second))
+    first, second = (" x ".join((names.get(matcher, matcher), *rejector)) for matcher, *rejector in sides)
+    return replace(contrast, first=first, second=second)
 
 
 def _run(spec: str, runs: Sequence[Run], tell: Tell, progress: Progress | None) -> list[Path]:

@@ -1,12 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Segmentation: the probability of every class at every pixel of an image, or that nothing is said there."""
 
-import json
-import struct
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +12,7 @@ from scipy.special import expit, logit
 
 from sasgeo_bench.errors import ImageError
 from sasgeo_bench.sensing.image import check_classes
+from sasgeo_bench.sensing.packing import pack_parts, split_parts, unpack_body
 
 SILENT: Final = 255  # the byte of a pixel of which nothing is said
 CERTAIN: Final = 254  # the byte of P(present) = 1
@@ -22,8 +20,6 @@ MOST_CLASSES: Final = 64
 MOST_VALUES: Final = 2**30  # bytes of probabilities in one segmentation
 
 _MAGIC: Final = b"SGSEG\x01"
-_HEAD: Final = struct.Struct("!I")
-_MOST_HEAD: Final = 2**16  # bytes
 _STEP: Final = 1 / CERTAIN
 _MOST_SHIFT: Final = 60.0  # of the log-odds: beyond it a probability is 0 or 1 to all digits
 _LEAST_SHARE: Final = 1e-9  # far less than a pixel
@@ -156,8 +152,8 @@ class Segmentation:
 
     def to_bytes(self) -> bytes:
         """Return classes, shape and compressed probabilities as bytes, which `from_bytes` reads; executes nothing."""
-        head = json.dumps({"classes": self.classes, "shape": self.shape}).encode()
-        return _MAGIC + _HEAD.pack(len(head)) + head + zlib.compress(self.probability_bytes.tobytes(), level=1)
+        head = {"classes": self.classes, "shape": self.shape}
+        return pack_parts(_MAGIC, head, self.probability_bytes.tobytes())
 
     @classmethod
     def from_bytes(cls, data: bytes, *, shape: tuple[int, int] | None = None) -> Self:
@@ -166,21 +162,12 @@ class Segmentation:
         `shape` is the expected number of rows and columns, if known. Raise `ImageError` if the bytes are damaged or
         too many, or of another shape.
         """
-        classes, found = _read_head(data)
+        head, rest = split_parts(_MAGIC, data, "a segmentation")
+        classes, found = _read_head(head)
         if shape is not None and found != shape:
             message = f"a segmentation of shape {found}, expected {shape} as the picture is"
             raise ImageError(message)
-        count = len(classes) * found[0] * found[1]
-        (head_bytes,) = _HEAD.unpack_from(data, len(_MAGIC))
-        unpacking = zlib.decompressobj()
-        try:
-            planes = unpacking.decompress(data[len(_MAGIC) + _HEAD.size + head_bytes :], count + 1)
-        except zlib.error as error:
-            message = f"the bytes of a segmentation are damaged ({error}): make it again"
-            raise ImageError(message) from error
-        if len(planes) != count or not unpacking.eof or unpacking.unused_data:
-            message = f"a segmentation of shape {(len(classes), *found)} does not hold {count} bytes: make it again"
-            raise ImageError(message)
+        planes = unpack_body(rest, len(classes) * found[0] * found[1], "a segmentation")
         cells = np.frombuffer(planes, dtype=np.uint8).reshape(len(classes), *found)
         return cls(classes=classes, probability_bytes=cells)
 
@@ -201,24 +188,21 @@ def _shifted_bytes(counts: NDArray[np.int64], share: float) -> NDArray[np.uint8]
     return same
 
 
-def _read_head(data: bytes) -> tuple[tuple[str, ...], tuple[int, int]]:
+def _read_head(head: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[int, int]]:
     """Read classes, rows and columns; raise `ImageError` if they are none, or too many."""
-    fault = "these bytes are no segmentation, or their head is damaged: make it again"
-    start = len(_MAGIC) + _HEAD.size
-    if len(data) < start or not data.startswith(_MAGIC):
-        raise ImageError(fault)
-    (head_bytes,) = _HEAD.unpack_from(data, len(_MAGIC))
-    if head_bytes > min(_MOST_HEAD, len(data) - start):
-        raise ImageError(fault)
-    try:
-        head = json.loads(data[start : start + head_bytes])
-        classes, (rows, cols) = tuple(head["classes"]), head["shape"]
-    except (ValueError, TypeError, KeyError, RecursionError) as error:
-        raise ImageError(fault) from error
-    is_sound = all(isinstance(name, str) for name in classes) and all(type(side) is int for side in (rows, cols))
-    if not is_sound or not 0 < len(classes) <= MOST_CLASSES or min(rows, cols) < 1:
-        raise ImageError(fault)
-    if len(classes) * rows * cols > MOST_VALUES:
+    classes, shape = head.get("classes"), head.get("shape")
+    is_sound = (
+        isinstance(classes, list)
+        and all(isinstance(name, str) for name in classes)
+        and isinstance(shape, list)
+        and len(shape) == 2  # noqa: PLR2004 - rows and columns
+        and all(type(side) is int and side > 0 for side in shape)
+    )
+    if not is_sound or classes is None or shape is None:
+        message = "the head of a segmentation is damaged: make it again"
+        raise ImageError(message)
+    rows, cols = shape
+    if len(classes) > MOST_CLASSES or len(classes) * rows * cols > MOST_VALUES:
         message = f"a segmentation of {len(classes)} classes and {rows} x {cols} pixels is too large: cut the picture"
         raise ImageError(message)
-    return classes, (rows, cols)
+    return tuple(classes), (rows, cols)

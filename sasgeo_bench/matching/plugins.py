@@ -38,7 +38,9 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     found: dict[str, EntryPoint] = {}
     for point in _installed(group):
         if point.name == _RESERVED.get(group):
-            message = f"{_home(point)} ({point.value}) is not used: {point.name!r} is the name of a control of the runner"
+            message = (
+                f"{_home(point)} ({point.value}) is not used: {point.name!r} is the name of a control of the runner"
+            )
             warnings.warn(message, stacklevel=2)
         elif point.name not in found:
             found[point.name] = point
@@ -215,9 +217,7 @@ def _known(name: str, group: str) -> EntryPoint:
     return points[name]
 
 
-def check_names(
-    *, matchers: Sequence[str] = (), rejectors: Sequence[str] = (), segmenters: Sequence[str] = ()
-) -> None:
+def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = (), segmenters: Sequence[str] = ()) -> None:
     """Raise `MatchError` for names that no installed package registers; import nothing, accept any module:Class."""
     for listed, group in ((matchers, MATCHERS), (rejectors, REJECTORS), (segmenters, SEGMENTERS)):
         for name in listed:

@@ -5,7 +5,7 @@ import datetime as dt
 import warnings
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Final, Protocol
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,7 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from sasgeo_bench.errors import ImageError
 from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.texts import message_of
 
 Picture = NDArray[np.uint8]
@@ -118,22 +119,6 @@ def _to_rgb(image: Image.Image) -> Picture:
         image = Image.new("RGBA", seen.size, (0, 0, 0, 255))
         image.alpha_composite(seen)
     return np.array(image.convert("RGB"), dtype=np.uint8)
-
-
-class _Size(Protocol):
-    @property
-    def width_px(self) -> int: ...
-    @property
-    def height_px(self) -> int: ...
-
-
-class Camera(Protocol):
-    """What an image needs to know of its camera."""
-
-    @property
-    def intrinsics(self) -> _Size:
-        """Return the camera's inner geometry, the size of its pictures included."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

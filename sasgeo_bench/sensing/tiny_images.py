@@ -20,10 +20,13 @@ _EACH: Final = 2  # pictures of a place
 _SEED: Final = 1  # of the drawings, which never change
 _NOISE: Final = 8.0  # of a pixel, in steps of 255
 _GROUND: Final = (150, 140, 120)
-_COLOURS: Final = {"road_minor": (100, 100, 105), "building": (190, 110, 90), "water": (40, 70, 110)} | {
-    "green": (70, 110, 60)
+_COLOURS: Final = {
+    "road_minor": (100, 100, 105),
+    "building": (190, 110, 90),
+    "water": (40, 70, 110),
+    "green": (70, 110, 60),
 }
-_SPREAD: Final = 20  # of a colour between pictures
+_SPREAD: Final = 8  # of a colour between pictures
 _MARGIN_PX: Final = 6  # at the right edge, where nobody has looked
 
 
@@ -69,7 +72,7 @@ def _drawn(rng: np.random.Generator) -> NDArray[np.uint8]:
     across = rng.integers(0, rows, 2).tolist()
     cv2.line(road, (0, across[0]), (cols - 1, across[1]), color=1, thickness=7)
     cv2.line(road, (int(rng.integers(0, cols)), 0), (int(rng.integers(0, cols)), rows - 1), color=1, thickness=5)
-    cv2.ellipse(water, (*_at(rng), 0), (14, 9), float(rng.uniform(0, 180)), 0, 360, color=1, thickness=-1)
+    cv2.ellipse(water, _at(rng), (14, 9), float(rng.uniform(0, 180)), 0, 360, color=1, thickness=-1)
     for _ in range(12):
         cv2.circle(green, _at(rng), int(rng.integers(4, 9)), color=1, thickness=-1)
     for _ in range(10):

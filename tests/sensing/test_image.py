@@ -3,7 +3,6 @@
 
 import struct
 import zlib
-from dataclasses import dataclass
 from io import BytesIO
 
 import numpy as np
@@ -11,22 +10,16 @@ import pytest
 from PIL import Image
 
 from sasgeo_bench.errors import ImageError
+from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, decode_image
+from sasgeo_bench.sensing.intrinsics import Intrinsics
 
 RED, GREEN, BLUE = (250, 0, 0), (0, 250, 0), (0, 0, 250)
 
 
-@dataclass(frozen=True)
-class Size:
-    width_px: int
-    height_px: int
-
-
-@dataclass(frozen=True)
-class Lens:
-    """A camera of which only the size of its pictures is known."""
-
-    intrinsics: Size
+def camera(rows: int, cols: int) -> Camera:
+    lens = Intrinsics.from_field_of_view(horizontal_deg=70.0, width_px=cols, height_px=rows)
+    return Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=80.0, yaw_deg=0.0)
 
 
 def encoded(image: Image.Image, kind: str = "PNG", **options: object) -> bytes:
@@ -147,7 +140,7 @@ def test_bytes_and_pixels_are_counted_before_decoding(monkeypatch: pytest.Monkey
 
 
 def aerial(rows: int = 4, cols: int = 6, **changes: object) -> AerialImage:
-    return AerialImage(**{"rgb": np.zeros((rows, cols, 3), np.uint8), "camera": Lens(Size(cols, rows))} | changes)
+    return AerialImage(**{"rgb": np.zeros((rows, cols, 3), np.uint8), "camera": camera(rows, cols)} | changes)
 
 
 def test_the_picture_of_an_aerial_image_cannot_be_changed() -> None:
@@ -160,7 +153,7 @@ def test_the_picture_of_an_aerial_image_cannot_be_changed() -> None:
 @pytest.mark.parametrize(
     ("changes", "fault"),
     [
-        ({"camera": Lens(Size(4, 6))}, r"shape \(6, 4, 3\)"),
+        ({"camera": camera(6, 4)}, r"shape \(6, 4, 3\)"),
         ({"rgb": np.zeros((4, 6, 3))}, "got float64"),
         ({"rgb": np.zeros((4, 6), np.uint8)}, r"got uint8 of shape \(4, 6\)"),
         ({"height_sigma_m": -1.0}, "height_sigma_m must be finite and not negative"),

@@ -333,7 +333,7 @@ def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False) -> str | 
         "yaw": query.prior.yaw_deg is not None,
         "scale": True,
         "vectors": query.vectors is not None,
-        "image": False,
+        "image": bool(query.frames),
         "training": is_taught,
     }
     return next((f"no {need}" for need in card.needs if not has[need]), None)

@@ -26,6 +26,7 @@ from sasgeo_bench.texts import json_text
 INDEX: Final = "release.json"
 SUMS: Final = "SHA256SUMS"
 NOTICE: Final = "LICENSE-ODbL.txt"
+_PICTURES: Final = "frames.list.element.picture"  # the column as Parquet names it
 IMAGERY: Final = "imagery/README.md"
 LICENCE_URL: Final = "https://opendatacommons.org/licenses/odbl/1-0/"
 COPYRIGHT_URL: Final = "https://www.openstreetmap.org/copyright"
@@ -47,7 +48,7 @@ the data may have another licence and carries the attribution.
 _NO_IMAGERY: Final = f"""\
 # Imagery
 
-None is in this release: every file of it is derived from OpenStreetMap ({ATTRIBUTION}), and the column `image` of the
+None is in this release: every file of it is derived from OpenStreetMap ({ATTRIBUTION}), and the column `frames` of the
 queries is empty. Imagery has a licence of its own; a release that holds some keeps it in this folder, apart from what
 is
 under the ODbL, each source with its licence.
@@ -175,7 +176,7 @@ def has_images(task_folder: Path) -> bool:
         metadata.row_group(group).column(at)
         for group in range(metadata.num_row_groups)
         for at in range(metadata.num_columns)
-        if metadata.schema.column(at).path == "image"
+        if metadata.schema.column(at).path == _PICTURES
     ]
     return any(one.statistics is None or one.statistics.null_count < one.num_values for one in columns)
 

@@ -50,7 +50,7 @@ QUERY_TEXTS: Final = {
     "frame": "number within the sequence; null in every suite of today",
     "increment": "motion since the frame before; null in every suite of today",
     "increment_covariance": "covariance of that motion; null in every suite of today",
-    "image": "a picture; null in every suite of today",
+    "frames": "pictures with the cameras that are believed; null where perception is modelled",
     "asked_sha256": "hash of the row and its map: an answer says which query it answers by it",
 }
 TRUTH_TEXTS: Final = {

@@ -171,7 +171,8 @@ def plan_run(request: RunRequest) -> RunPlan:
     ConfigError
         If the shard or a number is out of range, or the training set is refused (`plan_training`).
     StoreError
-        If a task is missing, of another version, or its map is.
+        If a task is missing, of another version, or its map is; or if no segmenter has seen its pictures, and the
+        matcher does not look at them itself.
     """
     _check(request)
     if request.dask is not None:  # other processes work in other folders
@@ -181,6 +182,7 @@ def plan_run(request: RunRequest) -> RunPlan:
         list_entry_points()  # warns of a clash of names: what the plugin's own process prints is not shown
     abouts = {folder: task_files.read_task(folder) for folder in request.tasks}
     card, code, learns = _card(request)
+    _check_seen(abouts, card)
     limits = _hashed(request.limits, learns=learns)
     settings = json.dumps({"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
@@ -207,6 +209,17 @@ def plan_run(request: RunRequest) -> RunPlan:
         training_set=training_set,
         training_result=result,
     )
+
+
+def _check_seen(abouts: Mapping[Path, Mapping[str, Any]], card: MatcherCard) -> None:
+    """Refuse tasks of pictures that nothing has made evidence of, unless the matcher looks at pictures itself."""
+    unseen = next((task for task, about in abouts.items() if about.get("frames") and not about.get("segmenter")), None)
+    if unseen is not None and "image" not in card.needs:
+        message = (
+            f"{unseen} holds pictures and no evidence, and {card.name!r} reads evidence: run sasgeo-bench segment "
+            f"--task {unseen} first"
+        )
+        raise StoreError(message)
 
 
 def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:

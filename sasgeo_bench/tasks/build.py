@@ -27,6 +27,7 @@ from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
@@ -331,7 +332,7 @@ def put_task(
     check_separate(out / "tasks", truth_folder)
     check_separate(task_folder, out / "truth")
     task_files.check_ours(task_folder, (task_files.QUERIES, task_files.TASK))
-    task_files.check_ours(truth_folder, (task_files.TRUTH, task_files.TRUTH_OF))
+    task_files.check_ours(truth_folder, (task_files.TRUTH, task_files.TRUTH_OF, LABELS))
     _check_unmixed(truth_folder, hidden)
     about |= {name: hidden[name] for name in (task_files.PRIVATE, task_files.SEALED) if name in hidden}
     try:

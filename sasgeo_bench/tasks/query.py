@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final, Literal, Self
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.tasks.frames import Frame, FrameLabels
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -23,8 +24,11 @@ TASK_VERSIONS: Final = (1, 2, TASK_VERSION)  # readable versions: their files ar
 Track = Literal["retrieval", "localization"]
 Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
-Detector = Literal["published", "measured"]  # families of errors of perception
+# Families of errors of perception: two models of a detector, and two of the look of a place, which a segmenter then sees.
+Detector = Literal["published", "measured", "rendered", "shifted"]
 PUBLISHED: Final[Detector] = "published"  # the one that is meant where none is named
+RENDERED: Final[Detector] = "rendered"  # the one that is meant where a suite has pictures
+PICTURED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")
 # Kinds of queries whose right score is known beforehand; the scorer knows them by these names.
 CONTROLS: Final = "controls"  # their suite
 NOISE_FREE: Final = "noise-free"
@@ -130,6 +134,9 @@ class Query(_Question):
         For retrieval: the places to rank; empty for localization.
     vectors : geopandas.GeoDataFrame, optional
         Perceived vectors in the view's frame ((right, up) from its middle, metres): columns class, level, is_bridge.
+    frames : tuple of Frame
+        Pictures, oldest first, each with its believed camera in the view's frame; empty where perception is modelled.
+        Until a segmenter has made evidence of them, all of `evidence` is unknown.
     """
 
     evidence: Evidence
@@ -137,6 +144,7 @@ class Query(_Question):
     season: str
     prior: Prior
     vectors: "gpd.GeoDataFrame | None" = None
+    frames: tuple[Frame, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -174,8 +182,10 @@ class Truth:
         Evaluation block of the centre, the unit of resampling, and scene tags of the region.
     measured : mapping of str to float
         Manipulation check: measures of the applied change.
-    detector : {"published", "measured"}
-        Family of the errors of perception; the query does not tell it.
+    detector : {"published", "measured", "rendered", "shifted"}
+        Family of the errors of perception, or of the look of pictures; the query does not tell it.
+    labels : tuple of FrameLabels
+        What is on the pixels of each frame; only in memory, and in a file beside the truths.
     """
 
     query_id: str
@@ -195,3 +205,4 @@ class Truth:
     scene: str
     measured: dict[str, float] = field(default_factory=dict)
     detector: Detector = PUBLISHED
+    labels: tuple[FrameLabels, ...] = field(default=(), repr=False, compare=False)

@@ -89,7 +89,7 @@ class Drawer:
                 track=track,
             )
             for site in sites
-            for detector in self.choice.detectors
+            for detector in self.suite.detectors(self.choice.detectors)
             for variant in (replace(item, detector=detector) for item in self.suite.variants)
             for track in self.suite.tracks(variant)
             if self.choice.takes(variant, track)
@@ -149,6 +149,7 @@ class Drawer:
             prior_group=group.name,
             candidates=places,
             vectors=draft.vectors,
+            frames=draft.frames,
         )
         return query, self._truth(job, draft, state, decoys, right)
 
@@ -192,6 +193,7 @@ class Drawer:
             | self._twin(site, draft)
             | _unanswerable(draft, state, draft.pose or site.pose, variant),
             detector=variant.detector,
+            labels=draft.labels,
         )
 
     def _rivals_m(self, job: Job, draft: Draft) -> tuple[tuple[float, float], ...]:

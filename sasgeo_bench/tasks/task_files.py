@@ -5,13 +5,14 @@ import hashlib
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Annotated, Any, Final, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import shapely
 from pydantic import Field
 
@@ -22,6 +23,7 @@ from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.tasks.frames import LABEL_SCHEMA, LABELS, label_row
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, Query, Truth
 from sasgeo_bench.tasks.task_rows import (
     ADDED,
@@ -59,6 +61,7 @@ SEALED: Final = "sealed_seed"  # the same of queries of a sealed place
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # of a row group, which is in memory at once
+_ROWS_WITH_FRAMES: Final = 8  # the same where labels of pictures are in memory, too
 _MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # hashes of the searched map in `task.json`
 _READ: Final = ", ".join(map(str, TASK_VERSIONS))  # readable versions of tasks
 
@@ -103,6 +106,8 @@ class TaskManifest(Document):
     candidates_sha256: str | None = None
     private_seed: dict[str, str | int] | None = None  # its commitment and bits
     sealed_seed: dict[str, str | int] | None = None  # the same
+    frames: Count | None = None  # pictures of all queries
+    segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
     files: TaskFiles
     licence: str | None = None
     attribution: str | None = None
@@ -123,6 +128,8 @@ def write_task(
     counts: Counter[str] = Counter()
     groups: set[str] = set()
     frozen = hashlib.sha256()
+    frames = 0
+    labels: pq.ParquetWriter | None = None  # opened at the first picture
     with ExitStack() as stack:
         queries, truths = (
             stack.enter_context(table_writer(path, schema, compression_level=9))
@@ -133,6 +140,11 @@ def write_task(
             asked = [asked_sha256(row, _map_hashes(about)) for row in rows.to_pylist()]
             queries.write_table(rows.append_column(FILE_SCHEMA.field(ASKED), pa.array(asked)))
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
+            of_frames = _label_rows(part)
+            if of_frames:
+                labels = labels or stack.enter_context(table_writer(truth_folder / LABELS, LABEL_SCHEMA))
+                labels.write_table(pa.Table.from_pylist(of_frames, schema=LABEL_SCHEMA), 1)
+            frames += sum(len(query.frames) for query, _ in part)
             for query, _ in part:
                 counts[query.track] += 1
                 groups.add(query.prior_group)
@@ -145,6 +157,7 @@ def write_task(
         "counts": dict(counts),
         "prior_groups": sorted(groups),
         "candidates_sha256": frozen.hexdigest(),
+        **({"frames": frames} if frames else {}),
         "files": {QUERIES: record.model_dump()},
         "licence": LICENCE,
         "attribution": ATTRIBUTION,
@@ -152,6 +165,13 @@ def write_task(
     _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **(hidden or {})})
     _write_json(task_folder / TASK, content)
     return counts.total()
+
+
+def _label_rows(part: Sequence[tuple[Query, Truth]]) -> list[dict[str, Any]]:
+    """Return the labels of all frames of some queries as rows."""
+    return [
+        label_row(truth.query_id, number, item) for _, truth in part for number, item in enumerate(truth.labels)
+    ]
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:
@@ -166,7 +186,12 @@ def _candidate_bytes(query: Query) -> bytes:
 
 def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Query, Truth]]]:
     left = iter(pairs)
-    while batch := list(islice(left, _ROWS)):
+    first = next(left, None)
+    if first is None:
+        return
+    rows = _ROWS_WITH_FRAMES if first[0].frames else _ROWS
+    whole = chain([first], left)
+    while batch := list(islice(whole, rows)):
         yield batch
 
 
@@ -388,13 +413,14 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
     Raises
     ------
     StoreError
-        If the file is missing or damaged, or lacks a column; older truths may lack those of `task_rows.ADDED`.
+        If the file is missing or damaged, or lacks a column; older files may lack those of `task_rows.ADDED`.
     """
     with open_table(path, mend=_MEND, is_whole=False) as source:
         there = [name for name in columns if name in source.schema_arrow.names or name not in ADDED]
         _check_columns(path, source.schema_arrow, there)
         for found in source.iter_batches(batch_size=_ROWS, columns=there):
-            batch = found if len(there) == len(columns) else with_added(found).select(list(columns))
+            lost = [name for name in columns if name not in there]
+            batch = with_added(found, lost).select(list(columns)) if lost else found
             empty = next((name for name in columns if name not in MAY_BE_NULL and batch[name].null_count), None)
             if empty is not None:
                 raise _damaged(path, f"{empty} is null in a row")

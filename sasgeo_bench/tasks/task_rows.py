@@ -15,6 +15,7 @@ import shapely
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.tasks.frames import FRAME, frame_of, frame_row
 from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, Query, Truth
 
 if TYPE_CHECKING:
@@ -38,7 +39,7 @@ _VECTOR: Final = pa.struct(
 _ASKED_VERSION: Final = 1  # raised if the same row asks for another answer, not if other rows are drawn
 _META: Final = {"attribution": ATTRIBUTION, "licence": LICENCE, "task_version": str(TASK_VERSION)}
 
-# The last five columns are for sequences and images, which no suite draws yet.
+# The columns from the sequence's to the increment's are for flights, which no suite draws yet.
 QUERY_SCHEMA: Final = pa.schema(
     [
         ("query_id", pa.string()),
@@ -68,7 +69,7 @@ QUERY_SCHEMA: Final = pa.schema(
         ("frame", pa.int32()),
         ("increment", pa.list_(pa.float64())),
         ("increment_covariance", pa.list_(pa.float64())),
-        ("image", pa.binary()),
+        ("frames", pa.list_(FRAME)),
     ],
     metadata=_META,
 )
@@ -114,14 +115,14 @@ TRUTH_SCHEMA: Final = pa.schema(
 )
 
 # Columns that older files lack, and the value that is meant by it.
-ADDED: Final = {"detector": PUBLISHED}
+ADDED: Final = {"detector": PUBLISHED, "frames": None}
 
 # Columns of queries and truths that may be null.
 MAY_BE_NULL: Final = frozenset(
     {
         *("confidence", "observed_on", "season", "prior_easting_m", "prior_northing_m", "prior_radius_m"),
         *("prior_yaw_deg", "prior_yaw_sigma_deg", "candidates", "vectors", "sequence_id", "frame", "increment"),
-        *("increment_covariance", "image", ASKED, *POSE_FIELDS, "alias_index"),
+        *("increment_covariance", "frames", ASKED, *POSE_FIELDS, "alias_index"),
     }
 )
 
@@ -152,6 +153,7 @@ def query_row(query: Query) -> dict[str, Any]:
             "prior_northing_m": center[1],
             "candidates": [_pose_row(pose) for pose in query.candidates],
             "vectors": None if query.vectors is None else _vector_rows(query.vectors),
+            "frames": [frame_row(frame) for frame in query.frames] or None,
         }
     )
 
@@ -190,6 +192,7 @@ def query_of(row: dict[str, Any]) -> Query:
         prior=prior,
         candidates=tuple(Pose(**pose) for pose in row["candidates"] or ()),
         vectors=None if row["vectors"] is None else _vectors_of(row["vectors"]),
+        frames=tuple(map(frame_of, row.get("frames") or ())),
     )
 
 
@@ -220,16 +223,16 @@ def _plain(value: bytes | dt.date) -> str:
     return value.isoformat() if isinstance(value, dt.date) else hashlib.sha256(value).hexdigest()
 
 
-def with_added(truths: Rows) -> Rows:
-    """Return truths with the columns that were added since they were written, last.
+def with_added(rows: Rows, added: Sequence[str] = ("detector",)) -> Rows:
+    """Return queries or truths with the columns that were added since they were written, last.
 
     >>> with_added(pa.table({"query_id": ["a"]})).to_pylist()
     [{'query_id': 'a', 'detector': 'published'}]
     """
-    lost: list[str] = [name for name in ADDED if name not in truths.schema.names]
-    columns = [*truths.columns, *(pa.array([ADDED[name]] * truths.num_rows, pa.string()) for name in lost)]
-    schema = pa.schema([*truths.schema, *map(TRUTH_SCHEMA.field, lost)], metadata=truths.schema.metadata)
-    return type(truths).from_arrays(columns, schema=schema)
+    lost = [name for name in added if name not in rows.schema.names]
+    fields = [(TRUTH_SCHEMA if name in TRUTH_SCHEMA.names else QUERY_SCHEMA).field(name) for name in lost]
+    columns = [*rows.columns, *(pa.array([ADDED[field.name]] * rows.num_rows, field.type) for field in fields)]
+    return type(rows).from_arrays(columns, schema=pa.schema([*rows.schema, *fields], metadata=rows.schema.metadata))
 
 
 def truth_row(truth: Truth) -> dict[str, Any]:

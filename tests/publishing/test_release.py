@@ -17,6 +17,7 @@ from pathlib import Path
 import jsonschema
 import mlcroissant
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet as pq
 import pyproj
 import pystac
@@ -38,8 +39,11 @@ from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running.plan import RunRequest, reach_of
+from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
+from sasgeo_bench.tasks.frames import FRAME, Frame, frame_row
 
 GRID, RIVERSIDE = "town-grid", "town-riverside"
 FOLDER = "release"
@@ -505,8 +509,10 @@ def test_without_the_extra_one_line_names_it(own, mistake, monkeypatch):
 def test_images_are_kept_apart_from_what_is_derived_from_the_map(own, mistake):
     path = own / "tasks/clean" / RIVERSIDE / "queries.parquet"
     table = pq.read_table(path)
-    images = [b"png", *[None] * (len(table) - 1)]
-    at = table.schema.get_field_index("image")
+    lens = Intrinsics.from_field_of_view(horizontal_deg=60.0, width_px=8, height_px=8)
+    camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=80.0, yaw_deg=0.0)
+    images = pa.array([[frame_row(Frame(picture=b"webp", camera=camera))], *[None] * (len(table) - 1)], pa.list_(FRAME))
+    at = table.schema.get_field_index("frames")
     pq.write_table(table.set_column(at, table.schema.field(at), [images]), path)
     assert "holds images, whose licence is not that of the map" in mistake(
         "release", "--regions", RIVERSIDE, "--out", own

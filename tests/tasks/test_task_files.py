@@ -279,13 +279,13 @@ def test_what_is_asked_has_one_hash_for_good_and_another_for_whatever_decides_an
     assert len(found | {asked_sha256(other, said) for other in others}) == len(others) + 3
 
 
-def test_the_tables_have_room_for_sequences_and_images(written):
+def test_the_tables_have_room_for_flights_and_pictures(written):
     types = {name: str(kind) for name, kind in zip(QUERY_SCHEMA.names, QUERY_SCHEMA.types, strict=True)}
     assert types["sequence_id"] == "string"
     assert types["frame"] == "int32"
     assert types["increment"].startswith("list<")
     assert types["increment_covariance"].startswith("list<")
-    assert types["image"] == "binary"
+    assert types["frames"].startswith("list<")
     assert pq.read_schema(written[0] / QUERIES).names == [*QUERY_SCHEMA.names, ASKED]
 
 

@@ -17,10 +17,11 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, LayerBits, observe
 from sasgeo_bench.regions.region import MapGraph, Region
+from sasgeo_bench.tasks.frames import Frame, FrameLabels
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.perturbations.detectors import DETECTORS
 from sasgeo_bench.tasks.private_seed import Seed
-from sasgeo_bench.tasks.query import PUBLISHED, Detector, PriorGroup, Role, Track
+from sasgeo_bench.tasks.query import PICTURED, PUBLISHED, Detector, PriorGroup, Role, Track
 from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.twin import Paste
 
@@ -213,7 +214,8 @@ class Draft:
     if it was not taken in this map. For retrieval, `is_removed` removes the true place from the candidates,
     `neighbours_m` replaces each candidate by a cluster of places, and `has_twins` adds the site's twins. `away_m` is
     the least distance from the truth to the rim of a searched disc that excludes it. `group` overrides the prior group.
-    `density` is that of the seen place, if that is not the site.
+    `density` is that of the seen place, if that is not the site. `frames` are pictures with what is believed of their
+    cameras, `labels` what is on them; their evidence is all unknown until a segmenter has seen them.
     """
 
     evidence: Evidence
@@ -230,6 +232,8 @@ class Draft:
     season: str = ""
     changed_share: float | None = None
     measured: dict[str, float] = field(default_factory=dict)
+    frames: tuple[Frame, ...] = ()
+    labels: tuple[FrameLabels, ...] = ()
 
     @classmethod
     def of_change(cls, evidence: Evidence, before: Evidence, after: Evidence, **measured: float) -> "Draft":
@@ -307,6 +311,10 @@ class Suite(ABC):
         """Return the older maps that queries search: where they show nothing, a view of today asks for nothing."""
         searched = {self.map_region(scene, variant) for variant in self.usable(scene)}
         return tuple(state for state in scene.others if state.region in searched)
+
+    def detectors(self, chosen: Sequence[Detector]) -> tuple[Detector, ...]:
+        """Return which of the chosen families of errors a suite draws: of perception, or of the look of pictures."""
+        return tuple(name for name in chosen if name not in PICTURED)
 
     def tracks(self, variant: Variant) -> tuple[Track, ...]:  # noqa: ARG002
         """Return the tracks of a variant."""

@@ -1,0 +1,209 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames: the pictures of a query, each with its camera as it is believed; and their labels, which only truths hold."""
+
+import datetime as dt
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from PIL import Image
+
+from sasgeo_bench.errors import ImageError
+from sasgeo_bench.files.parquet import open_table
+from sasgeo_bench.regions.evidence import pack, unpack
+from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.image import AerialImage, LabelledImage, decode_image
+from sasgeo_bench.sensing.intrinsics import Intrinsics
+
+LABELS: Final = "labels.parquet"  # beside the truths: what is on each pixel of each frame
+MOST_PICTURE_BYTES: Final = 150_000
+MOST_FRAMES: Final = 64
+_QUALITIES: Final = (85, 75, 65, 55, 45, 35, 25, 15, 5)  # of WebP, tried in turn until the picture fits
+_SIGMAS: Final = ("height_sigma_m", "attitude_sigma_deg", "position_sigma_m", "yaw_sigma_deg")
+_MOST_PICTURE_PIXELS: Final = 16_000_000
+
+FRAME: Final = pa.struct(
+    [
+        ("picture", pa.binary()),
+        ("width_px", pa.int32()),
+        ("height_px", pa.int32()),
+        *((name, pa.list_(pa.float64())) for name in ("focal_px", "centre_px", "distortion", "rotation")),
+        *((name, pa.float64()) for name in ("east_m", "north_m", "height_m", *_SIGMAS)),
+    ]
+)
+LABEL_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("frame", pa.int32()),
+        ("rows", pa.int32()),
+        ("cols", pa.int32()),
+        ("classes", pa.list_(pa.string())),
+        ("labels", pa.binary()),
+    ]
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Frame:
+    """One picture of a query, and what is believed of the camera that took it.
+
+    Parameters
+    ----------
+    picture : bytes
+        The picture as WebP, at most `MOST_PICTURE_BYTES`.
+    camera : Camera
+        In the frame of the view: east is right, north is up, metres from the middle of the view's evidence. What the
+        query must not tell, place and heading, is not in it.
+    height_sigma_m, attitude_sigma_deg : float
+        Standard deviations of the believed height, and of tilt and roll.
+    position_sigma_m, yaw_sigma_deg : float
+        Standard deviations of where the camera stands and heads against the newest frame, from odometry; 0 for that.
+
+    Raises
+    ------
+    ImageError
+        If the picture is too large, or a standard deviation negative or not finite.
+    """
+
+    picture: bytes
+    camera: Camera
+    height_sigma_m: float = 0.0
+    attitude_sigma_deg: float = 0.0
+    position_sigma_m: float = 0.0
+    yaw_sigma_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check size and standard deviations."""
+        if len(self.picture) > MOST_PICTURE_BYTES:
+            message = f"a picture has at most {MOST_PICTURE_BYTES} bytes, got {len(self.picture)}: compress it more"
+            raise ImageError(message)
+        for name in _SIGMAS:
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                message = f"{name} must be finite and not negative, got {value!r}"
+                raise ImageError(message)
+
+    def image(self, *, observed_on: dt.date | None = None, season: str = "") -> AerialImage:
+        """Decode the picture; its camera stands above the origin and looks as in the view's frame."""
+        rgb = decode_image(self.picture, name="the picture of a frame", most_pixels=_MOST_PICTURE_PIXELS)
+        return AerialImage(
+            rgb=rgb,
+            camera=self.camera.moved(east_m=-self.camera.east_m, north_m=-self.camera.north_m),
+            height_sigma_m=self.height_sigma_m,
+            attitude_sigma_deg=self.attitude_sigma_deg,
+            observed_on=observed_on,
+            season=season,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FrameLabels:
+    """What is on each pixel of a frame: uint8 of shape (C, H, W), ABSENT, PRESENT or UNKNOWN, class by class."""
+
+    classes: tuple[str, ...]
+    labels: NDArray[np.uint8]
+
+    def labelled(self, image: AerialImage, place: str) -> LabelledImage:
+        """Return an image of a place with these labels; raise `ImageError` if they do not fit."""
+        return LabelledImage(image=image, classes=self.classes, labels=self.labels, place=place)
+
+
+def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES) -> bytes:
+    """Return a picture as WebP of the best of nine qualities that fits; raise `ImageError` if none does.
+
+    >>> len(encode_webp(np.zeros((32, 32, 3), dtype=np.uint8))) < 200
+    True
+    """
+    picture = Image.fromarray(np.ascontiguousarray(rgb))
+    for quality in _QUALITIES:
+        encoded = BytesIO()
+        picture.save(encoded, format="WEBP", quality=quality, method=2)
+        if encoded.tell() <= most_bytes:
+            return encoded.getvalue()
+    message = f"a picture of {rgb.shape[1]} x {rgb.shape[0]} pixels does not fit into {most_bytes} bytes: make it smaller"
+    raise ImageError(message)
+
+
+def frame_row(frame: Frame) -> dict[str, Any]:
+    """Return a frame as a row of `FRAME`."""
+    lens = frame.camera.intrinsics
+    return {
+        "picture": frame.picture,
+        "width_px": lens.width_px,
+        "height_px": lens.height_px,
+        **{name: list(getattr(lens, name)) for name in ("focal_px", "centre_px", "distortion")},
+        "rotation": list(frame.camera.rotation),
+        **{name: getattr(frame.camera, name) for name in ("east_m", "north_m", "height_m")},
+        **{name: getattr(frame, name) for name in _SIGMAS},
+    }
+
+
+def frame_of(row: Mapping[str, Any]) -> Frame:
+    """Return the frame of a row of `FRAME`; raise as `Frame` and its camera do."""
+    lens = Intrinsics(
+        width_px=row["width_px"],
+        height_px=row["height_px"],
+        **{name: tuple(row[name]) for name in ("focal_px", "centre_px", "distortion")},
+    )
+    stands = {name: row[name] for name in ("east_m", "north_m", "height_m")}
+    camera = Camera(intrinsics=lens, rotation=tuple(row["rotation"]), **stands)
+    return Frame(picture=row["picture"], camera=camera, **{name: row[name] for name in _SIGMAS})
+
+
+def label_row(query_id: str, number: int, item: FrameLabels) -> dict[str, Any]:
+    """Return the labels of one frame as a row of `LABEL_SCHEMA`."""
+    return {
+        "query_id": query_id,
+        "frame": number,
+        "rows": item.labels.shape[1],
+        "cols": item.labels.shape[2],
+        "classes": list(item.classes),
+        "labels": pack(item.labels),
+    }
+
+
+def label_of(row: Mapping[str, Any]) -> FrameLabels:
+    """Return the labels of a row of `LABEL_SCHEMA`."""
+    shape = (len(row["classes"]), row["rows"], row["cols"])
+    return FrameLabels(classes=tuple(row["classes"]), labels=unpack(row["labels"], shape))
+
+
+def read_labels(truth_folder: Path) -> Iterator[tuple[str, int, FrameLabels]]:
+    """Yield query id, number of the frame and its labels, one at a time, in the order of the queries.
+
+    Raise `StoreError` if the file is missing or damaged.
+    """
+    with open_table(truth_folder / LABELS, mend="make the queries again", is_whole=False) as source:
+        for batch in source.iter_batches(batch_size=1):
+            row = batch.to_pylist()[0]
+            yield row["query_id"], row["frame"], label_of(row)
+
+
+def drift_of(
+    steps: Sequence[tuple[float, float, float]], *, share: float, yaw_deg_per_km: float, rng: np.random.Generator
+) -> list[tuple[float, float, float]]:
+    """Return increments of odometry: those that were flown, with an error of scale and heading that stays in a run.
+
+    Parameters
+    ----------
+    steps : sequence of (right_m, ahead_m, turn_deg)
+        Flown increments between frames, each in the heading before it.
+    share : float
+        Standard deviation of the scale's error, and per step of the error across, as fractions of the distance.
+    yaw_deg_per_km : float
+        Standard deviation of the heading's drift.
+    rng : numpy.random.Generator
+        Source of the errors.
+    """
+    scale, drift = 1 + share * rng.standard_normal(), yaw_deg_per_km * rng.standard_normal()
+    found = []
+    for right_m, ahead_m, turn_deg in steps:
+        far_m = float(np.hypot(right_m, ahead_m))
+        across_m = share * far_m * rng.standard_normal()
+        found.append((right_m * scale + across_m, ahead_m * scale, turn_deg + drift * far_m / 1000))
+    return found

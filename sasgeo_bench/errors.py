@@ -53,6 +53,10 @@ class PoseError(SasgeoError, ValueError):
     """A pose or prior with a value outside its range."""
 
 
+class CameraError(SasgeoError, ValueError):
+    """A camera, a ground or a photo whose values cannot be, or from which no view can be computed."""
+
+
 class ConfigError(SasgeoError, ValueError):
     """A TOML file with an unknown key, a wrong type or a value out of range."""
 

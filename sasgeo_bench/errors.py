@@ -73,6 +73,10 @@ class StoreError(SasgeoError, OSError):
     """A folder or file of ours that cannot be written, or contradicts its manifest."""
 
 
+class ImageError(SasgeoError, ValueError):
+    """A picture, labels or a segmentation that is damaged, too large, or of the wrong shape."""
+
+
 class PerturbError(SasgeoError, ValueError):
     """A perturbation with a strength out of range, or used where it must not be."""
 

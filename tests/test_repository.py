@@ -38,6 +38,7 @@ MAX_FILE_BYTES = 500_000
 # Distributions whose module has another name.
 IMPORTED_AS = {
     "lazy-loader": "lazy_loader",
+    "pillow": "PIL",
     "opencv-python-headless": "cv2",
     "rio-cogeo": "rio_cogeo",
     "scikit-image": "skimage",
@@ -45,7 +46,7 @@ IMPORTED_AS = {
 }
 
 # Declared, though no file of ours imports them: another library needs them for what we ask of it.
-INDIRECT = {"tqdm": "the progress bar of pooch"}
+INDIRECT = {"defusedxml": "the XMP of photos, which Pillow reads with it", "tqdm": "the progress bar of pooch"}
 
 
 def repository_files() -> list[Path]:

@@ -216,6 +216,12 @@ class Camera:
         matrix = camera_of_carrier @ body.T @ camera_of_carrier.T @ self.matrix
         return self._with(matrix, self.position_m)
 
+    def upright(self, turn: tuple[tuple[int, int], tuple[int, int]]) -> Self:
+        """Return the camera of the picture after a turn by quarters: rows are its right and down in the old ones."""
+        quarter = np.eye(3)
+        quarter[:2, :2] = turn
+        return self._with(quarter @ self.matrix, self.position_m)
+
     def moved(self, *, east_m: float = 0.0, north_m: float = 0.0, up_m: float = 0.0) -> Self:
         """Return the camera moved by metres; it looks as before."""
         return self._with(self.matrix, self.position_m + np.array([east_m, north_m, up_m]))

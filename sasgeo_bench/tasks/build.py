@@ -26,12 +26,14 @@ from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_spec import RegionFile
+from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
+from sasgeo_bench.tasks.split import Block, Split
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, State, Suite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
@@ -211,8 +213,17 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         others=others,
         elsewhere=elsewhere,
         ageing=_ageing(request.region) if "rates of ageing" in needs else None,
+        looks={block.id: _look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
     )
     return scene, base
+
+
+def _look_of(split: Split, block: Block) -> Family:
+    """Return the family of palettes of a block: that of its part; the halves of a cross-fit look different, too."""
+    place = split.place_of[block.id]
+    if split.half_of:
+        return "train" if split.half_of.get(place) == "a" else "test"
+    return split.folds[0].part_of[place]
 
 
 def _ageing(spec: RegionFile) -> Ageing:
@@ -285,6 +296,7 @@ def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
         bits=LayerBits.of(burn_layers(paint, base.grid)),
         features=features,
         graph=build_graph(features.iloc[:0]),
+        coverage=base.coverage,
     )
 
 
@@ -307,10 +319,20 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     hidden["request_sha256"] = _request_sha256(request)
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
-        made = put_task(map(drawer.draw, own), about, hidden, out=request.out, tell=tell)
+        made = put_task(_drawn(drawer, own), about, hidden, out=request.out, tell=tell)
         drawn = f"{counted(made.queries, 'query', 'queries')} at {counted(len(sites), 'site')}"
         tell(f"{name} on {region}: {drawn} in {made.folder}")
         yield made
+
+
+def _drawn(drawer: Drawer, jobs: Sequence[Job]) -> Iterator[tuple[Query, Truth]]:
+    """Draw queries in their order; pictures site by site first, since a place is painted once for all of its views."""
+    if not drawer.suite.is_pictured:
+        yield from map(drawer.draw, jobs)
+        return
+    by_site = sorted(jobs, key=lambda job: (job.site.index, job.variant.detector, job.variant.name))
+    drawn = {job.query_id: drawer.draw(job) for job in by_site}
+    yield from (drawn[job.query_id] for job in jobs)
 
 
 def put_task(

@@ -2,11 +2,12 @@
 """Frames: the pictures of a query, each with its camera as it is believed; and their labels, which only truths hold."""
 
 import datetime as dt
+import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -15,7 +16,7 @@ from PIL import Image
 
 from sasgeo_bench.errors import ImageError
 from sasgeo_bench.files.parquet import open_table
-from sasgeo_bench.regions.evidence import pack, unpack
+from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, pack, unpack
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, decode_image
 from sasgeo_bench.sensing.intrinsics import Intrinsics
@@ -103,10 +104,29 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameLabels:
-    """What is on each pixel of a frame: uint8 of shape (C, H, W), ABSENT, PRESENT or UNKNOWN, class by class."""
+    """What is on each pixel of a frame, class by class; kept compressed, for a few hundred are in memory at once.
+
+    >>> found = FrameLabels.of(("water",), np.array([[[0, 1, 2]]], dtype=np.uint8))
+    >>> found.labels.tolist()
+    [[[0, 1, 2]]]
+    """
 
     classes: tuple[str, ...]
-    labels: NDArray[np.uint8]
+    rows: int
+    cols: int
+    packed: bytes
+
+    @classmethod
+    def of(cls, classes: tuple[str, ...], labels: NDArray[np.uint8]) -> Self:
+        """Compress labels, uint8 of shape (C, H, W): ABSENT, PRESENT or UNKNOWN."""
+        return cls(classes=classes, rows=labels.shape[1], cols=labels.shape[2], packed=zlib.compress(pack(labels), 1))
+
+    @property
+    def labels(self) -> NDArray[np.uint8]:
+        """Return the labels, shape (C, H, W); raise `ShapeError` if the bytes do not fit."""
+        shape = (len(self.classes), self.rows, self.cols)
+        most = -(-int(np.prod(shape)) // CELLS_PER_BYTE)
+        return unpack(zlib.decompressobj().decompress(self.packed, most), shape)
 
     def labelled(self, image: AerialImage, place: str) -> LabelledImage:
         """Return an image of a place with these labels; raise `ImageError` if they do not fit."""
@@ -125,7 +145,9 @@ def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES)
         picture.save(encoded, format="WEBP", quality=quality, method=2)
         if encoded.tell() <= most_bytes:
             return encoded.getvalue()
-    message = f"a picture of {rgb.shape[1]} x {rgb.shape[0]} pixels does not fit into {most_bytes} bytes: make it smaller"
+    message = (
+        f"a picture of {rgb.shape[1]} x {rgb.shape[0]} pixels does not fit into {most_bytes} bytes: make it smaller"
+    )
     raise ImageError(message)
 
 
@@ -160,17 +182,16 @@ def label_row(query_id: str, number: int, item: FrameLabels) -> dict[str, Any]:
     return {
         "query_id": query_id,
         "frame": number,
-        "rows": item.labels.shape[1],
-        "cols": item.labels.shape[2],
+        "rows": item.rows,
+        "cols": item.cols,
         "classes": list(item.classes),
-        "labels": pack(item.labels),
+        "labels": item.packed,
     }
 
 
 def label_of(row: Mapping[str, Any]) -> FrameLabels:
     """Return the labels of a row of `LABEL_SCHEMA`."""
-    shape = (len(row["classes"]), row["rows"], row["cols"])
-    return FrameLabels(classes=tuple(row["classes"]), labels=unpack(row["labels"], shape))
+    return FrameLabels(classes=tuple(row["classes"]), rows=row["rows"], cols=row["cols"], packed=row["labels"])
 
 
 def read_labels(truth_folder: Path) -> Iterator[tuple[str, int, FrameLabels]]:

@@ -24,7 +24,7 @@ TASK_VERSIONS: Final = (1, 2, TASK_VERSION)  # readable versions: their files ar
 Track = Literal["retrieval", "localization"]
 Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
-# Families of errors of perception: two models of a detector, and two of the look of a place, which a segmenter then sees.
+# Families of errors of perception: two models of a detector, and two of the look of pictures, which a segmenter sees.
 Detector = Literal["published", "measured", "rendered", "shifted"]
 PUBLISHED: Final[Detector] = "published"  # the one that is meant where none is named
 RENDERED: Final[Detector] = "rendered"  # the one that is meant where a suite has pictures

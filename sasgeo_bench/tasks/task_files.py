@@ -169,9 +169,7 @@ def write_task(
 
 def _label_rows(part: Sequence[tuple[Query, Truth]]) -> list[dict[str, Any]]:
     """Return the labels of all frames of some queries as rows."""
-    return [
-        label_row(truth.query_id, number, item) for _, truth in part for number, item in enumerate(truth.labels)
-    ]
+    return [label_row(truth.query_id, number, item) for _, truth in part for number, item in enumerate(truth.labels)]
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

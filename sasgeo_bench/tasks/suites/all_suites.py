@@ -7,6 +7,8 @@ from typing import Final
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.tasks.suites import (
     absent,
+    accumulated,
+    aerial,
     alias,
     board_controls,
     clean,
@@ -14,11 +16,15 @@ from sasgeo_bench.tasks.suites import (
     grade_separation,
     growth,
     instance_twins,
+    light,
     local_warp,
     no_priors,
+    oblique,
     occlusion,
     real_age,
+    relief,
     season,
+    season_image,
     stable_not_distinctive,
     synthetic_age,
     topology_twins,
@@ -47,12 +53,32 @@ SUITES: Final[dict[str, Suite]] = {
         absent.SUITE,
     )
 }
+# Queries of these are pictures, of which a segmenter makes evidence; they are drawn where they are named.
+PICTURE_SUITES: Final[dict[str, Suite]] = {
+    suite.card.name: suite
+    for suite in (
+        aerial.SUITE,
+        oblique.SUITE,
+        relief.SUITE,
+        light.SUITE,
+        season_image.SUITE,
+        accumulated.SUITE,
+    )
+}
 # With the controls, which every board draws in addition to its experiment.
-EVERY_SUITE: Final[dict[str, Suite]] = {**SUITES, board_controls.SUITE.card.name: board_controls.SUITE}
+EVERY_SUITE: Final[dict[str, Suite]] = {
+    **SUITES,
+    **PICTURE_SUITES,
+    board_controls.SUITE.card.name: board_controls.SUITE,
+}
 
 
 def find_suite(name: str) -> Suite:
-    """Return the suite of a name; raise a ConfigError that suggests the nearest name if there is none."""
+    """Return the suite of a name; raise a ConfigError that suggests the nearest name if there is none.
+
+    A suite of pictures whose evidence a segmenter made is called by both, as in "aerial+pixel_forest".
+    """
+    name = name.split("+", maxsplit=1)[0]
     if name not in EVERY_SUITE:
         near = difflib.get_close_matches(name, EVERY_SUITE, n=1, cutoff=0.5)
         hint = f", did you mean {near[0]!r}?" if near else ""

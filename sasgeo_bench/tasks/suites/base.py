@@ -11,12 +11,15 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, LayerBits, observe
 from sasgeo_bench.regions.region import MapGraph, Region
+from sasgeo_bench.sensing.rendering.palettes import Family
+from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.perturbations.detectors import DETECTORS
@@ -45,6 +48,7 @@ class State:
     bits: LayerBits
     features: "gpd.GeoDataFrame"
     graph: MapGraph
+    coverage: shapely.Geometry
 
     @classmethod
     def of(cls, region: Region, name: str | None = None) -> "State":
@@ -57,6 +61,7 @@ class State:
             bits=LayerBits.of(region.layers),
             features=region.features,
             graph=region.graph,
+            coverage=region.coverage,
         )
 
     def view(self, pose: Pose, *, size_cells: int, cell_size_m: float) -> Evidence:
@@ -94,7 +99,8 @@ class Scene:
 
     `view_reach_m` is the largest distance that a view shows from its centre. `others` are states at other dates, oldest
     first; `elsewhere` is another place; `scenes` are the tags of the region; `twins` are the places that look like each
-    site; `ageing` has the rates of other places.
+    site; `ageing` has the rates of other places; `looks` are the families of palettes and materials of pictures, by
+    block, and `painted` the last windows that were painted.
     """
 
     map: State
@@ -106,6 +112,8 @@ class Scene:
     elsewhere: State | None = None
     twins: Mapping[int, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     ageing: Ageing | None = None
+    looks: Mapping[str, Family] = field(default_factory=dict)
+    painted: dict[tuple[object, ...], Painted] = field(default_factory=dict, repr=False)
 
     def state(self, region: str) -> State:
         """Return the state of a map by its name."""
@@ -289,6 +297,11 @@ class Suite(ABC):
     def lack(self, scene: Scene) -> str | None:
         """Return what the region lacks for this suite, or None."""
         return None if scene.map.drawn.any() else "no road, building or other thing to hold on to"
+
+    @property
+    def is_pictured(self) -> bool:
+        """Return whether queries hold pictures, whose evidence a segmenter makes."""
+        return False
 
     @property
     def has_rivals(self) -> bool:

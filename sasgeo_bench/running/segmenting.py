@@ -43,8 +43,20 @@ class SegmentRequest:
         root = self.out.resolve()
         hidden = [root / "regions", *hidden_below([root]), *self.hidden]
         shown = [path.resolve() for path in readable]
-        hidden = [path for path in hidden if not any(folder.is_relative_to(path) for folder in shown)]
-        return Reach(readable=shown, hidden=hidden, is_shut_in=self.is_shut_in)
+        return Reach(
+            readable=shown,
+            hidden=[part for path in hidden for part in _without(path, shown)],
+            is_shut_in=self.is_shut_in,
+        )
+
+
+def _without(hidden: Path, shown: Sequence[Path]) -> list[Path]:
+    """Return what is left of a hidden folder if some folders are shown: all that lies beside the way to them."""
+    if hidden in shown:
+        return []
+    if not any(folder.is_relative_to(hidden) for folder in shown):
+        return [hidden]
+    return [part for child in sorted(hidden.iterdir()) for part in _without(child, shown)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

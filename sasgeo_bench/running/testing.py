@@ -19,7 +19,7 @@ from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.running.checks import LEARNS, Check, kept_check, listing_of, loaded_check, refusal_of, taught_check
+from sasgeo_bench.running.checks import Check, kept_check, listing_of, loaded_check, refusal_of, taught_check
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files, task_rows

@@ -129,7 +129,7 @@ class LooksBack(Good):
 class OtherClasses(Good):
     def segment(self, image, *, learned):
         found = super().segment(image, learned=None)
-        at = 0 if image.rgb.mean() > 129 else 1
+        at = int(image.rgb.sum()) % 2
         return Segmentation(classes=(self.card.classes[at],), probability_bytes=found.probability_bytes[at : at + 1])
 
 

@@ -26,7 +26,7 @@ YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are n
 ORACLE: Final = "oracle_pose"
 ORACLE_SEGMENTER: Final = "oracle_segmenter"
 _RESERVED: Final = {MATCHERS: ORACLE, SEGMENTERS: ORACLE_SEGMENTER}
-_KINDS: Final = {MATCHERS: "matcher", REJECTORS: "rejector", SEGMENTERS: "segmenter"}
+KINDS: Final = {MATCHERS: "matcher", REJECTORS: "rejector", SEGMENTERS: "segmenter"}
 
 
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
@@ -92,7 +92,7 @@ def check_card_name(spec: str, name: str, *, is_oracle: bool = False, group: str
     shipped = shipped_names(group)
     is_ours = spec.partition(":")[0].partition(".")[0] in _MODULES if ":" in spec else spec in shipped
     if not is_ours and name in shipped:
-        message = f"{one_line(spec)}: its card is named {name!r}, as a {_KINDS[group]} that ships: rename it"
+        message = f"{one_line(spec)}: its card is named {name!r}, as a {KINDS[group]} that ships: rename it"
         raise MatchError(message)
     if name.startswith(YARDSTICK) and not (is_ours or is_oracle):
         message = (
@@ -178,7 +178,7 @@ def _check(spec: str, plugin: object, card_type: type, group: str, verbs: Sequen
         message = f"{spec}: card is a {type(card).__name__}, expected a {expected}"
         raise MatchError(message)
     if missing:
-        message = f"{spec}: {type(plugin).__name__} is not a {_KINDS[group]}, it has no {' and no '.join(missing)}"
+        message = f"{spec}: {type(plugin).__name__} is not a {KINDS[group]}, it has no {' and no '.join(missing)}"
         raise MatchError(message)
 
 
@@ -204,7 +204,7 @@ def _find(spec: str, group: str) -> Callable[[], Any]:
 
 
 def _known(name: str, group: str) -> EntryPoint:
-    points, kind = list_entry_points(group), _KINDS[group]
+    points, kind = list_entry_points(group), KINDS[group]
     if name not in points:
         near = difflib.get_close_matches(name, points, n=1, cutoff=0.6)
         hint = f", did you mean {near[0]!r}?" if near else ""

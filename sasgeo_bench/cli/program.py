@@ -52,6 +52,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "list-segmenters": "listing",
         "new-segmenter": "segmenters",
         "check-segmenter": "segmenters",
+        "segment": "segmenters",
     },
     "Runs": {
         "run": "runs",

@@ -1,14 +1,78 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands for authors of segmenters."""
+"""Commands for authors of segmenters; and the one that makes evidence of pictures."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.matchers import end_with_checks, lay_package
+from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
+from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.running.segmenter_testing import check_segmenter
+from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.tasks.split import find_split
+from sasgeo_bench.tasks.task_files import read_task
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentOptions(Options):
+    """Flags of segment."""
+
+    segmenter: Annotated[str, typer.Option(help="name from list-segmenters, or module:Class")]
+    tasks: Annotated[list[Path], typer.Option(help="task folder of pictures, OUT/tasks/SUITE/REGION; may be repeated")]
+    split: Annotated[
+        str | None, typer.Option(help="which places a segmenter learns from for which; default: the split of the tasks")
+    ] = None
+    most_trained: Annotated[int, typer.Option(min=1, help="pictures to learn from at most, evenly over places")] = 80
+    segment_s: Annotated[float, typer.Option(help="seconds for one picture")] = Limits().match_s
+    learn_s: Annotated[float, typer.Option(help="seconds to learn")] = Limits().learn_s
+    trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the segmenter in")] = False
+    out: Out = Path("out")
+
+
+@takes(SegmentOptions)
+def segment(options: SegmentOptions) -> tuple[Path, ...]:
+    """Make evidence of the pictures of tasks with a segmenter, which learns at other places than it is asked about.
+
+    Returns
+    -------
+    tuple of Path
+        Folders of tasks that every matcher can answer, `out/tasks/<suite>+<segmenter>/<region>`; their truths beside.
+
+    Raises
+    ------
+    ConfigError
+        If a task has no pictures, or there is nothing to learn from.
+    MatchError
+        If the segmenter cannot be loaded, or its card is not sound. A picture that it fails at has no evidence.
+    StoreError
+        If a task or its truths are missing or damaged.
+    """
+    return segment_tasks(
+        SegmentTasks(
+            spec=options.segmenter,
+            tasks=options.tasks,
+            split=find_split(options.split or str(read_task(options.tasks[0]).get("split"))),
+            out=options.out,
+            most=options.most_trained,
+            limits=Limits(match_s=options.segment_s, learn_s=options.learn_s),
+            is_shut_in=not options.trusted,
+        ),
+        tell=options.tell,
+        progress=options.progress,
+    )
+
+
+def segment_command(options: SegmentOptions) -> None:
+    """Make evidence of the pictures of tasks, so that every matcher can answer them: OUT/tasks/SUITE+SEGMENTER/."""
+    with shown_progress() as progress:
+        folders = segment(**vars(options) | {"tell": tell, "progress": progress})
+    for folder in folders:
+        say(folder)
 
 
 def new_segmenter_command(

@@ -3,7 +3,7 @@
 
 import datetime as dt
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -203,28 +203,3 @@ def read_labels(truth_folder: Path) -> Iterator[tuple[str, int, FrameLabels]]:
         for batch in source.iter_batches(batch_size=1):
             row = batch.to_pylist()[0]
             yield row["query_id"], row["frame"], label_of(row)
-
-
-def drift_of(
-    steps: Sequence[tuple[float, float, float]], *, share: float, yaw_deg_per_km: float, rng: np.random.Generator
-) -> list[tuple[float, float, float]]:
-    """Return increments of odometry: those that were flown, with an error of scale and heading that stays in a run.
-
-    Parameters
-    ----------
-    steps : sequence of (right_m, ahead_m, turn_deg)
-        Flown increments between frames, each in the heading before it.
-    share : float
-        Standard deviation of the scale's error, and per step of the error across, as fractions of the distance.
-    yaw_deg_per_km : float
-        Standard deviation of the heading's drift.
-    rng : numpy.random.Generator
-        Source of the errors.
-    """
-    scale, drift = 1 + share * rng.standard_normal(), yaw_deg_per_km * rng.standard_normal()
-    found = []
-    for right_m, ahead_m, turn_deg in steps:
-        far_m = float(np.hypot(right_m, ahead_m))
-        across_m = share * far_m * rng.standard_normal()
-        found.append((right_m * scale + across_m, ahead_m * scale, turn_deg + drift * far_m / 1000))
-    return found

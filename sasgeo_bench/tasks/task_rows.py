@@ -230,9 +230,9 @@ def with_added(rows: Rows, added: Sequence[str] = ("detector",)) -> Rows:
     [{'query_id': 'a', 'detector': 'published'}]
     """
     lost = [name for name in added if name not in rows.schema.names]
-    fields = [(TRUTH_SCHEMA if name in TRUTH_SCHEMA.names else QUERY_SCHEMA).field(name) for name in lost]
-    columns = [*rows.columns, *(pa.array([ADDED[field.name]] * rows.num_rows, field.type) for field in fields)]
-    return type(rows).from_arrays(columns, schema=pa.schema([*rows.schema, *fields], metadata=rows.schema.metadata))
+    new: list[pa.Field] = [(TRUTH_SCHEMA if name in TRUTH_SCHEMA.names else QUERY_SCHEMA).field(name) for name in lost]
+    columns = [*rows.columns, *(pa.array([ADDED[field.name]] * rows.num_rows, field.type) for field in new)]
+    return type(rows).from_arrays(columns, schema=pa.schema([*rows.schema, *new], metadata=rows.schema.metadata))
 
 
 def truth_row(truth: Truth) -> dict[str, Any]:

@@ -4,8 +4,9 @@
 from dataclasses import replace
 from typing import Final
 
+from sasgeo_bench.sensing.accumulation import Errors
 from sasgeo_bench.tasks.suites.base import SuiteCard, Variant
-from sasgeo_bench.tasks.suites.pictures import STOPS_M, Flight, PictureSuite
+from sasgeo_bench.tasks.suites.pictures import ODOMETRY, STOPS_M, Flight, PictureSuite
 
 FRAMES: Final = (3.0, 9.0)
 FRAME, DRIFT = "P6 frames", "P6 drift"
@@ -22,8 +23,7 @@ def _flight(variant: Variant) -> Flight:
     return replace(
         plain,
         stops_m=STOPS_M[-count:],
-        drift_share=bad * plain.drift_share,
-        drift_deg_per_km=bad * plain.drift_deg_per_km,
+        odometry=Errors(position_share=bad * ODOMETRY.position_share, yaw_deg_per_km=bad * ODOMETRY.yaw_deg_per_km),
     )
 
 

@@ -74,11 +74,7 @@ EVERY_SUITE: Final[dict[str, Suite]] = {
 
 
 def find_suite(name: str) -> Suite:
-    """Return the suite of a name; raise a ConfigError that suggests the nearest name if there is none.
-
-    A suite of pictures whose evidence a segmenter made is called by both, as in "aerial+pixel_forest".
-    """
-    name = name.split("+", maxsplit=1)[0]
+    """Return the suite of a name; raise a ConfigError that suggests the nearest name if there is none."""
     if name not in EVERY_SUITE:
         near = difflib.get_close_matches(name, EVERY_SUITE, n=1, cutoff=0.5)
         hint = f", did you mean {near[0]!r}?" if near else ""

@@ -4,7 +4,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -13,13 +12,15 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.sensing.accumulation import Errors, believed_steps, steps_between
 from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
 from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.rendering.conditions import Conditions, draw_conditions
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.sensing.rendering.scene import make_scene
 from sasgeo_bench.sensing.rendering.view import labels, render
-from sasgeo_bench.tasks.frames import Frame, FrameLabels, drift_of, encode_webp
+from sasgeo_bench.tasks.frame_evidence import poses_before
+from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import PICTURED, RENDERED, Detector
 from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, Variant
 
@@ -32,6 +33,7 @@ ATTITUDE_SIGMA_DEG: Final = 1.0
 # Roll and pitch of a survey drone that flies 8 to 12 m/s at 80 m, each: the tilt then has a median of 9.6 and a 95th
 # percentile of 20 degrees, where 9.6 and 21.5 were measured (MARS-LVIG).
 BODY_SIGMA_DEG: Final = 8.2
+ODOMETRY: Final = Errors(position_share=0.01, yaw_deg_per_km=2.0)  # a nominal visual-inertial odometry
 _MOST_TILT_DEG: Final = 60.0  # of optical axes: the middle of a view must be seen
 _CELL_PX: Final = 1.4  # cells of paint in a pixel, about
 _FINEST_M, _COARSEST_M = 0.25, 1.0
@@ -57,8 +59,8 @@ class Flight:
         The camera takes part in roll and pitch of the body, as measured; otherwise it is stabilized.
     stops_m : sequence of (right, ahead)
         Where frames are taken against the last one, oldest first, which is (0, 0).
-    drift_share, drift_deg_per_km : float
-        Standard deviations of odometry between the frames: of its scale, and of its heading.
+    odometry : Errors
+        Of the way between the frames.
     relief : float
         Multiplies the heights of buildings.
     conditions : callable
@@ -69,8 +71,7 @@ class Flight:
     tilt_deg: float = 0.0
     is_fixed: bool = False
     stops_m: Sequence[tuple[float, float]] = ((0.0, 0.0),)
-    drift_share: float = 0.01
-    drift_deg_per_km: float = 2.0
+    odometry: Errors = ODOMETRY
     relief: float = 1.0
     conditions: Callable[[Conditions], Conditions] = field(default=lambda ordinary: ordinary)
 
@@ -147,64 +148,40 @@ def _share_of(found: NDArray[np.uint8], classes: tuple[str, ...], name: str) -> 
 
 def stands_of(shot: Shot, flight: Flight) -> list[Stand]:
     """Return where the cameras of a shot stood, and where they are believed to have stood, oldest first."""
-    stops = flight.stops_m
-    steps = [(after[0] - before[0], after[1] - before[1], 0.0) for before, after in pairwise(stops)]
-    said = drift_of(
-        steps, share=flight.drift_share, yaw_deg_per_km=flight.drift_deg_per_km, rng=shot.seeds.rng("odometry")
-    )
-    places_m, turns_deg = _back_from_last(said)
-    rng = shot.seeds.rng("attitude")
-    angles_deg = rng.standard_normal((len(STOPS_M), 4))[-len(stops) :]  # the last frame's are the same in all variants
+    flown = [Pose(easting_m=right_m, northing_m=ahead_m, yaw_deg=0.0) for right_m, ahead_m in flight.stops_m]
+    said = poses_before(believed_steps(steps_between(flown), flight.odometry, shot.seeds.rng("odometry")))
+    # The newest frame's are drawn alike in all variants.
+    angles_deg = shot.seeds.rng("attitude").standard_normal((len(STOPS_M), 4))[len(STOPS_M) - len(flown) :]
     found = []
-    for stop_m, place_m, turn_deg, drawn in zip(stops, places_m, turns_deg, angles_deg, strict=True):
+    for stop, place, drawn in zip(flown, said, angles_deg, strict=True):
         body = BODY_SIGMA_DEG * drawn[:2] if flight.is_fixed else np.zeros(2)
-        error = ATTITUDE_SIGMA_DEG * drawn[2:]
-        tilt_deg = min(flight.tilt_deg + float(body[0]), _MOST_TILT_DEG)
-        roll_deg, far_m = float(body[1]), math.dist(stop_m, (0.0, 0.0))
+        tilt_deg, roll_deg = min(flight.tilt_deg + float(body[0]), _MOST_TILT_DEG), float(body[1])
+        off = (ATTITUDE_SIGMA_DEG * drawn[2:]).tolist()
+        distance_m = math.hypot(stop.easting_m, stop.northing_m)
         found.append(
             Stand(
-                true=_camera(flight, stop_m, tilt_deg + error[0], roll_deg + error[1], pose=shot.site.pose),
-                believed=_camera(flight, place_m, tilt_deg, roll_deg, yaw_deg=turn_deg),
-                position_sigma_m=round(flight.drift_share * far_m, 3),
-                yaw_sigma_deg=round(flight.drift_deg_per_km * far_m / 1000, 3),
+                true=_camera(flight, shot.site.pose, stop, tilt_deg + off[0], roll_deg + off[1]),
+                believed=_camera(flight, _VIEW, place, tilt_deg, roll_deg),
+                position_sigma_m=round(flight.odometry.position_share * distance_m, 3),
+                yaw_sigma_deg=round(flight.odometry.yaw_deg_per_km * math.sqrt(distance_m / 1000), 3),
             )
         )
     return found
 
 
-def _back_from_last(steps: Sequence[tuple[float, float, float]]) -> tuple[list[tuple[float, float]], list[float]]:
-    """Return where frames stand against the last one, by increments of odometry, and their headings, oldest first."""
-    places, turns, at, turn = [(0.0, 0.0)], [0.0], (0.0, 0.0), 0.0
-    for right_m, ahead_m, turn_deg in reversed(steps):
-        turn -= turn_deg
-        cos, sin = math.cos(math.radians(turn)), math.sin(math.radians(turn))
-        at = (at[0] - right_m * cos - ahead_m * sin, at[1] + right_m * sin - ahead_m * cos)
-        places.append(at)
-        turns.append(turn)
-    return places[::-1], turns[::-1]
-
-
-def _camera(
-    flight: Flight,
-    place_m: tuple[float, float],
-    tilt_deg: float,
-    roll_deg: float,
-    *,
-    yaw_deg: float = 0.0,
-    pose: Pose = _VIEW,
-) -> Camera:
-    """Return a camera in the frame of the view, or where a pose puts that on the map.
+def _camera(flight: Flight, view: Pose, stop: Pose, tilt_deg: float, roll_deg: float) -> Camera:
+    """Return the camera of a stop, given in the axes of the view's frame; `view` puts that on the map.
 
     The middle of the view is where the optical axis of the last camera should point.
     """
     ahead_m = flight.height_m * math.tan(math.radians(flight.tilt_deg))
-    east_m, north_m = pose.to_map(np.array([(place_m[0], place_m[1] - ahead_m)]))[0].tolist()
+    east_m, north_m = view.to_map(np.array([(stop.easting_m, stop.northing_m - ahead_m)]))[0].tolist()
     return Camera.mounted(
         intrinsics=LENS,
         east_m=east_m,
         north_m=north_m,
-        height_m=flight.height_m * pose.scale,
-        body=Attitude(roll_deg=roll_deg, pitch_deg=tilt_deg, yaw_deg=pose.yaw_deg + yaw_deg),
+        height_m=flight.height_m * view.scale,
+        body=Attitude(roll_deg=roll_deg, pitch_deg=tilt_deg, yaw_deg=view.yaw_deg + stop.yaw_deg),
         mount=Mount(),
     )
 

@@ -12,7 +12,7 @@ SEASONS: Final[tuple[Season, ...]] = ("spring", "autumn", "winter", "snow")
 
 
 def _flight(variant: Variant) -> Flight:
-    season = next((name for name in SEASONS if variant.kind.endswith(name)), "summer")
+    season: Season = next((name for name in SEASONS if variant.kind.endswith(name)), "summer")
     return Flight(conditions=lambda ordinary: replace(ordinary, season=season))
 
 

@@ -129,6 +129,7 @@ def scene(town) -> Callable[..., Scene]:
             others=tuple(State.of(town(name, on), name=f"{name}@{on}") for on in OLDER) if name in DATED else (),
             elsewhere=State.of(town("town-riverside")),
             ageing=Ageing(years=0.0, rates=_with_ground(rates_by_hand()), place="here"),
+            looks={block.id: "train" for block in blocks_of(state.region, state.grid)},
         )
 
     return of_town

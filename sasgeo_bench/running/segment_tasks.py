@@ -1,0 +1,287 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make evidence of the pictures of tasks: a segmenter that learned elsewhere sees them, and tasks of its own result."""
+
+import hashlib
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.files.folders import fresh_file, sha256_of
+from sasgeo_bench.matching.segmenter import check_text
+from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
+from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of, truth_of
+from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.sensing.image import AerialImage, LabelledImage
+from sasgeo_bench.sensing.segmentation import Segmentation
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import put_task
+from sasgeo_bench.tasks.frame_evidence import evidence_of
+from sasgeo_bench.tasks.frames import FrameLabels, read_labels
+from sasgeo_bench.tasks.query import RENDERED, Query, Truth, base_of
+from sasgeo_bench.tasks.split import HALVES, Split
+
+FOLDER: Final = "segmenters"  # below the root: what segmenters learned
+_MOST_SHOWN: Final = 3  # failures that are told
+# What `write_task` writes anew.
+_OF_FILES: Final = ("schema_version", "task_version", "counts", "prior_groups", "candidates_sha256", "frames", "files")
+
+
+@dataclass(frozen=True, kw_only=True)
+class SegmentTasks:
+    """Tasks of pictures, and the segmenter that is to see them.
+
+    `tasks` are folders of `out/tasks`. A segmenter that learns does so from tasks of the other half of a cross-fit, or
+    from the train places of a hold-out: at most `most` pictures of the ordinary look, evenly over places, suites and
+    sites. `limits.match_s` is for one picture.
+    """
+
+    spec: str
+    tasks: Sequence[Path]
+    split: Split
+    out: Path
+    most: int = 80
+    limits: Limits = field(default_factory=Limits)
+    is_shut_in: bool = True
+
+    @property
+    def request(self) -> SegmentRequest:
+        """Return what its processes are started by."""
+        return SegmentRequest(spec=self.spec, out=self.out, limits=self.limits, is_shut_in=self.is_shut_in)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Group:
+    """Tasks of places that one training serves, and the tasks that it learns from."""
+
+    asked: tuple[Path, ...]
+    train: tuple[Path, ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Sight:
+    """A segmenter ready to see the pictures of some tasks: its card, and what it learned for them."""
+
+    request: SegmentRequest
+    loaded: LoadedSegmenter
+    learned: str | None
+    tell: Tell
+    progress: Progress | None
+
+    def record(self, about: Mapping[str, Any]) -> dict[str, str]:
+        """Return what the evidence of a task follows from, for its `task.json`."""
+        return {
+            "name": self.loaded.card.name,
+            "version": self.loaded.card.version,
+            "code_sha256": self.loaded.code,
+            "learned_sha256": "" if self.learned is None else hashlib.sha256(self.learned.encode()).hexdigest(),
+            "pictures_sha256": str(about["files"][task_files.QUERIES]["sha256"]),
+        }
+
+
+def name_of(suite: str, segmenter: str) -> str:
+    """Return the name of a suite's tasks whose evidence a segmenter made.
+
+    >>> name_of("aerial", "pixel_forest")
+    'aerial+pixel_forest'
+    """
+    return f"{suite}+{segmenter}"
+
+
+def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None = None) -> tuple[Path, ...]:
+    """Segment the pictures of tasks that are not up to date, and return the folders of the tasks that result.
+
+    Raises
+    ------
+    ConfigError
+        If a task has no pictures, the split does not speak of it, or there is nothing to learn from.
+    MatchError
+        If the segmenter cannot be loaded. A picture that it fails at has no evidence, and is told.
+    StoreError
+        If a task, its truths or labels are missing or damaged, or training fails.
+    """
+    abouts = {folder: _pictured(folder) for folder in wanted.tasks}
+    groups = _groups(wanted, abouts)
+    request = wanted.request
+    loaded = load_card(request)
+    made: list[Path] = []
+    for group in groups:
+        learned = _learned(wanted, loaded, group, tell) if loaded.learns else None
+        sight = _Sight(request=request, loaded=loaded, learned=learned, tell=tell, progress=progress)
+        made += [_segmented(sight, task, abouts[task]) for task in group.asked]
+    return tuple(made)
+
+
+def _pictured(folder: Path) -> dict[str, Any]:
+    """Read a task's description; refuse a task without pictures, or with evidence already."""
+    about = task_files.read_task(folder)
+    if not about.get("frames"):
+        message = f"{folder} holds no pictures: draw a suite that has some, as in make-queries --suite aerial"
+        raise ConfigError(message)
+    if about.get("segmenter"):
+        message = f"{folder} has its evidence from a segmenter: name the task of the pictures, without '+'"
+        raise ConfigError(message)
+    return about
+
+
+def _groups(wanted: SegmentTasks, abouts: Mapping[Path, Mapping[str, Any]]) -> list[_Group]:
+    """Return the groups of tasks that learn from the same places."""
+    split = wanted.split
+    group = {task: _group_of(str(about["region"]), split) for task, about in abouts.items()}
+    strange = next((task for task, name in group.items() if name is None), None)
+    if strange is not None:
+        message = f"{strange}: split {split.spec.id!r} does not hold its region: name one that does with --split"
+        raise ConfigError(message)
+    names: tuple[str, ...] = HALVES if split.half_of else ("held out", "train")
+    found = []
+    for name in names:
+        is_taught = name != "train"  # what is learned from in a hold-out is not asked after learning from itself
+        asked = tuple(task for task in group if group[task] == name)
+        train = tuple(task for task in group if group[task] != name) if is_taught else ()
+        found.append(_Group(asked=asked, train=train))
+    return [one for one in found if one.asked]
+
+
+def _group_of(region: str, split: Split) -> str | None:
+    place = next(iter(split.places_in(base_of(region))), None)
+    if place is None:
+        return None
+    if split.half_of:
+        return split.half_of.get(place)
+    return "train" if split.part_of(place) == "train" else "held out"
+
+
+def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell: Tell) -> str | None:
+    """Return what a segmenter learned for a group, out of its file or by training; None with nothing to learn from."""
+    if not group.train:
+        if "training" in loaded.card.needs:
+            message = (
+                f"{loaded.card.name} needs training, and all tasks are of one half or part of split "
+                f"{wanted.split.spec.id!r}: name tasks of the other one, too"
+            )
+            raise ConfigError(message)
+        return None
+    chosen = plan_training(
+        group.train, asked=group.asked, split=wanted.split, most=wanted.most, lessons=Lessons(detector=RENDERED)
+    )
+    code = json.dumps([wanted.spec, loaded.card.version, loaded.code])
+    own = f"{loaded.card.name}-{hashlib.sha256(code.encode()).hexdigest()[:12]}"
+    path = wanted.out / FOLDER / own / f"{chosen.sha256}.txt"
+    if path.is_file():
+        return check_text(path.read_text(encoding="utf-8"))
+    result = train_segmenter(wanted.request, _lessons_of(chosen))
+    if result.text is None:
+        message = f"{loaded.card.name} could not learn from {chosen.to_text()}: {result.message} ({result.status})"
+        raise StoreError(message)
+    with fresh_file(path, mend="free some space and run again") as scratch:
+        scratch.write_text(result.text, encoding="utf-8")
+    tell(f"{loaded.card.name}: trained on the pictures of {chosen.to_text()}, {path}")
+    return result.text
+
+
+def _lessons_of(chosen: TrainingSet) -> Iterator[LabelledImage]:
+    """Yield the newest picture of each chosen query with its labels."""
+    for item in chosen.taken:
+        ids = frozenset(item.ids)
+        queries = {query.query_id: query for query in task_files.read_queries(item.task) if query.query_id in ids}
+        for query_id, number, found in read_labels(item.truth):
+            query = queries.get(query_id)
+            if query is not None and number == len(query.frames) - 1:
+                yield found.labelled(_image(query, number), item.region.name)
+
+
+def _image(query: Query, number: int) -> AerialImage:
+    return query.frames[number].image(observed_on=query.observed_on, season=query.season)
+
+
+def _segmented(sight: _Sight, task: Path, about: Mapping[str, Any]) -> Path:
+    """Segment one task unless that is done already, and return the folder of the task that results."""
+    suite, record = name_of(str(about["suite"]), sight.loaded.card.name), sight.record(about)
+    root = root_of(task)
+    folder: Path = root / "tasks" / suite / str(about["region"])
+    if _is_made(folder, record):
+        return folder
+    truth = truth_of(task, about)
+    task_files.check_queries(task)
+    task_files.check_truths(task, truth)
+    faults: list[str] = []
+    pairs = _pairs(sight, task, truth, suite, faults)
+    own = {name: value for name, value in about.items() if name not in _OF_FILES}
+    hidden = {name: value for name, value in task_files.read_hidden(truth).items() if name != "queries_sha256"}
+    made = put_task(pairs, own | {"suite": suite, "segmenter": record}, hidden, out=root, tell=sight.tell)
+    sight.tell(f"{suite} on {about['region']}: {counted(made.queries, 'query', 'queries')} in {made.folder}")
+    if faults:
+        failed = f"{sight.loaded.card.name} failed at {counted(len(faults), 'picture')}"
+        sight.tell(f"  {failed}, whose evidence is unknown: {'; '.join(faults[:_MOST_SHOWN])}")
+    return made.folder
+
+
+def _is_made(folder: Path, record: Mapping[str, str]) -> bool:
+    """Return whether a task was made of these pictures by this segmenter with what it has learned."""
+    try:
+        about = task_files.read_task(folder)
+    except StoreError:
+        return False
+    path = folder / task_files.QUERIES
+    is_whole = path.is_file() and sha256_of(path) == about["files"][task_files.QUERIES]["sha256"]
+    return is_whole and about.get("segmenter") == dict(record)
+
+
+def _pairs(sight: _Sight, task: Path, truth: Path, suite: str, faults: list[str]) -> list[tuple[Query, Truth]]:
+    """Return queries with evidence and their truths by id; `faults` gets a line for each picture that failed."""
+    truths = {item.query_id: item for item in task_files.read_truths(truth)}
+    rows, found, label = read_labels(truth), [], f"{suite} on {task.name}"
+    if sight.progress is not None:
+        sight.progress.begin(label, len(truths))
+    with SegmenterRun(sight.request, sight.loaded, learned=sight.learned) as run:
+        for query in task_files.read_queries(task):
+            seen: list[Segmentation | None] = []
+            for number in range(len(query.frames)):
+                of_frame = _next_labels(rows, query.query_id, number)
+                reply = run.segment(of_frame.labelled(_image(query, number), task.name))
+                faults += [] if reply.segmentation else [f"{query.query_id}: {reply.message} ({reply.status})"]
+                seen.append(reply.segmentation)
+            found.append(_with_evidence(query, truths[query.query_id], suite, sight.loaded.card.name, seen))
+            if sight.progress is not None:
+                sight.progress.advance(label, 1)
+    return sorted(found, key=lambda pair: pair[0].query_id)
+
+
+def _next_labels(rows: Iterator[tuple[str, int, FrameLabels]], query_id: str, number: int) -> FrameLabels:
+    """Return the labels of a frame, which are the next ones of the file; raise `StoreError` if they are not."""
+    found = next(rows, None)
+    if found is None or found[:2] != (query_id, number):
+        message = f"the labels of query {query_id} are missing or out of order: make the queries again"
+        raise StoreError(message)
+    return found[2]
+
+
+def _with_evidence(
+    query: Query, truth: Truth, suite: str, segmenter: str, seen: Sequence[Segmentation | None]
+) -> tuple[Query, Truth]:
+    """Return a query with the evidence of its pictures, under an id of its own, and its truth."""
+    empty = query.evidence
+    found = evidence_of(query.frames, seen, size_cells=empty.shape[0], cell_size_m=empty.cell_size_m)
+    evidence = _for_classes(found, empty)
+    query_id = hashlib.sha256(f"{query.query_id}/{segmenter}".encode()).hexdigest()[: len(query.query_id)]
+    return (
+        replace(query, query_id=query_id, suite=suite, evidence=evidence),
+        replace(truth, query_id=query_id, unknown_share=evidence.unknown_share),
+    )
+
+
+def _for_classes(found: Evidence | None, empty: Evidence) -> Evidence:
+    """Return evidence for the classes of a map, in their order: unknown where a segmenter tells nothing of one."""
+    cells = np.full(empty.cells.shape, UNKNOWN, dtype=np.uint8)
+    confidence = np.zeros(empty.cells.shape, dtype=np.uint8)
+    for index, name in enumerate(empty.classes):
+        if found is not None and found.confidence is not None and name in found.classes:
+            at = found.classes.index(name)
+            cells[index], confidence[index] = found.cells[at], found.confidence[at]
+    return empty.replace(cells, confidence)

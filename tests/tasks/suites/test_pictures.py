@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Suites of pictures: flights are those of their cards, and a drawn query shows the place that its truth names."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.sensing.rendering.conditions import Conditions
+from sasgeo_bench.sensing.segmentation import Segmentation
+from sasgeo_bench.tasks.frame_evidence import evidence_of
+from sasgeo_bench.tasks.suites import light, oblique
+from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES, SUITES
+from sasgeo_bench.tasks.suites.base import Seeds, Shot, Site, Variant
+from sasgeo_bench.tasks.suites.pictures import STOPS_M, Flight, PictureSuite, stands_of
+
+SMALL = Variant(role="control", kind="control", view_cells=48)
+
+
+def suite_of(**flight):
+    """A suite of small pictures from low above, which are painted at once."""
+    made = PICTURE_SUITES["aerial"]
+    return replace(made, flight=lambda _: Flight(**{"height_m": 40.0} | flight))
+
+
+@pytest.fixture(scope="module")
+def place(scene):
+    town = scene("town-grid")
+    middle = town.map.grid.bounds_m
+    pose = Pose(easting_m=middle[0] + 480.0, northing_m=middle[1] + 520.0, yaw_deg=60.0)
+    block = next(block for block in town.blocks if block.holds((pose.easting_m, pose.northing_m)))
+    return replace(town, painted={}), Site(index=0, pose=pose, block=block.id, density=0.2)
+
+
+def shot_of(place, variant=SMALL, **site):
+    scene, where = place
+    return Shot(scene=scene, site=replace(where, **site), variant=variant, seeds=Seeds(root=1, names=("here",)))
+
+
+def test_no_suite_of_pictures_is_drawn_unless_it_is_named():
+    assert not set(PICTURE_SUITES) & set(SUITES)
+
+
+@pytest.mark.parametrize("name", PICTURE_SUITES)
+def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_control(name):
+    suite = PICTURE_SUITES[name]
+    assert isinstance(suite, PictureSuite)
+    roles = [variant.role for variant in suite.variants]
+    assert (roles.count("control"), roles.count("falsifier")) == (1, 1)
+    assert roles.count("stress") >= 3
+    control, falsifier = (
+        next(item for item in suite.variants if item.role == role) for role in ("control", "falsifier")
+    )
+    one, other = suite.flight(control), suite.flight(falsifier)
+    ordinary = Conditions()
+    assert one.conditions(ordinary) == other.conditions(ordinary)
+    assert (one.height_m, one.tilt_deg, one.is_fixed, one.relief) == (
+        other.height_m,
+        other.tilt_deg,
+        other.is_fixed,
+        other.relief,
+    )
+    assert set(other.stops_m) == set(one.stops_m)
+    flights = [suite.flight(item) for item in suite.variants if item.role == "stress"]
+    told = {
+        (
+            item.height_m,
+            item.tilt_deg,
+            item.is_fixed,
+            item.relief,
+            item.stops_m,
+            item.odometry,
+            item.conditions(ordinary),
+        )
+        for item in flights
+    }
+    assert len(told) == len(flights)
+
+
+def test_the_sun_sinks_and_the_air_thickens_along_the_ladder():
+    def of(kind, share):
+        variant = Variant(role="stress", kind=kind, strength=share)
+        return light.SUITE.flight(variant).conditions(Conditions())
+
+    suns = [of(light.SUN, share).sun.elevation_deg for share in light.STRENGTHS]
+    assert suns == sorted(suns, reverse=True)
+    assert suns[-1] == 5.0
+    assert of(light.DUSK, 1.0).sun.elevation_deg == -8.0
+    assert of(light.HAZE, 1.0).visibility_m == pytest.approx(500.0)
+
+
+def test_a_camera_fixed_to_the_body_tilts_as_was_measured(place):
+    variant = next(item for item in oblique.SUITE.variants if item.kind == oblique.BODY)
+    tilts = []
+    for index in range(400):
+        shot = replace(shot_of(place, variant), seeds=Seeds(root=1, names=("here", str(index))))
+        tilts.append(stands_of(shot, oblique.SUITE.flight(variant))[0].believed.tilt_deg)
+    median, high = np.quantile(tilts, (0.5, 0.95))
+    assert abs(median - 9.6) < 1.0
+    assert abs(high - 20.5) < 2.5
+
+
+def test_a_true_camera_is_off_by_what_is_declared_and_flies_at_the_scale_of_its_view(place):
+    pose = replace(place[1].pose, scale=1.05)
+    off = []
+    for index in range(300):
+        shot = replace(shot_of(place, pose=pose), seeds=Seeds(root=1, names=("here", str(index))))
+        stand = stands_of(shot, Flight(height_m=100.0))[0]
+        off.append(stand.true.tilt_deg)
+        assert stand.true.height_m == pytest.approx(105.0)
+        assert stand.believed.tilt_deg == pytest.approx(0.0)
+    assert np.sqrt(np.mean(np.square(off)) / 2) == pytest.approx(1.0, rel=0.15)
+
+
+def test_nine_stops_end_where_the_query_is_and_drift_by_what_they_declare(place):
+    stands = stands_of(shot_of(place), Flight(stops_m=STOPS_M))
+    assert (stands[-1].believed.east_m, stands[-1].believed.north_m) == pytest.approx((0.0, 0.0))
+    assert stands[-1].position_sigma_m == 0.0
+    for stop, stand in zip(STOPS_M, stands, strict=True):
+        assert np.hypot(stand.believed.east_m - stop[0], stand.believed.north_m - stop[1]) < 12.0
+    assert stands[0].position_sigma_m == pytest.approx(0.01 * np.hypot(*STOPS_M[0]), abs=1e-3)
+
+
+def test_what_is_on_a_picture_is_what_the_map_shows_there_and_its_evidence_lies_where_the_truth_says(place):
+    shot = shot_of(place)
+    suite = suite_of()
+    draft = suite.draw(shot)
+    assert (draft.evidence.cells == UNKNOWN).all()
+    assert draft.evidence.confidence is None
+    labels = draft.labels[0].labels
+    planes = np.where(labels == UNKNOWN, np.nan, labels == PRESENT)
+    oracle = Segmentation.of_probabilities(draft.labels[0].classes, planes)
+    found = evidence_of(draft.frames, [oracle], size_cells=48, cell_size_m=1.0)
+    clean = shot.clean()
+    for name in ("building", "road_minor"):
+        seen, mapped = found.layer(name), clean.layer(name)
+        known = seen != UNKNOWN
+        both = ((seen == PRESENT) & (mapped == PRESENT) & known).sum()
+        either = (((seen == PRESENT) | (mapped == PRESENT)) & known).sum()
+        if either > 100:
+            assert both / either > 0.6, name
+    assert known.mean() > 0.5
+
+
+def test_pictures_of_one_site_differ_by_the_stress_alone_and_a_falsifier_is_another_picture_of_the_same(place):
+    suite = suite_of()
+    control = suite.draw(shot_of(place))
+    again = suite.draw(shot_of(place, Variant(role="falsifier", kind="same height", view_cells=48)))
+    assert control.frames[0].camera == again.frames[0].camera
+    np.testing.assert_array_equal(control.labels[0].labels, again.labels[0].labels)
+    assert control.frames[0].picture != again.frames[0].picture
+    assert suite.draw(shot_of(place)).frames == control.frames
+    shifted = suite.draw(shot_of(place, replace(SMALL, detector="shifted")))
+    assert shifted.frames[0].picture != control.frames[0].picture
+
+
+def test_a_suite_of_pictures_draws_looks_and_the_others_draw_detectors():
+    aerial, clean = PICTURE_SUITES["aerial"], SUITES["clean"]
+    assert aerial.detectors(("published",)) == ("rendered",)
+    assert aerial.detectors(("rendered", "shifted")) == ("rendered", "shifted")
+    assert clean.detectors(("published", "rendered")) == ("published",)

@@ -1,0 +1,149 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence of pictures: made at other places than it was learned from, once, and a fault costs its picture alone."""
+
+import json
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.segment_tasks import FOLDER, SegmentTasks, segment_tasks
+from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.sensing.tiny_images import tiny_images
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import make_tasks, put_task
+from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
+from sasgeo_bench.tasks.split import find_split
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+TOWNS = ("town-grid", "town-riverside")  # of either half
+PATIENT = Limits(match_s=600.0, learn_s=600.0, memory_bytes=2 * 10**9)
+
+
+def silent(line):
+    del line
+
+
+def with_pictures(query, truth, at):
+    """A query whose view is a drawn picture, and its truth with the labels."""
+    drawn = tiny_images()[at % len(tiny_images())]
+    blind = np.full_like(query.evidence.cells, UNKNOWN)
+    frame = Frame(picture=encode_webp(drawn.image.rgb), camera=drawn.image.camera)
+    labels = FrameLabels.of(drawn.classes, drawn.labels)
+    return (
+        replace(query, suite="aerial", evidence=query.evidence.replace(blind), frames=(frame,)),
+        replace(truth, labels=(labels,), detector="rendered"),
+    )
+
+
+@pytest.fixture
+def pictured(tmp_path, lay_towns, monkeypatch):
+    """Tasks of four pictures in each of two towns, in out/ of the working folder."""
+    out = tmp_path / "out"
+    lay_towns(out, *TOWNS)
+    wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=1, seed=4, out=out, may_be_fewer=True)
+    folders = []
+    for request in plan_requests(wanted, tell=silent):
+        (made,) = make_tasks(request, tell=silent)
+        about = task_files.read_task(made.folder)
+        truth = out / "truth" / "clean" / request.region.id
+        plain = islice(zip(task_files.read_queries(made.folder), task_files.read_truths(truth), strict=True), 4)
+        pairs = [with_pictures(*pair, at) for at, pair in enumerate(plain)]
+        kept = {name: about[name] for name in ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites")}
+        own = kept | {"suite": "aerial", "region": request.region.id}
+        folders.append(put_task(pairs, own, {"seed": 4}, out=out, tell=silent).folder)
+    monkeypatch.syspath_prepend(str(Path(__file__).parent))
+    monkeypatch.chdir(tmp_path)
+    return tuple(folders)
+
+
+def wanted(folders, spec, **changes):
+    given = {"spec": spec, "tasks": folders, "split": find_split("crossfit"), "out": Path("out"), "limits": PATIENT}
+    return SegmentTasks(**given | changes)
+
+
+def of_oracle(folders, lines=None):
+    return segment_tasks(wanted(folders, ORACLE_SEGMENTER), tell=silent if lines is None else lines.append)
+
+
+def test_the_oracles_evidence_is_what_the_labels_show_under_new_ids_with_the_truths_of_the_pictures(pictured):
+    made = of_oracle(pictured)
+    assert [folder.parent.name for folder in made] == ["aerial+oracle_segmenter"] * 2
+    queries = list(task_files.read_queries(made[0]))
+    truths = list(task_files.read_truths(Path("out/truth/aerial+oracle_segmenter") / made[0].name))
+    assert [query.query_id for query in queries] == sorted(truth.query_id for truth in truths)
+    before = {query.query_id for query in task_files.read_queries(pictured[0])}
+    assert not before & {query.query_id for query in queries}
+    for query, truth in zip(queries, truths, strict=True):
+        assert (query.evidence.layer("building") == PRESENT).any()
+        assert query.evidence.confidence.any()
+        assert (query.evidence.layer("railway") == UNKNOWN).all()  # nobody has labelled one
+        assert truth.unknown_share == pytest.approx(query.evidence.unknown_share)
+        assert len(query.frames) == 1
+    assert not list(Path("out/truth/aerial+oracle_segmenter").rglob("labels.parquet"))
+
+
+def test_what_is_up_to_date_stays_and_other_pictures_are_segmented_again(pictured):
+    lines = []
+    made = of_oracle(pictured, lines)
+    before = (made[0] / "queries.parquet").stat().st_mtime_ns
+    assert len(lines) == 2
+    assert of_oracle(pictured, lines) == made
+    assert (len(lines), (made[0] / "queries.parquet").stat().st_mtime_ns) == (2, before)
+    (made[0] / "queries.parquet").write_bytes(b"half written")
+    of_oracle(pictured, lines)
+    assert len(lines) == 3
+    assert len(list(task_files.read_queries(made[0]))) == 4
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_each_half_is_seen_after_learning_from_the_other_and_nothing_is_learned_twice(pictured):
+    lines = []
+    made = segment_tasks(wanted(pictured, "segmenters:Learns"), tell=lines.append)
+    texts = {path: json.loads(path.read_text()) for path in Path("out", FOLDER).rglob("*.txt")}
+    assert sorted(text["places"] for text in texts.values()) == [[name] for name in TOWNS]
+    records = {folder.name: task_files.read_task(folder)["segmenter"] for folder in made}
+    assert len({record["learned_sha256"] for record in records.values()}) == 2
+    assert sum("trained on the pictures" in line for line in lines) == 2
+    again = []
+    segment_tasks(wanted(pictured, "segmenters:Learns"), tell=again.append)
+    assert again == []
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_picture_that_a_segmenter_fails_at_has_no_evidence_and_is_told(pictured):
+    lines = []
+    made = segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"), tell=lines.append)
+    assert "failed at 4 pictures, whose evidence is unknown" in lines[-1]
+    for query in task_files.read_queries(made[0]):
+        assert (query.evidence.cells == UNKNOWN).all()
+        assert query.evidence.confidence is not None
+
+
+def test_wrong_tasks_are_refused_in_a_line(pictured):
+    made = of_oracle(pictured[:1])
+    with pytest.raises(ConfigError, match="name the task of the pictures, without"):
+        of_oracle(made)
+    with pytest.raises(ConfigError, match="holds no pictures: draw a suite that has some"):
+        of_oracle([Path("out/tasks/clean") / TOWNS[0]])
+    with pytest.raises(StoreError, match="make the queries first"):
+        of_oracle([Path("out/tasks/aerial/nowhere")])
+    labels = Path("out/truth/aerial") / TOWNS[1] / "labels.parquet"
+    labels.unlink()
+    with pytest.raises(StoreError, match=r"labels\.parquet cannot be read .*make the queries again"):
+        of_oracle(pictured[1:])
+    assert not Path("out/tasks/aerial+oracle_segmenter", TOWNS[1]).exists()
+
+
+def test_a_matcher_of_evidence_is_not_asked_about_pictures_that_nobody_has_seen(pictured):
+    request = RunRequest(spec="prior_centre", tasks=[pictured[0]], out=Path("out"))
+    with pytest.raises(StoreError, match=r"holds pictures and no evidence.*run sasgeo-bench segment"):
+        plan_run(request)
+    plan = plan_run(replace(request, tasks=of_oracle(pictured[:1])))
+    assert sum(len(part.left) for part in plan.parts) == 4

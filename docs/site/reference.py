@@ -339,7 +339,7 @@ def _suites() -> Iterator[str]:
 
 
 def _methods() -> Iterator[str]:
-    yield "# Matchers and rejectors"
+    yield "# Matchers, rejectors and segmenters"
     yield ""
     yield "Every method that comes with the program, from its card."
     for title, group in (("Matchers", MATCHERS), ("Rejectors", REJECTORS), ("Segmenters", SEGMENTERS)):

@@ -18,6 +18,8 @@ from sasgeo_bench.sensing.image import MOST_PIXELS, AerialImage, LabelledImage
 from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.packing import LABELLED, QUICK, STORED, pack_parts, split_parts, unpack_body
 
+SUFFIX: Final = LABELLED  # of a file that holds one labelled image
+
 _IMAGE: Final = b"SGIMG\x01"
 _LABELLED: Final = b"SGLAB\x01"
 _BANDS: Final = 3
@@ -125,7 +127,7 @@ def write_labelled(folder: Path, images: Iterable[LabelledImage]) -> tuple[Path,
                 "label the same classes everywhere, as unknown where nobody has looked"
             )
             raise ImageError(message)
-        paths.append(folder / f"{number:06d}{LABELLED}")
+        paths.append(folder / f"{number:06d}{SUFFIX}")
         with fresh_file(paths[-1], mend="free some space and run again") as scratch:
             scratch.write_bytes(labelled_bytes(labelled))
     return tuple(paths)

@@ -40,6 +40,7 @@ IMPORTED_AS = {
     "lazy-loader": "lazy_loader",
     "pillow": "PIL",
     "opencv-python-headless": "cv2",
+    "pillow": "PIL",
     "rio-cogeo": "rio_cogeo",
     "scikit-image": "skimage",
     "scikit-learn": "sklearn",

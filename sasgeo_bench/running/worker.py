@@ -31,6 +31,7 @@ from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import walk_code
 from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
 from sasgeo_bench.running.replies import PluginReply, Reply, read_reply
+from sasgeo_bench.sensing.packing import LABELLED
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_rows import pairs_bytes
 from sasgeo_bench.texts import one_line
@@ -237,7 +238,8 @@ class PluginProcess(ABC, Generic[AnyReply]):
         """Return the arguments of `sandbox.Policy`."""
         code = _code()
         scan = walk_code(code)
-        hidden = [*map(str, self.reach.hidden), *scan.hidden([*code, *self.reach.readable])]
+        found = scan.hidden([*code, *self.reach.readable])
+        hidden = [*map(str, self.reach.hidden), *(path for path in found if not self._is_lesson(path))]
         return {
             "readable": [str(path) for path in (*code, *self.reach.readable)],
             "scratch": scratch,
@@ -247,6 +249,10 @@ class PluginProcess(ABC, Generic[AnyReply]):
             "file_bytes": self.limits.file_bytes,
             "scratch_bytes": self.limits.scratch_bytes,
         }
+
+    def _is_lesson(self, path: str) -> bool:
+        """Return whether a file is a labelled image in a folder that the plugin may read, to learn from it."""
+        return path.endswith(LABELLED) and Path(path).parent in self.reach.readable
 
     def _last_words(self, closed: str) -> str:
         """Describe how a process ended, with the last line it printed."""

@@ -16,9 +16,9 @@ from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, pack, unpack
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.image import MOST_PIXELS, AerialImage, LabelledImage
 from sasgeo_bench.sensing.intrinsics import Intrinsics
-from sasgeo_bench.sensing.packing import QUICK, STORED, pack_parts, split_parts, unpack_body
+from sasgeo_bench.sensing.packing import LABELLED, QUICK, STORED, pack_parts, split_parts, unpack_body
 
-SUFFIX: Final = ".labelled"  # of a file that holds one labelled image
+SUFFIX: Final = LABELLED  # of a file that holds one labelled image
 
 _IMAGE: Final = b"SGIMG\x01"
 _LABELLED: Final = b"SGLAB\x01"

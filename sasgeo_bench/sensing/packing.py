@@ -13,6 +13,7 @@ _HEAD: Final = struct.Struct("!I")
 _MOST_HEAD: Final = 2**16  # bytes
 QUICK: Final = 1  # level of compression that is worth its time
 STORED: Final = 0  # for bytes that do not stay
+LABELLED: Final = ".labelled"  # suffix of a file that holds one labelled image
 
 
 def pack_parts(magic: bytes, head: Mapping[str, Any], body: bytes, *, level: int = QUICK) -> bytes:

@@ -7,6 +7,8 @@ from io import BytesIO
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from PIL import Image
 
 from sasgeo_bench.errors import ImageError
@@ -112,6 +114,10 @@ BAD: dict[str, tuple[bytes, str]] = {
     "no pixels": (png(0, 5, bits=8, kind=2, pixels=b""), "no JPEG, PNG, WebP or TIFF"),
     "bomb": (png(40_000, 40_000, bits=8, kind=2, pixels=bytes(1000)), "than twice the pixels"),
     "large": (png(9_000, 9_000, bits=8, kind=2, pixels=bytes(1000)), "has 9000 x 9000 pixels, at most 64000000"),
+    "text bomb": (
+        BIG[:33] + chunk(b"zTXt", b"a\0\0" + zlib.compress(bytes(2**26))) + BIG[33:],
+        "Decompressed data too large",
+    ),
     "floats": (encoded(Image.new("F", (2, 2)), "TIFF"), "kind 'F', not colours"),
     "integers": (encoded(Image.new("I", (2, 2)), "TIFF"), "kind 'I', not colours"),
 }
@@ -125,6 +131,26 @@ def test_a_bad_image_is_refused_in_one_line_that_says_what_to_do(name: str) -> N
     assert str(refusal.value).startswith("flight/0001.jpg ")
     assert ": " in str(refusal.value)
     assert "\n" not in str(refusal.value)
+
+
+MEDLEY = [BIG, PHOTO, encoded(Image.fromarray(np.eye(40, dtype=np.uint8) * 255), "WEBP", lossless=True)]
+
+
+@given(
+    st.sampled_from(MEDLEY), st.lists(st.tuples(st.integers(0, 500), st.integers(0, 255)), max_size=5), st.integers(1)
+)
+def test_bytes_that_were_changed_or_cut_are_a_picture_or_one_line(
+    data: bytes, changes: list[tuple[int, int]], kept: int
+) -> None:
+    broken = bytearray(data[:kept])
+    for at, value in changes:
+        broken[at % len(broken)] = value
+    told = ""
+    try:
+        assert decode_image(bytes(broken)).ndim == 3
+    except ImageError as error:
+        told = str(error)
+    assert "\n" not in told
 
 
 def test_bytes_and_pixels_are_counted_before_decoding(monkeypatch: pytest.MonkeyPatch) -> None:

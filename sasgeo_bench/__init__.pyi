@@ -54,6 +54,15 @@ from .search.plan import Mode as Mode
 from .search.vote_search import VotePlan as VotePlan
 from .search.votes import VoteGains as VoteGains
 from .search.votes import make_template as make_template
+from .sensing.camera import Attitude as Attitude
+from .sensing.camera import Camera as Camera
+from .sensing.camera import Mount as Mount
+from .sensing.ground import Dem as Dem
+from .sensing.ground import Plane as Plane
+from .sensing.ground import read_dem as read_dem
+from .sensing.intrinsics import Intrinsics as Intrinsics
+from .sensing.photos import Photo as Photo
+from .sensing.photos import read_photo as read_photo
 from .tasks.query import Query as Query
 from .tasks.query import Truth as Truth
 from .tasks.task_files import read_queries as read_queries

@@ -55,6 +55,7 @@ STAGES: Final = {
     "osm": "OpenStreetMap features",
     "regions": "Regions and evidence",
     "search": "Dense pose search",
+    "sensing": "Aerial images and segmentation",
     "tasks": "Queries and truths",
     "matching": "Matchers and rejectors",
     "running": "Predictions and conformance",

@@ -349,7 +349,8 @@ def _value_finding(contrast: Contrast, rows: pd.DataFrame, sides: _Sides, draws:
         second_only=int((gaps < 0).sum()),
         p_places=sign_flip(np.bincount(place, weights=gaps).astype(float)),
     )
-    found = _with_ends(found, (means[0][:, 0], means[1][:, 0]), won, drawn)
+    varied = (rows.loc[gaps != 0, "place"].nunique(), rows.loc[gaps != 0, "block"].nunique())
+    found = _with_ends(found, (means[0][:, 0], means[1][:, 0]), won, drawn.trials, varied)
     far = _by_country(contrast, rows, draws)
     return _with_countries(found, rows, None if far is None else bootstrap_means(gaps[:, None], far)[:, 0])
 
@@ -382,22 +383,27 @@ def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame)
         p_places=swap_places(both[0], both[1], place, contrast.metric),
         least=contrast.min_effect * (abs(theirs) if is_relative else 1.0),
     )
-    found = _with_ends(found, gaps, (ours, theirs), drawn)
+    units = (drawn.by_place.units_count, drawn.by_block.units_count)
+    found = _with_ends(found, gaps, (ours, theirs), drawn.trials, units)
     far = _by_country(contrast, first, SLOW_DRAWS)
     return _with_countries(found, first, None if far is None else gaps_of(far))
 
 
-def _with_ends(found: Finding, draws: tuple[Floats, Floats], sides: tuple[float, float], drawn: BoardDraws) -> Finding:
+def _with_ends(
+    found: Finding, draws: tuple[Floats, Floats], sides: tuple[float, float], trials: float, varied: tuple[int, int]
+) -> Finding:
     """Return a finding with the ends of the intervals by places and by blocks; the former are never inside the latter.
 
-    Draws say little for few clusters, and nothing where nothing varies: then Wilson's intervals over sites of both
-    `sides`, two fractions whose difference it is (of queries won and lost, or two areas), set the least width.
+    `varied` counts the places and the blocks in which the sides differ. Draws of few of these say little: where the
+    first side wins one query and loses none, no draw has a loss, though as many more queries might have one. Then
+    Wilson's intervals of both `sides`, two fractions whose difference it is (of queries won and lost, or two areas),
+    over as many `trials` as there are sites, set the least width.
     """
-    wide = difference_interval(*(wilson_share(side, drawn.trials) for side in sides))
+    wide = difference_interval(*(wilson_share(min(side, 1.0), trials) for side in sides))
     both: list[Interval] = []
-    for values, one in zip(draws, drawn.both, strict=True):
+    for values, count in zip(draws, varied, strict=True):
         ends = percentile_interval(found.difference, values)
-        is_enough = one.units_count >= LEAST_PLACES and ends.lo < ends.hi
+        is_enough = count >= LEAST_PLACES and ends.lo < ends.hi
         both.append(ends if is_enough else _around(ends, wide))
     places, blocks = _around(*both), both[1]
     return replace(found, lo=places.lo, hi=places.hi, lo_blocks=blocks.lo, hi_blocks=blocks.hi)

@@ -15,7 +15,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.pose import MISS, Rank, first_pose, pose_errors, rank_candidate, rank_of
 from sasgeo_bench.tasks.query import CEILING, COPIES, Head, Truth, base_of
 
-SCORER_VERSION: Final = 5  # raise it if the same predictions get other scores; a board has one version
+SCORER_VERSION: Final = 6  # raise it if the same predictions get other scores; a board has one version
 FIX_M: Final = 25.0  # mission tolerance e_max of Eq. 12: a fix beyond it is false, on both tracks
 MISSING: Final = "missing"  # status of a query without a row
 NOT_APPLICABLE: Final = "not applicable"

@@ -82,6 +82,17 @@ def test_a_difference_over_few_blocks_has_the_doubts_of_its_sites():
     assert (found.difference, found.hi) == (1.0, 1.0)
 
 
+@pytest.mark.parametrize(("places_won", "is_floored"), [(0, True), (1, True), (5, True), (6, False)])
+def test_few_places_that_differ_leave_the_doubts_of_the_sites(places_won, is_floored):
+    # A query of the first `places_won` of 40 places is won, and none is lost: no draw of places has a loss.
+    ours, theirs = np.ones(40), np.ones(40)
+    theirs[:places_won] = 99.0
+    found = held(CONTRAST, **{"with": scores(ours, blocks=40), "without": scores(theirs, blocks=40)})
+    won, lost = wilson(places_won, 40), wilson(0, 40)
+    floor = found.difference - math.hypot(won.value - won.lo, lost.hi)
+    assert (found.lo == pytest.approx(floor)) is is_floored
+
+
 def test_countries_are_drawn_where_places_share_some_and_widen_the_interval():
     # Sixty places, six to a country: in three countries the first side is right everywhere, in the others nowhere.
     country = [f"country {at % 10}" for at in range(600)]

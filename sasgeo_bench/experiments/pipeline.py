@@ -34,6 +34,7 @@ from sasgeo_bench.publishing.archive import contrast_of, pack_board
 from sasgeo_bench.publishing.archive_folder import check_results
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.runner import run
+from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.scoring.contestants import read_scored_task, rows_to_rank
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
@@ -41,6 +42,7 @@ from sasgeo_bench.scoring.registration import Pilot, check_contrasts
 from sasgeo_bench.scoring.score import score_task
 from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES
 from sasgeo_bench.tasks.task_plan import Request
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
@@ -68,7 +70,8 @@ def run_pipeline(
     if stored is not None:
         check_results(stored, board_folder(plan))
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored, tell=tell)
-    tasks = [*_draw(plan.requests, tell, jobs=plan.jobs), *_draw_paper(plan, tell)]
+    drawn = _draw(plan.requests, tell, jobs=plan.jobs)
+    tasks = [*_with_evidence(plan, drawn, tell=tell, progress=progress), *_draw_paper(plan, tell)]
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
     if not asked:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
@@ -185,6 +188,22 @@ def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
     if len(lacking) > MOST_LINES:
         tell(f"left out: {len(lacking) - MOST_LINES} more")
     return tasks
+
+
+def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path], *, tell: Tell, progress: Progress | None) -> list[Path]:
+    """Return tasks with those of pictures replaced by what each segmenter of the file made of them."""
+    pictured = [task for task in tasks if task.parent.name in PICTURE_SUITES]
+    found = [task for task in tasks if task not in pictured]
+    if plan.split is None:
+        return found
+    asked: dict[str, list[Path]] = {}
+    for spec in plan.spec.task:
+        for segmenter in spec.segmenters:
+            asked.setdefault(segmenter, []).extend(task for task in pictured if task.parent.name in spec.suites)
+    for segmenter, own in asked.items():
+        wanted = SegmentTasks(spec=segmenter, tasks=own, split=plan.split, out=plan.out)
+        found += segment_tasks(wanted, tell=tell, progress=progress)
+    return found
 
 
 def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:

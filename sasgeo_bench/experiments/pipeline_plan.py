@@ -26,9 +26,9 @@ from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.build import is_of_region, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
-from sasgeo_bench.tasks.query import CONTROLS, PriorGroup, base_of
+from sasgeo_bench.tasks.query import BY, CONTROLS, PriorGroup, base_of
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.suites.all_suites import find_suite
+from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES, find_suite
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
@@ -258,6 +258,7 @@ def plan_pipeline(
         message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
         raise ConfigError(message)
     _check_kinds(spec)
+    _check_pictures(spec)
     kept = needed(requests, spec.learning) if requests else ()
     left = {item.region.id for item in requests} - {item.region.id for item in kept}
     if left:
@@ -273,6 +274,18 @@ def plan_pipeline(
     )
 
 
+def _check_pictures(spec: PipelineFile) -> None:
+    """Refuse suites of pictures that no segmenter sees, and segmenters of suites without pictures."""
+    for task in spec.task:
+        for name in task.suites:
+            if find_suite(name).is_pictured == bool(task.segmenters):
+                continue
+            what = "draws pictures, and no segmenter sees them" if not task.segmenters else "draws no pictures"
+            mend = "name segmenters" if not task.segmenters else "leave segmenters out, or name it in another [[task]]"
+            message = f"pipeline {spec.id!r}: suite {name!r} {what}: {mend}"
+            raise ConfigError(message)
+
+
 def _check_kinds(spec: PipelineFile) -> None:
     """Refuse a kind of stress that a contrast counts, or learning uses, and no [[task]] draws on its suites."""
     asking = [(f"contrast {item.name!r}", item.suites, item.kinds) for item in spec.contrast]
@@ -282,8 +295,8 @@ def _check_kinds(spec: PipelineFile) -> None:
         drawn = {
             variant.kind
             for task in spec.task
-            for name in set(task.suites) & set(suites)
-            for variant in find_suite(name).variants
+            for name in set(task.asked) & set(suites)
+            for variant in find_suite(name.split(BY, maxsplit=1)[0]).variants
             if variant.role == "stress" and variant.kind.startswith(tuple(task.kinds) or "")
         }
         lost = next((kind for kind in kinds if not any(one.startswith(kind) for one in drawn)), None)
@@ -384,6 +397,8 @@ def _is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
 
     Nobody is asked on a train place of a hold-out.
     """
+    if suite in PICTURE_SUITES:  # asked with the evidence that a segmenter makes
+        return False
     if suite in {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}:
         return True
     return not is_train(plan, region) and (spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec))

@@ -22,7 +22,7 @@ from sasgeo_bench.config import (
 )
 from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric, attainable, best_value, unreachable
-from sasgeo_bench.tasks.query import CONTROLS, PUBLISHED, Detector, PriorGroup, Track
+from sasgeo_bench.tasks.query import BY, CONTROLS, PICTURED, PUBLISHED, RENDERED, Detector, PriorGroup, Track
 
 PAPER_SUITE: Final = "paper-poc"
 Crop = Literal["unknown", "absent", "smaller"]
@@ -33,7 +33,7 @@ ONE_DETECTOR: Final = [PUBLISHED]
 _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
     "contrast": {"pilot": None, "detectors": []},
     "pilot": {"control": None},
-    "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR},
+    "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR, "segmenters": []},
     "paper": {"crop_readings": []},
     "learning": {"detector": PUBLISHED, "kinds": []},
 }
@@ -104,7 +104,12 @@ class TaskSpec(Document):
 
     `prior` is that of each suite unless given; `matchers` are those that are asked, all of the file unless given.
     `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where they are empty: fewer variants
-    at more sites say more. Each variant is drawn with each of `detectors`.
+    at more sites say more. Each variant is drawn with each of `detectors`. Suites of pictures name `segmenters` from
+    `list-segmenters`: each makes evidence of all pictures, which is asked, learned from and compared as a suite of its
+    own.
+
+    >>> TaskSpec(suites=["aerial"], sites=2, segmenters=["pixel_forest"]).asked
+    ['aerial+pixel_forest']
     """
 
     suites: Annotated[list[str], Field(min_length=1)]
@@ -115,6 +120,19 @@ class TaskSpec(Document):
     kinds: list[Short] = []
     tracks: list[Track] = []
     detectors: Annotated[list[Detector], Field(min_length=1)] = ONE_DETECTOR
+    segmenters: list[Name] = []
+
+    @property
+    def asked(self) -> list[str]:
+        """Return the names of the suites as matchers are asked on them."""
+        both = [f"{suite}{BY}{segmenter}" for suite in self.suites for segmenter in self.segmenters]
+        return both or self.suites
+
+    @property
+    def looks(self) -> list[Detector]:
+        """Return the families of errors that are drawn: of perception, or of the look of pictures."""
+        pictured = [name for name in self.detectors if name in PICTURED]
+        return (pictured or [RENDERED]) if self.segmenters else self.detectors
 
 
 class PaperSpec(Document):
@@ -226,7 +244,7 @@ class PipelineFile(NamedDocument):
 
     @model_validator(mode="after")
     def _names_once(self) -> Self:
-        suites = [name for task in self.task for name in task.suites]
+        suites = [name for task in self.task for name in task.asked]
         suites += [] if self.paper is None else [PAPER_SUITE, *map(paper_suite, self.paper.crop_readings)]
         for what, listed in (
             ("suite", suites),
@@ -245,7 +263,7 @@ class PipelineFile(NamedDocument):
         if CONTROLS in suites:
             message = f"suite {CONTROLS!r} is drawn for every board: leave it out"
             raise ValueError(message)
-        drawn = [name for task in self.task for name in task.suites]
+        drawn = [name for task in self.task for name in task.asked]
         lost = next((name for name in (self.learning.suites if self.learning else ()) if name not in drawn), None)
         if lost is not None:
             message = f"learning names the suite {lost!r}, which no [[task]] draws: add it there, or leave it out"
@@ -301,15 +319,15 @@ class PipelineFile(NamedDocument):
         ['clean']
         """
         asked = (task for task in self.task if not task.matchers or matcher in task.matchers)
-        return frozenset(name for task in asked for name in task.suites)
+        return frozenset(name for task in asked for name in task.asked)
 
 
 def _check_drawn(contrast: ContrastSpec, tasks: list[TaskSpec]) -> None:
     """Refuse a contrast that could count no query: Holm's adjustment would count it all the same."""
-    own = [task for task in tasks if set(task.suites) & set(contrast.suites)]
+    own = [task for task in tasks if set(task.asked) & set(contrast.suites)]
     if not own:  # of the paper's trials
         return
-    named, drawn = set(contrast.detectors), {name for task in own for name in task.detectors}
+    named, drawn = set(contrast.detectors), {name for task in own for name in task.looks}
     if named and not named & drawn:
         message = (
             f"contrast {contrast.name!r} counts views of {' and '.join(sorted(named))} alone, and its suites are drawn "
@@ -323,7 +341,7 @@ def _check_drawn(contrast: ContrastSpec, tasks: list[TaskSpec]) -> None:
 
 def _check_learned(learning: LearningSpec, tasks: list[TaskSpec]) -> None:
     """Refuse a detector of learning with which no suite that is learned from is drawn."""
-    drawn = {name for task in tasks if set(task.suites) & set(learning.suites) for name in task.detectors}
+    drawn = {name for task in tasks if set(task.asked) & set(learning.suites) for name in task.looks}
     if learning.detector not in drawn:
         message = (
             f"learning is from views of {learning.detector!r}, and its suites are drawn with "
@@ -350,7 +368,7 @@ def _check_asked(item: ContrastSpec, tasks: list[TaskSpec]) -> None:
     """Refuse a contrast of a matcher that is not asked on its suites."""
     for task in tasks:
         for method in (item.first, item.second):
-            suite = next((name for name in task.suites if name in item.suites), None)
+            suite = next((name for name in task.asked if name in item.suites), None)
             matcher = method.split(" x ")[0]
             if suite is not None and task.matchers and matcher not in task.matchers:
                 message = f"contrast {item.name!r} names {matcher!r}, which is not asked on {suite!r}"

@@ -24,7 +24,7 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import FrameLabels, read_labels
-from sasgeo_bench.tasks.query import RENDERED, Query, Truth, base_of
+from sasgeo_bench.tasks.query import BY, RENDERED, Query, Truth, base_of
 from sasgeo_bench.tasks.split import HALVES, Split
 
 FOLDER: Final = "segmenters"  # below the root: what segmenters learned
@@ -91,7 +91,7 @@ def name_of(suite: str, segmenter: str) -> str:
     >>> name_of("aerial", "pixel_forest")
     'aerial+pixel_forest'
     """
-    return f"{suite}+{segmenter}"
+    return f"{suite}{BY}{segmenter}"
 
 
 def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None = None) -> tuple[Path, ...]:

@@ -29,6 +29,7 @@ Detector = Literal["published", "measured", "rendered", "shifted"]
 PUBLISHED: Final[Detector] = "published"  # the one that is meant where none is named
 RENDERED: Final[Detector] = "rendered"  # the one that is meant where a suite has pictures
 PICTURED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")
+BY: Final = "+"  # between a suite of pictures and the segmenter that made its evidence
 # Kinds of queries whose right score is known beforehand; the scorer knows them by these names.
 CONTROLS: Final = "controls"  # their suite
 NOISE_FREE: Final = "noise-free"

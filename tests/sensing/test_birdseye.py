@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import CameraError, ShapeError
@@ -48,6 +48,7 @@ def disc(east, north, radius=12.0):
     return lambda e, n: np.hypot(e - east, n - north) < radius
 
 
+@settings(max_examples=15)  # each unprojects a whole picture
 @given(yaw=st.floats(0, 359), tilt=st.floats(0, 50), bearing=st.floats(0, 359))
 def test_what_lies_on_the_ground_is_found_there(yaw, tilt, bearing):
     camera = camera_of(yaw_deg=yaw, tilt_deg=tilt, east_m=1000.0, north_m=2000.0)

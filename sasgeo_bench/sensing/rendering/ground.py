@@ -2,13 +2,14 @@
 """Paint open ground: country between the mapped things, yards around houses, green areas, fields, water."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.sensing.rendering.buildings import rectangles
 from sasgeo_bench.sensing.rendering.plan import WATER, Canvas, Cells, Mask, Shapes, blurred, burn_numbers, inside_m
 from sasgeo_bench.sensing.rendering.seasons import GROWTH
@@ -30,22 +31,25 @@ class Cover:
 
 
 def paint_ground(canvas: Canvas, numbers: Cells) -> Cover:
-    """Paint everything that lies flat and is neither road nor roof; `numbers` are those of the buildings, 0 elsewhere."""
+    """Paint what lies flat and is neither road nor roof; `numbers` are those of the buildings, 0 elsewhere."""
     canvas.built = blurred((numbers > 0).astype(np.float32), 28.0, canvas.grid)
     soil = _paint_country(canvas)
     yard, edge = _paint_yards(canvas, numbers, soil)
-    green = _paint_green(canvas)
-    orchard = _paint_fields(canvas)
+    green = np.concatenate([_paint_green(part) for part in canvas.parts()])
+    orchard = np.concatenate([_paint_fields(part) for part in canvas.parts()])
+    _roughen(canvas)
     _paint_water(canvas)
-    canvas.shade(np.ones(canvas.grid.shape, dtype=bool), _roughness(canvas))
     return Cover(green=green, orchard=orchard, yard=np.where(green >= 0, 0, yard), edge=edge & (green < 0) & ~orchard)
 
 
-def _roughness(canvas: Canvas) -> Field:
-    """Return brightness of the ground: grain, tufts and wide patches."""
+def _roughen(canvas: Canvas) -> None:
+    """Make the ground uneven: grain, tufts and wide patches."""
     seed, rough = canvas.plan.seed("ground"), canvas.plan.palette.unevenness
-    fine = 0.04 * grain(canvas.grid) + 0.05 * noise(canvas.grid, 0.8, seed) + 0.05 * noise(canvas.grid, 2.3, seed + 1)
-    return np.asarray(1 + rough * (fine + 0.05 * fractal(canvas.grid, 35.0, seed + 2)), dtype=np.float32)
+    for strip, grid in canvas.strips():
+        fine = 0.075 * grain(grid) + 0.08 * noise(grid, 0.7, seed) + 0.06 * noise(grid, 1.7, seed + 1)
+        tufts = -0.2 * np.clip(fractal(grid, 3.0, seed + 5) * (1 + noise(grid, 30.0, seed + 6)) - 0.3, 0, 0.7)
+        factor = 1 + rough * (fine + tufts + 0.07 * fractal(grid, 35.0, seed + 2))
+        canvas.colour[strip] = np.clip(canvas.colour[strip] * factor[..., None], 0, 255)
 
 
 def _grass(canvas: Canvas) -> tuple[Numbers, Numbers]:
@@ -57,45 +61,88 @@ def _grass(canvas: Canvas) -> tuple[Numbers, Numbers]:
 
 def _paint_country(canvas: Canvas) -> Field:
     """Paint grass, fresh and dry, with bare patches; return where soil shows, 0 to 1."""
-    grid, palette, seed = canvas.grid, canvas.plan.palette, canvas.plan.seed("country")
-    fresh, dry = _grass(canvas)
-    wide = fractal(grid, 60.0, seed, octaves=4)
-    near = fractal(grid, 7.0, seed + 10, octaves=4)
-    dryness = np.clip(0.45 + 0.7 * wide + 0.5 * near, 0, 1)[..., None]
-    ground = fresh.astype(np.float32) * (1 - dryness) + dry.astype(np.float32) * dryness
-    soil = np.clip((near + 0.6 * wide + 0.35 * canvas.built * 3 - 0.62 + 0.22 * palette.unevenness) * 2.2, 0, 1)
+    palette, seed = canvas.plan.palette, canvas.plan.seed("country")
+    fresh, dry = (colour.astype(np.float32) for colour in _grass(canvas))
     dark, light = (np.array(colour, dtype=np.float32) for colour in palette.soil)
-    part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)[..., None]
-    earth = dark * (1 - part) + light * part
-    ground += soil[..., None] * (earth - ground)
-    canvas.colour[...] = np.clip(ground, 0, 255).astype(np.uint8)
-    return np.asarray(soil, dtype=np.float32)
+    found = np.empty(canvas.grid.shape, dtype=np.float32)
+    for strip, grid in canvas.strips():
+        wide, near = fractal(grid, 60.0, seed, octaves=4), fractal(grid, 7.0, seed + 10, octaves=4)
+        dryness = np.clip(0.45 + 0.7 * wide + 0.5 * near, 0, 1)[..., None]
+        soil = near + 0.6 * wide + 1.05 * canvas.built[strip] - 0.62 + 0.22 * palette.unevenness
+        found[strip] = np.clip(soil * 2.2, 0, 1)
+        part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)[..., None]
+        ground = fresh + dryness * (dry - fresh)
+        ground += found[strip][..., None] * (dark + part * (light - dark) - ground)
+        _add_plots(canvas, grid, ground, found[strip])
+        canvas.colour[strip] = np.clip(ground, 0, 255)
+    return found
+
+
+def _add_plots(canvas: Canvas, grid: Grid, ground: Field, soil: Field) -> None:
+    """Change open ground plot by plot: what is on no map still belongs to somebody, who mows, sows or lets it lie."""
+    seed, palette = canvas.plan.seed("plots"), canvas.plan.palette
+    bend = 22 * noise(grid, 170.0, seed), 22 * noise(grid, 170.0, seed + 1)
+    turn = np.pi * draw(seed, np.array([0]))[0]
+    east, north = ground_m(grid)
+    east, north = east[None, :] + bend[0], north[:, None] + bend[1]
+    across, down = east * np.cos(turn) + north * np.sin(turn), north * np.cos(turn) - east * np.sin(turn)
+    plot = np.floor(across / 34).astype(np.int64), np.floor(down / 52).astype(np.int64)
+    luck, use = draw(seed + 2, *plot).astype(np.float32), draw(seed + 3, *plot)
+    tone = (1 + 0.28 * palette.patchwork * (luck - 0.5))[..., None]
+    ground *= tone
+    is_tilled = use < 0.22 * palette.patchwork
+    row_m = np.where(luck < 0.5, across, down) * 2 * np.pi / (1.2 + 0.8 * luck)
+    share = np.where(is_tilled, 0.45 + 0.25 * np.sin(row_m), 0)[..., None].astype(np.float32)
+    ground += share * (np.array(palette.soil[int(turn * 10) % 2], dtype=np.float32) - ground)
+    soil[is_tilled] = np.maximum(soil[is_tilled], 0.5)
 
 
 def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Mask]:
-    """Give each house the ground next to it; return whose ground each cell is (0 none) and where two grounds meet."""
+    """Give each house the ground next to it; return whose ground each cell is (0 none) and where two grounds meet.
+
+    Distances are those of every second cell, which is exact enough for a garden.
+    """
     grid, plan = canvas.grid, canvas.plan
-    outside = (numbers == 0).astype(np.uint8)
-    if outside.all():
+    if not numbers.any():
         return np.zeros(grid.shape, dtype=np.int32), np.zeros(grid.shape, dtype=bool)
-    away, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    away *= np.float32(grid.cell_size_m)
-    owners = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
-    owners[nearest[numbers > 0]] = numbers[numbers > 0]
-    ragged_m = _YARD_M * (0.75 + 0.25 * noise(grid, 9.0, plan.seed("ragged")))
-    yard = np.where((away < ragged_m) & (outside > 0), owners[nearest], 0).astype(np.int32)
+    away, owner, edge = _nearest_house(numbers[::2, ::2], 2 * grid.cell_size_m)
     keys = np.concatenate([[0], plan.of("building").key])
     style = np.searchsorted(np.cumsum(plan.palette.yards) / sum(plan.palette.yards), draw(plan.seed("yard"), keys))
-    _paint_yard_styles(canvas, yard, style, soil)
-    worn = np.clip(1.3 - away / (1.0 + 2.0 * plan.palette.unevenness), 0, 1) * np.clip(0.6 + soil, 0, 1)
-    canvas.tint((yard > 0) & (worn > 0.03), plan.palette.soil[1], np.asarray(worn * 0.7, dtype=np.float32))
-    terrace = (away < 3.4) & (yard > 0) & (draw(5, keys) < 0.3)[yard] & (noise(grid, 7.0, plan.seed("terrace")) > 0.05)
-    canvas.tint(terrace, plan.palette.paving, 0.85)
-    edge = np.zeros(grid.shape, dtype=bool)
-    for axis in (0, 1):
-        edge |= (owners[nearest] != np.roll(owners[nearest], 1, axis=axis)) & (yard > 0)
-    edge &= draw(plan.seed("fences"), np.arange(len(owners)))[nearest % len(owners)] < 2
-    return yard, edge & (away > 1.5)
+    reach_m = np.array([_YARD_M, _YARD_M, 6.0, _YARD_M, _YARD_M])  # paving ends near the house
+    has_terrace = draw(5, keys) < 0.3
+    yard = np.zeros(grid.shape, dtype=np.int32)
+    for (strip, part_grid), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        away_m, near = (_whole(values, strip, grid.cols) for values in (away, owner))
+        ragged_m = _YARD_M * (0.75 + 0.25 * noise(part_grid, 9.0, plan.seed("ragged")))
+        mine = np.where((away_m < ragged_m) & (numbers[strip] == 0), near, 0)
+        yard[strip] = mine
+        _paint_yard_styles(part, np.where(away_m < reach_m[style[mine]], mine, 0), style, soil[strip])
+        worn = np.clip(1.3 - away_m / (1.0 + 2.0 * plan.palette.unevenness), 0, 1) * np.clip(0.6 + soil[strip], 0, 1)
+        part.tint((mine > 0) & (worn > 0.03), plan.palette.soil[1], np.asarray(worn * 0.7, dtype=np.float32))
+        terrace = (away_m < 3.4) & has_terrace[mine] & (mine > 0)
+        part.tint(terrace & (noise(part_grid, 7.0, plan.seed("terrace")) > 0.05), plan.palette.paving, 0.85)
+    whole = np.concatenate([_whole(edge, strip, grid.cols) for strip, _ in canvas.strips()])
+    return yard, whole & (yard > 0)
+
+
+def _nearest_house(numbers: Cells, cell_size_m: float) -> tuple[Field, Cells, Mask]:
+    """Return distance to the nearest house, its number, and where two houses are equally near."""
+    outside = np.ascontiguousarray(numbers == 0).astype(np.uint8)
+    away, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    owners = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
+    owners[nearest[numbers > 0]] = numbers[numbers > 0]
+    owner = owners[nearest]
+    away_m = np.asarray(away, dtype=np.float32) * np.float32(cell_size_m)
+    edge = np.zeros(owner.shape, dtype=bool)
+    edge[1:] |= owner[1:] != owner[:-1]
+    edge[:, 1:] |= owner[:, 1:] != owner[:, :-1]
+    return away_m, owner, edge & (away_m > 1.5)
+
+
+def _whole(values: NDArray[Any], strip: slice, cols: int) -> NDArray[Any]:
+    """Return a strip of rows of a raster of which only every second cell is known."""
+    half = values[strip.start // 2 : (strip.stop + 1) // 2]
+    return np.repeat(np.repeat(half, 2, axis=0), 2, axis=1)[: strip.stop - strip.start, :cols]
 
 
 def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], soil: Field) -> None:
@@ -106,10 +153,10 @@ def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], so
     near = np.clip(0.5 + fractal(grid, 5.0, seed), 0, 1)
     lawn = fresh * 1.05 + 0.35 * bell(seed, yard[kind == 1].astype(np.int64))[:, None] * (dry - fresh)
     canvas.tint(kind == 1, lawn, 0.75)
-    canvas.tint(kind == 2, palette.soil[1], np.asarray(0.35 + 0.6 * near, dtype=np.float32))  # noqa: PLR2004
-    canvas.tint(kind == 3, palette.paving, np.asarray(0.6 + 0.35 * near, dtype=np.float32))  # noqa: PLR2004
+    canvas.tint(kind == 2, palette.soil[1], np.asarray(0.35 + 0.6 * near, dtype=np.float32))
+    canvas.tint(kind == 3, palette.paving, np.asarray(0.6 + 0.35 * near, dtype=np.float32))
     rows = np.sin(2 * np.pi * _stripe_m(canvas, yard) / 1.7) > 0.1
-    beds = (kind == 4) & (noise(grid, 11.0, seed + 5) > -0.1)  # noqa: PLR2004
+    beds = (kind == 4) & (noise(grid, 11.0, seed + 5) > -0.1)
     canvas.tint(beds & rows, np.array(fresh) * 0.85, 0.75)
     canvas.tint(beds & ~rows, palette.soil[0], np.asarray(0.4 + 0.3 * soil, dtype=np.float32))
 
@@ -117,11 +164,20 @@ def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], so
 def _stripe_m(canvas: Canvas, numbers: Cells) -> Field:
     """Return the distance across rows whose direction belongs to each number, metres, shape (rows, cols)."""
     grid = canvas.grid
-    turn = np.pi * draw(canvas.plan.seed("rows"), np.arange(int(numbers.max()) + 1))
+    turn = np.pi * draw(canvas.plan.seed("rows"), np.arange(int(numbers.max(initial=0)) + 1))
     cos, sin = (part.astype(np.float32)[numbers] for part in (np.cos(turn), np.sin(turn)))
-    across = (np.arange(grid.cols, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    down = (np.arange(grid.rows, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    return np.asarray(cos * across[None, :] + sin * down[:, None], dtype=np.float32)
+    east, north = ground_m(grid)
+    return np.asarray(cos * east[None, :] - sin * north[:, None], dtype=np.float32)
+
+
+def ground_m(grid: Grid) -> tuple[Field, Field]:
+    """Return eastings (cols,) and northings (rows,) of cell centres, metres.
+
+    They count from a corner that is fixed to the ground, so that windows agree, and near enough for float32.
+    """
+    east = (np.arange(grid.cols) + 0.5) * grid.cell_size_m + grid.west_m % 5000
+    north = grid.north_m % 5000 - (np.arange(grid.rows) + 0.5) * grid.cell_size_m
+    return east.astype(np.float32), north.astype(np.float32)
 
 
 def green_kinds(shapes: Shapes, seed: int) -> NDArray[np.int8]:
@@ -144,7 +200,9 @@ def _paint_green(canvas: Canvas) -> NDArray[np.int8]:
     found = np.full(canvas.grid.shape, -1, dtype=np.int8)
     if not len(shapes):
         return found
-    shapes = shapes.part(np.argsort(-shapely.area(shapes.geometry), kind="stable"))  # a pitch within a park
+    shapes = shapes.part(
+        np.argsort(-shapely.area(shapes.geometry), kind="stable").astype(np.int64)
+    )  # a pitch within a park
     numbers = burn_numbers(shapes.areas(), canvas.grid)
     kinds = np.concatenate([[-1], green_kinds(shapes, canvas.plan.seed("green"))]).astype(np.int8)
     found = kinds[numbers]
@@ -194,12 +252,7 @@ def _paint_fields(canvas: Canvas) -> Mask:
 def _field_rows_m(canvas: Canvas, shapes: Shapes, numbers: Cells) -> Field:
     """Return the distance across the rows of each field, which run along its longer side, metres."""
     axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[numbers]
-    grid = canvas.grid
-    east = (np.arange(grid.cols, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    north = -(np.arange(grid.rows, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    # From a corner that is fixed to the ground, so that windows agree.
-    east += np.float32(grid.west_m % 5000)
-    north += np.float32(grid.north_m % 5000)
+    east, north = ground_m(canvas.grid)
     return np.asarray(axis[..., 0] * north[:, None] - axis[..., 1] * east[None, :], dtype=np.float32)
 
 
@@ -212,12 +265,14 @@ def _paint_water(canvas: Canvas) -> None:
         water |= burn_numbers(shapes.areas(), grid) > 0
     if not water.any():
         return
-    depth_m = inside_m(water, grid)
-    bank_m = inside_m(~water, grid)
-    bank = (bank_m > 0) & (bank_m < 1.2 + 1.5 * noise(grid, 6.0, seed))
-    canvas.tint(bank, np.array(palette.soil[0]) * 0.8, 0.6)
+    depth_m, bank_m = inside_m(water, grid), inside_m(~water, grid)
     deep, shallow = (np.array(colour, dtype=np.float32) for colour in palette.water)
-    share = np.clip(np.exp(-depth_m / 4.0) + 0.25 * fractal(grid, 25.0, seed + 3), 0, 1)[water][:, None]
-    ripples = (1 + 0.04 * noise(grid, 1.6, seed + 7) + 0.03 * grain(grid, 5))[water][:, None]
-    canvas.tint(water, (deep * (1 - share) + shallow * share) * ripples)
-    canvas.kind[water] = WATER
+    for (strip, strip_grid), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        here = water[strip]
+        bank = ~here & (bank_m[strip] < 1.2 + 1.5 * noise(strip_grid, 6.0, seed))
+        part.tint(bank, np.array(palette.soil[0]) * 0.8, 0.6)
+        share = np.exp(-depth_m[strip] / 4.0) + 0.25 * fractal(strip_grid, 25.0, seed + 3)
+        share = np.clip(share, 0, 1)[here][:, None]
+        ripples = (1 + 0.04 * noise(strip_grid, 1.6, seed + 7) + 0.03 * grain(strip_grid, 5))[here][:, None]
+        part.tint(here, (deep * (1 - share) + shallow * share) * ripples)
+        part.kind[here] = WATER

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands where in one window of a region: shapes by class, each with a seed of its own, before any paint."""
 
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import cv2
@@ -23,9 +24,11 @@ if TYPE_CHECKING:
 Cells = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
+Raster = NDArray[np.integer] | NDArray[np.floating]
 
 # What a cell shows. A higher number hides a lower one.
 GROUND, ROAD, WATER, CAR, CROWN, WALL, ROOF = range(7)
+_STRIP_ROWS: Final = 256
 _KINDS: Final = {"way": 0, "relation": 1, SEA: 2}
 
 
@@ -47,7 +50,7 @@ class Shapes:
         """Return the number of features."""
         return len(self.geometry)
 
-    def part(self, chosen: Mask) -> "Shapes":
+    def part(self, chosen: Mask | NDArray[np.int64]) -> "Shapes":
         """Return the chosen features."""
         names = ("geometry", "width_m", "key", "level", "is_bridge", "is_sea")
         return Shapes(**{name: getattr(self, name)[chosen] for name in names})
@@ -94,7 +97,7 @@ class Canvas:
     height_m: Field
     kind: Picture
     owner: Cells
-    lamps: Field = field(default_factory=lambda: np.zeros((1, 1), dtype=np.float32))
+    lamps: Picture = field(default_factory=lambda: np.zeros((1, 1), dtype=np.uint8))
     built: Field = field(default_factory=lambda: np.zeros((1, 1), dtype=np.float32))
 
     @property
@@ -102,21 +105,47 @@ class Canvas:
         """Return the lattice."""
         return self.plan.grid
 
+    def strips(self) -> Iterator[tuple[slice, Grid]]:
+        """Yield strips of rows with their lattice: what is computed strip by strip needs little memory."""
+        for row in range(0, self.grid.rows, _STRIP_ROWS):
+            rows = min(_STRIP_ROWS, self.grid.rows - row)
+            yield slice(row, row + rows), self.grid.window(row, 0, rows, self.grid.cols)
+
+    def parts(self) -> Iterator["Canvas"]:
+        """Yield the canvas in strips of rows, each a canvas that paints into this one."""
+        for strip, grid in self.strips():
+            is_whole = self.built.shape == self.grid.shape
+            yield Canvas(
+                plan=replace(self.plan, grid=grid),
+                season=self.season,
+                colour=self.colour[strip],
+                height_m=self.height_m[strip],
+                kind=self.kind[strip],
+                owner=self.owner[strip],
+                built=self.built[strip] if is_whole else self.built,
+            )
+
     def tint(self, cells: Mask, colour: NDArray[np.floating] | Colour, share: Field | float = 1.0) -> None:
         """Mix a colour (one, or one for each chosen cell) into the chosen cells by a share (one, or a raster)."""
-        rows, cols = np.nonzero(cells)
-        if not len(rows):
-            return
-        old = self.colour[rows, cols].astype(np.float32)
-        part = share[rows, cols][:, None] if isinstance(share, np.ndarray) else np.float32(share)
-        new = old + part * (np.asarray(colour, dtype=np.float32) - old)
-        self.colour[rows, cols] = np.clip(new, 0, 255).astype(np.uint8)
+        colours, used = np.asarray(colour, dtype=np.float32), 0
+        for strip, _ in self.strips():
+            at = np.flatnonzero(cells[strip])
+            if not len(at):
+                continue
+            here = self.colour[strip].reshape(-1, 3)
+            old = here[at].astype(np.float32)
+            part = share[strip].ravel()[at][:, None] if isinstance(share, np.ndarray) else np.float32(share)
+            new = colours if colours.ndim == 1 else colours[used : used + len(at)]
+            old += part * (new - old)
+            here[at] = np.clip(old, 0, 255)
+            used += len(at)
 
     def shade(self, cells: Mask, factor: Field) -> None:
         """Multiply the colour of the chosen cells by a raster."""
-        rows, cols = np.nonzero(cells)
-        new = self.colour[rows, cols].astype(np.float32) * factor[rows, cols][:, None]
-        self.colour[rows, cols] = np.clip(new, 0, 255).astype(np.uint8)
+        for strip, _ in self.strips():
+            at = np.flatnonzero(cells[strip])
+            here = self.colour[strip].reshape(-1, 3)
+            here[at] = np.clip(here[at] * factor[strip].ravel()[at][:, None].astype(np.float32), 0, 255)
 
 
 def no_shapes() -> Shapes:
@@ -175,12 +204,12 @@ def blurred(values: Field, sigma_m: float, grid: Grid) -> Field:
     small = values
     if factor > 1:
         size = (max(1, grid.cols // factor), max(1, grid.rows // factor))
-        small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+        small = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
     sigma = sigma_m / grid.cell_size_m / factor
-    small = cv2.GaussianBlur(small, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    wide = cv2.GaussianBlur(small, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     if factor > 1:
-        small = cv2.resize(small, (grid.cols, grid.rows), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(small, dtype=np.float32)
+        wide = cv2.resize(wide, (grid.cols, grid.rows), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(wide, dtype=np.float32)
 
 
 def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Numbers:
@@ -190,7 +219,7 @@ def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Nu
     """
     found = [np.zeros((0, 4))]
     for part in shapely.get_parts(line):
-        path = shapely.get_exterior_ring(part) if shapely.get_type_id(part) == 3 else part  # noqa: PLR2004 - a polygon
+        path = shapely.get_exterior_ring(part) if shapely.get_type_id(part) == 3 else part
         at = np.arange(offset_m, shapely.length(path), spacing_m)
         if not len(at):
             continue
@@ -202,12 +231,13 @@ def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Nu
     return np.concatenate(found)
 
 
-def fill_boxes(
-    target: NDArray, boxes_m: Numbers, grid: Grid, values: NDArray
-) -> None:
+def fill_boxes(target: Raster, boxes_m: Numbers, grid: Grid, values: Raster) -> None:
     """Fill rotated rectangles, rows of (easting, northing, cos, sin, half length, half width), each with its value."""
-    for (east, north, cos, sin, half_long, half_wide), value in zip(boxes_m.tolist(), values.tolist(), strict=True):
-        ahead, left = np.array([cos, sin]) * half_long, np.array([-sin, cos]) * half_wide
-        corners = np.array([east, north]) + np.stack([ahead + left, ahead - left, -ahead - left, left - ahead])
-        uv = np.round((grid.to_uv(corners) - 0.5) * 8).astype(np.int32)
-        cv2.fillConvexPoly(target, uv, value, lineType=cv2.LINE_8, shift=3)
+    west, south, east, north = grid.bounds_m
+    near = (boxes_m[:, 0] > west) & (boxes_m[:, 0] < east) & (boxes_m[:, 1] > south) & (boxes_m[:, 1] < north)
+    boxes, kept = boxes_m[near], values[near].tolist()
+    ahead, left = boxes[:, 2:4] * boxes[:, 4:5], np.stack([-boxes[:, 3], boxes[:, 2]], axis=1) * boxes[:, 5:6]
+    corners = boxes[:, None, :2] + np.stack([ahead + left, ahead - left, -ahead - left, left - ahead], axis=1)
+    points = np.round((grid.to_uv(corners.reshape(-1, 2)) - 0.5) * 8).astype(np.int32).reshape(-1, 4, 2)
+    for box, value in zip(points, kept, strict=True):
+        cv2.fillConvexPoly(target, box, value, lineType=cv2.LINE_8, shift=3)

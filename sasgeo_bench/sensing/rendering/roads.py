@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from sasgeo_bench.sensing.rendering.plan import (
     ROAD,
     WALL,
+    WATER,
     Canvas,
     Cells,
     Mask,
+    Picture,
     Shapes,
     along,
     blurred,
@@ -67,24 +69,25 @@ def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:
     colour = np.where(is_paved[:, None], paved, np.array(palette.track) * tone[:, None])
     colour = np.vstack([colour[:1], colour])
     cover = _soft(mask, canvas, 0.35 if is_major else 0.3 + 0.5 * (1 - palette.paved_share), "edges")
-    reach = cover > 0.02
-    owner = _spread(numbers, reach)
-    canvas.tint(reach, colour[owner[reach]], cover)
+    _tint_each(canvas, numbers, colour, cover)
     canvas.kind[mask] = ROAD
     _wear(canvas, mask, np.concatenate([[True], is_paved])[numbers])
     lined = is_paved & (shapes.width_m >= _MARKED_M) & (plan.chance("lines", shapes.key) < palette.markings)
     _paint_markings(canvas, shapes.part(lined))
 
 
-def _spread(numbers: Cells, reach: Mask) -> Cells:
-    """Give the cells just beside a numbered area its number."""
-    grown = cv2.dilate(numbers.astype(np.float32), np.ones((5, 5), np.uint8)).astype(np.int32)
-    return np.where(numbers > 0, numbers, np.where(reach, grown, 0))
+def _tint_each(canvas: Canvas, numbers: Cells, colours: Numbers, cover: Field) -> None:
+    """Tint numbered areas and the cells just beside them, each in its colour, by how much of a cell they cover."""
+    grown = cv2.dilate(numbers.astype(np.uint16), np.ones((5, 5), np.uint8))
+    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        reach = cover[strip] > 0.02
+        number = np.where(numbers[strip] > 0, numbers[strip], grown[strip])[reach]
+        part.tint(reach, colours[number], cover[strip])
 
 
 def _paint_verges(canvas: Canvas, shapes: Shapes, mask: Mask) -> None:
     """Paint pavements in built-up quarters and worn strips elsewhere."""
-    beside = (burn_numbers(shapes.areas(2.2), canvas.grid) > 0) & ~mask
+    beside = (burn_numbers(shapes.areas(2.2), canvas.grid) > 0) & ~mask & (canvas.kind != WATER)
     is_town = canvas.built > 0.13 / max(canvas.plan.palette.paved_share, 0.1)
     canvas.tint(beside & is_town, canvas.plan.palette.paving, 0.8)
     worn = np.clip(0.35 + 0.6 * noise(canvas.grid, 3.0, canvas.plan.seed("verge")), 0, 0.8)
@@ -93,9 +96,15 @@ def _paint_verges(canvas: Canvas, shapes: Shapes, mask: Mask) -> None:
 
 def _wear(canvas: Canvas, mask: Mask, is_paved: Mask) -> None:
     """Make a road uneven: long stains, repaired patches, cracks, wheel tracks, grass in the middle of earth roads."""
+    edge_m = inside_m(mask, canvas.grid)
+    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        if mask[strip].any():
+            _wear_part(part, mask[strip], is_paved[strip], edge_m[strip])
+
+
+def _wear_part(canvas: Canvas, mask: Mask, is_paved: Mask, edge_m: Field) -> None:
     grid, seed, rough = canvas.grid, canvas.plan.seed("wear"), canvas.plan.palette.unevenness
-    edge_m = inside_m(mask, grid)
-    stains = 0.05 * fractal(grid, 9.0, seed) + 0.025 * grain(grid) + 0.03 * noise(grid, 1.0, seed + 4)
+    stains = 0.06 * fractal(grid, 9.0, seed) + 0.045 * grain(grid) + 0.045 * noise(grid, 1.0, seed + 4)
     patches = np.where(noise(grid, 5.0, seed + 5) > 0.72, -0.09, 0.0)
     cracks = np.where(np.abs(noise(grid, 6.0, seed + 6)) < 0.018, -0.12, 0.0)
     wheels = 0.035 * np.cos(2 * np.pi * edge_m / 1.75)
@@ -117,8 +126,8 @@ def _paint_markings(canvas: Canvas, shapes: Shapes) -> None:
                 edge = along(line, 2.0)
                 edge[:, :2] += side * (width_m / 2 - 0.35) * np.stack([-edge[:, 3], edge[:, 2]], axis=1)
                 fill_boxes(drawn, _boxes(edge, 1.05, 0.06), canvas.grid, np.full(len(edge), 190))
-    share = cv2.GaussianBlur(drawn, (0, 0), 0.6).astype(np.float32) / 255
-    share *= np.clip(0.85 + 0.6 * noise(canvas.grid, 5.0, canvas.plan.seed("paint")), 0.15, 1)
+    worn = np.clip(0.85 + 0.6 * noise(canvas.grid, 5.0, canvas.plan.seed("paint")), 0.15, 1)
+    share = np.asarray(cv2.GaussianBlur(drawn, (0, 0), 0.6) * worn / 255, dtype=np.float32)
     canvas.tint(share > 0.02, _WHITE, share)
 
 
@@ -134,13 +143,11 @@ def _paint_tracks(canvas: Canvas) -> None:
         return
     numbers = burn_numbers(shapes.areas(), canvas.grid)
     cover = _soft(numbers > 0, canvas, 0.7, "path edges")
-    reach = cover > 0.03
-    owner = _spread(numbers, reach)
     is_paved = plan.chance("path", shapes.key) < 0.55 * plan.palette.paved_share
     colour = np.where(is_paved[:, None], np.array(plan.palette.paving) * 0.92, np.array(plan.palette.track))
     colour = np.vstack([colour[:1], colour * (1 + 0.08 * bell(plan.seed("tone"), shapes.key))[:, None]])
     faint = np.clip(0.8 + 0.35 * noise(canvas.grid, 14.0, plan.seed("faint")), 0.35, 1)
-    canvas.tint(reach, colour[owner[reach]], cover * faint)
+    _tint_each(canvas, numbers, colour, np.asarray(cover * faint, dtype=np.float32))
     _wear(canvas, numbers > 0, np.zeros(canvas.grid.shape, dtype=bool))
     canvas.kind[numbers > 0] = ROAD
 
@@ -183,12 +190,12 @@ def _paint_parapets(canvas: Canvas) -> None:
     """Raise parapets along bridges; the deck itself lies on the ground plane."""
     for name in ("road_major", "road_minor", "path_track"):
         shapes = canvas.plan.of(name)
-        for line, width_m in zip(
-            shapes.geometry[shapes.is_bridge], shapes.width_m[shapes.is_bridge], strict=True
-        ):
+        for line, width_m in zip(shapes.geometry[shapes.is_bridge], shapes.width_m[shapes.is_bridge], strict=True):
             for side in (-1, 1):
                 at = along(line, 1.0, 0.5)
-                at[:, :2] += side * (np.nan_to_num(width_m, nan=5.0) / 2 + 0.2) * np.stack([-at[:, 3], at[:, 2]], axis=1)
+                at[:, :2] += (
+                    side * (np.nan_to_num(width_m, nan=5.0) / 2 + 0.2) * np.stack([-at[:, 3], at[:, 2]], axis=1)
+                )
                 _raise(canvas, _boxes(at, 0.55, 0.17), 1.0, (176, 172, 166))
 
 
@@ -213,8 +220,8 @@ def paint_barriers(canvas: Canvas, edge: Mask, yard: Cells) -> None:
     canvas.kind[walls] = WALL
 
 
-def _lamps(canvas: Canvas) -> Field:
-    """Return the light of lamps along roads in built-up quarters: 1 below a lamp, nothing 25 m away."""
+def _lamps(canvas: Canvas) -> Picture:
+    """Return the light of lamps along roads in built-up quarters: 210 below a lamp, nothing 25 m away."""
     lit = np.zeros(canvas.grid.shape, dtype=np.float32)
     for name in ("road_major", "road_minor"):
         for line in canvas.plan.of(name).geometry:
@@ -225,7 +232,7 @@ def _lamps(canvas: Canvas) -> Field:
             lit[cells[:, 0], cells[:, 1]] = canvas.built[cells[:, 0], cells[:, 1]] > 0.05
     sigma_m = 6.0
     spread = blurred(lit, sigma_m, canvas.grid) * np.float32(2 * np.pi * (sigma_m / canvas.grid.cell_size_m) ** 2)
-    return np.minimum(spread, np.float32(1.3))
+    return np.asarray(np.minimum(spread, 1.2) * 210, dtype=np.uint8)
 
 
 def street_points(canvas: Canvas, spacing_m: float, beside_m: float, names: tuple[str, ...]) -> NDArray[np.float64]:

@@ -27,8 +27,7 @@ def expose_sensor(light: Field, conditions: Conditions, dark: float, rng: np.ran
     """
     blurred = _blurred(light, conditions)
     blurred *= _vignette(*light.shape[:2])
-    tone = cv2.sqrt(np.maximum(blurred, 0, out=blurred))
-    tone = _curve(tone)
+    tone = _curve(np.sqrt(np.maximum(blurred, 0, out=blurred)))
     sigma = conditions.noise * (1 + 4 * dark)
     if sigma > 0:
         tone += _noise(tone.shape[:2], rng) * np.float32(255 * sigma)
@@ -38,11 +37,11 @@ def expose_sensor(light: Field, conditions: Conditions, dark: float, rng: np.ran
 
 def _blurred(light: Field, conditions: Conditions) -> Field:
     if conditions.blur_px > 0.2:
-        light = cv2.GaussianBlur(light, (0, 0), conditions.blur_px)
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), conditions.blur_px), dtype=np.float32)
     length = round(conditions.motion_px)
     if length > 1:  # the drone flies up the picture
         kernel = np.full((length, 1), 1 / length, dtype=np.float32)
-        light = cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+        light = np.asarray(cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REPLICATE), dtype=np.float32)
     return light
 
 
@@ -74,7 +73,10 @@ def _bank() -> Field:
 
 
 def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Field:
-    row, col = rng.integers(0, _BANK, 2)
+    if max(shape) <= _BANK:
+        row, col = (int(rng.integers(0, _BANK - count + 1)) for count in shape)
+        return _bank()[row : row + shape[0], col : col + shape[1]]
+    row, col = rng.integers(0, _BANK, 2).tolist()
     rows, cols = (row + np.arange(shape[0])) % _BANK, (col + np.arange(shape[1])) % _BANK
     return np.asarray(_bank()[rows[:, None], cols[None, :]])
 
@@ -84,4 +86,5 @@ def _stored(picture: Picture, quality: int) -> Picture:
     if not quality:
         return picture
     _, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    stored = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
+    return np.ascontiguousarray(stored[..., ::-1])

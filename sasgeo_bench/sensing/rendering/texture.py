@@ -5,6 +5,7 @@ import hashlib
 from functools import lru_cache
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -40,7 +41,7 @@ def draw(seed: int, *keys: NDArray[np.int64]) -> Numbers:
     >>> draw(7, np.arange(3)).round(3).tolist() == draw(7, np.arange(5))[:3].round(3).tolist()
     True
     """
-    state = np.uint64(seed)
+    state: NDArray[np.uint64] = np.asarray(seed, dtype=np.uint64)
     for key in keys:
         mixed = (np.asarray(key, dtype=np.int64).astype(np.uint64) ^ state) + _STEP
         mixed = (mixed ^ (mixed >> np.uint64(30))) * _MIX[0]
@@ -57,8 +58,15 @@ def bell(seed: int, *keys: NDArray[np.int64]) -> Numbers:
 def noise(grid: Grid, wavelength_m: float, seed: int) -> Field:
     """Return smooth noise in [-1, 1], shape (rows, cols), whose bumps are about a wavelength wide.
 
-    Values are drawn at the crossings of a lattice that is fixed to the ground, and joined by a smooth step.
+    Values are drawn at the crossings of a lattice that is fixed to the ground, and joined by a smooth step. Wide bumps
+    are made on coarser cells.
     """
+    factor = min(8, int(wavelength_m / grid.cell_size_m / 10))
+    if factor > 1:
+        coarse = noise(grid.coarsen(factor), wavelength_m, seed)
+        rows, cols = coarse.shape
+        wide = cv2.resize(coarse, (cols * factor, rows * factor), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(wide[: grid.rows, : grid.cols])
     west, _, _, north = grid.bounds_m
     across = (west + (np.arange(grid.cols) + 0.5) * grid.cell_size_m) / wavelength_m
     down = -(north - (np.arange(grid.rows) + 0.5) * grid.cell_size_m) / wavelength_m
@@ -66,11 +74,11 @@ def noise(grid: Grid, wavelength_m: float, seed: int) -> Field:
     cols = np.arange(first_col, int(np.floor(across[-1])) + 2)
     rows = np.arange(first_row, int(np.floor(down[-1])) + 2)
     values = (2 * draw(seed, rows[:, None], cols[None, :]) - 1).astype(np.float32)
-    wide = _joined(values.T, across - first_col).T
-    return _joined(np.ascontiguousarray(wide), down - first_row)
+    wide = _joined(values.T, np.asarray(across - first_col)).T
+    return _joined(np.ascontiguousarray(wide), np.asarray(down - first_row))
 
 
-def _joined(values: Field, at: Numbers) -> Field:
+def _joined(values: Field, at: NDArray[np.floating]) -> Field:
     """Interpolate along the first axis with a smooth step."""
     low = np.floor(at).astype(np.int64)
     part = (at - low).astype(np.float32)

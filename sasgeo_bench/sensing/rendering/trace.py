@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find what each pixel of a camera sees first: rays marched over a height raster, all at once."""
 
-import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -17,8 +17,12 @@ from sasgeo_bench.sensing.rendering.plan import Mask
 from sasgeo_bench.sensing.rendering.texture import Field
 
 _STRIDE: Final = 8  # pixels between the rays for which the highest thing is looked up
+_STRIP_PX: Final = 96  # a multiple of the stride
 _STEP_CELLS: Final = 0.9
 _LOW_M: Final = 0.05  # what is lower casts no ray off its way
+_SIDE_M: Final = 0.6  # higher above the point that a ray meets, a cell shows its flank there
+_CHUNK: Final = 32_768  # rays followed at a time, so that they stay in the cache
+_AT_ONCE: Final = 4  # steps
 _FLATTEST: Final = 0.035  # a ray that falls less than this per metre sees no ground
 
 
@@ -27,9 +31,9 @@ class Hits:
     """First surfaces that the pixels of a picture see, all of shape (H, W), float32.
 
     `col` and `row` are continuous cells of the scene (pixel-is-area), `z_m` the height there, `cells_px` how many cells
-    a pixel is wide on the ground, `fall` how steeply a ray falls (sine). `is_side` marks walls and the flanks of crowns;
-    `is_ground` is False above the horizon. `ahead` (2, H, W) is the direction of the ray in plan, cells (col, row) per
-    metre of fall.
+    a pixel is wide on the ground, `fall` how steeply a ray falls (sine). `is_side` marks walls and flanks of crowns;
+    `is_ground` is False above the horizon. `ahead` (2, H, W) is the direction of the ray in plan, cells (col, row)
+    per metre of fall.
     """
 
     col: Field
@@ -43,43 +47,40 @@ class Hits:
 
 
 class HeightPyramid:
-    """A height raster and, for each level, the highest cell in and around every block of 2 ** level cells."""
+    """A height raster and, for each level, the highest cell in and around every block of 2 ** level cells.
+
+    The raster is taken over, not copied; its border is made level ground.
+    """
 
     def __init__(self, height_m: Field) -> None:
-        self.height_m = height_m.copy()
-        self.height_m[[0, -1]] = 0
-        self.height_m[:, [0, -1]] = 0
-        self.levels: list[Field] = []
-        level = self.height_m
-        while max(level.shape) > 4:  # noqa: PLR2004 - blocks
+        height_m[[0, -1]] = 0
+        height_m[:, [0, -1]] = 0
+        self.height_m = height_m
+        level, levels = height_m, []
+        while max(level.shape) > 4 or not levels:
             level = _halved(level)
-            self.levels.append(cv2.dilate(level, np.ones((3, 3), np.uint8)))
-
-    @property
-    def highest_m(self) -> float:
-        """Return the height of the highest cell."""
-        return float(self.levels[-1].max()) if self.levels else float(self.height_m.max())
+            levels.append(np.asarray(cv2.dilate(level, np.ones((3, 3), np.uint8)), dtype=np.float32))
+        self._rows, self._cols = (np.array([1, *(part.shape[axis] for part in levels)], np.int32) for axis in (0, 1))
+        self._start = np.cumsum([0, 0, *(part.size for part in levels)], dtype=np.int32)
+        self._blocks = np.concatenate([part.ravel() for part in levels])
+        self.highest_m = float(levels[-1].max())
 
     def highest_within(self, col: Field, row: Field, radius: Field) -> Field:
-        """Return at least the highest cell within a radius (cells) of each point; 0 far outside."""
-        level = np.clip(np.ceil(np.log2(np.maximum(radius, 1))), 1, len(self.levels)).astype(np.int64)
-        found = np.full(col.shape, self.highest_m, dtype=np.float32)
-        for number, blocks in enumerate(self.levels, start=1):
-            chosen = (level == number) & (radius <= 2**number)
-            if chosen.any():
-                at_row, at_col = (np.floor(part[chosen] / 2**number).astype(np.int64) for part in (row, col))
-                rows, cols = blocks.shape
-                value = blocks[at_row.clip(0, rows - 1), at_col.clip(0, cols - 1)]
-                near = (at_row >= -1) & (at_row <= rows) & (at_col >= -1) & (at_col <= cols)
-                found[chosen] = np.where(near, value, 0)
-        return found
+        """Return at least the highest cell within a radius (cells) of each point; far outside, that of the edge."""
+        # The exponent of a number x in [1, inf) is the least n with x < 2 ** n.
+        level = np.minimum(np.frexp(np.maximum(radius, 1))[1], len(self._rows) - 1)
+        rows, cols = self._rows[level], self._cols[level]
+        at_row = np.minimum(np.maximum(row, 0).astype(np.int32) >> level, rows - 1)
+        at_col = np.minimum(np.maximum(col, 0).astype(np.int32) >> level, cols - 1)
+        found = self._blocks.take(self._start[level] + at_row * cols + at_col)
+        return np.where(radius <= np.float32(2.0) ** (len(self._rows) - 1), found, np.float32(self.highest_m))
 
 
 def _halved(values: Field) -> Field:
-    rows, cols = (-(-count // 2) * 2 for count in values.shape)
-    padded = np.zeros((rows, cols), dtype=np.float32)
-    padded[: values.shape[0], : values.shape[1]] = values
-    return np.asarray(padded.reshape(rows // 2, 2, cols // 2, 2).max(axis=(1, 3)))
+    if values.shape[0] % 2 or values.shape[1] % 2:
+        values = np.pad(values, [(0, count % 2) for count in values.shape])
+    rows = np.maximum(values[::2], values[1::2])
+    return np.maximum(rows[:, ::2], rows[:, 1::2])
 
 
 @lru_cache(maxsize=4)
@@ -92,16 +93,22 @@ def _slopes(lens: Intrinsics) -> NDArray[np.float32]:
     return slopes
 
 
-def trace(camera: Camera, grid: Grid, heights: HeightPyramid) -> Hits:
-    """Return what the pixels of a camera see of a height raster on a grid; the ground plane is at 0.
+def strips(camera: Camera) -> Iterator[slice]:
+    """Yield strips of a picture's rows: what is computed strip by strip stays in the cache of a core."""
+    for row in range(0, camera.intrinsics.height_px, _STRIP_PX):
+        yield slice(row, min(row + _STRIP_PX, camera.intrinsics.height_px))
+
+
+def trace(camera: Camera, grid: Grid, heights: HeightPyramid, rows: slice) -> Hits:
+    """Return what some rows of pixels see of a height raster on a grid; the ground plane is at 0.
 
     Notes
     -----
     A point of a ray is linear in its height z. For blocks of 8 x 8 pixels a pyramid of maxima bounds the highest thing
-    that their rays can meet; from there rays go down in steps of about a cell (or of a pixel, where that is wider) until
+    that their rays can meet; from there rays go down in steps of about a cell (or of a pixel, if that is wider) until
     the raster is above them. Rays over open ground need no step at all.
     """
-    right, down = _slopes(camera.intrinsics)
+    right, down = _slopes(camera.intrinsics)[:, rows]
     matrix = camera.matrix.astype(np.float32)
     east, north, up = (right * matrix[0, axis] + down * matrix[1, axis] + matrix[2, axis] for axis in range(3))
     flat = np.hypot(east, north)
@@ -131,8 +138,10 @@ def trace(camera: Camera, grid: Grid, heights: HeightPyramid) -> Hits:
 
 def _pixel_cells(col: Field, row: Field) -> Field:
     """Return the width of a pixel on the ground plane in cells: the mean of its two sides."""
-    small = [cv2.resize(part, None, fx=1 / _STRIDE, fy=1 / _STRIDE, interpolation=cv2.INTER_NEAREST) for part in (col, row)]
-    if min(small[0].shape) < 2:  # noqa: PLR2004 - a picture too small for a difference
+    small = [
+        cv2.resize(part, None, fx=1 / _STRIDE, fy=1 / _STRIDE, interpolation=cv2.INTER_NEAREST) for part in (col, row)
+    ]
+    if min(small[0].shape) < 2:
         return np.ones_like(col)
     down, right = (np.hypot(np.gradient(small[0], axis=axis), np.gradient(small[1], axis=axis)) for axis in (0, 1))
     size = ((down + right) / 2 / _STRIDE).astype(np.float32)
@@ -163,36 +172,54 @@ def _march(hits: Hits, heights: HeightPyramid) -> Hits:
     """Follow the rays that may meet something down to it; fill in column, row, height and side of what they meet."""
     ceiling = np.where(hits.is_ground, _ceiling(hits, heights), 0)
     pixel = np.flatnonzero(ceiling > _LOW_M)
-    if not len(pixel):
-        return hits
     top = ceiling.ravel()[pixel]
-    ahead_col, ahead_row = hits.ahead[0].ravel()[pixel], hits.ahead[1].ravel()[pixel]
-    step = np.maximum(_STEP_CELLS, 0.75 * hits.cells_px.ravel()[pixel])
-    steps = np.ceil(np.hypot(ahead_col, ahead_row) * top / step) + 1
-    fall = top / steps
-    col = hits.col.ravel()[pixel] - ahead_col * top
-    row = hits.row.ravel()[pixel] - ahead_row * top
-    rays = np.stack([col, row, top, ahead_col * fall, ahead_row * fall, fall])
-    raster = heights.height_m
-    for _ in range(int(steps.max()) + 2):
-        found = _heights_at(raster, rays[0], rays[1])
-        met = found >= rays[2] - np.float32(1e-3)
-        done = pixel[met]
-        hits.col.ravel()[done], hits.row.ravel()[done] = rays[0, met], rays[1, met]
-        hits.z_m.ravel()[done] = np.maximum(rays[2, met], 0)
-        hits.is_side.ravel()[done] = found[met] - rays[2, met] > rays[5, met] + np.float32(0.6)
-        open_ = ~met
-        if not open_.any():
-            break
-        pixel, rays = pixel[open_], rays[:, open_]
-        rays[0] += rays[3]
-        rays[1] += rays[4]
-        rays[2] -= rays[5]
+    for part in (0.0, 0.5, 0.5):  # now for each ray alone: its whole way, then the upper half of it
+        col, row, ahead_col, ahead_row = _rays(hits, pixel)
+        middle, half = top * np.float32((1 + part) / 2), top * np.float32((1 - part) / 2)
+        radius = np.hypot(ahead_col, ahead_row) * half + 1
+        found = heights.highest_within(col - ahead_col * middle, row - ahead_row * middle, radius)
+        top = np.clip(found, top * np.float32(part), top)
+        if not part:
+            pixel, top = pixel[top > _LOW_M], top[top > _LOW_M]
+    for start in range(0, len(pixel), _CHUNK):
+        _follow(hits, heights.height_m, pixel[start : start + _CHUNK], top[start : start + _CHUNK])
     return hits
+
+
+def _rays(hits: Hits, pixel: NDArray[np.int64]) -> tuple[Field, Field, Field, Field]:
+    """Return where rays meet the ground plane, column and row, and how far they go per metre of fall."""
+    ahead_col, ahead_row = hits.ahead[0].ravel()[pixel], hits.ahead[1].ravel()[pixel]
+    return hits.col.ravel()[pixel], hits.row.ravel()[pixel], ahead_col, ahead_row
+
+
+def _follow(hits: Hits, raster: Field, pixel: NDArray[np.int64], top: Field) -> None:
+    """Follow some rays down from a height, a few steps at a time."""
+    ground_col, ground_row, ahead_col, ahead_row = _rays(hits, pixel)
+    size = np.maximum(_STEP_CELLS, 0.75 * hits.cells_px.ravel()[pixel])
+    fall = top / (np.ceil(np.hypot(ahead_col, ahead_row) * top / size) + 1)
+    rays = np.stack([ground_col, ground_row, ahead_col, ahead_row, top, fall])
+    ahead = np.arange(_AT_ONCE, dtype=np.float32)[:, None]
+    while len(pixel):
+        z_m = rays[4] - ahead * rays[5]
+        found = _heights_at(raster, rays[0] - rays[2] * z_m, rays[1] - rays[3] * z_m)
+        met = found >= z_m
+        has_met = np.logical_or.reduce(met, axis=0)
+        chosen = np.flatnonzero(has_met)
+        step = met[:, chosen].argmax(axis=0)
+        here_m = np.maximum(z_m[step, chosen], 0)  # the ground plane, where the last step went below it
+        at = pixel[chosen]
+        hits.col.ravel()[at] = rays[0, chosen] - rays[2, chosen] * here_m
+        hits.row.ravel()[at] = rays[1, chosen] - rays[3, chosen] * here_m
+        hits.z_m.ravel()[at] = here_m
+        hits.is_side.ravel()[at] = found[step, chosen] - here_m > rays[5, chosen] + np.float32(_SIDE_M)
+        left = np.flatnonzero(~has_met)
+        pixel, rays = pixel[left], rays[:, left]
+        rays[4] -= _AT_ONCE * rays[5]
 
 
 def _heights_at(raster: Field, col: Field, row: Field) -> Field:
     """Return the heights of the cells under points; 0 outside, where the border of the raster is level ground."""
     rows, cols = raster.shape
-    at = np.clip(row, 0, rows - 1).astype(np.int32) * np.int32(cols) + np.clip(col, 0, cols - 1).astype(np.int32)
-    return np.asarray(raster.ravel().take(at))
+    if col.min() < 0 or row.min() < 0 or col.max() >= cols or row.max() >= rows:
+        col, row = np.clip(col, 0, cols - 1), np.clip(row, 0, rows - 1)
+    return np.asarray(raster.ravel().take(row.astype(np.int32) * np.int32(cols) + col.astype(np.int32)))

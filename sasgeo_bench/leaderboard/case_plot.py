@@ -143,6 +143,8 @@ class CasePicture:
         Lines on what the answer and the integrity model say.
     attribution : str
         Of the map.
+    picture : ndarray of uint8, shape (H, W, 3), optional
+        The newest picture that the evidence was made of, RGB.
     """
 
     title: str
@@ -156,6 +158,7 @@ class CasePicture:
     disc: tuple[float, float, float] | None
     lines: Sequence[str]
     attribution: str
+    picture: NDArray[np.uint8] | None = None
 
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
@@ -166,8 +169,11 @@ def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
         left, right = figure.framed(about).subfigures(1, 2, width_ratios=(3 * _SIDE, _MAP))
         above, below = left.subfigures(2, 1, height_ratios=(_SIDE, _MAP - _SIDE))
         where = "map at the true place" if case.is_present else "map where it was taken"
-        panels = (("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer))
-        for chart, (name, evidence) in zip(above.subplots(1, 3), panels, strict=True):
+        panels = [("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer)]
+        charts = list(above.subplots(1, len(panels) + (case.picture is not None)))
+        if case.picture is not None:
+            _picture(charts.pop(0), case.picture)
+        for chart, (name, evidence) in zip(charts, panels, strict=True):
             _panel(chart, name, evidence)
         _draw_map(right.subplots(), case)
         modes, text = below.subplots(1, 2)
@@ -184,6 +190,12 @@ def _panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
         chart.text(0.5, 0.5, "none", ha="center", va="center", fontsize=8, color=GREY, transform=chart.transAxes)
     else:
         chart.imshow(paint(evidence), interpolation="antialiased")
+
+
+def _picture(chart: Axes, picture: NDArray[np.uint8]) -> None:
+    without_ticks(chart)
+    chart.set_title("picture", fontsize=7.5)
+    chart.imshow(picture, interpolation="antialiased")
 
 
 def _draw_map(chart: Axes, case: CasePicture) -> None:

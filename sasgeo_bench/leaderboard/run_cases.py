@@ -146,6 +146,7 @@ def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePict
         disc=_disc(query),
         lines=_lines(case),
         attribution=manifest.attribution,
+        picture=query.frames[-1].image().rgb if query.frames else None,
     )
 
 

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A ranking file: for each query the gallery items in the order of a method, by the ids of `items.parquet`."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import DatasetError
+from sasgeo_bench.files.parquet import open_table
+from sasgeo_bench.importers.items import Item
+
+COLUMNS: Final = ("query_id", "gallery_id", "rank")
+MOST_ROWS: Final = 40_000_000
+_MEND: Final = f"write a Parquet file with the columns {', '.join(COLUMNS)}, ranks from 1"
+
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ranking:
+    """Answers of a method; items are given by their position in the dataset.
+
+    Parameters
+    ----------
+    queries : array of int, shape (Q,)
+        Answered queries.
+    starts : array of int, shape (Q + 1,)
+        Where the answers to each query begin in `answers`, and where the last ones end.
+    answers : array of int, shape (R,)
+        Gallery items, best first.
+    """
+
+    queries: Ints
+    starts: Ints
+    answers: Ints
+
+    @property
+    def depth(self) -> int:
+        """Return the length of the shortest list."""
+        return int(np.diff(self.starts).min())
+
+    @property
+    def ranks(self) -> Ints:
+        """Return the rank of each answer, from 0, shape (R,)."""
+        return np.arange(len(self.answers)) - np.repeat(self.starts[:-1], np.diff(self.starts))
+
+    def first(self, count: int) -> Ints:
+        """Return the first answers to each query, shape (Q, count); `count` is at most the depth."""
+        return self.answers[self.starts[:-1, None] + np.arange(count)]
+
+
+def read_ranking(path: Path, items: Sequence[Item]) -> Ranking:
+    """Read a ranking of the items of a dataset.
+
+    Raise `StoreError` if the file cannot be read, `DatasetError` if it has other columns, an id that no item of that
+    role has, two answers on one rank, one answer twice, or ranks that do not run from 1 without a gap.
+    """
+    with open_table(path, mend=_MEND, most_rows=MOST_ROWS) as source:
+        lacking = [name for name in COLUMNS if name not in source.schema_arrow.names]
+        if lacking:
+            message = f"{path} has no column {lacking[0]!r}: {_MEND}"
+            raise DatasetError(message)
+        table = source.read(columns=list(COLUMNS))
+    if table.num_rows == 0:
+        message = f"{path} has no row: {_MEND}"
+        raise DatasetError(message)
+    rank_type = table.schema.field("rank").type
+    if not pa.types.is_integer(rank_type) or table["rank"].null_count:
+        message = f"{path}, rank: expected whole numbers without a gap, got {rank_type}: {_MEND}"
+        raise DatasetError(message)
+    queries, answers = (_positions(path, table, name, items) for name in COLUMNS[:2])
+    return _sorted(path, items, (queries, answers, table["rank"].to_numpy().astype(np.int64)))
+
+
+def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) -> Ints:
+    """Return the position of each id among the items that have its role."""
+    role = column.removesuffix("_id")
+    values = table[column]
+    if pa.types.is_dictionary(values.type):
+        values = values.cast(values.type.value_type)
+    if not (pa.types.is_string(values.type) or pa.types.is_large_string(values.type)):
+        message = f"{path}, {column}: expected text, got {values.type}: {_MEND}"
+        raise DatasetError(message)
+    known = [at for at, item in enumerate(items) if item.role == role]
+    found = pc.index_in(values, value_set=pa.array([items[at].item_id for at in known], type=values.type))
+    if found.null_count:
+        wrong = values.filter(pc.is_null(found))[0].as_py()
+        shown = "a missing value" if wrong is None else repr(wrong[:100])
+        message = f"{path}, {column}: {shown} is no {role} of the dataset: ids are those of items.parquet"
+        raise DatasetError(message)
+    return np.array(known, dtype=np.int64)[found.to_numpy()]
+
+
+def _sorted(path: Path, items: Sequence[Item], columns: tuple[Ints, Ints, Ints]) -> Ranking:
+    """Bring rows into the order of queries and ranks; refuse ties, repeats and gaps."""
+    order = np.lexsort((columns[2], columns[0]))
+    queries, answers, ranks = (column[order] for column in columns)
+    unique, begins = np.unique(queries, return_index=True)
+    ranking = Ranking(queries=unique, starts=np.append(begins, len(answers)), answers=answers)
+    wrong = np.flatnonzero(ranks != ranking.ranks + 1)
+    if len(wrong):
+        shown = items[queries[wrong[0]]].item_id
+        message = f"{path}: the ranks of query {shown!r} do not run from 1 without a gap or a tie: {_MEND}"
+        raise DatasetError(message)
+    pairs = np.sort(queries * len(items) + answers)
+    twice = pairs[1:][pairs[1:] == pairs[:-1]]
+    if len(twice):
+        query, answer = divmod(int(twice[0]), len(items))
+        message = f"{path} ranks {items[answer].item_id!r} twice for query {items[query].item_id!r}: keep one of them"
+        raise DatasetError(message)
+    return ranking

@@ -26,7 +26,7 @@ LAYOUT: Final = (
 _TEST: Final = ("query_drone", "query_satellite", "gallery_drone", "gallery_satellite")
 _DIGITS: Final = 6
 _LINE: Final = re.compile(r"(?P<path>\S.*?)\s+E(?P<longitude>\S+)\s+N(?P<latitude>\S+)(\s+(?P<height>[^\sEN]\S*))?\s*")
-_HEIGHT: Final = re.compile(r"H(\d{1,4})(_old)?\.\w+")
+_HEIGHT: Final = re.compile(r"H([0-9]{1,4})(_old)?\.\w+")
 _SAME_M: Final = 1.0
 
 

@@ -52,7 +52,7 @@ class Ranking:
 
     def first(self, count: int) -> Ints:
         """Return the first answers to each query, shape (Q, count); `count` is at most the depth."""
-        return self.answers[self.starts[:-1, None] + np.arange(count)]
+        return np.asarray(self.answers[self.starts[:-1, None] + np.arange(count)])
 
 
 def read_ranking(path: Path, items: Sequence[Item]) -> Ranking:
@@ -94,7 +94,7 @@ def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) 
         shown = "a missing value" if wrong is None else repr(wrong[:100])
         message = f"{path}, {column}: {shown} is no {role} of the dataset: ids are those of items.parquet"
         raise DatasetError(message)
-    return np.array(known, dtype=np.int64)[found.to_numpy()]
+    return np.asarray(np.array(known, dtype=np.int64)[found.to_numpy()])
 
 
 def _sorted(path: Path, items: Sequence[Item], columns: tuple[Ints, Ints, Ints]) -> Ranking:

@@ -15,7 +15,7 @@ from sasgeo_bench.importers.items import MOST_ITEMS, Item, Role
 IMAGES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 _MOST_BYTES: Final = 100_000_000  # of a table
 _MOST_QUOTED: Final = 60  # characters
-_NUMBER: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?")
+_NUMBER: Final = re.compile(r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?")
 
 
 class FolderReader:

@@ -88,8 +88,8 @@ def float32_degrees(first: Floats, second: Floats) -> NDArray[np.float32]:
 def geodesic_m(first: Floats, second: Floats) -> Floats:
     """Distance on the ellipsoid of WGS 84 between longitudes and latitudes, shape (..., 2), in metres."""
     first, second = np.broadcast_arrays(first, second)
-    parts = [np.array(points[..., axis]) for points in (first, second) for axis in (0, 1)]
-    return np.asarray(pyproj.Geod(ellps="WGS84").inv(*parts)[2])
+    (lon_deg, lat_deg), (to_lon_deg, to_lat_deg) = (np.array(np.moveaxis(at, -1, 0)) for at in (first, second))
+    return np.asarray(pyproj.Geod(ellps="WGS84").inv(lon_deg, lat_deg, to_lon_deg, to_lat_deg)[2])
 
 
 def haversine_m(first: Floats, second: Floats) -> Floats:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """SUES-200: four flying heights, which are reported one by one; as split by its authors' script, or raw."""
 
+import re
 from typing import Final
 
 from sasgeo_bench.errors import DatasetError
@@ -74,7 +75,7 @@ def _raw_items(reader: FolderReader) -> list[Item]:
 
 
 def _raw_drone_items(reader: FolderReader, relative: str, *, label: str, height: str) -> list[Item]:
-    if not (label.isdecimal() and len(label) == _DIGITS and height in _HEIGHTS):
+    if not (re.fullmatch(rf"[0-9]{{{_DIGITS}}}", label) and height in _HEIGHTS):
         message = f"{relative} is no <4 digits>/<height> with a height of {', '.join(_HEIGHTS)}: remove it or rename it"
         raise DatasetError(message)
     about = {"role": "unsplit", "view": "drone", "label": label, "group": height, "height_m": float(height)}

@@ -26,9 +26,9 @@ _SPACED: Final = "satellite_ coordinates_range.csv"  # the name in some copies o
 _MAP_COLUMNS: Final = ("mapname", "LT_lat_map", "LT_lon_map", "RB_lat_map", "RB_lon_map")
 _FRAME_COLUMNS: Final = ("filename", "lat", "lon", "height")
 _ANGLES: Final = {"heading_deg": "Phi1", "pitch_deg": "Omega", "roll_deg": "Kappa"}
-_MAP: Final = re.compile(r"satellite((\d\d)(_\d\d-\d\d)?)\.tif")
+_MAP: Final = re.compile(r"satellite(([0-9]{2})(_[0-9]{2}-[0-9]{2})?)\.tif")
 _FIRST: Final = "01"
-_FLIGHT: Final = re.compile(r"\d\d")
+_FLIGHT: Final = re.compile(r"[0-9]{2}")
 
 
 def read_visloc(reader: FolderReader) -> Dataset:

@@ -24,8 +24,8 @@ def import_dataset_command(
     *,
     kind: Kind,
     ranking: Annotated[
-        Path | None,
-        typer.Option(help="Parquet file of query_id, gallery_id and rank (from 1): compute the metrics of the set"),
+        list[Path] | None,
+        typer.Option(help="Parquet file of query_id, gallery_id, rank (from 1) to score; may be repeated"),
     ] = None,
     out: Out = Path("out"),
 ) -> None:
@@ -37,10 +37,10 @@ def import_dataset_command(
 
     dataset = _read(folder, kind)
     target = import_folder(out, dataset, source=folder)
-    reports = () if ranking is None else score_ranking(dataset, read_ranking(ranking, dataset.items))
+    reports = score_ranking(dataset, read_ranking(ranking, dataset.items)) if ranking else ()
     say(write_items(target, dataset))
-    if ranking is not None:
-        say(write_reports(target, dataset, reports, ranking_sha256=sha256_of(ranking)))
+    if ranking:
+        say(write_reports(target, dataset, reports, rankings=[sha256_of(path) for path in ranking]))
     for report in reports:
         _show(report)
 

@@ -16,7 +16,7 @@ from sasgeo_bench.files.parquet import open_table
 from sasgeo_bench.importers.items import Item
 
 COLUMNS: Final = ("query_id", "gallery_id", "rank")
-MOST_ROWS: Final = 40_000_000
+MOST_ROWS: Final = 33_000_000  # of one file
 _MEND: Final = f"write a Parquet file with the columns {', '.join(COLUMNS)}, ranks from 1"
 
 Ints = NDArray[np.int64]
@@ -55,13 +55,20 @@ class Ranking:
         return np.asarray(self.answers[self.starts[:-1, None] + np.arange(count)])
 
 
-def read_ranking(path: Path, items: Sequence[Item]) -> Ranking:
-    """Read a ranking of the items of a dataset.
+def read_ranking(paths: Sequence[Path], items: Sequence[Item]) -> Ranking:
+    """Read a ranking of the items of a dataset, from one file or several.
 
-    Raise `StoreError` if the file cannot be read, `DatasetError` if it has other columns, an id that no item of that
+    Raise `StoreError` if a file cannot be read, `DatasetError` if it has other columns, an id that no item of that
     role has, two answers on one rank, one answer twice, or ranks that do not run from 1 without a gap.
     """
-    with open_table(path, mend=_MEND, most_rows=MOST_ROWS) as source:
+    columns = [_read_columns(path, items) for path in paths]
+    queries, answers, ranks = (np.concatenate(parts) for parts in zip(*columns, strict=True))
+    return _sorted(paths[0], items, (queries, answers, ranks))
+
+
+def _read_columns(path: Path, items: Sequence[Item]) -> tuple[Ints, Ints, Ints]:
+    """Read queries and answers, by position in the dataset, and ranks."""
+    with open_table(path, mend=_MEND, most_rows=MOST_ROWS, read_dictionary=list(COLUMNS[:2])) as source:
         lacking = [name for name in COLUMNS if name not in source.schema_arrow.names]
         if lacking:
             message = f"{path} has no column {lacking[0]!r}: {_MEND}"
@@ -75,20 +82,22 @@ def read_ranking(path: Path, items: Sequence[Item]) -> Ranking:
         message = f"{path}, rank: expected whole numbers without a gap, got {rank_type}: {_MEND}"
         raise DatasetError(message)
     queries, answers = (_positions(path, table, name, items) for name in COLUMNS[:2])
-    return _sorted(path, items, (queries, answers, table["rank"].to_numpy().astype(np.int64)))
+    return queries, answers, table["rank"].to_numpy().astype(np.int64)
 
 
 def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) -> Ints:
     """Return the position of each id among the items that have its role."""
     role = column.removesuffix("_id")
-    values = table[column]
-    if pa.types.is_dictionary(values.type):
-        values = values.cast(values.type.value_type)
-    if not (pa.types.is_string(values.type) or pa.types.is_large_string(values.type)):
-        message = f"{path}, {column}: expected text, got {values.type}: {_MEND}"
+    values = table[column].combine_chunks()
+    is_encoded = pa.types.is_dictionary(values.type)
+    text_type = values.type.value_type if is_encoded else values.type
+    if not (pa.types.is_string(text_type) or pa.types.is_large_string(text_type)):
+        message = f"{path}, {column}: expected text, got {text_type}: {_MEND}"
         raise DatasetError(message)
+    values = values if is_encoded else values.dictionary_encode()
     known = [at for at, item in enumerate(items) if item.role == role]
-    found = pc.index_in(values, value_set=pa.array([items[at].item_id for at in known], type=values.type))
+    names = pa.array([items[at].item_id for at in known], type=text_type)
+    found = pc.index_in(values.dictionary, value_set=names).take(values.indices)
     if found.null_count:
         wrong = values.filter(pc.is_null(found))[0].as_py()
         shown = "a missing value" if wrong is None else repr(wrong[:100])

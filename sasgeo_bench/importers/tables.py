@@ -137,14 +137,14 @@ def write_items(folder: Path, dataset: Dataset) -> Path:
     return path
 
 
-def write_reports(folder: Path, dataset: Dataset, reports: Sequence[Report], *, ranking_sha256: str) -> Path:
-    """Write `metrics.parquet`, replaced whole; raise `StoreError` if it cannot be written."""
+def write_reports(folder: Path, dataset: Dataset, reports: Sequence[Report], *, rankings: Sequence[str]) -> Path:
+    """Write `metrics.parquet`, replaced whole, with the SHA-256 of each ranking; raise `StoreError` if that fails."""
     path = folder / METRICS
     attrs = {
         "kind": dataset.card.kind,
         "source": dataset.card.source,
         "attribution": dataset.card.attribution,
-        "ranking_sha256": ranking_sha256,
+        "rankings_sha256": list(rankings),
     }
     with fresh_file(path, mend=_MEND) as scratch:
         write_frame(reports_frame(reports), scratch, attrs=attrs)

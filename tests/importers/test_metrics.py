@@ -40,7 +40,7 @@ def scores(tmp_path):
     """Metrics of the only report of a ranking, by name."""
 
     def score(dataset, answers):
-        ranking = read_ranking(writers.write_ranking(tmp_path / "ranking.parquet", answers), dataset.items)
+        ranking = read_ranking([writers.write_ranking(tmp_path / "ranking.parquet", answers)], dataset.items)
         (report,) = score_ranking(dataset, ranking)
         return {each.metric: each for each in report.scores}
 
@@ -214,7 +214,7 @@ def test_mean_distances_are_of_all_the_first_answers(tmp_path, scores):
 def test_a_query_without_an_answer_is_a_miss(tmp_path):
     dataset = dataset_of("university-1652", {"q1": "a", "q2": "b"}, {"g1": "a", "g2": "b"})
     path = writers.write_ranking(tmp_path / "r.parquet", {"q1": ["g1", "g2"]})
-    (report,) = score_ranking(dataset, read_ranking(path, dataset.items))
+    (report,) = score_ranking(dataset, read_ranking((path,), dataset.items))
     assert (report.queries, report.answered, report.without_positive, report.gallery) == (2, 1, 0, 2)
     assert {score.metric: both(score) for score in report.scores}["recall_1"] == (0.5, 0.5)
 
@@ -246,7 +246,7 @@ def test_each_height_of_sues_is_reported_by_itself(tmp_path):
         answers[f"Testing/{height}/query_drone/0001/0.jpg"] = gallery
         answers[f"Testing/{height}/query_drone/0002/0.jpg"] = gallery[::-1]
     path = writers.write_ranking(tmp_path / "r.parquet", answers)
-    reports = score_ranking(dataset, read_ranking(path, dataset.items))
+    reports = score_ranking(dataset, read_ranking((path,), dataset.items))
     assert [(report.title, report.queries, report.gallery) for report in reports] == [
         ("drone to satellite, 150 m", 2, 2),
         ("drone to satellite, 300 m", 2, 2),
@@ -259,7 +259,7 @@ def test_a_height_of_sues_is_not_answered_from_another(tmp_path):
     answers = [f"Testing/{height}/gallery_satellite/0001/0.jpg" for height in ("150", "300")]
     path = writers.write_ranking(tmp_path / "r.parquet", {"Testing/150/query_drone/0001/0.jpg": answers})
     with pytest.raises(DatasetError, match="several views and heights"):
-        score_ranking(dataset, read_ranking(path, dataset.items))
+        score_ranking(dataset, read_ranking((path,), dataset.items))
 
 
 def test_both_directions_are_reported_one_by_one(tmp_path):
@@ -269,7 +269,7 @@ def test_both_directions_are_reported_one_by_one(tmp_path):
         "test/query_satellite/0001/0001.jpg": ["test/gallery_drone/0000/0000.jpg"],
     }
     path = writers.write_ranking(tmp_path / "r.parquet", answers)
-    reports = {each.title: each for each in score_ranking(dataset, read_ranking(path, dataset.items))}
+    reports = {each.title: each for each in score_ranking(dataset, read_ranking((path,), dataset.items))}
     assert {title: (each.queries, each.gallery) for title, each in reports.items()} == {
         "drone to satellite": (3, 3),
         "satellite to drone": (2, 3),
@@ -279,7 +279,7 @@ def test_both_directions_are_reported_one_by_one(tmp_path):
 def test_flights_without_an_answer_are_not_asked(tmp_path):
     dataset = read_dataset(writers.write_visloc(tmp_path / "set"), "uav-visloc")
     path = writers.write_ranking(tmp_path / "r.parquet", {"07/drone/07_0001.JPG": ["07_1_000_000.png"]})
-    (report,) = score_ranking(dataset, read_ranking(path, dataset.items))
+    (report,) = score_ranking(dataset, read_ranking((path,), dataset.items))
     assert (report.queries, report.gallery, report.without_positive) == (1, 10, 0)
 
 
@@ -292,7 +292,7 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
     for at, some in enumerate((rows, [rows[each] for each in order])):
         names = dict(zip(("query_id", "gallery_id", "rank"), zip(*some, strict=True), strict=True))
         pq.write_table(pa.table(names), folder / f"{at}.parquet")
-        found.append(score_ranking(dataset, read_ranking(folder / f"{at}.parquet", dataset.items)))
+        found.append(score_ranking(dataset, read_ranking([folder / f"{at}.parquet"], dataset.items)))
     assert found[0] == found[1]
 
 
@@ -330,7 +330,7 @@ def test_a_wrong_ranking_is_refused_in_one_line(columns, told, tmp_path):
     dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a", "g2": "b"})
     pq.write_table(pa.table(columns), tmp_path / "r.parquet")
     with pytest.raises(DatasetError) as fault:
-        read_ranking(tmp_path / "r.parquet", dataset.items)
+        read_ranking([tmp_path / "r.parquet"], dataset.items)
     assert told in str(fault.value)
     assert str(fault.value).isprintable()
 
@@ -340,7 +340,7 @@ def test_what_is_no_table_is_refused(content, tmp_path):
     if content is not None:
         (tmp_path / "r.parquet").write_bytes(content)
     with pytest.raises(StoreError, match="ranks from 1"):
-        read_ranking(tmp_path / "r.parquet", ())
+        read_ranking([tmp_path / "r.parquet"], ())
 
 
 def test_names_may_be_stored_as_a_dictionary(tmp_path):
@@ -348,7 +348,7 @@ def test_names_may_be_stored_as_a_dictionary(tmp_path):
     table = pa.table({"query_id": ["q"], "gallery_id": ["g1"], "rank": pa.array([1], pa.int32())})
     table = table.set_column(0, "query_id", table["query_id"].dictionary_encode())
     pq.write_table(table, tmp_path / "r.parquet")
-    assert read_ranking(tmp_path / "r.parquet", dataset.items).queries.tolist() == [0]
+    assert read_ranking([tmp_path / "r.parquet"], dataset.items).queries.tolist() == [0]
 
 
 def test_a_card_says_its_terms():
@@ -356,3 +356,14 @@ def test_a_card_says_its_terms():
         card: DatasetCard = importer.card
         assert card.source.startswith("https://github.com/")
         assert all(text.isprintable() and text for text in (card.title, card.licence, card.attribution))
+
+
+def test_a_ranking_may_lie_in_several_files(tmp_path):
+    dataset = dataset_of("university-1652", {"q1": "a", "q2": "b"}, {"g1": "a", "g2": "b"})
+    answers = {"q1": ["g1", "g2"], "q2": ["g2", "g1"]}
+    one = writers.write_ranking(tmp_path / "one.parquet", answers)
+    parts = [writers.write_ranking(tmp_path / f"{query}.parquet", {query: answers[query]}) for query in ("q2", "q1")]
+    whole, joined = (score_ranking(dataset, read_ranking(paths, dataset.items)) for paths in ([one], parts))
+    assert whole == joined
+    with pytest.raises(DatasetError, match="a gap or a tie"):
+        read_ranking([*parts, parts[0]], dataset.items)

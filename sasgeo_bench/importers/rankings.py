@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import DatasetError
-from sasgeo_bench.files.parquet import open_table
+from sasgeo_bench.files.parquet import open_table, read_schema
 from sasgeo_bench.importers.items import Item
 
 COLUMNS: Final = ("query_id", "gallery_id", "rank")
@@ -68,35 +68,41 @@ def read_ranking(paths: Sequence[Path], items: Sequence[Item]) -> Ranking:
 
 def _read_columns(path: Path, items: Sequence[Item]) -> tuple[Ints, Ints, Ints]:
     """Read queries and answers, by position in the dataset, and ranks."""
+    _check_columns(path, read_schema(path, mend=_MEND))
     with open_table(path, mend=_MEND, most_rows=MOST_ROWS, read_dictionary=list(COLUMNS[:2])) as source:
-        lacking = [name for name in COLUMNS if name not in source.schema_arrow.names]
-        if lacking:
-            message = f"{path} has no column {lacking[0]!r}: {_MEND}"
-            raise DatasetError(message)
         table = source.read(columns=list(COLUMNS))
     if table.num_rows == 0:
         message = f"{path} has no row: {_MEND}"
         raise DatasetError(message)
-    rank_type = table.schema.field("rank").type
-    if not pa.types.is_integer(rank_type) or table["rank"].null_count:
-        message = f"{path}, rank: expected whole numbers without a gap, got {rank_type}: {_MEND}"
+    if table["rank"].null_count:
+        message = f"{path}, rank: expected whole numbers, found a missing value: {_MEND}"
         raise DatasetError(message)
     queries, answers = (_positions(path, table, name, items) for name in COLUMNS[:2])
     return queries, answers, table["rank"].to_numpy().astype(np.int64)
+
+
+def _check_columns(path: Path, schema: pa.Schema) -> None:
+    """Refuse a table without the columns of a ranking, or with other types."""
+    for name in COLUMNS:
+        if schema.names.count(name) != 1:
+            message = f"{path} has no column {name!r}, or more than one: {_MEND}"
+            raise DatasetError(message)
+        kind = schema.field(name).type
+        kind = kind.value_type if pa.types.is_dictionary(kind) and name != "rank" else kind
+        is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
+        if not (pa.types.is_integer(kind) if name == "rank" else is_text):
+            expected = "whole numbers" if name == "rank" else "text"
+            message = f"{path}, {name}: expected {expected}, got {kind}: {_MEND}"
+            raise DatasetError(message)
 
 
 def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) -> Ints:
     """Return the position of each id among the items that have its role."""
     role = column.removesuffix("_id")
     values = table[column].combine_chunks()
-    is_encoded = pa.types.is_dictionary(values.type)
-    text_type = values.type.value_type if is_encoded else values.type
-    if not (pa.types.is_string(text_type) or pa.types.is_large_string(text_type)):
-        message = f"{path}, {column}: expected text, got {text_type}: {_MEND}"
-        raise DatasetError(message)
-    values = values if is_encoded else values.dictionary_encode()
+    values = values if pa.types.is_dictionary(values.type) else values.dictionary_encode()
     known = [at for at, item in enumerate(items) if item.role == role]
-    names = pa.array([items[at].item_id for at in known], type=text_type)
+    names = pa.array([items[at].item_id for at in known], type=values.type.value_type)
     found = pc.index_in(values.dictionary, value_set=names).take(values.indices)
     if found.null_count:
         wrong = values.filter(pc.is_null(found))[0].as_py()
@@ -108,10 +114,12 @@ def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) 
 
 def _sorted(path: Path, items: Sequence[Item], columns: tuple[Ints, Ints, Ints]) -> Ranking:
     """Bring rows into the order of queries and ranks; refuse ties, repeats and gaps."""
-    order = np.lexsort((columns[2], columns[0]))
-    queries, answers, ranks = (column[order] for column in columns)
-    unique, begins = np.unique(queries, return_index=True)
-    ranking = Ranking(queries=unique, starts=np.append(begins, len(answers)), answers=answers)
+    queries, answers, ranks = columns
+    if ranks.min() >= 1 and ranks.max() <= len(items):
+        order = np.argsort(queries * (len(items) + 1) + ranks, kind="stable")  # linear where rows are in order already
+        queries, answers, ranks = queries[order], answers[order], ranks[order]
+    begins = np.flatnonzero(np.diff(queries, prepend=-1))
+    ranking = Ranking(queries=queries[begins], starts=np.append(begins, len(answers)), answers=answers)
     wrong = np.flatnonzero(ranks != ranking.ranks + 1)
     if len(wrong):
         shown = items[queries[wrong[0]]].item_id

@@ -303,6 +303,8 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
     ("columns", "told"),
     [
         ({"query_id": ["q"], "gallery_id": ["g1"]}, "has no column 'rank'"),
+        ({"gallery_id": ["g1"], "rank": [1]}, "has no column 'query_id'"),
+        (pa.table([["q"], ["q"], ["g1"], [1]], ["query_id", "query_id", "gallery_id", "rank"]), "or more than one"),
         ({"query_id": ["q"], "gallery_id": ["g1"], "rank": [1.5]}, "expected whole numbers"),
         ({"query_id": ["q"], "gallery_id": ["g1"], "rank": pa.array([None], pa.int64())}, "expected whole numbers"),
         ({"query_id": [7], "gallery_id": ["g1"], "rank": [1]}, "query_id: expected text, got int64"),
@@ -311,6 +313,8 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
         ({"query_id": ["q"], "gallery_id": [None], "rank": [1]}, "gallery_id: expected text, got null"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", None], "rank": [1, 2]}, "a missing value is no gallery"),
         ({"query_id": ["q"], "gallery_id": ["g1"], "rank": [0]}, "do not run from 1"),
+        ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 2**62]}, "do not run from 1"),
+        ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [-1, 1]}, "do not run from 1"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 1]}, "without a gap or a tie"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 3]}, "without a gap or a tie"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g1"], "rank": [1, 2]}, "ranks 'g1' twice for query 'q'"),
@@ -328,7 +332,7 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
 )
 def test_a_wrong_ranking_is_refused_in_one_line(columns, told, tmp_path):
     dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a", "g2": "b"})
-    pq.write_table(pa.table(columns), tmp_path / "r.parquet")
+    pq.write_table(pa.table(columns) if isinstance(columns, dict) else columns, tmp_path / "r.parquet")
     with pytest.raises(DatasetError) as fault:
         read_ranking([tmp_path / "r.parquet"], dataset.items)
     assert told in str(fault.value)

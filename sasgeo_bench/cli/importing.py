@@ -86,7 +86,7 @@ def _show(report: Report) -> None:
     """Print the metrics of a report."""
     queries = f"{counted(report.queries, 'query', 'queries')}, {report.answered} answered"
     say(f"{report.title}: {queries}, {report.without_positive} without a positive; gallery of {report.gallery}")
-    table = Table("metric", "released", "corrected", "difference", box=None, pad_edge=False)
+    table = Table("metric", "released", "corrected", "released / corrected", box=None, pad_edge=False)
     for score in report.scores:
         values = (_value(value, score.unit) for value in (score.released, score.corrected))
         table.add_row(score.metric, *values, score.difference)

@@ -105,8 +105,8 @@ def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) 
     names = pa.array([items[at].item_id for at in known], type=values.type.value_type)
     found = pc.index_in(values.dictionary, value_set=names).take(values.indices)
     if found.null_count:
-        wrong = values.filter(pc.is_null(found))[0].as_py()
-        shown = "a missing value" if wrong is None else repr(wrong[:100])
+        wrong = values.filter(pc.is_null(found))[:1].dictionary_decode().cast(pa.binary())[0].as_py()
+        shown = "a missing value" if wrong is None else repr(wrong[:100].decode(errors="replace"))
         message = f"{path}, {column}: {shown} is no {role} of the dataset: ids are those of items.parquet"
         raise DatasetError(message)
     return np.asarray(np.array(known, dtype=np.int64)[found.to_numpy()])

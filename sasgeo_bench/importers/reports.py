@@ -38,22 +38,23 @@ _DIS: Final = (1, 3, 5)
 _MA_M: Final = (3, 5, 10, 20, 50, 100)
 _ACCURACY_M: Final = (20, 40, 80, 100, 200)
 
-_DENOMINATOR: Final = "released over all queries, corrected over those with a positive in the gallery"
-_RANK: Final = f"released one rank further; {_DENOMINATOR}"
-_TRAPEZOID: Final = f"released by trapezoids, corrected by steps; {_DENOMINATOR}"
-_DEGREES: Final = "released in degrees of single precision, corrected in metres with the same decay"
-_OTHER: Final = "the SDM of another paper: not comparable"
-_STRICT: Final = "released below the limit, corrected up to it"
-_SPHERE: Final = f"{_STRICT}; released on a sphere, corrected on the ellipsoid"
-_LONGITUDE: Final = "released without the difference of latitudes"
-_SAME: Final = "none"
+# Released / corrected.
+_DENOMINATOR: Final = "over all queries / those with a positive"
+_RANK: Final = f"one rank too far; {_DENOMINATOR}"
+_TRAPEZOID: Final = f"trapezoids / steps; {_DENOMINATOR}"
+_DEGREES: Final = "single-precision degrees / metres"
+_OTHER: Final = "SDM of another paper: not comparable"
+_STRICT: Final = "below the limit / up to it"
+_SPHERE: Final = f"{_STRICT}; sphere / ellipsoid"
+_LONGITUDE: Final = "longitudes alone / both"
+_SAME: Final = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
     """One metric twice: as released, and corrected; None where the ranking is too short or the code has no such metric.
 
-    `unit` is 1 for a share and m for metres; `difference` says how the two differ.
+    `unit` is 1 for a share and m for metres; `difference` says how the two differ, empty if they do not.
     """
 
     metric: str

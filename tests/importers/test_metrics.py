@@ -339,6 +339,14 @@ def test_a_wrong_ranking_is_refused_in_one_line(columns, told, tmp_path):
     assert str(fault.value).isprintable()
 
 
+def test_an_id_that_is_no_text_is_refused(tmp_path):
+    dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a"})
+    wrong = pa.array([b"\xf4q"], pa.binary()).view(pa.string())
+    pq.write_table(pa.table({"query_id": wrong, "gallery_id": ["g1"], "rank": [1]}), tmp_path / "r.parquet")
+    with pytest.raises(DatasetError, match="is no query of the dataset"):
+        read_ranking([tmp_path / "r.parquet"], dataset.items)
+
+
 @pytest.mark.parametrize("content", [b"", b"PAR1 no table PAR1", b"query_id,gallery_id,rank\nq,g1,1\n", None])
 def test_what_is_no_table_is_refused(content, tmp_path):
     if content is not None:

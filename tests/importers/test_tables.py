@@ -3,20 +3,22 @@
 
 import datetime as dt
 import json
+from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.errors import DatasetError, StoreError
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.importers.items import Item, Position, UtmPlaces
-from sasgeo_bench.importers.kinds import read_dataset
+from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
 from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
 from sasgeo_bench.importers.tables import ITEM_SCHEMA, import_folder, items_table, write_items, write_reports
 from tests.importers import writers
+
+ROLES = ("query", "gallery")
 
 
 def row(table, name):
@@ -111,6 +113,18 @@ def test_an_item_has_a_name_of_one_line():
         Item(item_id="a\nb", role="query", view="drone")
 
 
-def test_names_and_numbers_have_their_types():
-    assert ITEM_SCHEMA.field("taken_on").type == pa.date32()
-    assert ITEM_SCHEMA.field("easting_m").type == pa.float64()
+def test_the_guide_explains_every_column_and_metric(tmp_path):
+    page = (Path(__file__).parents[2] / "docs" / "howto" / "other-datasets.md").read_text(encoding="utf-8")
+    assert [name for name in ITEM_SCHEMA.names if f"`{name}`" not in page] == []
+    for kind, root in (("uav-visloc", writers.write_visloc(tmp_path / "a")), ("dense-uav", dense(tmp_path / "b"))):
+        dataset = read_dataset(root, kind)
+        query, answer = (next(item.item_id for item in dataset.items if item.role == role) for role in ROLES)
+        path = writers.write_ranking(tmp_path / "r.parquet", {query: [answer]})
+        (report,) = score_ranking(dataset, read_ranking([path], dataset.items))
+        kinds = {score.metric.rsplit("_", 1)[0] for score in report.scores} - {"logged"}
+        assert [name for name in kinds if f"`{name}" not in page] == []
+    assert all(f"`{kind}`" in page for kind in IMPORTERS)
+
+
+def dense(root: Path) -> Path:
+    return writers.write_dense(root, {"000000": (120.0, 30.0)})

@@ -53,6 +53,10 @@ class PoseError(SasgeoError, ValueError):
     """A pose or prior with a value outside its range."""
 
 
+class CameraError(SasgeoError, ValueError):
+    """A camera, a ground or a photo whose values cannot be, or from which no view can be computed."""
+
+
 class ConfigError(SasgeoError, ValueError):
     """A TOML file with an unknown key, a wrong type or a value out of range."""
 
@@ -67,6 +71,10 @@ class CoverageError(SasgeoError, ValueError):
 
 class StoreError(SasgeoError, OSError):
     """A folder or file of ours that cannot be written, or contradicts its manifest."""
+
+
+class ImageError(SasgeoError, ValueError):
+    """A picture, labels or a segmentation that is damaged, too large, or of the wrong shape."""
 
 
 class PerturbError(SasgeoError, ValueError):

@@ -39,6 +39,7 @@ MAX_FILE_BYTES = 500_000
 IMPORTED_AS = {
     "lazy-loader": "lazy_loader",
     "opencv-python-headless": "cv2",
+    "pillow": "PIL",
     "rio-cogeo": "rio_cogeo",
     "scikit-image": "skimage",
     "scikit-learn": "sklearn",

@@ -1,0 +1,332 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A camera in the air: where it is, how it looks, and the way from the ground to its picture and back.
+
+Order of angles, here and nowhere else. A body's axes are forward, right, down; the ground's are north, east, down.
+From a body that heads north and level, turn by **yaw** about down (clockwise from above), then by **pitch** about the
+new right (nose up), then by **roll** about the new forward (right side down): aerospace's z, y', x''. A camera is a
+body whose forward is its optical axis; one that looks straight down has pitch -90. `tilt_deg` is pitch + 90: 0 is
+straight down, and the tilt goes towards the heading. For such a camera, yaw is the heading of the picture's up.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Final, Self
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sasgeo_bench.errors import CameraError
+from sasgeo_bench.geometry.pose import bearing_deg
+from sasgeo_bench.sensing.ground import Ground, Plane
+from sasgeo_bench.sensing.intrinsics import Intrinsics
+
+Points = NDArray[np.float64]
+Nine = tuple[float, float, float, float, float, float, float, float, float]
+
+# Rows of a camera's right, down, ahead in the axes of its body (forward, right, down); and of NED in east, north, up.
+_CAMERA_OF_BODY: Final = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+_NED_OF_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+_STRAIGHT_DOWN_DEG: Final = -90.0
+_MOST_M: Final = 1e8  # of a coordinate: more than any projected CRS has
+_HIGHEST_M: Final = 50_000.0
+_NEAREST_M: Final = 1e-6  # ahead of the camera; what is nearer is not projected
+_MESH: Final = 32  # parts of a side of the picture, for the footprint
+_REACH: Final = 20.0  # of a footprint, in heights above the ground
+_BEYOND: Final = 0.01  # of the slope at a footprint's end: where its straight far side is cut, before its round end
+_HALF_PX: Final = 0.5
+
+
+def _check_finite(owner: object, *values: float) -> None:
+    if not all(map(math.isfinite, values)):
+        message = f"angles and places of a camera are finite numbers, got {owner!r}"
+        raise CameraError(message)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Attitude:
+    """Roll, pitch and yaw of a body, degrees, in the order that the head of this file states.
+
+    A nose that rises by 10 degrees lifts what is ahead:
+
+    >>> Attitude(pitch_deg=10.0).matrix[2, 0].round(3).item()  # forward, seen along down
+    -0.174
+    """
+
+    roll_deg: float = 0.0
+    pitch_deg: float = 0.0
+    yaw_deg: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Check the angles."""
+        _check_finite(self, self.roll_deg, self.pitch_deg, self.yaw_deg)
+
+    @property
+    def matrix(self) -> Points:
+        """Return the matrix from the body's (forward, right, down) to (north, east, down), shape (3, 3)."""
+        angles = (self.yaw_deg, self.pitch_deg, self.roll_deg)
+        return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mount:
+    """How a camera sits on its vehicle: tilt, roll and yaw against the body, straight down by default.
+
+    A stabilized mount (gimbal) follows the body's yaw alone; a fixed one takes part in its roll and pitch.
+    """
+
+    tilt_deg: float = 0.0
+    roll_deg: float = 0.0
+    yaw_deg: float = 0.0
+    is_stabilized: bool = False
+
+    def __post_init__(self) -> None:
+        """Check the angles."""
+        _check_finite(self, self.tilt_deg, self.roll_deg, self.yaw_deg)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Camera:
+    """Centre of projection and direction of a camera over the ground.
+
+    `east_m`, `north_m` and `height_m` are in the frame of the ground that it looks at; height counts from that frame's
+    z = 0. `rotation` is the matrix from (east, north, up) to the camera's (right, down, ahead), row by row; use
+    `pointed` or `mounted` to make it from angles. Raise `CameraError` if a value cannot be.
+
+    Examples
+    --------
+    From 100 m, 10 m on the ground take 80 of 800 pixels that see 100 m; with yaw 90, east is up:
+
+    >>> lens = Intrinsics.from_field_of_view(horizontal_deg=53.13010235, width_px=800, height_px=600)
+    >>> camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=100.0, yaw_deg=90.0)
+    >>> camera.project(np.array([[10.0, 0.0, 0.0]])).round(3).tolist()
+    [[400.0, 220.0]]
+    """
+
+    intrinsics: Intrinsics
+    east_m: float
+    north_m: float
+    height_m: float
+    rotation: Nine = field(repr=False)
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        _check_finite(self, self.east_m, self.north_m, self.height_m, *self.rotation)
+        if max(abs(self.east_m), abs(self.north_m)) > _MOST_M or abs(self.height_m) > _HIGHEST_M:
+            message = (
+                f"a camera is within {_HIGHEST_M:g} m of height 0 and at coordinates in metres, got height "
+                f"{self.height_m!r} at {self.east_m!r}, {self.north_m!r}"
+            )
+            raise CameraError(message)
+        matrix = np.reshape(self.rotation, (3, 3))
+        if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) or np.linalg.det(matrix) < 0:
+            message = f"rotation is nine numbers of a right-handed rotation, got {self.rotation!r}"
+            raise CameraError(message)
+
+    @classmethod
+    def pointed(
+        cls,
+        *,
+        intrinsics: Intrinsics,
+        east_m: float,
+        north_m: float,
+        height_m: float,
+        yaw_deg: float,
+        tilt_deg: float = 0.0,
+        roll_deg: float = 0.0,
+    ) -> Self:
+        """Return a camera that looks down, tilted towards its heading by `tilt_deg` (pitch of a gimbal + 90)."""
+        return cls.mounted(
+            intrinsics=intrinsics,
+            east_m=east_m,
+            north_m=north_m,
+            height_m=height_m,
+            body=Attitude(yaw_deg=yaw_deg),
+            mount=Mount(tilt_deg=tilt_deg, roll_deg=roll_deg),
+        )
+
+    @classmethod
+    def mounted(
+        cls,
+        *,
+        intrinsics: Intrinsics,
+        east_m: float,
+        north_m: float,
+        height_m: float,
+        body: Attitude,
+        mount: Mount,
+    ) -> Self:
+        """Return the camera of a vehicle with an attitude; what is fixed to the body turns with it.
+
+        A nose 9.6 degrees up moves the middle of a fixed camera's picture ahead, by 13.5 m from 80 m:
+
+        >>> from sasgeo_bench.sensing.ground import Plane
+        >>> lens = Intrinsics.from_field_of_view(horizontal_deg=60.0, width_px=800, height_px=600)
+        >>> body = Attitude(pitch_deg=9.6)
+        >>> camera = Camera.mounted(
+        ...     intrinsics=lens, east_m=0.0, north_m=0.0, height_m=80.0, body=body, mount=Mount()
+        ... )
+        >>> camera.unproject(np.array([[400.0, 300.0]]), Plane()).round(1).tolist()
+        [[0.0, 13.5, 0.0]]
+        """
+        carrier = Attitude(yaw_deg=body.yaw_deg) if mount.is_stabilized else body
+        pitch_deg = mount.tilt_deg + _STRAIGHT_DOWN_DEG
+        on_body = Attitude(roll_deg=mount.roll_deg, pitch_deg=pitch_deg, yaw_deg=mount.yaw_deg)
+        ned_of_camera_body = carrier.matrix @ on_body.matrix
+        matrix = _CAMERA_OF_BODY @ ned_of_camera_body.T @ _NED_OF_ENU
+        return cls(
+            intrinsics=intrinsics,
+            east_m=float(east_m),
+            north_m=float(north_m),
+            height_m=float(height_m),
+            rotation=_nine(matrix),
+        )
+
+    @property
+    def matrix(self) -> Points:
+        """Return the rotation from (east, north, up) to (right, down, ahead), shape (3, 3)."""
+        return np.reshape(self.rotation, (3, 3)).astype(np.float64)
+
+    @property
+    def position_m(self) -> Points:
+        """Return east, north, height, shape (3,), metres."""
+        return np.array([self.east_m, self.north_m, self.height_m])
+
+    @property
+    def yaw_deg(self) -> float:
+        """Return the heading of the picture's up direction, [0, 360) degrees."""
+        return float(bearing_deg(-self.rotation[3], -self.rotation[4]))
+
+    @property
+    def tilt_deg(self) -> float:
+        """Return the angle between the optical axis and straight down, [0, 180] degrees."""
+        return math.degrees(math.acos(max(-1.0, min(1.0, -self.rotation[8]))))
+
+    def turned(self, error: Attitude) -> Self:
+        """Return the camera turned about its own axes: pitch about its right, roll about its picture's up, yaw ahead.
+
+        Small turns of a camera that looks straight down are those of the body that carries it: pitch moves the view
+        ahead, roll (right side down) to the left, yaw clockwise.
+        """
+        body = Rotation.from_euler("ZYX", (error.yaw_deg, error.pitch_deg, error.roll_deg), degrees=True).as_matrix()
+        down_of_nadir = Attitude(pitch_deg=_STRAIGHT_DOWN_DEG).matrix
+        camera_of_carrier = _CAMERA_OF_BODY @ down_of_nadir.T
+        matrix = camera_of_carrier @ body.T @ camera_of_carrier.T @ self.matrix
+        return self._with(matrix, self.position_m)
+
+    def moved(self, *, east_m: float = 0.0, north_m: float = 0.0, up_m: float = 0.0) -> Self:
+        """Return the camera moved by metres; it looks as before."""
+        return self._with(self.matrix, self.position_m + np.array([east_m, north_m, up_m]))
+
+    def _with(self, matrix: Points, position_m: Points) -> Self:
+        east_m, north_m, height_m = position_m.tolist()
+        return type(self)(
+            intrinsics=self.intrinsics, east_m=east_m, north_m=north_m, height_m=height_m, rotation=_nine(matrix)
+        )
+
+    def project(self, points_m: Points) -> Points:
+        """Convert (east, north, up), shape (N, 3), metres, to pixels, shape (N, 2); NaN behind the camera.
+
+        Points beside the picture get pixels outside it: ask `intrinsics.contains`.
+        """
+        seen = (np.asarray(points_m, dtype=np.float64) - self.position_m) @ self.matrix.T
+        ahead_m = np.where(seen[:, 2] > _NEAREST_M, seen[:, 2], np.nan)
+        return self.intrinsics.to_pixels(seen[:, :2] / ahead_m[:, None])
+
+    def rays(self, points_px: Points) -> Points:
+        """Return the direction of each pixel, shape (N, 2) -> (N, 3), in (east, north, up), 1 long along the axis."""
+        slopes = self.intrinsics.to_slopes(points_px)
+        return np.column_stack([slopes, np.ones(len(slopes))]) @ self.matrix
+
+    def unproject(self, points_px: Points, ground: Ground) -> Points:
+        """Convert pixels, shape (N, 2), to the ground they show, (N, 3); NaN above the horizon and off the ground."""
+        return ground.meet(self.position_m, self.rays(points_px))
+
+    def gsd_m(self, points_px: Points, ground: Ground) -> Points:
+        """Return the ground sampling distance at each pixel, shape (N,), metres; NaN where no ground is seen.
+
+        The side of a pixel on the ground in the direction in which it is longest: how far apart two things must be to
+        be seen as two whichever way they lie. Straight down it is height / focal length.
+
+        >>> from sasgeo_bench.sensing.ground import Plane
+        >>> lens = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=1000, height_px=1000)
+        >>> camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=100.0, yaw_deg=0.0)
+        >>> camera.gsd_m(np.array([[500.0, 500.0]]), Plane()).round(6).tolist()
+        [0.2]
+        """
+        points_px = np.asarray(points_px, dtype=np.float64)
+        steps = _HALF_PX * np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
+        right, left, down, up = (self.unproject(points_px + step, ground)[:, :2] for step in steps)
+        across, along = right - left, down - up
+        # Largest singular value of the matrix with these columns.
+        total = (across**2).sum(axis=1) + (along**2).sum(axis=1)
+        area = across[:, 0] * along[:, 1] - across[:, 1] * along[:, 0]
+        return np.asarray(np.sqrt((total + np.sqrt(np.maximum(total**2 - 4 * area**2, 0))) / 2))
+
+    def footprint(self, ground: Ground, *, reach_m: float | None = None) -> shapely.Polygon:
+        """Return the outline of the ground in the picture, east and north, metres; empty where no ground is seen.
+
+        It ends `reach_m` from the point beneath the camera (20 times the height above ground by default), so that a
+        picture with the horizon in it has an end. Over a plane it is exact; over heights it is the union of the patches
+        of ground that a mesh of 32 x 32 parts of the picture shows, hidden ground between them included.
+
+        >>> from sasgeo_bench.sensing.ground import Plane
+        >>> lens = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=1000, height_px=500)
+        >>> camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=50.0, yaw_deg=0.0)
+        >>> tuple(round(edge_m, 6) for edge_m in camera.footprint(Plane()).bounds)
+        (-50.0, -25.0, 50.0, 25.0)
+        """
+        beneath_m = ground.heights_m(self.position_m[None, :2])[0]
+        above_m = self.height_m - (beneath_m if math.isfinite(beneath_m) else 0.0)
+        if above_m <= 0:
+            return shapely.Polygon()
+        reach_m = reach_m or _REACH * above_m
+        seen = self._outline(ground, above_m / reach_m) if isinstance(ground, Plane) else self._patches(ground)
+        return _largest(seen.intersection(shapely.Point(self.east_m, self.north_m).buffer(reach_m, quad_segs=64)))
+
+    def _outline(self, ground: Plane, slope: float) -> shapely.Geometry:
+        """Return the outline of the picture on a plane, cut far beyond where rays fall less than a slope."""
+        rays = self.rays(self.intrinsics.border_px(_MESH))
+        points_m = ground.meet(self.position_m, _cut(rays[np.isfinite(rays).all(axis=1)], slope * _BEYOND))
+        seen = points_m[np.isfinite(points_m).all(axis=1), :2].round(6)
+        return shapely.Polygon(seen).buffer(0) if len(seen) > 2 else shapely.Polygon()  # noqa: PLR2004 - a triangle
+
+    def _patches(self, ground: Ground) -> shapely.Geometry:
+        """Return the union of the quadrilaterals of a mesh over the picture whose four corners show ground."""
+        steps = np.linspace(0.0, 1.0, _MESH + 1)
+        mesh = np.stack(np.meshgrid(steps * self.intrinsics.width_px, steps * self.intrinsics.height_px), axis=-1)
+        points_m = self.unproject(mesh.reshape(-1, 2), ground)[:, :2].reshape(*mesh.shape)
+        rings = np.stack([points_m[:-1, :-1], points_m[:-1, 1:], points_m[1:, 1:], points_m[1:, :-1]], axis=2)
+        rings = rings.reshape(-1, 4, 2)
+        quads = shapely.polygons(rings[np.isfinite(rings).all(axis=(1, 2))])
+        return shapely.union_all(quads[shapely.is_valid(quads)])
+
+
+def _nine(matrix: Points) -> Nine:
+    """Return a matrix row by row; rounding keeps rotations by quarter turns exact."""
+    a, b, c, d, e, f, g, h, i = (matrix.ravel().round(15) + 0.0).tolist()
+    return (a, b, c, d, e, f, g, h, i)
+
+
+def _cut(rays: Points, slope: float) -> Points:
+    """Clip a closed ring of rays, shape (N, 3), to those that fall by at least `slope` metres a metre."""
+
+    def excess(ray: Points) -> float:
+        return float(-ray[2] - slope * math.hypot(ray[0], ray[1]))
+
+    kept = []
+    for ray, after in zip(rays, np.roll(rays, -1, axis=0), strict=True):
+        here, there = excess(ray), excess(after)
+        if here >= 0:
+            kept.append(ray)
+        if (here >= 0) != (there >= 0):
+            kept.append(ray + (after - ray) * here / (here - there))
+    return np.array(kept).reshape(-1, 3)
+
+
+def _largest(shape: shapely.Geometry) -> shapely.Polygon:
+    """Return the largest polygon of a geometry; an empty one if it holds none."""
+    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+    return max(parts, key=shapely.area, default=shapely.Polygon())

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Planes and heights out of GeoTIFFs: where rays meet them, and what is refused."""
+
+import numpy as np
+import pytest
+import rasterio
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.errors import CameraError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
+
+GRID = Grid(epsg=32632, west_m=500_000.0, north_m=5_200_100.0, cell_size_m=10.0, rows=10, cols=12)
+
+
+def slope_of(grid=GRID, rise=0.2):
+    """Ground that rises to the east."""
+    columns = (np.arange(grid.cols) + 0.5) * grid.cell_size_m * rise
+    return Dem(grid=grid, cells_m=np.tile(columns, (grid.rows, 1)).astype(np.float32))
+
+
+def write_dem(path, dem, *, crs="EPSG:32632", dtype="float32", nodata=None, count=1):
+    transform = rasterio.Affine(*dem.grid.transform)
+    with rasterio.open(
+        path, "w", driver="GTiff", height=dem.grid.rows, width=dem.grid.cols, count=count, dtype=dtype, crs=crs,
+        transform=transform, nodata=nodata,
+    ) as file:  # fmt: skip
+        for band in range(count):
+            file.write(dem.cells_m.astype(dtype), band + 1)
+    return path
+
+
+@given(
+    east=st.floats(20, 100),
+    north=st.floats(10, 90),
+    right=st.floats(-0.8, 0.8),
+    up=st.floats(-0.8, 0.8),
+)
+def test_a_ray_to_a_slope_meets_it_where_geometry_says(east, north, right, up):
+    dem = slope_of().relative_to(GRID.west_m, GRID.north_m - 100.0)
+    origin, direction = np.array([east, north, 60.0]), np.array([right, up, -1.0])
+    along = (60.0 - 0.2 * east) / (1 + 0.2 * right)  # 60 - t = 0.2 (east + t right)
+    expected = origin + along * direction
+    met = dem.meet(origin, direction[None])[0]
+    inside = 5 <= expected[0] <= 115 and 0 <= expected[1] <= 100
+    if inside:
+        np.testing.assert_allclose(met, expected, atol=1e-4)
+    elif not (-0.1 <= expected[0] <= 120.1 and -0.1 <= expected[1] <= 100.1):
+        assert np.isnan(met).all()
+
+
+def test_a_ray_stops_at_the_hill_in_front():
+    cells = np.zeros((10, 12), dtype=np.float32)
+    cells[:, 6] = 30.0
+    hill = Dem(grid=GRID, cells_m=cells).relative_to(GRID.west_m, GRID.north_m - 100.0)
+    met = hill.meet(np.array([5.0, 50.0, 40.0]), np.array([[1.0, 0.0, -0.4]]))[0]
+    assert 50 < met[0] < 65
+    assert met[2] == pytest.approx(40 - 0.4 * (met[0] - 5))
+
+
+def test_level_heights_are_a_plane():
+    dem = Dem(grid=GRID, cells_m=np.full((10, 12), 7.0, dtype=np.float32)).relative_to(GRID.west_m, GRID.north_m - 100)
+    directions = np.array([[0.1, 0.2, -1.0], [0.0, 0.0, -1.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    origin = np.array([50.0, 50.0, 57.0])
+    np.testing.assert_allclose(dem.meet(origin, directions), Plane(height_m=7.0).meet(origin, directions), atol=1e-6)
+
+
+def test_a_camera_under_ground_sees_none():
+    assert np.isnan(slope_of().meet(np.array([500_060.0, 5_200_050.0, 1.0]), np.array([[0.0, 0.0, -1.0]]))).all()
+
+
+def test_heights_are_read_and_brought_onto_the_lattice(tmp_path):
+    path = write_dem(tmp_path / "dem.tif", slope_of(), nodata=-9999.0)
+    inner = Grid(epsg=32632, west_m=500_020.0, north_m=5_200_080.0, cell_size_m=5.0, rows=8, cols=8)
+    dem = read_dem(path, inner)
+    points = np.array([[500_030.0, 5_200_060.0], [500_042.5, 5_200_050.0]])
+    np.testing.assert_allclose(dem.heights_m(points), [6.0, 8.5], atol=1e-4)
+
+
+def test_heights_in_whole_metres_without_nodata_are_read_and_their_edge_is_noticed(tmp_path):
+    path = write_dem(tmp_path / "dem.tif", slope_of(rise=1.0), dtype="int16")
+    assert read_dem(path, GRID).cells_m[0, :2].tolist() == [5.0, 15.0]
+    with pytest.raises(CameraError, match="does not cover"):
+        read_dem(path, Grid(epsg=32632, west_m=499_900.0, north_m=5_200_100.0, cell_size_m=10.0, rows=4, cols=20))
+
+
+def test_heights_in_degrees_are_reprojected(tmp_path):
+    grid = Grid(epsg=4326, west_m=8.99, north_m=46.96, cell_size_m=0.001, rows=30, cols=30)  # in degrees
+    path = write_dem(
+        tmp_path / "dem.tif", Dem(grid=grid, cells_m=np.full((30, 30), 400.0, np.float32)), crs="EPSG:4326"
+    )
+    middle = Grid(epsg=32632, west_m=500_000.0, north_m=5_199_300.0, cell_size_m=10.0, rows=10, cols=10)
+    assert read_dem(path, middle).heights_m(np.array([[500_050.0, 5_199_250.0]])).tolist() == [400.0]
+
+
+@pytest.mark.parametrize(
+    ("how", "hint"),
+    [
+        ({"crs": None}, "no CRS"),
+        ({"count": 3, "dtype": "uint8"}, "no file of heights"),
+        ({"nodata": 1.0}, "does not cover"),
+    ],
+)
+def test_a_file_that_is_no_ground_is_refused_on_one_line(tmp_path, how, hint):
+    path = write_dem(tmp_path / "dem.tif", slope_of(), **how)
+    with pytest.raises(CameraError, match=hint) as caught:
+        read_dem(path, GRID)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_file_that_is_no_raster_is_refused(tmp_path):
+    (tmp_path / "dem.tif").write_bytes(b"no heights")
+    for name in ("dem.tif", "none.tif"):
+        with pytest.raises(CameraError, match="cannot be read"):
+            read_dem(tmp_path / name, GRID)
+
+
+def test_heights_of_a_nodata_value_are_refused():
+    with pytest.raises(CameraError, match="nodata"):
+        Dem(grid=GRID, cells_m=np.full((10, 12), -32768.0, dtype=np.float32))
+
+
+def test_heights_of_another_shape_are_refused():
+    with pytest.raises(CameraError, match="shape"):
+        Dem(grid=GRID, cells_m=np.zeros((3, 3), dtype=np.float32))
+
+
+@pytest.mark.parametrize("height_m", [float("nan"), 1e9])
+def test_a_plane_at_no_height_is_refused(height_m):
+    with pytest.raises(CameraError, match="ground lies"):
+        Plane(height_m=height_m)

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lenses: from slopes to pixels and back, against OpenCV."""
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.errors import CameraError
+from sasgeo_bench.sensing.intrinsics import Intrinsics
+
+LENS = (-0.12, 0.03, 0.001, -0.0005, -0.004)
+
+
+def lens_of(distortion=LENS, width_px=800, height_px=600):
+    return Intrinsics(
+        width_px=width_px, height_px=height_px, focal_px=(700.0, 690.0), centre_px=(410.0, 295.0), distortion=distortion
+    )
+
+
+def test_pixels_are_those_of_opencv_half_a_pixel_on():
+    slopes = np.random.default_rng(1).uniform(-0.6, 0.6, (200, 2))
+    points = np.column_stack([slopes, np.ones(200)]) * 7
+    expected = cv2.projectPoints(points, np.zeros(3), np.zeros(3), lens_of().matrix, np.array(LENS))[0].reshape(-1, 2)
+    np.testing.assert_allclose(lens_of().to_pixels(slopes), expected + 0.5, atol=1e-9)
+
+
+@given(
+    k1=st.floats(-0.2, 0.2),
+    k2=st.floats(-0.05, 0.05),
+    p1=st.floats(-0.003, 0.003),
+    at=st.tuples(st.floats(0, 800), st.floats(0, 600)),
+)
+def test_a_pixel_and_its_ray_belong_together(k1, k2, p1, at):
+    lens = lens_of((k1, k2, p1, -p1, 0.0))
+    point = np.array([at])
+    np.testing.assert_allclose(lens.to_pixels(lens.to_slopes(point)), point, atol=1e-3)
+
+
+def test_what_the_lens_would_fold_into_the_picture_gets_no_pixel():
+    barrel = lens_of((-0.3, 0.0, 0.0, 0.0, 0.0))  # grows up to a slope of 1 / sqrt(0.9)
+    folded = barrel.to_pixels(np.array([[1.0, 0.0], [1.2, 0.0], [1.8, 0.0]]))
+    assert np.isnan(folded).all(axis=1).tolist() == [False, True, True]
+
+
+def test_a_pixel_beyond_the_fold_has_no_ray():
+    barrel = lens_of((-0.3, 0.0, 0.0, 0.0, 0.0))
+    assert np.isnan(barrel.to_slopes(np.array([[2000.0, 300.0]]))).all()
+
+
+def test_a_matrix_of_opencv_comes_back():
+    lens = lens_of()
+    again = Intrinsics.from_matrix(lens.matrix, width_px=800, height_px=600, distortion=LENS)
+    assert again == lens
+
+
+def test_the_middle_of_a_picture_is_half_its_size():
+    lens = Intrinsics.from_field_of_view(horizontal_deg=70.0, width_px=801, height_px=600)
+    assert lens.centre_px == (400.5, 300.0)
+    assert lens.horizontal_deg == pytest.approx(70.0)
+
+
+def test_the_border_runs_once_around_the_picture():
+    border = lens_of().border_px(4)
+    assert border[[0, 4, 8, 12]].tolist() == [[0, 0], [800, 0], [800, 600], [0, 600]]
+
+
+def test_no_points_are_no_pixels():
+    assert lens_of().to_pixels(np.empty((0, 2))).shape == (0, 2)
+    assert lens_of().to_slopes(np.empty((0, 2))).shape == (0, 2)
+
+
+@pytest.mark.parametrize(
+    ("fault", "hint"),
+    [
+        ({"width_px": 0}, "pixels a side"),
+        ({"height_px": 10**9}, "pixels a side"),
+        ({"focal_px": (3.6, 3.6)}, "millimetres"),
+        ({"focal_px": (-700.0, 700.0)}, "positive"),
+        ({"focal_px": (float("nan"), 700.0)}, "finite"),
+        ({"centre_px": (float("inf"), 0.0)}, "finite"),
+        ({"distortion": (0.1, 0.1)}, "five"),
+    ],
+)
+def test_an_absurd_lens_is_refused_on_one_line(fault, hint):
+    good = {"width_px": 800, "height_px": 600, "focal_px": (700.0, 700.0), "centre_px": (400.0, 300.0)}
+    with pytest.raises(CameraError, match=hint):
+        Intrinsics(**(good | fault))
+
+
+@pytest.mark.parametrize("degrees", [0.0, -3.0, 180.0, float("nan")])
+def test_an_absurd_field_of_view_is_refused(degrees):
+    with pytest.raises(CameraError, match="field of view"):
+        Intrinsics.from_field_of_view(horizontal_deg=degrees, width_px=800, height_px=600)
+
+
+@pytest.mark.parametrize("matrix", [np.eye(2), np.array([[9.0, 1, 4], [0, 9, 3], [0, 0, 1]]), np.ones((3, 3))])
+def test_a_matrix_with_skew_or_of_another_shape_is_refused(matrix):
+    with pytest.raises(CameraError, match="camera matrix"):
+        Intrinsics.from_matrix(matrix, width_px=8, height_px=6)

@@ -58,6 +58,7 @@ ONLY_PARSED = {
     r"HASH|--query ID": "needs a run or a query of the reader's own; tests/leaderboard/test_board_pictures.py does it",
     r"out/boards/demo": "needs the board of the demo; tests/publishing/test_publish.py publishes small ones",
     r"^sasgeo-bench verify crossfit": "minutes: tests/cli/test_cli_queries.py does it",
+    r"^sasgeo-bench (import|locate)-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
 }
 # Commands of other programs that are not run, each with its reason.

@@ -66,6 +66,10 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "publish": "publishing",
         "release": "releasing",
     },
+    "Datasets of others": {
+        "import-dataset": "importing",
+        "locate-dataset": "importing",
+    },
 }
 
 

@@ -40,7 +40,6 @@ IMPORTED_AS = {
     "lazy-loader": "lazy_loader",
     "pillow": "PIL",
     "opencv-python-headless": "cv2",
-    "pillow": "PIL",
     "rio-cogeo": "rio_cogeo",
     "scikit-image": "skimage",
     "scikit-learn": "sklearn",

@@ -28,7 +28,13 @@ from .matching.matcher import RejectorCard as RejectorCard
 from .matching.matcher import Training as Training
 from .matching.plugins import load_matcher as load_matcher
 from .matching.plugins import load_rejector as load_rejector
+from .matching.plugins import load_segmenter as load_segmenter
 from .matching.results import Prediction as Prediction
+from .matching.segmenter import ImageTraining as ImageTraining
+from .matching.segmenter import LearningSegmenter as LearningSegmenter
+from .matching.segmenter import Segmenter as Segmenter
+from .matching.segmenter import SegmenterCard as SegmenterCard
+from .matching.segmenter import check_segmentation as check_segmentation
 from .osm.features import make_features as make_features
 from .osm.taxonomy import load_taxonomy as load_taxonomy
 from .regions.evidence import ABSENT as ABSENT
@@ -43,6 +49,7 @@ from .regions.region import Region as Region
 from .regions.region_files import read_region as read_region
 from .running.prediction_files import read_predictions as read_predictions
 from .running.prediction_rows import PREDICTION_SCHEMA as PREDICTION_SCHEMA
+from .running.segmenter_testing import check_segmenter as check_segmenter
 from .running.testing import TinyPlace as TinyPlace
 from .running.testing import check_matcher as check_matcher
 from .running.testing import tiny_place as tiny_place
@@ -60,9 +67,15 @@ from .sensing.camera import Mount as Mount
 from .sensing.ground import Dem as Dem
 from .sensing.ground import Plane as Plane
 from .sensing.ground import read_dem as read_dem
+from .sensing.image import AerialImage as AerialImage
+from .sensing.image import LabelledImage as LabelledImage
+from .sensing.image import decode_image as decode_image
 from .sensing.intrinsics import Intrinsics as Intrinsics
 from .sensing.photos import Photo as Photo
 from .sensing.photos import read_photo as read_photo
+from .sensing.segmentation import Segmentation as Segmentation
+from .sensing.tiny_images import tiny_images as tiny_images
+from .sensing.tiny_images import with_picture as with_picture
 from .tasks.query import Query as Query
 from .tasks.query import Truth as Truth
 from .tasks.task_files import read_queries as read_queries

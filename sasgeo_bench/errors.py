@@ -87,3 +87,7 @@ class MatchError(SasgeoError, ValueError):
 
 class MetricError(SasgeoError, ValueError):
     """Values, weights or a level from which a metric cannot be computed."""
+
+
+class DatasetError(SasgeoError, ValueError):
+    """A folder of another benchmark's data, or a ranking of its items, that is not what its layout says."""

@@ -33,6 +33,9 @@ from sasgeo_bench.files.folders import check_site
 from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.importers.kinds import read_dataset
+from sasgeo_bench.importers.rankings import read_ranking
+from sasgeo_bench.importers.reports import score_ranking
 from sasgeo_bench.leaderboard.board_files import check_shape
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.learned_file import read_learned
@@ -55,6 +58,7 @@ from sasgeo_bench.scoring.submission_files import read_card, read_submission, wr
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import read_split_file
 from tests.handmade import card_of, full_board, put_board, put_pictures
+from tests.importers import writers
 
 FEW = settings(
     max_examples=8,
@@ -205,6 +209,12 @@ def make_ageing(folder: Path, _: TinyPlace) -> None:
     write_frame(table, folder / "ageing.parquet", attrs=said)
 
 
+def make_ranking(folder: Path, _: TinyPlace) -> None:
+    writers.write_university(folder / "set")
+    answers = {"test/query_drone/0001/0001.jpg": [f"test/gallery_satellite/000{at}/000{at}.jpg" for at in (1, 0, 2)]}
+    writers.write_ranking(folder / "ranking.parquet", answers)
+
+
 # --- how they are read ------------------------------------------------------------------------------------------------
 
 
@@ -237,6 +247,11 @@ def read_board(folder: Path) -> object:
     for name, table in files.tables.items():
         check_shape(name, table)
     return files
+
+
+def read_scores(folder: Path) -> object:
+    dataset = read_dataset(folder / "set", "university-1652")
+    return score_ranking(dataset, read_ranking([folder / "ranking.parquet"], dataset.items))
 
 
 def read_states(file: str) -> Callable[[Path], object]:
@@ -315,6 +330,20 @@ FORMATS = {
             "figures/age-real-age-localization-r500-weak-s3.svg",
         )
     },
+    "dataset/Dense_GPS_ALL.txt": Format(
+        file="Dense_GPS_ALL.txt",
+        make=lambda folder, _: writers.write_dense(folder, {"000000": (120.5, 30.25)}),
+        read=lambda folder: read_dataset(folder, "dense-uav"),
+    ),
+    **{
+        f"dataset/{file}": Format(
+            file=file,
+            make=lambda folder, _: writers.write_visloc(folder),
+            read=lambda folder: read_dataset(folder, "uav-visloc"),
+        )
+        for file in ("satellite_coordinates_range.csv", "01/01.csv", "01/satellite01.tif")
+    },
+    "ranking.parquet": Format(file="ranking.parquet", make=make_ranking, read=read_scores),
     "ageing.parquet": Format(file="ageing.parquet", make=make_ageing, read=read_ageing),
     "site.json": Format(file="site.json", make=written("site.json", '{"files": ["index.html"]}'), read=check_site),
     "SHA256SUMS": Format(

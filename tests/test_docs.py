@@ -40,7 +40,7 @@ PROSE = [  # rows of tables and code may be longer
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.py"))
 PATHS = re.compile(r"\b(?:sasgeo_bench|baselines|benchmarks|tests|docs)/[\w./-]*\w\.(?:py|md|toml|sh)\b")
 MOST_TERMS = 60
-ENTRY_POINTS = ("sasgeo_bench.matchers", "sasgeo_bench.rejectors")
+ENTRY_POINTS = ("sasgeo_bench.matchers", "sasgeo_bench.rejectors", "sasgeo_bench.segmenters")
 
 
 def read(path: Path) -> str:
@@ -157,6 +157,13 @@ def test_the_perturbations_of_the_guide_keep_to_its_rules():
         assert seen.cells.sum() == left
     with pytest.raises(PerturbError, match=r"MissedBuildings: share lies between 0 and 1, got 2\.0"):
         made["MissedBuildings"](share=2.0)  # type: ignore[operator]
+
+
+def test_the_segmenter_of_the_guide_keeps_to_the_door():
+    (first, _) = re.findall(r"^```python\n(.*?)^```$", read(DOCS / "howto" / "segmenter.md"), re.MULTILINE | re.DOTALL)
+    made: dict[str, object] = {}
+    exec(first, made)  # noqa: S102 - of our own documents
+    assert sgb.check_segmentation(made["found"], made["picture"]) is made["found"]
 
 
 def test_the_readme_is_read_in_four_minutes():

@@ -58,17 +58,21 @@ ONLY_PARSED = {
     r"HASH|--query ID": "needs a run or a query of the reader's own; tests/leaderboard/test_board_pictures.py does it",
     r"out/boards/demo": "needs the board of the demo; tests/publishing/test_publish.py publishes small ones",
     r"^sasgeo-bench verify crossfit": "minutes: tests/cli/test_cli_queries.py does it",
+    r"^sasgeo-bench (import|locate)-dataset ": "needs a dataset of others; tests/cli/test_cli_importing.py makes some",
     r"^sasgeo-bench score --predictions out/runs --name mine$": "any run that lies there, those of other documents too",
 }
 # Commands of other programs that are not run, each with its reason.
 OTHERS = {
-    r"^pip install -e my-matcher$": "done by hand: an installation needs the package registry",
+    r"^pip install -e my-(matcher|segmenter)$": "done by hand: an installation needs the package registry",
     r"^sha256sum ": "a program of the system",
     r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
     r"^pip install 'sasgeo-bench\[publish\]'$": "an installation needs the package registry",
 }
 PLUGIN = """[sasgeo_bench.matchers]
 my-matcher = my_matcher.matcher:MyMatcher
+
+[sasgeo_bench.segmenters]
+my-segmenter = my_segmenter.segmenter:MySegmenter
 """
 
 
@@ -223,7 +227,7 @@ def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     about.mkdir(parents=True)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my-matcher\nVersion: 0.1.0\n", encoding="utf-8")
     (about / "entry_points.txt").write_text(PLUGIN, encoding="utf-8")
-    for path in (tmp_path / "site", folder / "my-matcher" / "src"):
+    for path in (tmp_path / "site", folder / "my-matcher" / "src", folder / "my-segmenter" / "src"):
         monkeypatch.syspath_prepend(str(path))
     monkeypatch.chdir(folder)
     monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)

@@ -10,19 +10,24 @@ from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench.running import answers, plan, testing, training
-from sasgeo_bench.running.serve import TOOLS, Server
-from sasgeo_bench.running.worker import Worker
+from sasgeo_bench.running import answers, plan, segmenter_testing, segmenting, testing, training
+from sasgeo_bench.running.segmenter_process import SegmenterProcess
+from sasgeo_bench.running.serve import TOOLS, PluginServer, Server
+from sasgeo_bench.running.serve_segmenter import SegmenterServer
+from sasgeo_bench.running.worker import PluginProcess, Worker
 
 
-class Threaded(Worker):
-    """A worker without a process of its own: nothing limits or isolates its matcher."""
+class _Threaded(PluginProcess):
+    """No process of its own: nothing limits or isolates the plugin."""
+
+    def _server(self, theirs: socket.socket) -> PluginServer:
+        raise NotImplementedError
 
     def _started(self) -> socket.socket:
         if self._channel is None:
             self._channel, theirs = socket.socketpair()
             self._process = SimpleNamespace(poll=lambda: None)
-            threading.Thread(target=Server(theirs, spec=self.spec).run, daemon=True).start()
+            threading.Thread(target=self._server(theirs).run, daemon=True).start()
         return self._channel
 
     def end(self) -> None:
@@ -32,12 +37,28 @@ class Threaded(Worker):
         self._process, self._channel = None, None
 
 
+class Threaded(_Threaded, Worker):
+    """A matcher, served by a thread."""
+
+    def _server(self, theirs: socket.socket) -> PluginServer:
+        return Server(theirs, spec=self.spec)
+
+
+class ThreadedSegmenter(_Threaded, SegmenterProcess):
+    """A segmenter, served by a thread."""
+
+    def _server(self, theirs: socket.socket) -> PluginServer:
+        return SegmenterServer(theirs, spec=self.spec, luggage=self._luggage())
+
+
 @contextmanager
 def threaded() -> Iterator[None]:
-    """Serve every matcher by a thread."""
+    """Serve every matcher and segmenter by a thread."""
     for tool in TOOLS:  # the hash of a matcher's code covers those that are imported: all of them, from the beginning
         import_module(f"sasgeo_bench.{tool}")
     with pytest.MonkeyPatch.context() as patch:
         for module in (answers, plan, training, testing):
             patch.setattr(module, "Worker", Threaded)
+        for module in (segmenting, segmenter_testing):
+            patch.setattr(module, "SegmenterProcess", ThreadedSegmenter)
         yield

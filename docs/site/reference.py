@@ -17,7 +17,7 @@ from sasgeo_bench.cli import program
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, TERMS
 from sasgeo_bench.leaderboard.pipeline_spec import ContrastSpec, LearningSpec, PaperSpec, PipelineFile, TaskSpec
-from sasgeo_bench.matching.plugins import MATCHERS, REJECTORS, list_entry_points
+from sasgeo_bench.matching.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import Card, Submission
 from sasgeo_bench.osm.features import DTYPES
@@ -57,7 +57,7 @@ STAGES: Final = {
     "search": "Dense pose search",
     "sensing": "Aerial images and segmentation",
     "tasks": "Queries and truths",
-    "matching": "Matchers and rejectors",
+    "matching": "Matchers, rejectors and segmenters",
     "running": "Predictions and conformance",
 }
 _MODELS: Final[dict[str, tuple[str, Mapping[str, type[BaseModel]]]]] = {
@@ -339,10 +339,10 @@ def _suites() -> Iterator[str]:
 
 
 def _methods() -> Iterator[str]:
-    yield "# Matchers and rejectors"
+    yield "# Matchers, rejectors and segmenters"
     yield ""
     yield "Every method that comes with the program, from its card."
-    for title, group in (("Matchers", MATCHERS), ("Rejectors", REJECTORS)):
+    for title, group in (("Matchers", MATCHERS), ("Rejectors", REJECTORS), ("Segmenters", SEGMENTERS)):
         yield f"\n## {title}"
         for name, point in sorted(list_entry_points(group).items()):
             if point.dist is not None and not point.dist.name.startswith("sasgeo-"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""List regions, suites, matchers and rejectors; each command imports what it lists."""
+"""List regions, suites, matchers, rejectors and segmenters; each command imports what it lists."""
 
 from collections.abc import Mapping
 
@@ -7,7 +7,14 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table
 from sasgeo_bench.cli.options import RegionFolders
-from sasgeo_bench.matching.plugins import MATCHERS, ORACLE, REJECTORS, list_entry_points
+from sasgeo_bench.matching.plugins import (
+    MATCHERS,
+    ORACLE,
+    ORACLE_SEGMENTER,
+    REJECTORS,
+    SEGMENTERS,
+    list_entry_points,
+)
 
 
 def list_regions_command(regions: RegionFolders = None) -> None:
@@ -45,6 +52,11 @@ def list_matchers_command() -> None:
 def list_rejectors_command() -> None:
     """List the rejectors that are installed, and where each comes from."""
     _list("rejector", REJECTORS, {})
+
+
+def list_segmenters_command() -> None:
+    """List the segmenters that are installed, and where each comes from."""
+    _list("segmenter", SEGMENTERS, {ORACLE_SEGMENTER: ("sasgeo-bench", "a control, given the labels")})
 
 
 def _list(kind: str, group: str, own: Mapping[str, tuple[str, str]]) -> None:

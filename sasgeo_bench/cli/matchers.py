@@ -4,6 +4,7 @@
 import shlex
 import shutil
 import sys
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +14,7 @@ from rich.table import Table
 from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
 from sasgeo_bench.errors import counted
 from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
+from sasgeo_bench.running.checks import Check
 from sasgeo_bench.running.testing import check_matcher
 
 
@@ -21,12 +23,17 @@ def new_matcher_command(
     folder: Annotated[Path | None, typer.Option("--into", help="an empty folder; default: one of that name")] = None,
 ) -> None:
     """Write a plugin package that passes check-matcher at once, for you to put your method into."""
-    files = plugin_files(name)
+    target = lay_package(name, folder, plugin_files(name), check="check-matcher")
+    tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/howto/matcher.md walks the path)")
+
+
+def lay_package(name: str, folder: Path | None, files: Mapping[str, str], *, check: str) -> Path:
+    """Write the files of a package, say how to go on with the command `check`, and return its folder."""
     target = folder or Path(name)
     write_plugin(target, files)
     install = f"{_pip()} install -e {shlex.quote(str(target))}"
-    say(f"{target}: {len(files)} files; next: {install} && sasgeo-bench check-matcher {name}")
-    tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/howto/matcher.md walks the path)")
+    say(f"{target}: {len(files)} files; next: {install} && sasgeo-bench {check} {name}")
+    return target
 
 
 def _pip() -> str:
@@ -44,12 +51,17 @@ def check_matcher_command(
     trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in")] = False,
 ) -> None:
     """Try a matcher on a tiny town and say, row by row, whether it keeps to what all of them keep to."""
+    end_with_checks(matcher, check_matcher(matcher, is_shut_in=not trusted))
+
+
+def end_with_checks(plugin: str, checks: Iterable[Check]) -> None:
+    """Print a conformance table, and end with the user's status if a check failed."""
     table = Table("check", "outcome", "found", box=None, pad_edge=False)
     failed = 0
-    for check in check_matcher(matcher, is_shut_in=not trusted):
+    for check in checks:
         failed += check.outcome == "fail"
         table.add_row(check.name, check.outcome, check.found)
     print_table(table)
     if failed:
-        tell(f"{matcher}: {counted(failed, 'check')} failed")
+        tell(f"{plugin}: {counted(failed, 'check')} failed")
         raise typer.Exit(EXIT_USER)

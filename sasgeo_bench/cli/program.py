@@ -48,6 +48,11 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "weights": "weights",
         "lookalike": "weights",
     },
+    "Segmenters": {
+        "list-segmenters": "listing",
+        "new-segmenter": "segmenters",
+        "check-segmenter": "segmenters",
+    },
     "Runs": {
         "run": "runs",
         "merge": "runs",
@@ -59,6 +64,10 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "leaderboard": "boards",
         "publish": "publishing",
         "release": "releasing",
+    },
+    "Datasets of others": {
+        "import-dataset": "importing",
+        "locate-dataset": "importing",
     },
 }
 

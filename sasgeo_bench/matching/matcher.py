@@ -93,7 +93,7 @@ class MatcherCard:
             message = "card: tracks is empty, name retrieval, localization or both"
             raise MatchError(message)
         for place in self.trained_on:
-            _check_line("trained_on", place)
+            check_line("trained_on", place)
 
 
 def check_said(card: object) -> None:
@@ -103,11 +103,12 @@ def check_said(card: object) -> None:
         if not isinstance(value, str) or not value.strip():
             message = f"card: {name} is empty, say it in one line"
             raise MatchError(message)
-        _check_line(name, value)
-    _check_line("limits", getattr(card, "limits"))  # noqa: B009 - of either kind of card
+        check_line(name, value)
+    check_line("limits", getattr(card, "limits"))  # noqa: B009 - of either kind of card
 
 
-def _check_line(name: str, value: object) -> None:
+def check_line(name: str, value: object) -> None:
+    """Refuse a card on which a field is no line."""
     if not isinstance(value, str) or not value.isprintable() or len(value) > MOST_SAID:
         message = f"card: {name} must be one line of at most {MOST_SAID} printable characters"
         raise MatchError(message)
@@ -204,7 +205,7 @@ class Learner(Matcher, Protocol):
         ...
 
 
-def check_learned(learned: object) -> str:
+def check_learned(learned: object, *, most_bytes: int = MOST_LEARNED_BYTES) -> str:
     """Return a learned text, if it is one that can be stored; raise `MatchError` otherwise."""
     if not isinstance(learned, str):
         message = f"learn() returned {type(learned).__name__}, expected a text: write it as JSON, say"
@@ -214,8 +215,8 @@ def check_learned(learned: object) -> str:
     except UnicodeEncodeError as error:
         message = "learn() returned a text that is no UTF-8, expected characters alone: write bytes as base64, say"
         raise MatchError(message) from error
-    if size > MOST_LEARNED_BYTES:
-        message = f"learn() returned {size} bytes, expected at most {MOST_LEARNED_BYTES}"
+    if size > most_bytes:
+        message = f"learn() returned {size} bytes, expected at most {most_bytes}"
         raise MatchError(message)
     return learned
 

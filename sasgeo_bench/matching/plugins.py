@@ -14,13 +14,19 @@ from sasgeo_bench.texts import message_of, one_line
 
 if TYPE_CHECKING:
     from sasgeo_bench.matching.matcher import Matcher, Rejector
+    from sasgeo_bench.matching.segmenter import Segmenter
 
 MATCHERS: Final = "sasgeo_bench.matchers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
+SEGMENTERS: Final = "sasgeo_bench.segmenters"
 SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
 _MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
 YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are never ranked
-ORACLE: Final = "oracle_pose"  # the runner's own control, which is given the truth: no plugin can have its name
+# The runner's own controls, which are given the truth: no plugin can have their names.
+ORACLE: Final = "oracle_pose"
+ORACLE_SEGMENTER: Final = "oracle_segmenter"
+_RESERVED: Final = {MATCHERS: ORACLE, SEGMENTERS: ORACLE_SEGMENTER}
+KINDS: Final = {MATCHERS: "matcher", REJECTORS: "rejector", SEGMENTERS: "segmenter"}
 
 
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
@@ -31,8 +37,10 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     """
     found: dict[str, EntryPoint] = {}
     for point in _installed(group):
-        if group == MATCHERS and point.name == ORACLE:
-            message = f"{_home(point)} ({point.value}) is not used: {ORACLE!r} is the name of a control of the runner"
+        if point.name == _RESERVED.get(group):
+            message = (
+                f"{_home(point)} ({point.value}) is not used: {point.name!r} is the name of a control of the runner"
+            )
             warnings.warn(message, stacklevel=2)
         elif point.name not in found:
             found[point.name] = point
@@ -65,13 +73,14 @@ def _clash(first: EntryPoint, other: EntryPoint) -> str:
     )
 
 
-def shipped_names() -> frozenset[str]:
-    """Return the names of shipped matchers, which no other plugin may use."""
-    return frozenset({ORACLE, *(point.name for point in _installed(MATCHERS) if _home(point) in SHIPPED)})
+def shipped_names(group: str = MATCHERS) -> frozenset[str]:
+    """Return the names of shipped plugins of a group, which no other plugin may use."""
+    shipped = {point.name for point in _installed(group) if _home(point) in SHIPPED}
+    return frozenset(shipped | {_RESERVED[group]} if group in _RESERVED else shipped)
 
 
-def check_card_name(spec: str, name: str, *, is_oracle: bool = False) -> None:
-    """Raise `MatchError` for a card name that would imitate a shipped matcher or an oracle.
+def check_card_name(spec: str, name: str, *, is_oracle: bool = False, group: str = MATCHERS) -> None:
+    """Raise `MatchError` for a card name that would imitate a shipped plugin or an oracle.
 
     `spec` is the name of the plugin, or module:Class; `is_oracle` states that a pipeline lists it as an oracle.
 
@@ -80,9 +89,10 @@ def check_card_name(spec: str, name: str, *, is_oracle: bool = False) -> None:
         ...
     sasgeo_bench.errors.MatchError: mine:Matcher: its card is named 'oracle_pose', as a matcher that ships: rename it
     """
-    is_ours = spec.partition(":")[0].partition(".")[0] in _MODULES if ":" in spec else spec in shipped_names()
-    if not is_ours and name in shipped_names():
-        message = f"{one_line(spec)}: its card is named {name!r}, as a matcher that ships: rename it"
+    shipped = shipped_names(group)
+    is_ours = spec.partition(":")[0].partition(".")[0] in _MODULES if ":" in spec else spec in shipped
+    if not is_ours and name in shipped:
+        message = f"{one_line(spec)}: its card is named {name!r}, as a {KINDS[group]} that ships: rename it"
         raise MatchError(message)
     if name.startswith(YARDSTICK) and not (is_ours or is_oracle):
         message = (
@@ -113,9 +123,25 @@ def load_matcher(spec: str) -> "Matcher":
     """
     from sasgeo_bench.matching.matcher import MatcherCard  # noqa: PLC0415 - names are listed without it
 
-    matcher: Matcher = _made(spec, _find(spec, MATCHERS, "matcher"))
-    _check(spec, matcher, MatcherCard, "matcher", ("prepare", "match"))
+    matcher: Matcher = _made(spec, _find(spec, MATCHERS))
+    _check(spec, matcher, MatcherCard, MATCHERS, ("prepare", "match"))
     return matcher
+
+
+def load_segmenter(spec: str) -> "Segmenter":
+    """Import and make the segmenter of a name, or of "module:Class"; raise `MatchError` as `load_matcher` does.
+
+    >>> load_segmenter("no_such_segmenter")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.MatchError: there is no segmenter 'no_such_segmenter' (list-segmenters shows all; or
+    module:Class)
+    """
+    from sasgeo_bench.matching.segmenter import SegmenterCard  # noqa: PLC0415 - as in load_matcher
+
+    segmenter: Segmenter = _made(spec, _find(spec, SEGMENTERS))
+    _check(spec, segmenter, SegmenterCard, SEGMENTERS, ("segment",))
+    return segmenter
 
 
 def load_rejector(spec: str) -> "Rejector":
@@ -128,18 +154,18 @@ def rejector_maker(spec: str) -> "Callable[[], Rejector]":
 
     Raise `MatchError` if there is none of that name, or it cannot be imported.
     """
-    return partial(_rejector, spec, _find(spec, REJECTORS, "rejector"))
+    return partial(_rejector, spec, _find(spec, REJECTORS))
 
 
 def _rejector(spec: str, target: Callable[[], Any]) -> "Rejector":
     from sasgeo_bench.matching.matcher import RejectorCard  # noqa: PLC0415 - as in load_matcher
 
     rejector: Rejector = _made(spec, target)
-    _check(spec, rejector, RejectorCard, "rejector", ("fit", "p_false"))
+    _check(spec, rejector, RejectorCard, REJECTORS, ("fit", "p_false"))
     return rejector
 
 
-def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequence[str]) -> None:
+def _check(spec: str, plugin: object, card_type: type, group: str, verbs: Sequence[str]) -> None:
     """Refuse a plugin without the card and the methods of its kind."""
     try:
         card = getattr(plugin, "card", None)
@@ -152,7 +178,7 @@ def _check(spec: str, plugin: object, card_type: type, kind: str, verbs: Sequenc
         message = f"{spec}: card is a {type(card).__name__}, expected a {expected}"
         raise MatchError(message)
     if missing:
-        message = f"{spec}: {type(plugin).__name__} is not a {kind}, it has no {' and no '.join(missing)}"
+        message = f"{spec}: {type(plugin).__name__} is not a {KINDS[group]}, it has no {' and no '.join(missing)}"
         raise MatchError(message)
 
 
@@ -165,10 +191,10 @@ def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any pl
         raise MatchError(message) from error
 
 
-def _find(spec: str, group: str, kind: str) -> Callable[[], Any]:
+def _find(spec: str, group: str) -> Callable[[], Any]:
     """Return the class behind a name or module:Class."""
     if ":" not in spec:
-        return _from_entry_point(spec, group, kind)
+        return _from_entry_point(spec, group)
     module, _, name = spec.partition(":")
     try:
         return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
@@ -177,8 +203,8 @@ def _find(spec: str, group: str, kind: str) -> Callable[[], Any]:
         raise MatchError(message) from error
 
 
-def _known(name: str, group: str, kind: str) -> EntryPoint:
-    points = list_entry_points(group)
+def _known(name: str, group: str) -> EntryPoint:
+    points, kind = list_entry_points(group), KINDS[group]
     if name not in points:
         near = difflib.get_close_matches(name, points, n=1, cutoff=0.6)
         hint = f", did you mean {near[0]!r}?" if near else ""
@@ -191,12 +217,12 @@ def _known(name: str, group: str, kind: str) -> EntryPoint:
     return points[name]
 
 
-def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = ()) -> None:
+def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = (), segmenters: Sequence[str] = ()) -> None:
     """Raise `MatchError` for names that no installed package registers; import nothing, accept any module:Class."""
-    for listed, group, kind in ((matchers, MATCHERS, "matcher"), (rejectors, REJECTORS, "rejector")):
+    for listed, group in ((matchers, MATCHERS), (rejectors, REJECTORS), (segmenters, SEGMENTERS)):
         for name in listed:
-            if ":" not in name and not (group == MATCHERS and name == ORACLE):
-                _known(name, group, kind)
+            if ":" not in name and name != _RESERVED.get(group):
+                _known(name, group)
 
 
 def check_registered(rejectors: Sequence[str], *, source: str) -> None:
@@ -214,8 +240,8 @@ def check_registered(rejectors: Sequence[str], *, source: str) -> None:
         raise MatchError(message)
 
 
-def _from_entry_point(name: str, group: str, kind: str) -> Callable[[], Any]:
-    point = _known(name, group, kind)
+def _from_entry_point(name: str, group: str) -> Callable[[], Any]:
+    point = _known(name, group)
     try:
         return point.load()  # type: ignore[no-any-return]
     except (Exception, SystemExit) as error:

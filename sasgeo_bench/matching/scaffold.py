@@ -4,13 +4,13 @@
 import keyword
 import re
 import sys
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.matching.plugins import ORACLE, SHIPPED, list_entry_points
+from sasgeo_bench.matching.plugins import KINDS, MATCHERS, shipped_names
 from sasgeo_bench.matching.submission import example_card
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
@@ -109,8 +109,6 @@ class {cls}:
         return float(agree.sum() / max(1, either.sum()))
 '''
 
-_IMPORTED: Final = frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", _MATCHER, re.MULTILINE))))
-
 _TEST: Final = '''\
 """The matcher keeps to what every matcher keeps to."""
 
@@ -143,33 +141,11 @@ sasgeo-bench submit --predictions out/runs/{name} --card card.toml --for docs/re
 
 
 def plugin_files(name: str) -> dict[str, str]:
-    """Return the text of every file of a new plugin package, by its path.
+    """Return the text of every file of a new package with a matcher, by its path.
 
     `name` is that of the matcher; raise `ConfigError` if it is not allowed, or taken.
     """
-    module = name.replace("-", "_")
-    if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
-        message = f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name"
-        raise ConfigError(message)
-    if not _NAME.fullmatch(name):
-        message = (
-            f"a matcher's name has lower-case letters, digits, hyphens and underscores, as in my-matcher; got {name!r}"
-        )
-        raise ConfigError(message)
-    known = list_entry_points().get(name)
-    home = known.dist.name if known is not None and known.dist is not None else ""
-    if name == ORACLE or home in SHIPPED:
-        message = f"{name!r} is a matcher of sasgeo-bench itself, which would be used instead of yours; choose another"
-        raise ConfigError(message)
-    words = re.split(r"[-_]", name)
-    own = "".join(word.capitalize() for word in words)
-    words_of = {
-        "name": name,
-        "distribution": name.replace("_", "-"),
-        "module": module,
-        "cls": f"{own}Matcher" if own in _IMPORTED or keyword.iskeyword(own) else own,
-        "title": " ".join(words).capitalize(),
-    }
+    words = words_of(name, group=MATCHERS, imported=imported_names(_MATCHER))
     files = {
         "pyproject.toml": _PYPROJECT,
         "README.md": _README,
@@ -177,8 +153,46 @@ def plugin_files(name: str) -> dict[str, str]:
         "src/{module}/matcher.py": _MATCHER,
         "tests/test_conforms.py": _TEST,
     }
-    made = {path.format(**words_of): text.format(**words_of) for path, text in files.items()}
-    return made | {"card.toml": example_card(name)}
+    return filled(files, words) | {"card.toml": example_card(name)}
+
+
+def filled(files: Mapping[str, str], words: Mapping[str, str]) -> dict[str, str]:
+    """Return files with words put into their paths and texts."""
+    return {path.format(**words): text.format(**words) for path, text in files.items()}
+
+
+def words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, str]:
+    """Return the words of a new package: its name, distribution, module, class and title.
+
+    The class is called as none of the `imported` names is. Raise `ConfigError` if the name is not allowed, or taken.
+    """
+    kind = KINDS[group]
+    module = name.replace("-", "_")
+    if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
+        message = f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name"
+        raise ConfigError(message)
+    if not _NAME.fullmatch(name):
+        message = (
+            f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, as in my-{kind}; got {name!r}"
+        )
+        raise ConfigError(message)
+    if name in shipped_names(group):
+        message = f"{name!r} is a {kind} of sasgeo-bench itself, which would be used instead of yours; choose another"
+        raise ConfigError(message)
+    words = re.split(r"[-_]", name)
+    own = "".join(word.capitalize() for word in words)
+    return {
+        "name": name,
+        "distribution": name.replace("_", "-"),
+        "module": module,
+        "cls": f"{own}{kind.capitalize()}" if own in imported or keyword.iskeyword(own) else own,
+        "title": " ".join(words).capitalize(),
+    }
+
+
+def imported_names(text: str) -> frozenset[str]:
+    """Return the words of the import lines of a module, which its own class must not be called."""
+    return frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", text, re.MULTILINE))))
 
 
 def write_plugin(folder: Path, files: Mapping[str, str]) -> None:

@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, TypeVar
 
-from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.texts import message_of, one_line
 
 LOG: Final = "failures.log"  # in the folder of a run; next to that of a board
@@ -25,6 +25,28 @@ def stops_all(error: BaseException | None) -> bool:
             return True
         error = error.__cause__
     return False
+
+
+def guard(ask: Callable[[], Item], failed: Callable[[Exception], Item]) -> Item:
+    """Return the reply to a question; an error counts as one, unless our own disk or folders are at fault.
+
+    `failed` makes a reply of an error. Raise `StoreError` if the disk is at fault.
+    """
+    try:
+        return ask()
+    except StoreError:
+        raise
+    except Exception as error:
+        if stops_all(error):
+            message = f"no process of a plugin can be started ({message_of(error)}): free some space and run again"
+            raise StoreError(message) from error
+        return failed(error)
+
+
+def our_failure(log: Path, name: str, error: Exception) -> str:
+    """Log the traceback of an error of our own code, and return the line for its row."""
+    write_log(log, name, error)
+    return one_line(f"not its own process failed, but ours: {message_of(error)} (see {log.name})")
 
 
 def write_log(log: Path, name: str, error: BaseException) -> None:

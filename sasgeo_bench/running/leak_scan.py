@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find files next to the code that reveal answers: queries, truths, results, boards, releases, other maps.
+"""Find files next to the code that reveal answers: queries, truths, labels, results, boards, releases, other maps.
 
 A matcher reads the folders that it is imported from. Walk them here, without following links, so that files which
 reveal where a query was taken can be hidden; report how far the walk came.
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.running.root import SYSTEM
+from sasgeo_bench.sensing.packing import LABELLED
 from sasgeo_bench.tasks.private_seed import SUFFIX as SEED
 
 MOST_ENTRIES: Final = 200_000  # names: about a second of a fast disk
@@ -164,4 +165,4 @@ def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]
 
 
 def _is_table(name: str) -> bool:
-    return name.startswith(_SIGN_STARTS) and name.endswith(".parquet")
+    return (name.startswith(_SIGN_STARTS) and name.endswith(".parquet")) or name.endswith(LABELLED)

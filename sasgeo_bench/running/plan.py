@@ -289,13 +289,18 @@ def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:
     """Let a matcher read some maps; hide other maps, all queries and truths, and the output of other runs."""
     roots = {root_of(folder) for folder in (*request.tasks, *request.train)} | {request.out.resolve()}
     readable = [region.resolve() for region in regions]
-    hidden = [root / name for root in sorted(roots) for name in _HIDDEN]
+    hidden = hidden_below(sorted(roots))
     # A release next to other output is hidden too, unless its own map is the one in question.
     hidden = [path for path in hidden if not any(region.is_relative_to(path) for region in readable)]
     # Other dates of a place, and the map that a twin was edited from, would reveal the changes.
     maps = sorted(path for root in sorted(roots) for path in (root / "regions").glob("*") if path.is_dir())
     hidden += [*(path for path in maps if path not in readable), *request.hidden]
     return Reach(readable=readable, hidden=hidden, is_shut_in=request.is_shut_in)
+
+
+def hidden_below(roots: Sequence[Path]) -> list[Path]:
+    """Return the folders below some roots of output that tell truths, tasks and answers."""
+    return [root / name for root in roots for name in _HIDDEN]
 
 
 def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:

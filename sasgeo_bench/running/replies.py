@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parse the answers of a matcher's process against one schema: the process is not trusted."""
+"""Parse the answers of a plugin's process against one schema: the process is not trusted."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, Strict, ValidationError
 
@@ -29,11 +30,11 @@ _SHOWN: Final = 60  # characters of where a fault is
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Reply:
-    """Reply to a question, with its status, and its cause in one line.
+class PluginReply:
+    """Reply of any plugin to a question, with its status, and its cause in one line.
 
-    `seconds` is by the runner's clock, `own_s` and `cpu_s` are those that the process reports. Loading returns `card`,
-    the hash `code` and whether the plugin `learns`; preparing, by how much memory grew; training, the `learned` text.
+    `seconds` is by the runner's clock, `own_s` and `cpu_s` are those that the process reports. Loading returns the hash
+    `code` and whether the plugin `learns`; training, the `learned` text.
     """
 
     status: Status
@@ -41,12 +42,18 @@ class Reply:
     seconds: float | None = None
     own_s: float | None = None
     cpu_s: float = 0.0
-    match: Match | None = None
-    card: MatcherCard | None = None
     code: str = ""
     learns: bool = False
-    grown_bytes: int | None = None
     learned: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reply(PluginReply):
+    """Reply of a matcher: loading returns its `card` too; preparing, by how much memory grew; a query, the `match`."""
+
+    match: Match | None = None
+    card: MatcherCard | None = None
+    grown_bytes: int | None = None
 
 
 def _line(text: str) -> str:
@@ -60,6 +67,8 @@ def _bounded(name: str) -> Any:  # noqa: ANN401 - a field of pydantic
     least, most = BOUNDS[name]
     return Field(ge=least, le=most)
 
+
+Model = TypeVar("Model", bound=BaseModel)
 
 Line = Annotated[str, AfterValidator(_line)]
 Metres = Annotated[float, _bounded("easting_m")]
@@ -87,18 +96,20 @@ def _once(pairs: list[tuple[str, float]]) -> list[tuple[str, float]]:
     return pairs
 
 
-class _Strict(BaseModel):
+class Strictly(BaseModel):
     """No silent conversion, nothing that is not known, no number that is none."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class _Failed(_Strict):
+class Failed(Strictly):
+    """A failure, and its cause."""
+
     status: Literal["crash", "invalid", "refused"]
     message: Annotated[Line, Field(max_length=MOST_MESSAGE)]
 
 
-class _Card(_Strict):
+class _Card(Strictly):
     name: Line
     version: Line
     title: Line
@@ -111,7 +122,7 @@ class _Card(_Strict):
     trained_on: Annotated[list[Line], Field(max_length=_MOST_PLACES)]
 
 
-class _Loaded(_Strict):
+class _Loaded(Strictly):
     status: Literal["ok"]
     card: _Card
     code: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
@@ -123,7 +134,7 @@ class _Loaded(_Strict):
         return Reply(status="ok", card=MatcherCard(**fields), code=self.code, learns=self.learns)
 
 
-class _Trained(_Strict):
+class _Trained(Strictly):
     status: Literal["ok"]
     seconds: Seconds
     learned: str
@@ -133,7 +144,7 @@ class _Trained(_Strict):
         return Reply(status="ok", own_s=self.seconds, learned=check_learned(self.learned))
 
 
-class _Prepared(_Strict):
+class _Prepared(Strictly):
     status: Literal["ok"]
     seconds: Seconds
     grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)]
@@ -143,13 +154,13 @@ class _Prepared(_Strict):
         return Reply(status="ok", own_s=self.seconds, grown_bytes=self.grown_bytes)
 
 
-class _Row(_Strict):
+class _Row(Strictly):
     candidates: Annotated[list[Candidate], Field(max_length=MOST_CANDIDATES)]
     confidence: Annotated[float, _bounded("confidence")] | None
     diagnostics: Annotated[list[Diagnostic], Field(max_length=MOST_DIAGNOSTICS), AfterValidator(_once)]
 
 
-class _Matched(_Strict):
+class _Matched(Strictly):
     status: Literal["ok"]
     seconds: Seconds
     cpu_s: Annotated[float, Field(ge=0)]
@@ -185,15 +196,28 @@ def read_reply(kind: str, given: Mapping[str, Any], *, nonce: str) -> Reply:
     >>> read_reply("match", given, nonce="7").message
     'ValueError: no index today'
     """
+    with in_one_line():
+        answer = read_answer(_KINDS[kind], given, nonce=nonce)
+        return Reply(status=answer.status, message=answer.message) if isinstance(answer, Failed) else answer.reply()
+
+
+def read_answer(model: type[Model], given: Mapping[str, Any], *, nonce: str) -> Model | Failed:
+    """Read a JSON message as an answer of a model, or as a failure.
+
+    Raise `MatchError` if it was made for another question, pydantic's `ValidationError` if it is neither.
+    """
     content = dict(given)
     if content.pop("nonce", None) != nonce:
         message = "it was not made for this question"
         raise MatchError(message)
+    return Failed.model_validate(content) if content.get("status") != "ok" else model.model_validate(content)
+
+
+@contextmanager
+def in_one_line() -> Iterator[None]:
+    """Turn a `ValidationError` of the block into a `MatchError` of one line."""
     try:
-        if content.get("status") != "ok":
-            failed = _Failed.model_validate(content)
-            return Reply(status=failed.status, message=failed.message)
-        return _KINDS[kind].model_validate(content).reply()
+        yield
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"]))[:_SHOWN]

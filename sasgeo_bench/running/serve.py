@@ -7,8 +7,9 @@ import os
 import socket
 import sys
 import time
+from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Self
@@ -30,13 +31,12 @@ TOOLS: Final = ("matching.controls", "regions.evidence", "regions.graph", "regio
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
-class Server:
+class PluginServer(ABC):
     """Answers messages until the runner closes its end."""
 
     def __init__(self, channel: socket.socket, *, spec: str) -> None:
         self.channel = channel
         self.spec = spec
-        self.matcher: Matcher | None = None
 
     def run(self) -> None:
         """Serve until the other side closes."""
@@ -47,7 +47,8 @@ class Server:
                 return
             head = {"nonce": message["nonce"]}
             try:
-                answer = wire.packed(head | self._answer(message, blob))
+                content, data = self._answer(message, blob)
+                answer = wire.packed(head | content, data)
             except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
                 answer = wire.packed(head | _failure(error))
             try:
@@ -55,28 +56,48 @@ class Server:
             except wire.Closed:  # the runner waited no longer
                 return
 
-    def _answer(self, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+    @abstractmethod
+    def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
+        """Return the answer to a message, and the bytes that follow it."""
+
+
+class Server(PluginServer):
+    """Answers for a matcher."""
+
+    def __init__(self, channel: socket.socket, *, spec: str) -> None:
+        super().__init__(channel, spec=spec)
+        self.matcher: Matcher | None = None
+
+    def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
         if message["kind"] == "load":
             self.matcher = load_matcher(self.spec)
             about = {"card": asdict(self.matcher.card), "code": code_hash(self.matcher)}
-            return {"status": "ok", **about, "learns": isinstance(self.matcher, Learner)}
+            return {"status": "ok", **about, "learns": isinstance(self.matcher, Learner)}, b""
         if self.matcher is None:
             self.matcher = load_matcher(self.spec)
         if message["kind"] == "learn":
-            return _learn(self.matcher, message, blob)
+            return _learn(self.matcher, message, blob), b""
         if message["kind"] == "prepare":
-            reading = _Cost()
-            region = read_region(Path(message["region"]), around=lambda: reading)
-            with (preparing := _Cost()):
-                self.matcher.prepare(region, message["learned"])
-            grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
-            return {"status": "ok", "seconds": preparing.seconds - reading.seconds, "grown_bytes": grown_bytes}
-        query = query_from(blob)
-        start, start_cpu = time.perf_counter(), time.process_time()
-        found = self.matcher.match(query, top_k=message["top_k"])
-        seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
-        row = match_row(check_match(found, query, top_k=message["top_k"]))
-        return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
+            return _prepare(self.matcher, message), b""
+        return _match(self.matcher, message, blob), b""
+
+
+def _prepare(matcher: Matcher, message: dict[str, Any]) -> dict[str, Any]:
+    reading = _Cost()
+    region = read_region(Path(message["region"]), around=lambda: reading)
+    with (preparing := _Cost()):
+        matcher.prepare(region, message["learned"])
+    grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
+    return {"status": "ok", "seconds": preparing.seconds - reading.seconds, "grown_bytes": grown_bytes}
+
+
+def _match(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+    query = query_from(blob)
+    start, start_cpu = time.perf_counter(), time.process_time()
+    found = matcher.match(query, top_k=message["top_k"])
+    seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
+    row = match_row(check_match(found, query, top_k=message["top_k"]))
+    return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
 
 
 def _failure(error: Exception) -> dict[str, Any]:
@@ -147,21 +168,21 @@ class Maps(Mapping[str, Region]):
         return len(self._folders)
 
 
-def code_hash(matcher: Matcher) -> str:
-    """Return the SHA-256 of the code that makes answers: the plugin's own, and the `TOOLS` that it has loaded.
+def code_hash(plugin: object, tools: Sequence[str] | None = None) -> str:
+    """Return the SHA-256 of the code that makes answers: the plugin's own, and the tools, `TOOLS`, that it has loaded.
 
     Its own is the file of its class or, in a package, all Python files next to and below it, by name.
     """
-    module = sys.modules.get(type(matcher).__module__)
+    module = sys.modules.get(type(plugin).__module__)
     name = getattr(module, "__file__", None)
     digest = hashlib.sha256()
     if name is None:
         return digest.hexdigest()
     own = Path(name)
-    is_package = "." in type(matcher).__module__ or own.name == "__init__.py"
+    is_package = "." in type(plugin).__module__ or own.name == "__init__.py"
     files = sorted(own.parent.rglob("*.py")) if is_package else [own]
     named = {path.relative_to(own.parent).as_posix(): path for path in files}
-    loaded = [sys.modules.get(f"sasgeo_bench.{tool}") for tool in TOOLS]
+    loaded = [sys.modules.get(f"sasgeo_bench.{tool}") for tool in (TOOLS if tools is None else tools)]
     for path in (Path(tool.__file__) for tool in loaded if tool is not None and tool.__file__):
         for part in sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]:
             named[f"sasgeo_bench:{part.relative_to(path.parent.parent).as_posix()}"] = part

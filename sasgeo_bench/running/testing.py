@@ -7,18 +7,19 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match, lacks
-from sasgeo_bench.matching.plugins import check_card_name
+from sasgeo_bench.matching.plugins import MATCHERS
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.running.checks import Check, kept_check, listing_of, loaded_check, refusal_of, taught_check
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files, task_rows
@@ -28,23 +29,11 @@ from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWN: Final = "town-agricultural"  # the smallest that has room for candidates
 TOP_K: Final = 10
-LEARNS: Final = "learns, the same text twice"  # a row of those that have a learn()
 _SUITES: Final = ("clean", "no-priors")
 _EACH: Final = 2  # queries asked of each kind
 _RADIUS_M: Final = 100.0  # of two discs that do not meet, each so far from the edge of the map:
 _EDGE_SHARE: Final = 0.3
 _QUICK_S: Final = 5.0
-
-Outcome = Literal["pass", "fail", "not applicable"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Check:
-    """One row of the table."""
-
-    name: str
-    outcome: Outcome
-    found: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,17 +98,11 @@ def check_matcher(
         readable, hidden = place.map_folder.resolve(), (place.folder / "truth").resolve()
         reach = Reach(readable=[readable], hidden=[hidden], is_shut_in=is_shut_in)
         worker = stack.enter_context(Worker(spec=spec, reach=reach, limits=limits or Limits()))
-        before = _listing(place.folder)
+        before = listing_of(place.folder)
         loaded = worker.load()
-        if loaded.status != "ok" or loaded.card is None:
-            yield Check(name="loads, and has a card", outcome="fail", found=loaded.message)
+        yield (first := loaded_check(spec, loaded, loaded.card, group=MATCHERS))
+        if loaded.card is None or first.outcome == "fail":
             return
-        try:
-            check_card_name(spec, loaded.card.name)
-        except MatchError as error:
-            yield Check(name="loads, and has a card", outcome="fail", found=str(error))
-            return
-        yield Check(name="loads, and has a card", outcome="pass", found=f"{loaded.card.name} {loaded.card.version}")
         taught = _taught(worker, place) if loaded.learns else None
         if taught is not None:
             yield taught.check
@@ -131,10 +114,10 @@ def check_matcher(
         kit = _Kit(worker=worker, card=loaded.card, place=place, is_taught=text is not None)
         if ready.status == "ok":
             yield from kit.checks()
-        yield _kept(
-            refused or kit.refused or _refusal(ready),
+        yield kept_check(
+            refused or kit.refused or refusal_of(ready),
             before,
-            _listing(place.folder),
+            listing_of(place.folder),
             worker.isolation.get("files_changed", ""),
         )
 
@@ -158,13 +141,8 @@ def _taught(worker: Worker, place: TinyPlace) -> _Taught:
         replies.append(worker.learn(maps, zip(blobs, place.truths, strict=True)))
     worker.end()
     first, second = replies
-    lost = next((reply for reply in replies if reply.learned is None), None)
-    fault = "another text the second time" if lost is None and first.learned != second.learned else ""
-    fault = fault if lost is None else f"{lost.status}: {lost.message}"
-    size = len((first.learned or "").encode())
-    found = fault or f"{size} bytes from {len(blobs)} queries, {first.seconds or 0.0:.2f} s"
-    check = Check(name=LEARNS, outcome="fail" if fault else "pass", found=found)
-    return _Taught(text=first.learned, refused=_refusal(first) or _refusal(second), check=check)
+    check = taught_check(first, second, f"{len(blobs)} queries")
+    return _Taught(text=first.learned, refused=refusal_of(first) or refusal_of(second), check=check)
 
 
 def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
@@ -180,28 +158,6 @@ def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
     worker.end()
     found = f"learned = None: {fault}" if fault else f"{len(queries)} queries"
     return Check(name=name, outcome="fail" if fault else "pass", found=found)
-
-
-def _listing(folder: Path) -> dict[str, tuple[int, int]]:
-    """List everything below a folder, files with size and time of writing."""
-    found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
-    status = {name: path.stat() for name, path in found.items() if path.is_file()}
-    return {name: (status[name].st_size, status[name].st_mtime_ns) if name in status else (0, 0) for name in found}
-
-
-def _refusal(reply: Reply) -> str:
-    return reply.message if reply.status == "refused" else ""
-
-
-def _kept(refused: str, before: dict[str, tuple[int, int]], after: dict[str, tuple[int, int]], limited: str) -> Check:
-    """Check that nothing outside the scratch folder was refused, or written where no sandbox refuses it."""
-    name = "kept to its scratch folder"
-    changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
-    if refused:
-        return Check(name=name, outcome="fail", found=f"was refused what it asked for: {refused}")
-    if changed:
-        return Check(name=name, outcome="fail", found=f"wrote among maps and tasks: {', '.join(changed[:3])}")
-    return Check(name=name, outcome="pass", found=limited or "not shut in: looked for files among maps and tasks alone")
 
 
 def _chosen(queries: Iterable[Query]) -> list[Query]:
@@ -261,7 +217,7 @@ class _Kit:
 
     def _ask(self, query: Query, *, top_k: int = TOP_K) -> Reply:
         reply = self.worker.match(task_rows.query_bytes(query), top_k=top_k)
-        self.refused = self.refused or _refusal(reply)
+        self.refused = self.refused or refusal_of(reply)
         return reply
 
     def _over(self, name: str, check: Callable[[Query], str | None], queries: Sequence[Query]) -> Check:

@@ -4,16 +4,15 @@
 from collections.abc import Callable
 from functools import partial
 
-from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.learned_file import read_learned, write_learned
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.running.failures import LOG, stops_all, write_log
+from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.plan import RunPlan, TrainingResult, reach_of, with_training_result
-from sasgeo_bench.running.replies import Reply
+from sasgeo_bench.running.replies import PluginReply, Reply
 from sasgeo_bench.running.training_tasks import TrainingSet, read_pairs
 from sasgeo_bench.running.worker import Worker
-from sasgeo_bench.texts import message_of, one_line
+from sasgeo_bench.texts import one_line
 
 
 def trained(plan: RunPlan, *, tell: Tell) -> RunPlan:
@@ -35,7 +34,7 @@ def trained(plan: RunPlan, *, tell: Tell) -> RunPlan:
         if text is None:
             reply = _learn(plan, given)
             if reply.status != "ok" or reply.learned is None:
-                failed = _failed(reply)
+                failed = failed_training(reply)
                 tell(f"{plan.card.name}: {failed.message} ({failed.status}), learning from {given.to_text()}")
                 return with_training_result(plan, failed)
             write_learned(path, reply.learned)
@@ -55,25 +54,15 @@ def _learn(plan: RunPlan, training_set: TrainingSet) -> Reply:
 
 def guarded(plan: RunPlan, ask: Callable[[], Reply]) -> Reply:
     """Return the reply to a question; an error counts as one, unless our own disk or folders are at fault."""
-    try:
-        return ask()
-    except StoreError:
-        raise
-    except Exception as error:
-        if stops_all(error):
-            message = f"no process of a matcher can be started ({message_of(error)}): free some space and run again"
-            raise StoreError(message) from error
-        return failed_by_us(plan, error)
+    return guard(ask, partial(failed_by_us, plan))
 
 
 def failed_by_us(plan: RunPlan, error: Exception) -> Reply:
     """Log the traceback of an error of our own code, and return the reply to its query."""
-    write_log(plan.run_folder / LOG, plan.card.name, error)
-    message = one_line(f"not its own process failed, but ours: {message_of(error)} (see {LOG})")
-    return Reply(status="crash", message=message)
+    return Reply(status="crash", message=our_failure(plan.run_folder / LOG, plan.card.name, error))
 
 
-def _failed(reply: Reply) -> TrainingResult:
+def failed_training(reply: PluginReply) -> TrainingResult:
     """Return the result of a failed training, whose message all rows get."""
     if reply.status == "ok":
         return TrainingResult(status="invalid", message="while learning: no text in an answer")

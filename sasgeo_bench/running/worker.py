@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Start, ask, watch and end a matcher's process."""
+"""Start, ask, watch and end the process of a plugin; that of a matcher."""
 
 import contextlib
 import os
@@ -11,24 +11,27 @@ import sys
 import tempfile
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Final, Self
+from typing import IO, Any, ClassVar, Final, Generic, Self, TypeVar
 
 import psutil
 
 import sasgeo_bench.running.child
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.folders import remove_tree
+from sasgeo_bench.matching.results import Status
 from sasgeo_bench.running import wire
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import walk_code
 from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
-from sasgeo_bench.running.replies import Reply, read_reply
+from sasgeo_bench.running.replies import PluginReply, Reply, read_reply
+from sasgeo_bench.sensing.packing import LABELLED
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_rows import pairs_bytes
 from sasgeo_bench.texts import one_line
@@ -44,11 +47,11 @@ _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of a matcher.
+    """Limits of a matcher or segmenter.
 
-    Seconds for one query, for one map, and for all training at once. `memory_bytes` bounds the resident memory of all
-    its processes together, and the address space of each. `file_bytes` bounds one file in its scratch folder; where the
-    system offers a way, `scratch_bytes` bounds all of them and `processes` the processes and threads at once.
+    Seconds for one query or image, for one map, and for all training at once. `memory_bytes` bounds the resident memory
+    of all its processes together, and the address space of each. `file_bytes` bounds one file in its scratch folder;
+    where the system offers a way, `scratch_bytes` bounds all of them and `processes` the processes and threads at once.
     """
 
     match_s: float = 30.0
@@ -62,19 +65,25 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reach:
-    """Folders that a matcher may read, folders hidden from it, and whether it runs in the sandbox."""
+    """Folders that a plugin may read, folders hidden from it, and whether it runs in the sandbox."""
 
     readable: Sequence[Path]
     hidden: Sequence[Path]
     is_shut_in: bool = True
 
 
-@dataclass(kw_only=True)
-class Worker:
-    """A matcher's process; a new one is started whenever the last one has ended.
+AnyReply = TypeVar("AnyReply", bound=PluginReply)
 
-    Use it in a `with` block: at its end no process or file of it is left.
+
+@dataclass(kw_only=True)
+class PluginProcess(ABC, Generic[AnyReply]):
+    """The process of a plugin; a new one is started whenever the last one has ended.
+
+    Use it in a `with` block: at its end no process or file of it is left. Each kind of plugin has a class of its own,
+    which names its `door` and asks its questions.
     """
+
+    door: ClassVar[str]
 
     spec: str
     reach: Reach
@@ -89,8 +98,6 @@ class Worker:
     _printed: deque[bytes] = field(default_factory=deque)
     _drain: threading.Thread | None = None
     _scratch: Path | None = None
-    _region: Path | None = None
-    _learned: str | None = None
 
     def __enter__(self) -> Self:
         """Start nothing yet."""
@@ -102,65 +109,50 @@ class Worker:
         """End the process."""
         self.end()
 
-    def load(self) -> Reply:
+    @abstractmethod
+    def _failure(self, status: Status, message: str) -> AnyReply:
+        """Return the reply of a process that gave none."""
+
+    @abstractmethod
+    def _read(self, kind: str, answer: dict[str, Any], data: bytes, *, nonce: str) -> AnyReply:
+        """Read an answer, and the bytes after it, to a question of a kind; raise `MatchError` if it is none."""
+
+    def _luggage(self) -> bytes | None:
+        """Return bytes that a process of this door gets at its start, None for none."""
+        return None
+
+    def load(self) -> AnyReply:
         """Import the plugin."""
         return self._ask({"kind": "load"}, timeout_s=self.limits.prepare_s)
-
-    def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
-        """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
-        sizes, blob = pairs_bytes(pairs)
-        maps = {name: str(path.resolve()) for name, path in regions.items()}
-        message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
-        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARN_BYTES)
-
-    def prepare(self, region: Path, learned: str | None = None) -> Reply:
-        """Index a map, given the learned text."""
-        self._region, self._learned = region, learned
-        message = {"kind": "prepare", "region": str(region.resolve()), "learned": learned}
-        reply = self._ask(message, timeout_s=self.limits.prepare_s)
-        if reply.status != "ok":
-            self.end()
-        return reply
-
-    def match(self, query: bytes, *, top_k: int) -> Reply:
-        """Ask one query, a row in Arrow's stream format, on the map prepared last."""
-        if self._process is None and self._region is not None:
-            again = self.prepare(self._region, self._learned)
-            if again.status != "ok":
-                return again
-        reply = self._ask({"kind": "match", "top_k": top_k}, query, timeout_s=self.limits.match_s)
-        if reply.status in {"timeout", "crash"} and self._is_gone():
-            self.end()
-        return reply
 
     def _is_gone(self) -> bool:
         return self._process is None or self._process.poll() is not None
 
     def _ask(
         self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float, most_bytes: int = wire.MOST_BYTES
-    ) -> Reply:
+    ) -> AnyReply:
         nonce = secrets.token_hex(16)  # so that no answer can be made in advance
         try:
             channel = self._started()
             asked = time.perf_counter()
             deadline = time.monotonic() + timeout_s
             wire.send(channel, {**message, "nonce": nonce}, blob, deadline=deadline)
-            answer, _ = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
+            answer, data = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
             came = time.perf_counter()
-            reply = read_reply(message["kind"], answer, nonce=nonce)
+            reply = self._read(message["kind"], answer, data, nonce=nonce)
         except wire.Late as late:
             self.end()
-            return Reply(status="timeout", message=str(late) or f"no answer within {timeout_s:g} s")
+            return self._failure("timeout", str(late) or f"no answer within {timeout_s:g} s")
         except wire.TooLong as error:
             self.end()
-            return Reply(status="crash", message=one_line(str(error)))
+            return self._failure("crash", one_line(str(error)))
         except wire.Closed as closed:
-            reply = Reply(status="crash", message=self._last_words(str(closed)))
+            words = self._last_words(str(closed))
             self.end()
-            return reply
+            return self._failure("crash", words)
         except (MatchError, wire.Garbled) as error:
             self.end()
-            return Reply(status="invalid", message=one_line(f"an answer that is none: {error}"))
+            return self._failure("invalid", one_line(f"an answer that is none: {error}"))
         if reply.status != "ok":
             return reply
         seconds = came - asked
@@ -172,7 +164,7 @@ class Worker:
             return self._channel
         self.end()
         ours, theirs = socket.socketpair()
-        self._scratch = Path(tempfile.mkdtemp(prefix="sasgeo-matcher-")).resolve()
+        self._scratch = Path(tempfile.mkdtemp(prefix=f"sasgeo-{self.door}-")).resolve()
         command = _command(theirs.fileno(), is_shut_in=self.reach.is_shut_in)
         self._process = subprocess.Popen(  # noqa: S603 - our own module, by our own interpreter
             command,
@@ -196,7 +188,9 @@ class Worker:
             self.isolation = {str(name): one_line(str(text)) for name, text in dict(started["isolation"]).items()}
         self.isolation["memory"] = _memory_words(self.limits, self._group)
         paths = [os.getcwd(), *filter(None, sys.path)]  # noqa: PTH109
-        wire.send(ours, {"spec": self.spec, "scratch": str(self._scratch), "paths": paths})
+        luggage = self._luggage()
+        start = {"door": self.door, "spec": self.spec, "scratch": str(self._scratch), "paths": paths}
+        wire.send(ours, start | {"has_luggage": luggage is not None}, luggage or b"")
         return ours
 
     @staticmethod
@@ -244,7 +238,8 @@ class Worker:
         """Return the arguments of `sandbox.Policy`."""
         code = _code()
         scan = walk_code(code)
-        hidden = [*map(str, self.reach.hidden), *scan.hidden([*code, *self.reach.readable])]
+        found = scan.hidden([*code, *self.reach.readable])
+        hidden = [*map(str, self.reach.hidden), *(path for path in found if not self._is_lesson(path))]
         return {
             "readable": [str(path) for path in (*code, *self.reach.readable)],
             "scratch": scratch,
@@ -254,6 +249,10 @@ class Worker:
             "file_bytes": self.limits.file_bytes,
             "scratch_bytes": self.limits.scratch_bytes,
         }
+
+    def _is_lesson(self, path: str) -> bool:
+        """Return whether a file is a labelled image in a folder that the plugin may read, to learn from it."""
+        return path.endswith(LABELLED) and Path(path).parent in self.reach.readable
 
     def _last_words(self, closed: str) -> str:
         """Describe how a process ended, with the last line it printed."""
@@ -282,6 +281,50 @@ class Worker:
         if self._scratch is not None:
             remove_tree(self._scratch)
         self._process, self._channel, self._scratch = None, None, None
+
+
+@dataclass(kw_only=True)
+class Worker(PluginProcess[Reply]):
+    """The process of a matcher."""
+
+    door: ClassVar[str] = "matcher"
+
+    _region: Path | None = None
+    _learned: str | None = None
+
+    def learn(self, regions: Mapping[str, Path], pairs: Iterable[tuple[bytes, Truth]]) -> Reply:
+        """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
+        sizes, blob = pairs_bytes(pairs)
+        maps = {name: str(path.resolve()) for name, path in regions.items()}
+        message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
+        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARN_BYTES)
+
+    def prepare(self, region: Path, learned: str | None = None) -> Reply:
+        """Index a map, given the learned text."""
+        self._region, self._learned = region, learned
+        message = {"kind": "prepare", "region": str(region.resolve()), "learned": learned}
+        reply = self._ask(message, timeout_s=self.limits.prepare_s)
+        if reply.status != "ok":
+            self.end()
+        return reply
+
+    def match(self, query: bytes, *, top_k: int) -> Reply:
+        """Ask one query, a row in Arrow's stream format, on the map prepared last."""
+        if self._process is None and self._region is not None:
+            again = self.prepare(self._region, self._learned)
+            if again.status != "ok":
+                return again
+        reply = self._ask({"kind": "match", "top_k": top_k}, query, timeout_s=self.limits.match_s)
+        if reply.status in {"timeout", "crash"} and self._is_gone():
+            self.end()
+        return reply
+
+    def _failure(self, status: Status, message: str) -> Reply:
+        return Reply(status=status, message=message)
+
+    def _read(self, kind: str, answer: dict[str, Any], data: bytes, *, nonce: str) -> Reply:
+        del data  # no answer of a matcher has any
+        return read_reply(kind, answer, nonce=nonce)
 
 
 def _signal_name(number: int) -> str:

@@ -324,7 +324,7 @@ def test_where_no_process_can_be_started_for_lack_of_room_the_run_stops_in_one_l
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr("tempfile.mkdtemp", full)
-    with pytest.raises(StoreError, match=r"no process of a matcher can be started .*No space left"):
+    with pytest.raises(StoreError, match=r"no process of a plugin can be started .*No space left"):
         run(plan, tell=lambda _: None)
 
 

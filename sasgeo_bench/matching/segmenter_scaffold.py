@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of a new package with a segmenter: complete, small, and passing the conformance kit."""
+
+from typing import Final
+
+from sasgeo_bench.matching.plugins import SEGMENTERS
+from sasgeo_bench.matching.scaffold import filled, imported_names, words_of
+
+_PYPROJECT: Final = """\
+[build-system]
+requires = ["hatchling>=1.27"]
+build-backend = "hatchling.build"
+
+[project]
+name = "{distribution}"
+version = "0.1.0"
+description = "A segmenter for sasgeo-bench"
+requires-python = ">=3.11"
+dependencies = ["numpy>=2", "sasgeo-bench>=0.1"]
+
+[project.entry-points."sasgeo_bench.segmenters"]
+{name} = "{module}.segmenter:{cls}"
+
+[tool.hatch.build.targets.wheel]
+packages = ["src/{module}"]
+"""
+
+_SEGMENTER: Final = '''\
+"""The segmenter {name}: here is where your method goes."""
+
+import json
+from functools import lru_cache
+
+import numpy as np
+from sasgeo_bench import ABSENT, PRESENT, AerialImage, ImageTraining, Segmentation, SegmenterCard
+
+SOFTNESS = 40.0  # of a colour, in steps of 255
+
+
+class {cls}:
+    """Compares single pixels with mean colours. A place to start from, no method to win with."""
+
+    card = SegmenterCard(
+        name="{name}",
+        version="0.1.0",
+        title="{title}",
+        source="original",
+        ours="all of it",
+        licence="MIT",
+        limits="looks at the colour of one pixel at a time; silent before it has learned",
+    )
+
+    def learn(self, training: ImageTraining) -> str:
+        """Mean colours of each class, where it is and where it is not; the text goes to every call of `segment`."""
+        sums = {{name: np.zeros((2, 4)) for name in training.classes}}
+        for labelled in training.images:
+            for name, labels in zip(labelled.classes, labelled.labels, strict=True):
+                for row, state in enumerate((ABSENT, PRESENT)):
+                    pixels = labelled.image.rgb[labels == state]
+                    sums[name][row] += [*pixels.sum(axis=0, dtype=np.float64), len(pixels)]
+        found = {{name: rows for name, rows in sums.items() if rows[:, 3].all()}}
+        return json.dumps({{name: (rows[:, :3] / rows[:, 3:]).round(2).tolist() for name, rows in found.items()}})
+
+    def segment(self, image: AerialImage, *, learned: str | None) -> Segmentation:
+        """Probability of each class at each pixel; NaN, as everywhere before it has learned, says nothing."""
+        colours = colours_of(learned) if learned else {{}}
+        if not colours:
+            silent = np.full((1, *image.shape), np.nan)
+            return Segmentation.of_probabilities(("building",), silent)
+        pixels = image.rgb.astype(np.float64)
+        planes = []
+        for absent, present in colours.values():
+            nearer = ((pixels - absent) ** 2).sum(axis=2) - ((pixels - present) ** 2).sum(axis=2)
+            planes.append(1 / (1 + np.exp(-np.clip(nearer / SOFTNESS**2, -30, 30))))
+        return Segmentation.of_probabilities(tuple(colours), np.stack(planes))
+
+
+@lru_cache(maxsize=1)  # every image comes with the same text
+def colours_of(learned: str) -> dict[str, np.ndarray]:
+    return {{name: np.array(rows) for name, rows in json.loads(learned).items()}}
+'''
+
+_TEST: Final = '''\
+"""The segmenter keeps to what every segmenter keeps to."""
+
+from sasgeo_bench import check_segmenter
+
+
+def test_it_conforms():
+    faults = [check for check in check_segmenter("{module}.segmenter:{cls}") if check.outcome == "fail"]
+    assert not faults, faults
+'''
+
+_README: Final = """\
+# {title}
+
+A segmenter for sasgeo-bench.
+
+```bash
+pip install -e .
+sasgeo-bench check-segmenter {name}
+```
+
+Say in the card (`src/{module}/segmenter.py`) where the method comes from and what of it is yours; raise its version
+whenever answers change.
+"""
+
+
+def segmenter_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a segmenter, by its path.
+
+    `name` is that of the segmenter; raise `ConfigError` if it is not allowed, or taken.
+
+    >>> sorted(segmenter_files("my-segmenter"))[-1]
+    'tests/test_conforms.py'
+    """
+    words = words_of(name, group=SEGMENTERS, imported=imported_names(_SEGMENTER))
+    files = {
+        "pyproject.toml": _PYPROJECT,
+        "README.md": _README,
+        "src/{module}/__init__.py": '"""The package of the segmenter {name}."""\n',
+        "src/{module}/segmenter.py": _SEGMENTER,
+        "tests/test_conforms.py": _TEST,
+    }
+    return filled(files, words)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The process of a segmenter: what it is asked, and what it may answer."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+from pydantic import Field
+
+from sasgeo_bench.errors import ImageError, MatchError
+from sasgeo_bench.matching.results import Status
+from sasgeo_bench.matching.segmenter import (
+    MOST_TEXT_BYTES,
+    SegmenterCard,
+    SegmenterNeed,
+    check_segmentation,
+    check_text,
+)
+from sasgeo_bench.running import wire
+from sasgeo_bench.running.replies import Failed, Line, PluginReply, Seconds, Strictly, in_one_line, read_answer
+from sasgeo_bench.running.worker import PluginProcess
+from sasgeo_bench.sensing.image import AerialImage
+from sasgeo_bench.sensing.image_bytes import image_bytes
+from sasgeo_bench.sensing.segmentation import MOST_CLASSES, Segmentation
+
+_MOST_PLACES: Final = 1000
+_MOST_GROWTH: Final = 1.01  # of bytes that do not become fewer by compression
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SegmenterReply(PluginReply):
+    """Reply of a segmenter: loading returns its `card`; an image, its `segmentation`."""
+
+    card: SegmenterCard | None = None
+    segmentation: Segmentation | None = None
+
+
+class _Card(Strictly):
+    name: Line
+    version: Line
+    title: Line
+    source: Line
+    ours: Line
+    licence: Line
+    classes: Annotated[list[Line], Field(max_length=MOST_CLASSES)]
+    needs: list[SegmenterNeed]
+    limits: Line
+    trained_on: Annotated[list[Line], Field(max_length=_MOST_PLACES)]
+
+
+class _Loaded(Strictly):
+    status: Literal["ok"]
+    card: _Card
+    code: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+    learns: bool
+
+    def reply(self, data: bytes) -> SegmenterReply:
+        """Return the reply for the runner."""
+        del data
+        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
+        return SegmenterReply(status="ok", card=SegmenterCard(**fields), code=self.code, learns=self.learns)
+
+
+class _Trained(Strictly):
+    status: Literal["ok"]
+    seconds: Seconds
+
+    def reply(self, data: bytes) -> SegmenterReply:
+        """Return the reply for the runner, with the text that the bytes are."""
+        try:
+            text = data.decode()
+        except UnicodeDecodeError as error:
+            message = "the learned text is no UTF-8"
+            raise MatchError(message) from error
+        return SegmenterReply(status="ok", own_s=self.seconds, learned=check_text(text))
+
+
+class _Segmented(Strictly):
+    status: Literal["ok"]
+    seconds: Seconds
+    cpu_s: Annotated[float, Field(ge=0)]
+
+
+_KINDS: Final[dict[str, type[_Loaded | _Trained | _Segmented]]] = {
+    "load": _Loaded,
+    "learn": _Trained,
+    "segment": _Segmented,
+}
+
+
+@dataclass(kw_only=True)
+class SegmenterProcess(PluginProcess[SegmenterReply]):
+    """The process of a segmenter; `learned` is the text that it gets with each image, None without training."""
+
+    door: ClassVar[str] = "segmenter"
+
+    learned: str | None = None
+    _asked: tuple[AerialImage, tuple[str, ...]] | None = None
+
+    def learn(self, images: Sequence[Path]) -> SegmenterReply:
+        """Train on the labelled images of some files, which the process must be able to read."""
+        message = {"kind": "learn", "images": [str(path.resolve()) for path in images]}
+        most_bytes = MOST_TEXT_BYTES + wire.MOST_BYTES
+        return self._ask(message, timeout_s=self.limits.learn_s, most_bytes=most_bytes)
+
+    def segment(self, image: AerialImage, *, classes: Sequence[str] = ()) -> SegmenterReply:
+        """Ask about one image; `classes` are those of the card, against which the answer is checked once more."""
+        self._asked = (image, tuple(classes))
+        rows, cols = image.shape
+        most_bytes = int(MOST_CLASSES * rows * cols * _MOST_GROWTH) + wire.MOST_BYTES
+        return self._ask({"kind": "segment"}, image_bytes(image), timeout_s=self.limits.match_s, most_bytes=most_bytes)
+
+    def _luggage(self) -> bytes | None:
+        return None if self.learned is None else self.learned.encode()
+
+    def _failure(self, status: Status, message: str) -> SegmenterReply:
+        return SegmenterReply(status=status, message=message)
+
+    def _read(self, kind: str, answer: dict[str, Any], data: bytes, *, nonce: str) -> SegmenterReply:
+        with in_one_line():
+            found = read_answer(_KINDS[kind], answer, nonce=nonce)
+        if isinstance(found, Failed):
+            return self._failure(found.status, found.message)
+        return self._segmented(found, data) if isinstance(found, _Segmented) else found.reply(data)
+
+    def _segmented(self, found: _Segmented, data: bytes) -> SegmenterReply:
+        """Return the reply with the segmentation that the bytes are, of the image that was asked about."""
+        if self._asked is None:
+            message = "nobody asked about an image"
+            raise MatchError(message)
+        image, classes = self._asked
+        try:
+            segmentation = Segmentation.from_bytes(data, shape=image.shape)
+        except ImageError as error:
+            raise MatchError(str(error)) from error
+        checked = check_segmentation(segmentation, image, classes=classes)
+        return SegmenterReply(status="ok", own_s=found.seconds, cpu_s=found.cpu_s, segmentation=checked)

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Aerial images: decoded within limits, with the camera as it is believed; and with labels to learn from."""
+
+import datetime as dt
+import warnings
+from dataclasses import dataclass
+from io import BytesIO
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps, UnidentifiedImageError
+
+from sasgeo_bench.errors import ImageError
+from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.texts import message_of
+
+Picture = NDArray[np.uint8]
+
+MOST_BYTES: Final = 64 * 2**20  # of an encoded image
+MOST_PIXELS: Final = 64_000_000  # of a decoded one; Pillow itself warns beyond 89 million
+_FORMATS: Final = ("JPEG", "PNG", "WEBP", "TIFF")
+_WITHIN_8_BITS: Final = frozenset(
+    {"1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB"}
+)
+_16_BITS: Final = 65535
+
+
+def decode_image(
+    data: bytes, *, name: str = "the image", most_bytes: int = MOST_BYTES, most_pixels: int = MOST_PIXELS
+) -> Picture:
+    """Decode an image from outside: JPEG, PNG, WebP or TIFF; bytes and pixels are counted before anything is decoded.
+
+    Parameters
+    ----------
+    data : bytes
+        The encoded image. Of several pictures in one file the first is read.
+    name : str
+        What errors call it, such as its path.
+    most_bytes, most_pixels : int
+        Limits of the encoded and of the decoded image.
+
+    Returns
+    -------
+    ndarray of uint8, shape (H, W, 3)
+        Red, green, blue, turned upright as its EXIF orientation says. Grey becomes three equal bands; 16 bits are
+        rounded to 8; transparent pixels are laid over black.
+
+    Raises
+    ------
+    ImageError
+        In one line, if the image is empty, too large, truncated or damaged, or holds no colours (32-bit numbers).
+
+    Examples
+    --------
+    >>> encoded = BytesIO()
+    >>> Image.new("P", (3, 2)).save(encoded, format="PNG")
+    >>> decode_image(encoded.getvalue()).shape
+    (2, 3, 3)
+    >>> decode_image(encoded.getvalue(), name="roof.png", most_pixels=5)
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ImageError: roof.png has 3 x 2 pixels, at most 5 are decoded: cut it, or scale it down, first
+    """
+    if not data:
+        message = f"{name} is empty: copy or download it again"
+        raise ImageError(message)
+    if len(data) > most_bytes:
+        message = f"{name} has {len(data)} bytes, at most {most_bytes} are read: cut it, or scale it down, first"
+        raise ImageError(message)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of Pillow: large images and odd metadata; we refuse what matters
+        return _decoded(data, name, most_pixels)
+
+
+def _decoded(data: bytes, name: str, most_pixels: int) -> Picture:
+    try:
+        with Image.open(BytesIO(data), formats=_FORMATS) as image:  # reads the head alone
+            _check_head(image, name, most_pixels)
+            return _to_rgb(ImageOps.exif_transpose(image))
+    except ImageError:
+        raise
+    except Image.DecompressionBombError as error:
+        message = f"{name} has more than twice the pixels that Pillow decodes: cut it, or scale it down, first"
+        raise ImageError(message) from error
+    except UnidentifiedImageError as error:
+        message = f"{name} is no JPEG, PNG, WebP or TIFF image, or its first bytes are damaged: export it as one"
+        raise ImageError(message) from error
+    except Exception as error:  # Pillow fails at damaged files with errors of many kinds
+        message = f"{name} is truncated or damaged ({message_of(error)}): copy or download it again"
+        raise ImageError(message) from error
+
+
+def _check_head(image: Image.Image, name: str, most_pixels: int) -> None:
+    """Refuse an image by its head, before its pixels are decoded."""
+    width, height = image.size
+    if width < 1 or height < 1:
+        message = f"{name} has {width} x {height} pixels: export it again"
+        raise ImageError(message)
+    if width * height > most_pixels:
+        message = (
+            f"{name} has {width} x {height} pixels, at most {most_pixels} are decoded: cut it, or scale it down, first"
+        )
+        raise ImageError(message)
+    if image.mode not in _WITHIN_8_BITS and not image.mode.startswith("I;16"):
+        message = f"{name} holds numbers of kind {image.mode!r}, not colours: export it with 8 or 16 bits a band"
+        raise ImageError(message)
+
+
+def _to_rgb(image: Image.Image) -> Picture:
+    """Return the bands of a decoded image as 8-bit red, green and blue."""
+    if image.mode.startswith("I;16"):
+        grey = np.asarray(image).astype(np.uint32)
+        bytes_ = ((grey * 255 + _16_BITS // 2) // _16_BITS).astype(np.uint8)
+        return np.repeat(bytes_[:, :, None], 3, axis=2)
+    if image.has_transparency_data:
+        seen = image.convert("RGBA")
+        image = Image.new("RGBA", seen.size, (0, 0, 0, 255))
+        image.alpha_composite(seen)
+    return np.array(image.convert("RGB"), dtype=np.uint8)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AerialImage:
+    """A picture from the air, and what is believed of the camera that took it.
+
+    Parameters
+    ----------
+    rgb : ndarray of uint8, shape (H, W, 3)
+        Red, green, blue; it is made read-only.
+    camera : Camera
+        As believed: its pose in a frame whose origin is below the camera; yaw 0, since the heading is not given away.
+    height_sigma_m, attitude_sigma_deg : float
+        Standard deviations of the believed height, and of each angle of the believed attitude; 0 where exact.
+    observed_on : date, optional
+        Day of the picture; None if unknown.
+    season : str
+        As in a query: "leaf_on", "snow", ..., or "" for unspecified.
+
+    Raises
+    ------
+    ImageError
+        If the picture is no 8-bit RGB of the camera's size, or a standard deviation is negative or not finite.
+    """
+
+    rgb: Picture
+    camera: Camera
+    height_sigma_m: float = 0.0
+    attitude_sigma_deg: float = 0.0
+    observed_on: dt.date | None = None
+    season: str = ""
+
+    def __post_init__(self) -> None:
+        """Check shape, type and sigmas; lock the picture."""
+        size = (self.camera.intrinsics.height_px, self.camera.intrinsics.width_px)
+        if self.rgb.dtype != np.uint8 or self.rgb.shape != (*size, 3):
+            message = (
+                f"rgb is uint8 of shape {(*size, 3)}, as the camera's pictures are; "
+                f"got {self.rgb.dtype} of shape {self.rgb.shape}"
+            )
+            raise ImageError(message)
+        for name in ("height_sigma_m", "attitude_sigma_deg"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0):
+                message = f"{name} must be finite and not negative, got {value!r}"
+                raise ImageError(message)
+        self.rgb.flags.writeable = False
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return rows and columns."""
+        return (self.rgb.shape[0], self.rgb.shape[1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LabelledImage:
+    """An aerial image and what is on it, pixel by pixel.
+
+    Parameters
+    ----------
+    image : AerialImage
+        The picture.
+    classes : tuple of str
+        Names of the classes, in the order of `labels`; classes overlap, as a bridge and the river below it do.
+    labels : ndarray of uint8, shape (C, H, W)
+        ABSENT 0, PRESENT 1 or UNKNOWN 2, where nobody has looked; made read-only.
+    place : str
+        Region or town; parts of an image set are never split within one.
+
+    Raises
+    ------
+    ImageError
+        If the labels are of another shape than the picture, have no or repeated classes, or hold any other value.
+    """
+
+    image: AerialImage
+    classes: tuple[str, ...]
+    labels: NDArray[np.uint8]
+    place: str
+
+    def __post_init__(self) -> None:
+        """Check shape, type and values; lock the labels."""
+        check_classes(self.classes)
+        expected = (len(self.classes), *self.image.shape)
+        if self.labels.dtype != np.uint8 or self.labels.shape != expected:
+            message = f"labels are uint8 of shape {expected}, got {self.labels.dtype} of shape {self.labels.shape}"
+            raise ImageError(message)
+        if self.labels.max() > UNKNOWN:
+            message = f"labels are 0 absent, 1 present or 2 unknown, got {int(self.labels.max())}"
+            raise ImageError(message)
+        self.labels.flags.writeable = False
+
+
+def check_classes(classes: tuple[str, ...]) -> None:
+    """Raise `ImageError` if there is no class, or one twice.
+
+    >>> check_classes(("building", "water", "building"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ImageError: classes are at least one and each once, got building, water, building
+    """
+    if not classes or len(set(classes)) != len(classes):
+        message = f"classes are at least one and each once, got {', '.join(classes) or 'none'}"
+        raise ImageError(message)

@@ -1,0 +1,208 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Segmentation: the probability of every class at every pixel of an image, or that nothing is said there."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq
+from scipy.special import expit, logit
+
+from sasgeo_bench.errors import ImageError
+from sasgeo_bench.sensing.image import check_classes
+from sasgeo_bench.sensing.packing import pack_parts, split_parts, unpack_body
+
+SILENT: Final = 255  # the byte of a pixel of which nothing is said
+CERTAIN: Final = 254  # the byte of P(present) = 1
+MOST_CLASSES: Final = 64
+MOST_VALUES: Final = 2**30  # bytes of probabilities in one segmentation
+
+_MAGIC: Final = b"SGSEG\x01"
+_STEP: Final = 1 / CERTAIN
+_MOST_SHIFT: Final = 60.0  # of the log-odds: beyond it a probability is 0 or 1 to all digits
+_LEAST_SHARE: Final = 1e-9  # far less than a pixel
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Segmentation:
+    """What a segmenter says of an image: for each class and pixel the probability that the class is there, or nothing.
+
+    Parameters
+    ----------
+    classes : tuple of str
+        Names of the classes, in the order of the planes. Classes overlap, so probabilities do not add up to 1.
+    probability_bytes : ndarray of uint8, shape (C, H, W)
+        0..254 is P(present) times 254, rounded; 255 says nothing. Row 0 is the top of the picture. Made read-only.
+
+    Raises
+    ------
+    ImageError
+        If shape or type do not fit, or a class is missing or repeated.
+
+    Examples
+    --------
+    >>> seen = Segmentation(classes=("water",), probability_bytes=np.array([[[0, 127, 254, 255]]], dtype=np.uint8))
+    >>> seen.probabilities()[0, 0].tolist()
+    [0.0, 0.5, 1.0, nan]
+    """
+
+    classes: tuple[str, ...]
+    probability_bytes: NDArray[np.uint8]
+
+    def __post_init__(self) -> None:
+        """Check shape and type; lock the bytes."""
+        check_classes(self.classes)
+        planes = self.probability_bytes
+        is_sound = planes.dtype == np.uint8 and planes.ndim == 3 and len(planes) == len(self.classes)  # noqa: PLR2004
+        if not is_sound or planes.size == 0:
+            message = (
+                f"a segmentation of {len(self.classes)} classes is uint8 of shape (C, H, W) with a pixel at least, "
+                f"got {planes.dtype} of shape {planes.shape}"
+            )
+            raise ImageError(message)
+        planes.flags.writeable = False
+
+    @classmethod
+    def of_probabilities(cls, classes: tuple[str, ...], probabilities: NDArray[np.floating]) -> Self:
+        """Round probabilities, shape (C, H, W), to bytes; NaN says nothing. Raise `ImageError` for one beyond 0..1.
+
+        >>> Segmentation.of_probabilities(("water",), np.array([[[0.25, np.nan]]])).probability_bytes.tolist()
+        [[[64, 255]]]
+        """
+        is_silent = np.isnan(probabilities)
+        filled = np.where(is_silent, 0, probabilities)
+        if filled.size and not (filled.min() >= 0 and filled.max() <= 1):
+            message = f"probabilities lie in 0..1, got {filled.min():g}..{filled.max():g}"
+            raise ImageError(message)
+        planes = np.where(is_silent, SILENT, np.floor(filled * CERTAIN + 0.5)).astype(np.uint8)
+        return cls(classes=classes, probability_bytes=planes)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Return rows and columns."""
+        return (self.probability_bytes.shape[1], self.probability_bytes.shape[2])
+
+    def probabilities(self) -> NDArray[np.float32]:
+        """Return P(present) for each class and pixel, shape (C, H, W); NaN where nothing is said."""
+        table = (np.arange(SILENT + 1) * _STEP).astype(np.float32)
+        table[SILENT] = np.nan
+        return table[self.probability_bytes]
+
+    def shares(self) -> dict[str, float]:
+        """Return the mean probability of each class over the pixels of which something is said; NaN where none is.
+
+        >>> seen = Segmentation(classes=("water",), probability_bytes=np.array([[[0, 254, 255]]], dtype=np.uint8))
+        >>> seen.shares()
+        {'water': 0.5}
+        """
+        counts = (np.bincount(plane.ravel(), minlength=256)[:SILENT] for plane in self.probability_bytes)
+        steps = np.arange(SILENT)
+        means = (float(count @ steps / count.sum() * _STEP) if count.any() else np.nan for count in counts)
+        return dict(zip(self.classes, means, strict=True))
+
+    def with_shares(self, shares: Mapping[str, float]) -> Self:
+        """Return the segmentation recalibrated so that the mean probability of a class is a given share; no labels.
+
+        Parameters
+        ----------
+        shares : mapping of str to float
+            Fraction of the ground that a class covers, 0..1, such as the map's own in the area of the prior. Classes
+            that are not named stay as they are.
+
+        Returns
+        -------
+        Segmentation
+            Log-odds of each named class are shifted by one number, so the order of pixels stays; pixels of which
+            nothing is said stay so. The mean is met up to the rounding of bytes (1/508).
+
+        Raises
+        ------
+        ImageError
+            If a class is not there, or a share is not within 0..1.
+
+        Notes
+        -----
+        Under a change of priors alone, all odds of a class change by one factor (Saerens, Latinne and Decaestecker,
+        Neural Computation 14, 2002, Eq. 2.4). They compute it from the shares of the training data; here it is the one
+        factor that gives the new share, so that shares of the training data need not be known. It holds as far as the
+        look of a class does not change with the place, and the share is that of the ground in the picture.
+
+        Examples
+        --------
+        A segmenter that learned in a town sees too many roofs in the country, where the map has 10 %:
+
+        >>> cells = np.array([[[127, 127, 127, 203]]], dtype=np.uint8)
+        >>> seen = Segmentation(classes=("building",), probability_bytes=cells)
+        >>> seen.with_shares({"building": 0.1}).probability_bytes.tolist()
+        [[[16, 16, 16, 54]]]
+        """
+        planes = self.probability_bytes.copy()
+        for name, share in shares.items():
+            if name not in self.classes:
+                message = f"there is no class {name!r}, the segmentation has {', '.join(self.classes)}"
+                raise ImageError(message)
+            if not 0 <= share <= 1:
+                message = f"the share of {name} must lie in 0..1, got {share!r}"
+                raise ImageError(message)
+            plane = planes[self.classes.index(name)]
+            plane[:] = _shifted_bytes(np.bincount(plane.ravel(), minlength=256)[:SILENT], share)[plane]
+        return type(self)(classes=self.classes, probability_bytes=planes)
+
+    def to_bytes(self) -> bytes:
+        """Return classes, shape and compressed probabilities as bytes, which `from_bytes` reads; executes nothing."""
+        head = {"classes": self.classes, "shape": self.shape}
+        return pack_parts(_MAGIC, head, self.probability_bytes.tobytes())
+
+    @classmethod
+    def from_bytes(cls, data: bytes, *, shape: tuple[int, int] | None = None) -> Self:
+        """Read the bytes of `to_bytes`, from anywhere: never more is unpacked than the head announces.
+
+        `shape` is the expected number of rows and columns, if known. Raise `ImageError` if the bytes are damaged or
+        too many, or of another shape.
+        """
+        head, rest = split_parts(_MAGIC, data, "a segmentation")
+        classes, found = _read_head(head)
+        if shape is not None and found != shape:
+            message = f"a segmentation of shape {found}, expected {shape} as the picture is"
+            raise ImageError(message)
+        planes = unpack_body(rest, len(classes) * found[0] * found[1], "a segmentation")
+        cells = np.frombuffer(planes, dtype=np.uint8).reshape(len(classes), *found)
+        return cls(classes=classes, probability_bytes=cells)
+
+
+def _shifted_bytes(counts: NDArray[np.int64], share: float) -> NDArray[np.uint8]:
+    """Return the new byte of every byte, shape (256,), so that the mean over `counts`, shape (255,), is the share."""
+    same = np.arange(SILENT + 1, dtype=np.uint8)
+    if not counts.any():
+        return same
+    if share in (0, 1):
+        return np.where(same == SILENT, SILENT, round(share * CERTAIN)).astype(np.uint8)
+    # The outer bytes stand for half a step each: their odds are finite, so a share can always be met.
+    log_odds = logit(np.clip(np.arange(SILENT) * _STEP, _STEP / 4, 1 - _STEP / 4))
+    share = min(max(share, _LEAST_SHARE), 1 - _LEAST_SHARE)
+    weights = counts / counts.sum()
+    shift = brentq(lambda by: float(weights @ expit(log_odds + by)) - share, -_MOST_SHIFT, _MOST_SHIFT)
+    same[:SILENT] = np.floor(expit(log_odds + shift) * CERTAIN + 0.5)
+    return same
+
+
+def _read_head(head: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[int, int]]:
+    """Read classes, rows and columns; raise `ImageError` if they are none, or too many."""
+    classes, shape = head.get("classes"), head.get("shape")
+    is_sound = (
+        isinstance(classes, list)
+        and all(isinstance(name, str) for name in classes)
+        and isinstance(shape, list)
+        and len(shape) == 2  # noqa: PLR2004 - rows and columns
+        and all(type(side) is int and side > 0 for side in shape)
+    )
+    if not is_sound or classes is None or shape is None:
+        message = "the head of a segmentation is damaged: make it again"
+        raise ImageError(message)
+    rows, cols = shape
+    if len(classes) > MOST_CLASSES or len(classes) * rows * cols > MOST_VALUES:
+        message = f"a segmentation of {len(classes)} classes and {rows} x {cols} pixels is too large: cut the picture"
+        raise ImageError(message)
+    return tuple(classes), (rows, cols)

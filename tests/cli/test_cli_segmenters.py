@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands for authors of segmenters: a package, a table, a list; mistakes on one line."""
+
+import pytest
+
+from sasgeo_bench.matching.scaffold import write_plugin
+from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
+
+
+def test_segmenters_are_listed_with_the_control(program) -> None:
+    code, told, err = program("list-segmenters")
+    assert (code, err) == (0, "")
+    head, *rows = (line.split() for line in told.splitlines() if line)
+    assert head == ["segmenter", "package", "class"]
+    assert "oracle_segmenter" in {row[0] for row in rows}
+
+
+def test_a_new_segmenter_is_written_and_the_next_step_is_told(program, tmp_path) -> None:
+    code, told, err = program("new-segmenter", "my-segmenter", "--into", "deep/er")
+    assert (code, err) == (0, "")
+    assert told.startswith("deep/er: 5 files; next: ")
+    assert told.endswith(" install -e deep/er && sasgeo-bench check-segmenter my-segmenter\n")
+    assert (tmp_path / "deep" / "er" / "src" / "my_segmenter" / "segmenter.py").is_file()
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("My Segmenter",), "a segmenter's name has lower-case letters, digits, hyphens and underscores"),
+        (("numpy",), "cannot be a package: it is taken"),
+        (("oracle_segmenter",), "is a segmenter of sasgeo-bench itself"),
+        (("mine", "--into", "full"), "full is there already and not empty"),
+    ],
+)
+def test_a_segmenter_that_cannot_be_made_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, told) -> None:
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "file").write_text("")
+    assert told in mistake("new-segmenter", *words)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_a_check_prints_every_row_and_a_failed_one_is_the_users(program, tmp_path, monkeypatch) -> None:
+    files = segmenter_files("my-checked")
+    write_plugin(tmp_path / "plugin", files)
+    monkeypatch.syspath_prepend(str(tmp_path / "plugin" / "src"))
+    code, told, err = program("check-segmenter", "my_checked.segmenter:MyChecked")
+    assert (code, err) == (0, "")
+    assert "the same answer twice" in told
+    code, told, err = program("check-segmenter", "no_such_segmenter")
+    assert code == 2
+    assert "there is no segmenter 'no_such_segmenter'" in told
+    assert err == "no_such_segmenter: 1 check failed\n"

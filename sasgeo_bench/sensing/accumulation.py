@@ -50,23 +50,21 @@ class Errors:
             message = f"errors are finite and not negative, shares under 1, got {self!r}"
             raise CameraError(message)
 
-    def projection_m(self, height_m: float, reach_m: float) -> float:
-        """Return how far a point `reach_m` from beneath a camera is off by attitude and height, metres (1 sigma).
+    def apart_m(self, *, distance_m: float, height_m: float, reach_m: float) -> float:
+        """Return how far apart two frames show the same point, metres (1 sigma).
 
-        >>> round(Errors(attitude_deg=1.0).projection_m(100.0, 0.0), 2)
-        1.75
-        """
-        turn = math.radians(self.attitude_deg)
-        return math.hypot(height_m * turn, reach_m * turn, reach_m * self.height_share)
+        `distance_m` is flown between them at `height_m`; the point lies `reach_m` from the middle of the view. Both
+        attitudes are off, and the odometry between them. A wrong height scales both frames, each about its own middle.
 
-    def drift_m(self, distance_m: float, reach_m: float) -> float:
-        """Return how far odometry is off over a distance, for a point `reach_m` from the middle, metres (1 sigma).
-
-        >>> Errors(position_share=0.01).drift_m(200.0, 50.0)
+        >>> round(Errors(attitude_deg=1.0).apart_m(distance_m=0.0, height_m=100.0, reach_m=0.0), 2)
+        2.47
+        >>> Errors(position_share=0.01).apart_m(distance_m=200.0, height_m=100.0, reach_m=50.0)
         2.0
         """
-        turn = math.radians(self.yaw_deg_per_km) * math.sqrt(distance_m / _M_PER_KM)
-        return math.hypot(distance_m * self.position_share, reach_m * turn)
+        turn = math.sqrt(2) * math.radians(self.attitude_deg)
+        walk = math.radians(self.yaw_deg_per_km) * math.sqrt(distance_m / _M_PER_KM)
+        shares = (distance_m * self.position_share, distance_m * self.height_share)
+        return math.hypot(height_m * turn, reach_m * turn, reach_m * walk, *shares)
 
 
 def believed_cameras(cameras: Sequence[Camera], errors: Errors, rng: np.random.Generator) -> list[Camera]:
@@ -111,6 +109,7 @@ def accumulate(
     errors: Errors | None = None,
     height_m: float = 0.0,
     correlation: float = 0.5,
+    caution: float = 0.5,
 ) -> SoftView:
     """Return what all frames together say of the ground in the last one.
 
@@ -127,6 +126,8 @@ def accumulate(
     correlation : float
         Of the log-odds of two frames of the same ground, 0 to 1: a segmenter that mistakes a field for a road does so
         in each frame. 0 adds log-odds, 1 takes their mean.
+    caution : float
+        By how many standard deviations of place a frame may be off, see below. 0 ignores the errors.
 
     Returns
     -------
@@ -136,7 +137,7 @@ def accumulate(
     Raises
     ------
     ShapeError, CameraError
-        If frames differ in lattice or classes, there are none, steps do not fit, or `correlation` is out of range.
+        If frames differ in lattice or classes, there are none, steps do not fit, or a number is out of range.
 
     Notes
     -----
@@ -144,9 +145,9 @@ def accumulate(
     projection. Here it is that of log-odds, times n / (1 + (n - 1) * correlation) for n frames that know a cell, as for
     equally correlated measurements. Uncertainty of place is no weight but an interval: a frame that may be off by r
     says "present" only where all cells within r are, and "absent" only where none is; elsewhere it says nothing. So
-    unknown grows around every border with the distance since a frame, and thin things are forgotten first. r is one
-    standard deviation, of projection in both frames and of the odometry between them, at a mean distance from the
-    middle of the view.
+    unknown grows around every border with the distance since a frame, and thin things are forgotten first. r is
+    `caution` times `Errors.apart_m` at a mean distance from the middle of the view. More caution makes what is said
+    truer, and less is said: choose it on training places.
 
     Examples
     --------
@@ -157,11 +158,10 @@ def accumulate(
     >>> round(float(accumulate([frame, frame], [still]).probabilities[0, 2, 2]), 3)
     0.864
     """
-    _check(frames, steps, correlation)
+    _check(frames, steps, correlation, caution)
     errors = errors or Errors()
     last = frames[-1]
     reach_m = _MEAN_REACH * last.probabilities.shape[1] * last.cell_size_m
-    projection_m = errors.projection_m(height_m, reach_m)
     total = np.zeros(last.probabilities.shape, dtype=np.float64)
     count = np.zeros(last.probabilities.shape, dtype=np.int64)
     pose, distance_m = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0), 0.0  # of the last frame in frame `index`
@@ -170,7 +170,7 @@ def accumulate(
         if index < len(frames) - 1:
             pose = _after(steps[index], pose)
             distance_m += math.hypot(steps[index].easting_m, steps[index].northing_m)
-            radius_m = math.hypot(math.sqrt(2) * projection_m, errors.drift_m(distance_m, reach_m))
+            radius_m = caution * errors.apart_m(distance_m=distance_m, height_m=height_m, reach_m=reach_m)
         sure = _certain(frames[index].probabilities, radius_m / last.cell_size_m)
         found = sure if index == len(frames) - 1 else _warped(sure, pose, last.cell_size_m)
         is_known = np.isfinite(found)
@@ -181,7 +181,7 @@ def accumulate(
     return SoftView(classes=last.classes, probabilities=probabilities, cell_size_m=last.cell_size_m)
 
 
-def _check(frames: Sequence[SoftView], steps: Sequence[Pose], correlation: float) -> None:
+def _check(frames: Sequence[SoftView], steps: Sequence[Pose], correlation: float, caution: float) -> None:
     if not frames or len(steps) != len(frames) - 1:
         message = f"n frames, at least one, have n - 1 steps between them, got {len(frames)} and {len(steps)}"
         raise ShapeError(message)
@@ -189,8 +189,8 @@ def _check(frames: Sequence[SoftView], steps: Sequence[Pose], correlation: float
     if len(kinds) > 1:
         message = f"frames have one lattice and the same classes, got {len(kinds)} kinds of them"
         raise ShapeError(message)
-    if not 0 <= correlation <= 1:
-        message = f"correlation is 0 to 1, got {correlation!r}"
+    if not 0 <= correlation <= 1 or not 0 <= caution < math.inf:
+        message = f"correlation is 0 to 1 and caution not negative, got {correlation!r} and {caution!r}"
         raise CameraError(message)
 
 

@@ -90,18 +90,18 @@ def test_with_drift_declared_unknown_grows_and_what_is_known_stays_right():
     errors = Errors(position_share=0.15)
     drifting = [believed_steps(steps_between(poses), errors, np.random.default_rng(seed)) for seed in range(20)]
     naive = [share_right(accumulate(hidden, steps), poses[-1]) for steps in drifting]
-    aware = [share_right(accumulate(hidden, steps, errors=errors), poses[-1]) for steps in drifting]
+    aware = [share_right(accumulate(hidden, steps, errors=errors, caution=1.0), poses[-1]) for steps in drifting]
     assert np.mean([right for right, _ in aware]) > np.mean([right for right, _ in naive]) + 0.02
     assert np.mean([unknown for _, unknown in aware]) > np.mean([unknown for _, unknown in naive]) + 0.02
 
 
-@pytest.mark.parametrize("errors", [Errors(attitude_deg=1.0), Errors(height_share=0.1), Errors(yaw_deg_per_km=60.0)])
+@pytest.mark.parametrize("errors", [Errors(attitude_deg=1.0), Errors(height_share=0.5), Errors(yaw_deg_per_km=60.0)])
 def test_every_error_makes_unknown_grow(errors):
     poses = flight()
     frames = [view_of(pose) for pose in poses[:-1]] + [view_of(poses[-1], hidden=0.999)]
     steps = steps_between(poses)
     _, exact = share_right(accumulate(frames, steps), poses[-1])
-    _, grown = share_right(accumulate(frames, steps, errors=errors, height_m=100.0), poses[-1])
+    _, grown = share_right(accumulate(frames, steps, errors=errors, height_m=100.0, caution=1.0), poses[-1])
     assert grown > exact + 0.01
 
 
@@ -111,7 +111,7 @@ def test_a_thin_thing_is_forgotten_before_a_wide_one():
     probabilities[0, :, 40:54] = 0.9
     old = SoftView(classes=("water",), probabilities=probabilities, cell_size_m=1.0)
     nothing = SoftView(classes=("water",), probabilities=np.full_like(probabilities, np.nan), cell_size_m=1.0)
-    view = accumulate([old, nothing], [HERE], errors=Errors(attitude_deg=1.0), height_m=100.0)  # 2.5 m
+    view = accumulate([old, nothing], [HERE], errors=Errors(attitude_deg=1.0), height_m=100.0, caution=1.0)  # 2.5 m
     cells = view.to_evidence().cells[0, 32]
     assert (cells[18:24] == UNKNOWN).all()
     assert cells[47] == PRESENT
@@ -158,6 +158,8 @@ def test_frames_that_do_not_fit_are_refused(frames, steps):
 def test_absurd_numbers_are_refused():
     with pytest.raises(CameraError, match="correlation"):
         accumulate([view_of(HERE)], [], correlation=2.0)
+    with pytest.raises(CameraError, match="caution"):
+        accumulate([view_of(HERE)], [], caution=-1.0)
     for how in ({"attitude_deg": -1.0}, {"height_share": float("nan")}, {"position_share": 3.0}):
         with pytest.raises(CameraError, match="errors are"):
             Errors(**how)

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import ConfigError, ExtractError
+from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
@@ -158,11 +158,11 @@ def check_separate(tasks: Path, truth: Path) -> None:
 
 
 def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -> bool:
-    """Return whether a region is synthetic, or its newest extract is on this machine."""
+    """Return whether a region is synthetic, or its newest extract and its pictures are on this machine."""
     offline = spec.model_copy(update={"extract": [item.model_copy(update={"urls": ()}) for item in spec.extract]})
     try:
         plan_build(offline, out=out, extract_folders=request_folders)
-    except ExtractError:
+    except (ExtractError, ImageryError):
         return False
     return True
 

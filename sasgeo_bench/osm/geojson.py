@@ -51,16 +51,14 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
 
 def _features(path: Path) -> Iterator[Any]:
     """Yield the features of a file, after a check of its form and its coordinate reference system."""
+    if path.stat().st_size > MOST_BYTES:
+        message = f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region"
+        raise ExtractError(message)
     try:
-        with path.open("rb") as source:
-            data = source.read(MOST_BYTES + 1)
-        content = parse_json(data) if len(data) <= MOST_BYTES else None
+        content = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         message = f"{path} cannot be read as GeoJSON ({str(error)[:200]}): get it again"
         raise ExtractError(message) from error
-    if content is None:
-        message = f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region"
-        raise ExtractError(message)
     features = content.get("features") if isinstance(content, dict) else None
     if not isinstance(features, list) or content.get("type") != "FeatureCollection":
         message = f"{path} is no GeoJSON FeatureCollection: export the features of OpenStreetMap as one"

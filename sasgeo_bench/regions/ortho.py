@@ -39,7 +39,7 @@ _JPEG_QUALITY: Final = 90
 _EMPTY_M: Final = 10.0  # a disc of one colour this wide is no roof, but a hole in a mosaic
 _EMPTY_LEVELS: Final = 4  # by which JPEG changes that colour
 _EDGE_POINTS: Final = 21
-_SNAP: Final = 1e-3  # of a pixel
+_SNAP: Final = 0.05  # of a pixel: a little coarser will do, rather than a third finer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -149,7 +149,7 @@ def _text(bounds_m: Sequence[float]) -> str:
 def ortho_grid(pictures: Sequence[Picture], region: Grid) -> Grid:
     """Return the lattice of the imagery: its edges are edges of map cells, its pixels whole fractions of them.
 
-    The pixels are as fine as the finest picture or a little finer; of pictures coarser than the map a whole multiple of
+    The pixels are about as fine as the finest picture, or finer; of pictures coarser than the map a whole multiple of
     its cells. Raise `ImageryError` if it has too many pixels.
 
     >>> region = Grid(epsg=32632, west_m=0.0, north_m=100.0, cell_size_m=1.0, rows=100, cols=100)

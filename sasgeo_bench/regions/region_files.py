@@ -135,6 +135,18 @@ def read_imagery(path: str | Path) -> Imagery | None:
     return imagery
 
 
+def check_publishable(folder: Path, manifest: Manifest) -> None:
+    """Raise `StoreError` if the imagery of a map must not be passed on; call it before imagery leaves this machine."""
+    if manifest.imagery is None or manifest.imagery.is_publishable:
+        return
+    kept = next(item for item in manifest.imagery.pictures if not item.publish)
+    message = (
+        f"{folder / ORTHO} holds {kept.file}, whose region file says publish = false (licence: {kept.licence}): leave "
+        f"{manifest.id} out, or build it from a region file without [[imagery]]"
+    )
+    raise StoreError(message)
+
+
 def _imagery(folder: Path, manifest: Manifest) -> Imagery | None:
     """Return what reads the imagery; its file is not opened."""
     if manifest.imagery is None:

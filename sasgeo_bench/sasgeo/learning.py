@@ -139,9 +139,7 @@ def classes_of(regions: Iterable[Region]) -> tuple[str, ...]:
     return tuple(name for name in load_taxonomy().names if name in known)
 
 
-def _fit_classes(
-    training: Training, views: ViewsByMap, switches: Switches, classes: tuple[str, ...]
-) -> ScorerModel:
+def _fit_classes(training: Training, views: ViewsByMap, switches: Switches, classes: tuple[str, ...]) -> ScorerModel:
     """Fit rates, likeness, seasons and trust of classes."""
     tallies: dict[str, list[Tally]] = {"": []}
     stamps: list[StampTally] = []

@@ -113,7 +113,9 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
 
 def _other_split(region: str) -> str:
     """Say which shipped split holds a region, or what to do if none does."""
-    found = next((name for name, path in list_split_files().items() if region in read_split_file(path).region_ids), None)
+    found = next(
+        (name for name, path in list_split_files().items() if region in read_split_file(path).region_ids), None
+    )
     return "add it to a split file of your own" + (f", or use --split {found}" if found else "")
 
 

@@ -129,5 +129,7 @@ def write_picture(path: Path, bands: NDArray[np.generic], **profile: object) -> 
     """Write bands, shape (bands, rows, cols), as a GeoTIFF; in Web Mercator unless told otherwise."""
     count, rows, cols = bands.shape
     about = {"crs": f"EPSG:{MERCATOR}", "tiled": True, "compress": "deflate", **profile}
-    with rasterio.open(path, "w", driver="GTiff", count=count, height=rows, width=cols, dtype=bands.dtype, **about) as to:
+    with rasterio.open(
+        path, "w", driver="GTiff", count=count, height=rows, width=cols, dtype=bands.dtype, **about
+    ) as to:
         to.write(bands)

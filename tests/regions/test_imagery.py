@@ -137,7 +137,9 @@ def test_a_region_without_pictures_has_no_imagery(tiny):
 
 def test_a_second_build_is_skipped_until_the_picture_changes(hamlet, built):
     out = built.parent.parent
-    assert plan_build(hamlet.spec(), out=out, imagery_folders=[hamlet.folder], extract_folders=[hamlet.folder]).is_current
+    assert plan_build(
+        hamlet.spec(), out=out, imagery_folders=[hamlet.folder], extract_folders=[hamlet.folder]
+    ).is_current
     other = hamlet.but(publish=False)
     assert not plan_build(
         other.spec(), out=out, imagery_folders=[hamlet.folder], extract_folders=[hamlet.folder]
@@ -183,7 +185,9 @@ def test_parts_without_a_picture_are_unknown_however_the_file_says_so(how, hamle
 
 def test_a_picture_that_is_nowhere_is_named_with_the_places_to_put_it(hamlet, tmp_path, monkeypatch):
     monkeypatch.setenv("SASGEO_IMAGERY", str(tmp_path / "named"))
-    with pytest.raises(ImageryError, match=r"mosaic.tif .* was not found: put it into .*named.* --imagery or SASGEO_IMAG"):
+    with pytest.raises(
+        ImageryError, match=r"mosaic.tif .* was not found: put it into .*named.* --imagery or SASGEO_IMAG"
+    ):
         plan_build(hamlet.spec(), out=tmp_path, extract_folders=[hamlet.folder])
 
 
@@ -266,7 +270,9 @@ def test_a_truncated_picture_is_refused_and_an_older_region_stays(hamlet, built,
 
 def test_imagery_that_must_not_be_passed_on_is_refused(hamlet, tmp_path):
     folder = build(hamlet.but(publish=False), tmp_path)
-    with pytest.raises(StoreError, match=r"publish = false .*: leave hamlet out, or build it .* without \[\[imagery\]\]"):
+    with pytest.raises(
+        StoreError, match=r"publish = false .*: leave hamlet out, or build it .* without \[\[imagery\]\]"
+    ):
         check_publishable(folder, read_manifest(folder))
 
 

@@ -29,7 +29,10 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root with the clean and absent queries of a place whose map knows of buildings alone."""
     hamlet, out = make_hamlet(tmp_path_factory.mktemp("hamlet")), tmp_path_factory.mktemp("out")
     town = read_region_file(list_region_files()["town-suburb"]).model_copy(update={"size_m": (640.0, 640.0)})
-    places = [{"name": "hamlet", "half": "a", "regions": ["hamlet"]}, {"name": "b", "half": "a", "regions": ["town-grid"]}]
+    places = [
+        {"name": "hamlet", "half": "a", "regions": ["hamlet"]},
+        {"name": "b", "half": "a", "regions": ["town-grid"]},
+    ]
     places += [{"name": name, "half": "b", "regions": [name]} for name in ("town-suburb", "town-riverside")]
     spec = SplitFile(id="own", title="own", kind="crossfit", buffer_m=100.0, place=places)
     known = {name: read_region_file(path) for name, path in list_region_files().items()}

@@ -9,7 +9,12 @@ from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard,
 
 STRENGTHS: Final = (0.3, 0.6, 0.9)
 SMALL_STRENGTHS: Final = (0.6, 0.9)
-NEEDS: Final[dict[Kind, tuple[str, ...]]] = {"leaf_on": ("green",), "snow": (), "low_water": ("water", "waterway"), "harvest": ("farmland",)}
+NEEDS: Final[dict[Kind, tuple[str, ...]]] = {
+    "leaf_on": ("green",),
+    "snow": (),
+    "low_water": ("water", "waterway"),
+    "harvest": ("farmland",),
+}
 _LEAST_SHARE: Final = 0.003  # of the mapped cells that the classes of a season cover
 
 

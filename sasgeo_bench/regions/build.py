@@ -57,7 +57,7 @@ class BuildPlan:
     """Inputs and outputs of a build.
 
     `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
-    `pictures` are the checked pictures that become the imagery.
+    `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date.
     """
 
     spec: RegionFile
@@ -122,7 +122,7 @@ def plan_build(
     is_newest = extract == spec.pick(None)
     folder = out / "regions" / (spec.id if is_newest else f"{spec.id}@{extract.date.isoformat()}")
     inputs = _inputs_sha256(spec, extract, sha256_of(source) if source else "")
-    grid = spec.grid()
+    grid, is_current = spec.grid(), _is_current(folder, inputs)
     return BuildPlan(
         spec=spec,
         extract=extract,
@@ -130,11 +130,11 @@ def plan_build(
         grid=grid,
         folder=folder,
         inputs_sha256=inputs,
-        is_current=_is_current(folder, inputs),
+        is_current=is_current,
         more=more,
         pictures=tuple(
             check_picture(find_imagery(entry, folders=imagery_folders, extracts=extract_folders), entry, grid)
-            for entry in spec.imagery
+            for entry in (() if is_current else spec.imagery)
         ),
     )
 
@@ -188,6 +188,9 @@ def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> M
 
 def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: bool) -> Manifest:
     name = plan.folder.name
+    if len(plan.pictures) < len(plan.spec.imagery):
+        message = f"{plan.folder} was changed after it was found up to date: build it again"
+        raise StoreError(message)
     with _source(plan) as source:
         tell(f"{name}: reading {source.name}")
         reading = _read(plan, source)

@@ -17,7 +17,7 @@ from sasgeo_bench.geometry.grid import Grid
 
 ORTHO: Final = "ortho.tif"
 MOST_WINDOW_PIXELS: Final = 64_000_000  # 256 MB as colours and mask
-BANDS: Final = (1, 2, 3)
+BANDS: Final = (1, 2, 3)  # red, green, blue
 
 Bounds = tuple[float, float, float, float]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -91,6 +91,14 @@ class OrthoRecord(_Record):
     def attribution(self) -> str:
         """Return the attributions of all pictures with their licences, each once."""
         return "; ".join(dict.fromkeys(f"{item.attribution} ({item.licence})" for item in self.pictures))
+
+    def to_text(self) -> str:
+        """Describe in one line what there is, how far it is off the map, and whether it may be passed on."""
+        files = ", ".join(f"{item.file} of {item.date}" for item in self.pictures)
+        off = f"off the map by {self.offset.to_text()}" if self.offset else "its offset is not known"
+        rights = "may be passed on" if self.is_publishable else "must not be passed on"
+        shown = f"pixels of {self.gsd_m:.3f} m show {self.share:.1%} of the mapped ground"
+        return f"{files}; {shown}, {off}; {self.attribution}, {rights}"
 
     def grid(self, *, epsg: int) -> Grid:
         """Return the lattice of the pixels."""
@@ -184,11 +192,11 @@ def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
                 add_alpha=True,
             ) as view,
         ):
-            rgb, mask = view.read(BANDS), view.dataset_mask()
+            bands = view.read()  # at once: each call warps anew
     except RasterioError as error:
         message = f"{path} cannot be read ({error}): build the region again"
         raise StoreError(message) from error
-    is_known = np.asarray(mask > 0)
+    rgb, is_known = bands[:-1], np.asarray(bands[-1] > 0)
     return ImageryWindow(
         grid=grid, rgb=np.moveaxis(rgb, 0, -1) * is_known[..., None].astype(np.uint8), is_known=is_known
     )

@@ -16,7 +16,7 @@ from affine import Affine
 from numpy.typing import NDArray
 from pyproj import Transformer
 from pyproj.exceptions import ProjError
-from rasterio.enums import MaskFlags, Resampling
+from rasterio.enums import ColorInterp, MaskFlags, Resampling
 from rasterio.errors import CRSError, RasterioError
 from rasterio.vrt import WarpedVRT
 from rasterio.warp import transform_bounds
@@ -272,6 +272,7 @@ class _Warped:
                 warp_mem_limit=64,
             )
         )
+        self._alpha = self._view.colorinterp.index(ColorInterp.alpha) + 1
 
     def lay(self, window: Window, part: Grid, rgb: NDArray[np.uint8], is_known: NDArray[np.bool_]) -> None:
         """Write the picture's pixels of a window over what is there; arrays of shape (3, rows, cols), (rows, cols)."""
@@ -288,10 +289,11 @@ class _Warped:
             min(top + part.rows + margin, self._view.height - window.row_off + top),
         )
         try:
-            colours, mask = self._view.read(BANDS, window=wide), self._view.dataset_mask(window=wide) > 0
+            bands = self._view.read((*BANDS, self._alpha), window=wide)  # at once: each call warps anew
         except RasterioError as error:
             message = f"{self._picture.path} is damaged ({str(error)[:200]}): get it again"
             raise ImageryError(message) from error
+        colours, mask = bands[:3], bands[3] > 0
         if empty is not None:
             mask = mask & ~is_empty(colours, empty, diameter_px=margin)
         here = (slice(top, top + part.rows), slice(left, left + part.cols))

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rasterio.features import rasterize
 from shapely import affinity
 
+from sasgeo_bench.config import parse_toml
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.regions.region_spec import RegionFile
 
@@ -61,8 +62,6 @@ class Hamlet:
 
     def spec(self) -> RegionFile:
         """Return the region file."""
-        from sasgeo_bench.config import parse_toml
-
         ring = to_lonlat(shapely.box(WEST + 20, SOUTH + 20, WEST + SIDE_M - 20, SOUTH + SIDE_M - 20))
         bounds = to_lonlat(shapely.box(WEST, SOUTH, WEST + SIDE_M, SOUTH + SIDE_M)).bounds
         text = SPEC.format(

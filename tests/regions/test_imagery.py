@@ -12,7 +12,7 @@ import shapely
 from affine import Affine
 from rio_cogeo.cogeo import cog_validate
 
-from sasgeo_bench.errors import ConfigError, ImageryError, StoreError
+from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError, StoreError
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import (
@@ -22,6 +22,7 @@ from sasgeo_bench.regions.region_files import (
     read_manifest,
     read_region,
 )
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from tests.regions.imagery_place import GSD_M, SOUTH, WEST, Hamlet, make_hamlet, write_picture
 
 OFF_M = (1.3, -0.7)
@@ -191,6 +192,12 @@ def test_a_picture_that_is_nowhere_is_named_with_the_places_to_put_it(hamlet, tm
         plan_build(hamlet.spec(), out=tmp_path, extract_folders=[hamlet.folder])
 
 
+def test_a_region_that_is_up_to_date_needs_its_pictures_no_more(hamlet, built):
+    plan = plan_build(hamlet.spec(), out=built.parent.parent, extract_folders=[hamlet.folder])
+    assert plan.is_current
+    assert plan.pictures == ()
+
+
 def test_pictures_are_found_one_folder_deeper_and_beside_the_extracts(hamlet, tmp_path):
     (tmp_path / "imagery" / "hamlet").mkdir(parents=True)
     (tmp_path / "osm").mkdir()
@@ -262,10 +269,18 @@ def test_a_truncated_picture_is_refused_and_an_older_region_stays(hamlet, built,
     shutil.copytree(hamlet.folder, place.folder)
     whole = (place.folder / "mosaic.tif").read_bytes()
     (place.folder / "mosaic.tif").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(ImageryError, match="mosaic.tif"):
+    with pytest.raises(ImageryError, match=r"mosaic.tif"):
         build(place, out)
     assert differing_files(out / "regions" / "hamlet") == []
     assert [path.name for path in (out / "regions").iterdir() if "partial" in path.name] == []
+
+
+def test_a_line_says_what_there_is_and_whose_it_is(built):
+    text = read_manifest(built).imagery.to_text()
+    assert text.startswith(
+        "mosaic.tif of 2023-06-01; pixels of 0.500 m show 100.0% of the mapped ground, off the map by"
+    )
+    assert text.endswith("(c) somebody with a drone (CC-BY-4.0), may be passed on")
 
 
 def test_imagery_that_must_not_be_passed_on_is_refused(hamlet, tmp_path):
@@ -287,3 +302,24 @@ def test_the_mapped_ground_shown_is_counted(built):
     assert record.share == 1.0
     assert record.pictures[0].gsd_m == pytest.approx(GSD_M, rel=0.05)
     assert (record.rows, record.cols) == (2 * manifest.rows, 2 * manifest.cols)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("name", "most_m", "tiles"), [("zanzibar", 0.3, 6), ("banepa", 0.1, 40)])
+def test_a_real_mosaic_lies_on_its_map(name, most_m, tiles, tmp_path):
+    spec = read_region_file(list_region_files()[name])
+    if name == "zanzibar":  # its southern part is enough
+        ring = spec.coverage_parts_lonlat[1]
+        box = shapely.Polygon(ring).bounds
+        changes = {"bounds_lonlat": box, "coverage_parts_lonlat": [ring], "imagery": spec.imagery[1:]}
+        spec = spec.model_copy(update=changes)
+    try:
+        plan = plan_build(spec, out=tmp_path)
+    except (ExtractError, ImageryError) as error:
+        pytest.skip(f"real imagery: {error}")
+    manifest = build_region(plan, tell=lambda _: None, with_preview=False)
+    assert manifest.classes == ("building",)
+    assert manifest.imagery.share > 0.98
+    assert max(abs(manifest.imagery.offset.east_m), abs(manifest.imagery.offset.north_m)) < most_m
+    assert manifest.imagery.offset.tiles >= tiles
+    assert manifest.imagery.is_publishable == (name == "banepa")

@@ -44,8 +44,11 @@ from .regions.evidence import Evidence as Evidence
 from .regions.evidence import LayerBits as LayerBits
 from .regions.evidence import observe as observe
 from .regions.graph import build_graph as build_graph
+from .regions.imagery import Imagery as Imagery
+from .regions.imagery import ImageryWindow as ImageryWindow
 from .regions.region import MapGraph as MapGraph
 from .regions.region import Region as Region
+from .regions.region_files import read_imagery as read_imagery
 from .regions.region_files import read_region as read_region
 from .running.prediction_files import read_predictions as read_predictions
 from .running.prediction_rows import PREDICTION_SCHEMA as PREDICTION_SCHEMA

@@ -65,6 +65,10 @@ class ExtractError(SasgeoError, OSError):
     """An OpenStreetMap file that is missing, damaged or contradicts its hash."""
 
 
+class ImageryError(SasgeoError, OSError):
+    """An aerial picture that is missing, damaged, of an unusable kind, or not of the place."""
+
+
 class CoverageError(SasgeoError, ValueError):
     """Bounds that the extract does not cover, or that hold nothing."""
 

@@ -49,6 +49,7 @@ DOCUMENTS = (
 ONLY_PARSED = {
     r"vaduz": "needs an extract of Liechtenstein",
     r"--extracts|--extract ": "needs extracts",
+    r"--imagery|zanzibar": "needs aerial pictures; tests/regions/test_imagery.py makes some",
     r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",
     r"--dask": "needs a scheduler; tests/running does it",
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",

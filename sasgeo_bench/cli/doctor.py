@@ -17,7 +17,7 @@ from rich.table import Table
 from sasgeo_bench.cli.console import print_table
 from sasgeo_bench.cli.options import ExtractFolders, Out
 from sasgeo_bench.errors import ExtractError
-from sasgeo_bench.osm.locate import Extract, answers, extract_folders, find_extract
+from sasgeo_bench.osm.locate import IMAGERY_VARIABLE, Extract, answers, extract_folders, find_extract
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
 _LIBRARIES: Final = ("osmium", "shapely", "geopandas", "rasterio", "numpy", "pandas", "pyarrow")
@@ -39,6 +39,7 @@ def examine(folders: Sequence[Path], *, out: Path) -> Iterator[tuple[str, str]]:
     yield "SASGEO_EXTRACTS", os.environ.get("SASGEO_EXTRACTS", "not set")
     for folder in extract_folders(folders):
         yield "extracts in", f"{folder}" + ("" if folder.is_dir() else " (no such folder)")
+    yield IMAGERY_VARIABLE, os.environ.get(IMAGERY_VARIABLE, "not set")
     root = next(parent for parent in (out.absolute(), *out.absolute().parents) if parent.exists())
     is_writable = os.access(root, os.W_OK)
     free_gb = shutil.disk_usage(root).free / 1e9

@@ -14,6 +14,7 @@ from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
 from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
@@ -146,6 +147,10 @@ def _summary(manifest: Manifest, folder: Path) -> Table:
         "grid", f"{manifest.rows} x {manifest.cols} cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}"
     )
     table.add_row("mapped", f"{coverage.to_text()}; what is not mapped is unknown, not absent")
+    if len(manifest.classes) < len(load_taxonomy().names):
+        table.add_row("classes", f"{', '.join(manifest.classes)}; whatever is of another class is unknown")
+    if manifest.imagery is not None:
+        table.add_row("imagery", manifest.imagery.to_text())
     table.add_row("graph", graph)
     table.add_row("preview", str(folder / "preview.png"))
     table.add_row("licence", f"{manifest.licence}, {manifest.attribution}")

@@ -34,6 +34,12 @@ ExtractFolders = Annotated[
     list[Path] | None,
     typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),
 ]
+ImageryFolders = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--imagery", help="folder to search for aerial pictures, before SASGEO_IMAGERY and 'imagery' beside extracts"
+    ),
+]
 
 
 _OTHERS: Final = """say, tell : callable

@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from sasgeo_bench.cli.console import read_date, say, tell
-from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
+from sasgeo_bench.cli.options import ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.progress import spread
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
@@ -24,6 +24,7 @@ class BuildOptions(Options):
     )
     date: Annotated[str | None, typer.Option(help="YYYY-MM-DD of one of the region's extracts; default: newest")] = None
     extracts: ExtractFolders = None
+    imagery: ImageryFolders = None
     region_files: RegionFolders = None
     out: Out = Path("out")
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be read and written, and stop")] = False
@@ -32,7 +33,7 @@ class BuildOptions(Options):
 
 @takes(BuildOptions)
 def build_region(options: BuildOptions) -> tuple[Path, ...]:
-    """Build regions from dated extracts: layers, features, graph, manifest and preview.
+    """Build regions from dated extracts: layers, features, graph, imagery if there is any, manifest and preview.
 
     A region that is up to date is not built again.
 
@@ -47,6 +48,8 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
         If there is no such region, or none of that date.
     ExtractError
         If an extract is not on this machine and cannot be downloaded.
+    ImageryError
+        If a picture of the region file is not on this machine, or cannot be used.
 
     Examples
     --------
@@ -56,8 +59,8 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
     ['out/regions/town-grid@2019-01-01', 'out/regions/town-suburb@2019-01-01']
     """
     specs = [read_region_file(find_region_file(name, folders=options.region_files or ())) for name in options.region]
-    day, folders = read_date(options.date), options.extracts or ()
-    plans = [build.plan_build(spec, out=options.out, date=day, extract_folders=folders) for spec in specs]
+    folders = {"extract_folders": options.extracts or (), "imagery_folders": options.imagery or ()}
+    plans = [build.plan_build(spec, out=options.out, date=read_date(options.date), **folders) for spec in specs]
     if options.dry_run:
         options.say("\n".join(plan.to_text() for plan in plans))
     else:
@@ -67,5 +70,5 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
 
 
 def build_region_command(options: BuildOptions) -> None:
-    """Build regions from dated extracts: layers, features, graph, manifest and preview in OUT/regions/<id>/."""
+    """Build regions from dated extracts: layers, features, graph, imagery and preview in OUT/regions/<id>/."""
     build_region(**vars(options) | {"say": say, "tell": tell})

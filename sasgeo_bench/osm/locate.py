@@ -10,16 +10,24 @@ from functools import cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from threading import Event, Thread
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 from urllib.parse import urlsplit
 
-from pydantic import Field, StringConstraints, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    SerializerFunctionWrapHandler,
+    StringConstraints,
+    model_serializer,
+    model_validator,
+)
 
 from sasgeo_bench.config import Document, Line
 from sasgeo_bench.errors import ExtractError
 from sasgeo_bench.files.folders import sha256_of
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
+IMAGERY_VARIABLE: Final = "SASGEO_IMAGERY"
 _SILENT_S: Final = 30.0  # between two parts of a download
 ANSWER_S: Final = 3.0  # a server silent for longer counts as unreachable
 
@@ -37,26 +45,56 @@ class TownEntry(Document):
     size_m: Annotated[float, Field(gt=0, le=10_000)] = 1024.0
 
 
+def plain_name(file: str) -> str:
+    """Return a file name; raise `ValueError` if it holds folders."""
+    if Path(file).name != file:
+        message = f"file must be a plain file name without folders, got {file!r}"
+        raise ValueError(message)
+    return file
+
+
+PlainName = Annotated[Line, AfterValidator(plain_name)]
+
+
+class ExtractPart(Document):
+    """A further file of an extract that comes in several; `sha256` as for the extract."""
+
+    file: PlainName
+    sha256: Annotated[tuple[Sha256, ...], Field(strict=False, min_length=1)]
+
+
 class Extract(Document):
     """One `[[extract]]` of a region file.
 
     `date` is the date of the extract; for a full history, the date to cut it at. Several hashes are several accepted
     forms of one file, such as with and without user names.
+
+    `format` "geojson" is for features of OpenStreetMap as GeoJSON, whose properties are tags. `tags` are those that
+    all its features have, as in a file of buildings that does not say so; `also` are further files of that format.
     """
 
-    file: Line
+    file: PlainName
     date: dt.date
     sha256: Annotated[tuple[Sha256, ...], Field(strict=False)] = ()
     urls: Annotated[tuple[str, ...], Field(strict=False)] = ()
     town: TownEntry | None = None
+    format: Literal["osm", "geojson"] = "osm"
+    tags: dict[str, Line] = {}
+    also: Annotated[tuple[ExtractPart, ...], Field(strict=False)] = ()
 
-    @field_validator("file")
-    @classmethod
-    def _is_plain(cls, file: str) -> str:
-        if Path(file).name != file:
-            message = f"file must be a plain file name without folders, got {file!r}"
+    @model_serializer(mode="wrap")
+    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `format`, `tags` and `also` of an OSM file: such regions keep the hash of older versions."""
+        fields: dict[str, Any] = write(self)
+        newer = ("format", "tags", "also") if self.format == "osm" else ()
+        return {name: value for name, value in fields.items() if name not in newer}
+
+    @model_validator(mode="after")
+    def _has_only_keys_of_its_format(self) -> Self:
+        if self.format == "osm" and (self.tags or self.also):
+            message = f"extract {self.file!r} has tags or also, which are for format = 'geojson': leave them out"
             raise ValueError(message)
-        return file
+        return self
 
     @model_validator(mode="after")
     def _has_source(self) -> Self:
@@ -72,6 +110,24 @@ def extract_folders(given: Sequence[Path] = ()) -> tuple[Path, ...]:
     return (*given, *named, cache_folder())
 
 
+def imagery_folders(given: Sequence[Path] = (), *, extracts: Sequence[Path] = ()) -> tuple[Path, ...]:
+    """Return the folders to search for aerial imagery, in order.
+
+    Those given, SASGEO_IMAGERY, and the folder `imagery` beside each folder of extracts; files may lie one folder
+    deeper.
+
+    >>> Path("data/imagery") in imagery_folders(extracts=[Path("data/osm")])
+    True
+    """
+    named = [Path(folder) for folder in os.environ.get(IMAGERY_VARIABLE, "").split(os.pathsep) if folder]
+    return (*given, *named, *(folder.parent / "imagery" for folder in extract_folders(extracts)[:-1]))
+
+
+def named_files(name: str, folders: Sequence[Path]) -> list[Path]:
+    """List the files of a name in folders and in the folders directly below them, in order."""
+    return [path for folder in folders for path in (folder / name, *sorted(folder.glob(f"*/{name}"))) if path.is_file()]
+
+
 def cache_folder() -> Path:
     """Return the folder of downloaded extracts."""
     import pooch  # noqa: PLC0415 - only downloads need it
@@ -82,15 +138,17 @@ def cache_folder() -> Path:
 def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
     """Find the file of an extract by name and SHA-256, or download it into the user's cache; `folders` come first.
 
-    Raise `ExtractError` if no folder holds it and it cannot be downloaded; the message names the file, its SHA-256 and
-    where to put it.
+    GeoJSON, which comes with imagery, is looked for in the folders of imagery too. Raise `ExtractError` if no folder
+    holds the file and it cannot be downloaded; the message names the file, its SHA-256 and where to put it.
     """
     if not extract.sha256:
         message = f"{extract.file} is an embedded town: it is made by the build, there is no file to find"
         raise ExtractError(message)
     wrong: list[str] = []
-    for folder in extract_folders(folders):
-        path = folder / extract.file
+    places = [folder / extract.file for folder in extract_folders(folders)]
+    if extract.format == "geojson":
+        places += named_files(extract.file, imagery_folders(extracts=folders))
+    for path in places:
         if path.is_file():
             found = sha256_of(path)
             if found in extract.sha256:
@@ -103,6 +161,12 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
         except ExtractError as error:
             failures.append(str(error))
     raise ExtractError(_not_found(extract, folders, wrong + failures))
+
+
+def find_parts(extract: Extract, *, folders: Sequence[Path] = ()) -> tuple[Path, ...]:
+    """Find the further files of an extract; raise as `find_extract` does."""
+    parts = (extract.model_copy(update={"file": part.file, "sha256": part.sha256, "urls": ()}) for part in extract.also)
+    return tuple(find_extract(part, folders=folders) for part in parts)
 
 
 def _not_found(extract: Extract, folders: Sequence[Path], reasons: Sequence[str]) -> str:

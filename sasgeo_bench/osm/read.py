@@ -2,10 +2,10 @@
 """Read an OSM file into a feature table: read, classify, project, cut to the grid."""
 
 import datetime as dt
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import geopandas as gpd
 import numpy as np
@@ -17,10 +17,11 @@ from sasgeo_bench.errors import CoverageError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.coverage import choose_coverage
 from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features
+from sasgeo_bench.osm.geojson import scan_geojson
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.osm.mapped import Mapped, box_text, lonlat_box, map_ground, project
 from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits, scan_file
-from sasgeo_bench.osm.snapshot import open_snapshot
+from sasgeo_bench.osm.snapshot import Snapshot, open_snapshot
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
 
 _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium returns 1970-01-01 if a file has no timestamps
@@ -47,53 +48,95 @@ class Reading:
     unknown_m2: dict[str, float] = field(default_factory=dict)
     cuts: dict[str, int] = field(default_factory=dict)
 
+    def dated(self, snapshot: Snapshot) -> Self:
+        """Return the content with the date and the warnings of the file that it was read from."""
+        return replace(self, osm_timestamp=snapshot.replicated_at or self.osm_timestamp, warnings=snapshot.warnings)
+
 
 def read_extract(
-    path: Path, grid: Grid, *, at: dt.date | None = None, stated_coverage: shapely.Geometry | None = None
+    path: Path,
+    grid: Grid,
+    *,
+    at: dt.date | None = None,
+    stated_coverage: shapely.Geometry | None = None,
+    classes: Sequence[str] | None = None,
 ) -> Reading:
     """Read the features of one extract that touch a grid, in its CRS, with whole geometries, sorted by class and id.
 
     `at` cuts a full history (.osh.pbf) at the end of a day. `stated_coverage` is the mapped area in longitude and
-    latitude, if the user knows it. A node beyond the globe is removed from its ways and counted in `drops`.
+    latitude, if the user knows it. `classes` are those to keep, by default all. A node beyond the globe is removed from
+    its ways and counted in `drops`.
 
     Raise `ExtractError` if the file is missing, damaged or of an unknown format, or an id, date or coordinate is not a
     number; `CoverageError` if the grid lies outside the extract, or no element of any class lies in it.
     """
-    taxonomy = load_taxonomy()
-    grid_lonlat = lonlat_box(grid)
     with open_snapshot(path, at=at) as snapshot:
-        scan = scan_file(snapshot.path, taxonomy, box=grid_lonlat)
+        scan = scan_file(snapshot.path, load_taxonomy(), box=lonlat_box(grid))
+    return _reading(
+        path.name, scan, grid, box_lonlat=snapshot.box_lonlat, stated=stated_coverage, classes=classes
+    ).dated(snapshot)
+
+
+def read_geojson(
+    files: Sequence[Path],
+    grid: Grid,
+    *,
+    tags: Mapping[str, str],
+    stated_coverage: shapely.Geometry,
+    classes: Sequence[str] | None = None,
+) -> Reading:
+    """Read the features of GeoJSON files as `read_extract` reads an OSM file.
+
+    `tags` are those that all features have. Raise `ExtractError` if a file is damaged, `CoverageError` as
+    `read_extract`.
+    """
+    scan = scan_geojson(files, load_taxonomy(), tags=tags, box=lonlat_box(grid))
+    return _reading(files[0].name, scan, grid, box_lonlat=None, stated=stated_coverage, classes=classes)
+
+
+def _reading(
+    name: str,
+    scan: Scan,
+    grid: Grid,
+    *,
+    box_lonlat: Box | None,
+    stated: shapely.Geometry | None,
+    classes: Sequence[str] | None,
+) -> Reading:
+    """Turn what one pass found into features and mapped ground."""
+    taxonomy, grid_lonlat = load_taxonomy(), lonlat_box(grid)
     geometry = shapely.from_wkb(np.array([row.wkb for row in scan.rows], dtype=object))
     beyond = shapely.from_wkb(np.array(scan.far, dtype=object))
     lonlat = shapely.get_coordinates(np.concatenate((geometry, beyond)))
-    coverage, source = choose_coverage(lonlat, stated=stated_coverage, header_box=snapshot.box_lonlat)
+    coverage, source = choose_coverage(lonlat, stated=stated, header_box=box_lonlat)
     mapped = map_ground(
         grid,
         coverage,
         source,
         coast=shapely.from_wkb(np.array(scan.coast, dtype=object)),
         gaps=np.array([mark for marks in scan.gaps.values() for mark in marks], dtype=object),
-        frame=shapely.box(*(snapshot.box_lonlat or shapely.total_bounds(shapely.multipoints(lonlat)))),
+        frame=shapely.box(*(box_lonlat or shapely.total_bounds(shapely.multipoints(lonlat)))),
     )
-    _check_covered(path, grid_lonlat, coverage, mapped)
+    _check_covered(name, grid_lonlat, coverage, mapped)
     near = _meets(shapely.bounds(geometry), grid_lonlat)
     features = _table(scan, np.flatnonzero(near), geometry[near], grid, taxonomy)
     features = _with_sea(features, mapped.sea, taxonomy)
+    if classes is not None:
+        features = features[features["class"].isin(list(classes)).to_numpy()].reset_index(drop=True)
     if len(features) == 0:
-        message = (
-            f"{path.name} holds no element of any class within {box_text(grid_lonlat)}: move or enlarge the bounds"
-        )
+        of_class = "any class" if classes is None else f"class {', '.join(classes)}"
+        message = f"{name} holds no element of {of_class} within {box_text(grid_lonlat)}: move or enlarge the bounds"
         raise CoverageError(message)
     newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
     return Reading(
         features=features,
         coverage=mapped.coverage,
         coverage_source=mapped.source,
-        osm_timestamp=snapshot.replicated_at or (newest if newest > _EPOCH else None),
+        osm_timestamp=newest if newest > _EPOCH else None,
         drops=dict(scan.tally.drops.most_common()),
         hidden=dict(scan.tally.hidden.most_common()),
         notes=dict(scan.tally.notes.most_common()),
-        warnings=snapshot.warnings,
+        warnings=(),
         unknown_m2=mapped.unknown_m2,
         cuts=_cuts(scan),
     )
@@ -106,14 +149,14 @@ def _cuts(scan: Scan) -> dict[str, int]:
     return {what: count for what, count in found.items() if count}
 
 
-def _check_covered(path: Path, grid_lonlat: Box, coverage: shapely.Geometry, mapped: Mapped) -> None:
+def _check_covered(name: str, grid_lonlat: Box, coverage: shapely.Geometry, mapped: Mapped) -> None:
     if coverage.is_empty:
-        message = f"{path.name} holds no element of any class: is it an extract of map data?"
+        message = f"{name} holds no element of any class: is it an extract of map data?"
         raise CoverageError(message)
     if mapped.coverage.is_empty and not mapped.unknown_m2:
         covered = box_text(shapely.bounds(coverage))
         message = (
-            f"bounds {box_text(grid_lonlat)} lie outside {path.name}, which covers {covered} (west, south, east, north)"
+            f"bounds {box_text(grid_lonlat)} lie outside {name}, which covers {covered} (west, south, east, north)"
         )
         raise CoverageError(message)
 

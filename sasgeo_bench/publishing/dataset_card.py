@@ -80,8 +80,16 @@ Everything is made from dated OpenStreetMap extracts by {release.made_by}; publi
 | `stac/catalog.json` | the maps as a static STAC catalog |
 | `croissant.json` | Croissant 1.1 metadata |
 | `datasheet.md` | how the data came to be, what it is for, and what not |
-| `imagery/` | imagery, apart from what is derived from OpenStreetMap: none in this release |
+| `imagery/` | {_imagery_line(release)} |
 | `SHA256SUMS` | `sha256sum -c SHA256SUMS` checks every file |"""
+
+
+def _imagery_line(release: Release) -> str:
+    """Say where imagery is, which is under other licences."""
+    shown = [item.name for item in release.maps if item.manifest.imagery is not None]
+    if not shown:
+        return "imagery, apart from what is derived from OpenStreetMap: none in this release"
+    return f"licences and authors of the imagery, `ortho.tif` of {', '.join(shown)}, which is not under the ODbL"
 
 
 def _truth_line(release: Release) -> str:
@@ -253,7 +261,7 @@ After Gebru et al., *Datasheets for Datasets*, Communications of the ACM 64(12),
         _collection(release),
         _preprocessing(release),
         _uses(),
-        _distribution(),
+        _distribution(release),
         _maintenance(release),
     )
     return "\n\n".join(parts) + "\n"
@@ -403,7 +411,13 @@ maps: they are simplified, and some (`name+suite`) are edited so that places loo
 do worse where little is mapped."""
 
 
-def _distribution() -> str:
+def _distribution(release: Release) -> str:
+    has_imagery = any(item.manifest.imagery is not None for item in release.maps)
+    more = (
+        "Aerial imagery (`ortho.tif`), under the licences that `imagery/README.md` lists."
+        if has_imagery
+        else "No imagery; the folder `imagery/` is where it would be, apart and with its own\nlicence."
+    )
     return f"""\
 ## Distribution
 
@@ -413,8 +427,7 @@ catalog, Croissant metadata and a card that the `datasets` library reads.
 **Under which licence?** Open Database License 1.0, {LICENCE_URL}. {ATTRIBUTION}. Every file says so in its own
 metadata or text.
 
-**Is there anything else in it?** No imagery; the folder `imagery/` is where it would be, apart and with its own
-licence."""
+**Is there anything else in it?** {more}"""
 
 
 def _maintenance(release: Release) -> str:

@@ -30,6 +30,7 @@ from sasgeo_bench.publishing.release_files import (
 )
 from sasgeo_bench.publishing.release_metadata import write_croissant, write_stac
 from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import cog_faults
 from sasgeo_bench.regions.region import LICENCE, Manifest
 from sasgeo_bench.regions.region_spec import find_region_file
@@ -79,7 +80,7 @@ def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
         write_stac(folder, release)
         write_croissant(folder, release)
         write_index(folder, release)
-        write_texts(folder, {CARD: card_text(release), DATASHEET: datasheet_text(release)})
+        write_texts(folder, release, {CARD: card_text(release), DATASHEET: datasheet_text(release)})
         write_sums(folder, release.files)
     return release
 
@@ -88,8 +89,9 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     """Return the content of a release; everything that can be refused is refused here, before anything is written.
 
     Raise `ConfigError` if a region, suite, split or address is wrong, there are no tasks, or the extra packages are
-    missing; `StoreError` if a region is not built, states no licence, or its layers are no valid COG, if a task is of
-    another map or split or lacks its truths, or if the folder holds something else.
+    missing; `StoreError` if a region is not built, states no licence, has imagery that must not be passed on, or its
+    rasters are no valid COG, if a task is of another map or split or lacks its truths, or if the folder holds something
+    else.
     """
     check_installed()
     _check_address(request.url)
@@ -184,7 +186,7 @@ def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
 
 
 def _map(folder: Path) -> ReleaseMap:
-    """Read a map, after checking its licence and its raster."""
+    """Read a map, after checking its licences and its rasters."""
     manifest = region_files.read_manifest(folder)
     path = folder / region_files.MANIFEST
     stray = next((name for name in manifest.files if Path(name).name != name), None)
@@ -197,10 +199,12 @@ def _map(folder: Path) -> ReleaseMap:
     if manifest.licence != LICENCE:
         message = f"{path} says licence {manifest.licence!r}: a release holds data under {LICENCE} alone, leave it out"
         raise StoreError(message)
-    faults = cog_faults(folder / region_files.LAYERS)
-    if faults:
-        message = f"{folder / region_files.LAYERS} is no cloud-optimized GeoTIFF ({faults[0]}): build the region again"
-        raise StoreError(message)
+    region_files.check_publishable(folder, manifest)
+    for name in (region_files.LAYERS, *([ORTHO] if manifest.imagery else [])):
+        faults = cog_faults(folder / name)
+        if faults:
+            message = f"{folder / name} is no cloud-optimized GeoTIFF ({faults[0]}): build the region again"
+            raise StoreError(message)
     return ReleaseMap(folder=folder, manifest=manifest)
 
 

@@ -3,7 +3,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +15,7 @@ import pyarrow.compute as pc
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import FileRecord, file_record, fresh_folder, locked
 from sasgeo_bench.files.parquet import open_table, read_table, table_writer
+from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.tasks import task_files
@@ -48,9 +49,17 @@ _NO_IMAGERY: Final = f"""\
 # Imagery
 
 None is in this release: every file of it is derived from OpenStreetMap ({ATTRIBUTION}), and the column `image` of the
-queries is empty. Imagery has a licence of its own; a release that holds some keeps it in this folder, apart from what
-is
-under the ODbL, each source with its licence.
+queries is empty. Imagery has a licence of its own; a release that holds some lists it here, each picture with its
+licence.
+"""
+_IMAGERY: Final = """\
+# Imagery
+
+These files are not derived from OpenStreetMap, and not under the ODbL. Each has the licence of the pictures that it was
+cut out of; whoever passes it on names their authors where a reader sees it. All other files are as the notice says.
+
+| file | picture | date | licence | attribution | source |
+|---|---|---|---|---|---|
 """
 
 
@@ -310,11 +319,23 @@ def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:
     return found
 
 
-def write_texts(folder: Path, texts: Mapping[str, str]) -> None:
+def write_texts(folder: Path, release: Release, texts: Mapping[str, str]) -> None:
     """Write the licence notice, the note on imagery, and further texts by their paths."""
-    for name, text in {NOTICE: _NOTICE, IMAGERY: _NO_IMAGERY, **texts}.items():
+    for name, text in {NOTICE: _NOTICE, IMAGERY: imagery_text(release.maps), **texts}.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
+
+
+def imagery_text(maps: Sequence[ReleaseMap]) -> str:
+    """Return the note on imagery: each picture with its licence and attribution, or that there is none."""
+    rows = [
+        f"| `regions/{item.name}/{ORTHO}` | {one.file} | {one.date.isoformat()} | {one.licence} | {one.attribution} "
+        f"| {one.source or ''} |"
+        for item in maps
+        if item.manifest.imagery is not None
+        for one in item.manifest.imagery.pictures
+    ]
+    return _IMAGERY + "\n".join(rows) + "\n" if rows else _NO_IMAGERY
 
 
 def write_index(folder: Path, release: Release) -> None:

@@ -15,6 +15,7 @@ from sasgeo_bench.files.parquet import read_schema
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.publishing.release_files import COPYRIGHT_URL, LICENCE_URL, TRUTHS, Release, ReleaseMap
 from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA
@@ -306,6 +307,7 @@ _ASSETS: Final = {
         "image/tiff; application=geotiff; profile=cloud-optimized",
         ["data"],
     ),
+    ORTHO: ("aerial imagery", "image/tiff; application=geotiff; profile=cloud-optimized", ["visual"]),
     region_files.FEATURES: ("classified geometry, GeoParquet 1.1", _PARQUET, ["data"]),
     region_files.NODES: ("nodes of the map graph, GeoParquet 1.1", _PARQUET, ["data"]),
     region_files.EDGES: ("edges of the map graph", _PARQUET, ["data"]),
@@ -420,7 +422,18 @@ def _item(item: ReleaseMap, release: Release) -> "pystac.Item":
 
 
 def _bands(name: str, item: ReleaseMap) -> dict[str, Any]:
-    """Return the bands of a raster; nothing for another file."""
+    """Return the bands of a raster, of imagery its own resolution and licence; nothing for another file."""
+    imagery = item.manifest.imagery
+    if name == ORTHO and imagery is not None:
+        bands = [{"name": band} for band in ("red", "green", "blue")]
+        licences = "; ".join(dict.fromkeys(picture.licence for picture in imagery.pictures))
+        return {
+            "data_type": "uint8",
+            "bands": bands,
+            "gsd": imagery.gsd_m,
+            "license": licences,
+            "attribution": imagery.attribution,
+        }
     if name != region_files.LAYERS:
         return {}
     return {"data_type": "uint8", "nodata": OUTSIDE, "bands": [{"name": band} for band in item.manifest.classes]}

@@ -15,22 +15,26 @@ from tempfile import TemporaryDirectory
 from typing import Final
 
 import geopandas as gpd
+import numpy as np
 import shapely
 
-from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import file_record, fresh_folder, locked, sha256_of
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
-from sasgeo_bench.osm.locate import Extract, find_extract
+from sasgeo_bench.osm.locate import Extract, find_extract, find_parts
 from sasgeo_bench.osm.mapped import lonlat_box
-from sasgeo_bench.osm.read import Reading, read_extract
+from sasgeo_bench.osm.read import Reading, read_extract, read_geojson
 from sasgeo_bench.osm.snapshot import is_history
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
-from sasgeo_bench.osm.taxonomy import Taxonomy, load_taxonomy
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.regions.layers import PaintWindow, burn_layers, make_paint, read_overview, write_layers
+from sasgeo_bench.regions.imagery import ORTHO, Imagery, OrthoRecord
+from sasgeo_bench.regions.imagery_files import find_imagery
+from sasgeo_bench.regions.layers import PaintWindow, burn, burn_layers, make_paint, read_overview, write_layers
+from sasgeo_bench.regions.ortho import Picture, check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.region import (
     ATTRIBUTION,
     DATA_VERSION,
@@ -45,11 +49,16 @@ from sasgeo_bench.regions.region import (
 from sasgeo_bench.regions.region_spec import RegionFile
 
 PREVIEW_CELLS: Final = 2048
+_OFFSET_SEED: Final = 0  # of the tiles drawn anew for an interval: the same pictures give the same bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BuildPlan:
-    """Inputs and outputs of a build. `source` is None for an embedded town, which is made during the build."""
+    """Inputs and outputs of a build.
+
+    `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
+    `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date.
+    """
 
     spec: RegionFile
     extract: Extract
@@ -58,50 +67,75 @@ class BuildPlan:
     folder: Path
     inputs_sha256: str
     is_current: bool
+    more: tuple[Path, ...] = ()
+    pictures: tuple[Picture, ...] = ()
 
     def to_text(self) -> str:
         """Describe inputs, grid, outputs and their size before compression, in several lines."""
-        classes = len(load_taxonomy().names)
+        classes = len(self.spec.class_names)
         grid = self.grid
         west, south, east, north = lonlat_box(grid)
         cells = grid.rows * grid.cols
         area_km2 = cells * grid.cell_size_m**2 / 1e6
         reads = f"{self.source} ({self.source.stat().st_size / 1e6:.1f} MB)" if self.source else "an embedded town"
+        shown = ortho_grid(self.pictures, grid) if self.pictures else None
+        pictures = [
+            f"  reads   {item.path} ({item.path.stat().st_size / 1e6:.1f} MB, {item.gsd_m:.3f} m a pixel)"
+            for item in self.pictures
+        ]
+        imagery = f"  imagery {shown.rows} x {shown.cols} pixels of {shown.cell_size_m:.3f} m" if shown else ""
         return "\n".join(
             (
                 f"{self.spec.id}: {self.spec.title}",
                 f"  reads   {reads}, as of {self.extract.date}",
+                *(f"  reads   {path} ({path.stat().st_size / 1e6:.1f} MB)" for path in self.more),
+                *pictures,
                 f"  bounds  {west:.5f}, {south:.5f}, {east:.5f}, {north:.5f} (west, south, east, north)",
                 f"  grid    {grid.rows} x {grid.cols} cells of {grid.cell_size_m:g} m, EPSG:{grid.epsg}",
                 f"  area    {area_km2:.2f} km2",
-                f"  layers  {classes} classes, {classes * cells / 1e6:.0f} MB before compression",
+                f"  layers  {counted(classes, 'class', 'classes')}, {classes * cells / 1e6:.0f} MB before compression",
+                *([imagery] if imagery else []),
                 f"  writes  {self.folder}" + (" (up to date, nothing to do)" if self.is_current else ""),
             )
         )
 
 
 def plan_build(
-    spec: RegionFile, *, out: Path, date: dt.date | None = None, extract_folders: Sequence[Path] = ()
+    spec: RegionFile,
+    *,
+    out: Path,
+    date: dt.date | None = None,
+    extract_folders: Sequence[Path] = (),
+    imagery_folders: Sequence[Path] = (),
 ) -> BuildPlan:
     """Find the inputs of a build, and whether its result is up to date; write nothing.
 
     The region goes to `out/regions/<id>`, that of an older date to `out/regions/<id>@<date>`; without `date` the newest
-    extract is taken. `extract_folders` are searched before SASGEO_EXTRACTS and the user's cache. Raise `ConfigError` if
-    the region has no extract of that date, `ExtractError` if the extract is not found.
+    extract is taken. `extract_folders` are searched before SASGEO_EXTRACTS and the user's cache, `imagery_folders`
+    before SASGEO_IMAGERY and the folders `imagery` beside those of extracts. Raise `ConfigError` if the region has no
+    extract of that date, `ExtractError` if the extract is not found, `ImageryError` if a picture is not found or cannot
+    be used.
     """
     extract = spec.pick(date)
     source = None if extract.town else find_extract(extract, folders=extract_folders)
+    more = find_parts(extract, folders=extract_folders)
     is_newest = extract == spec.pick(None)
     folder = out / "regions" / (spec.id if is_newest else f"{spec.id}@{extract.date.isoformat()}")
     inputs = _inputs_sha256(spec, extract, sha256_of(source) if source else "")
+    grid, is_current = spec.grid(), _is_current(folder, inputs)
     return BuildPlan(
         spec=spec,
         extract=extract,
         source=source,
-        grid=spec.grid(),
+        grid=grid,
         folder=folder,
         inputs_sha256=inputs,
-        is_current=_is_current(folder, inputs),
+        is_current=is_current,
+        more=more,
+        pictures=tuple(
+            check_picture(find_imagery(entry, folders=imagery_folders, extracts=extract_folders), entry, grid)
+            for entry in (() if is_current else spec.imagery)
+        ),
     )
 
 
@@ -153,15 +187,13 @@ def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> M
 
 
 def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: bool) -> Manifest:
-    taxonomy, name = load_taxonomy(), plan.folder.name
+    name = plan.folder.name
+    if len(plan.pictures) < len(plan.spec.imagery):
+        message = f"{plan.folder} was changed after it was found up to date: build it again"
+        raise StoreError(message)
     with _source(plan) as source:
         tell(f"{name}: reading {source.name}")
-        reading = read_extract(
-            source,
-            plan.grid,
-            at=plan.extract.date if is_history(source) else None,
-            stated_coverage=shapely.Polygon(plan.spec.coverage_lonlat) if plan.spec.coverage_lonlat else None,
-        )
+        reading = _read(plan, source)
         record = file_record(source)
         extract = ExtractRecord(
             file=plan.extract.file,
@@ -169,23 +201,87 @@ def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: boo
             bytes=record.bytes,
             date=plan.extract.date,
             osm_timestamp=reading.osm_timestamp,
+            also={path.name: sha256_of(path) for path in plan.more},
         )
     tell(
-        f"{name}: {len(reading.features)} features into a graph and {len(taxonomy.names)} layers"
+        f"{name}: {len(reading.features)} features into a graph and {counted(len(plan.spec.class_names), 'layer')}"
         f" of {plan.grid.rows} x {plan.grid.cols} cells"
     )
-    return _write_into(scratch, plan, extract, reading, with_preview=with_preview)
+    imagery = _write_imagery(scratch, plan, reading, tell) if plan.pictures else None
+    return _write_into(scratch, plan, extract, reading, imagery=imagery, with_preview=with_preview)
+
+
+def _read(plan: BuildPlan, source: Path) -> Reading:
+    """Read the extract in its format."""
+    stated = plan.spec.stated_coverage()
+    if plan.extract.format == "geojson" and stated is not None:
+        return read_geojson(
+            (source, *plan.more),
+            plan.grid,
+            tags=plan.extract.tags,
+            stated_coverage=stated,
+            classes=plan.spec.class_names,
+        )
+    at = plan.extract.date if is_history(source) else None
+    return read_extract(source, plan.grid, at=at, stated_coverage=stated, classes=plan.spec.classes)
+
+
+def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading, tell: Tell) -> OrthoRecord:
+    """Write `ortho.tif`, and measure its offset against the map."""
+    from sasgeo_bench.regions.offset import measure_offset  # noqa: PLC0415 - few regions have imagery
+
+    name, path = plan.folder.name, scratch / ORTHO
+    tell(f"{name}: cutting {counted(len(plan.pictures), 'picture')} to the region")
+    grid = ortho_grid(plan.pictures, plan.grid)
+    write_ortho(path, plan.pictures, grid)
+    record = OrthoRecord(
+        pictures=tuple(item.record() for item in plan.pictures),
+        gsd_m=grid.cell_size_m,
+        bounds_m=grid.bounds_m,
+        rows=grid.rows,
+        cols=grid.cols,
+        share=0.0,
+        offset=None,
+    )
+    imagery = Imagery(path=path, file=file_record(path), record=record, epsg=grid.epsg)
+    houses = reading.features[((reading.features["class"] == "building") & reading.features["is_visible"]).to_numpy()]
+    offset = measure_offset(
+        imagery, houses.geometry.to_numpy(), reading.coverage, rng=np.random.default_rng(_OFFSET_SEED)
+    )
+    share = _share_shown(imagery, reading.coverage, plan.grid.cell_size_m)
+    shown = f"{name}: imagery shows {share:.1%} of the mapped ground"
+    tell(f"{shown}, off the map by {offset.to_text()}" if offset else f"{shown}; its offset could not be measured")
+    return record.model_copy(update={"offset": offset, "share": share})
+
+
+def _share_shown(imagery: Imagery, mapped: shapely.Geometry, cell_size_m: float) -> float:
+    """Return the fraction of the mapped ground that the imagery shows, by cells of the map or larger ones."""
+    shown = total = 0
+    areas = shapely.orient_polygons(shapely.get_parts(mapped), exterior_cw=False)
+    step_m = max(cell_size_m, imagery.record.gsd_m)
+    for _, _, part in Grid.from_bounds(*mapped.bounds, cell_size_m=step_m, epsg=imagery.epsg).windows(1024):
+        is_mapped = burn(areas, part)
+        if is_mapped.any():
+            total += int(is_mapped.sum())
+            shown += int((is_mapped & imagery.read(part.bounds_m, gsd_m=step_m).is_known).sum())
+    return round(shown / total, 4) if total else 0.0
 
 
 def _write_into(
-    scratch: Path, plan: BuildPlan, extract: ExtractRecord, reading: Reading, *, with_preview: bool
+    scratch: Path,
+    plan: BuildPlan,
+    extract: ExtractRecord,
+    reading: Reading,
+    *,
+    imagery: OrthoRecord | None = None,
+    with_preview: bool,
 ) -> Manifest:
     """Burn the layers, make the graph, and write all files of a region."""
-    taxonomy = load_taxonomy()
+    classes = plan.spec.class_names
     # GDAL packs blocks without holding the interpreter, so the layers are written while the graph is made.
     with ThreadPoolExecutor(max_workers=1) as executor:
-        paint = partial(_painter, reading, plan.grid, taxonomy)
-        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, taxonomy.names, paint)
+        paint = partial(_painter, reading, plan.grid, classes)
+        layers = executor.submit(write_layers, scratch / region_files.LAYERS, plan.grid, classes, paint)
         graph = build_graph(reading.features, bounds_m=plan.grid.bounds_m)
         region_files.write_tables(scratch, reading.features, graph)
         manifest = make_manifest(plan, extract, reading, graph)
@@ -196,7 +292,7 @@ def _write_into(
         overview = read_overview(scratch / region_files.LAYERS, longest_cells=PREVIEW_CELLS)
         write_preview(scratch / region_files.PREVIEW, manifest=manifest, overview=overview)
     files = {path.name: file_record(path) for path in sorted(scratch.iterdir())}
-    manifest = manifest.model_copy(update={"files": files})
+    manifest = manifest.model_copy(update={"files": files, "imagery": imagery})
     region_files.write_manifest(scratch, manifest)
     return manifest
 
@@ -204,13 +300,14 @@ def _write_into(
 def build_edited(plan: BuildPlan, base: Region, features: gpd.GeoDataFrame, *, suffix: str, note: str) -> Path:
     """Write a region with edited features next to its base, as `<id>+<suffix>`, and return its folder.
 
-    Coverage and provenance stay those of the base; `note` says in the manifest what was edited. Raise `StoreError` if
+    It has no imagery, which would show what was there before. Coverage and provenance stay those of the base; `note`
+    says in the manifest what was edited. Raise `StoreError` if
     the folder cannot be written.
     """
     name = f"{plan.folder.name}+{suffix}"
     inputs = hashlib.sha256(f"{base.manifest.inputs_sha256}/{note}/{fingerprint(features)}".encode()).hexdigest()
     spec = plan.spec.model_copy(update={"id": name, "title": f"{plan.spec.title} ({suffix})"})
-    edited = replace(plan, spec=spec, folder=plan.folder.parent / name, inputs_sha256=inputs)
+    edited = replace(plan, spec=spec, folder=plan.folder.parent / name, inputs_sha256=inputs, pictures=())
     record = base.manifest
     reading = Reading(
         features=features,
@@ -293,20 +390,18 @@ def _source(plan: BuildPlan) -> Iterator[Path]:
         yield path
 
 
-def _painter(reading: Reading, grid: Grid, taxonomy: Taxonomy, factor: int) -> PaintWindow:
+def _painter(reading: Reading, grid: Grid, classes: tuple[str, ...], factor: int) -> PaintWindow:
     """Return what burns a window of one overview, or of the map itself (factor 1).
 
     Overviews draw lines at least one of their cells wide.
     """
     least_width_m = 0.0 if factor == 1 else grid.cell_size_m * factor
-    return partial(
-        burn_layers, make_paint(reading.features, taxonomy.names, reading.coverage, least_width_m=least_width_m)
-    )
+    return partial(burn_layers, make_paint(reading.features, classes, reading.coverage, least_width_m=least_width_m))
 
 
 def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, graph: MapGraph) -> Manifest:
     """Make the content of `region.json`, without the hashes of the files."""
-    taxonomy, grid, spec = load_taxonomy(), plan.grid, plan.spec
+    grid, spec = plan.grid, plan.spec
     west, south, east, north = grid.bounds_m
     counts = reading.features["class"].value_counts()
     kinds = graph.nodes["kind"].value_counts()
@@ -323,7 +418,7 @@ def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, gra
         cell_size_m=grid.cell_size_m,
         rows=grid.rows,
         cols=grid.cols,
-        classes=taxonomy.names,
+        classes=spec.class_names,
         extract=extract,
         coverage=CoverageRecord(
             source=reading.coverage_source,
@@ -332,7 +427,7 @@ def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, gra
             unknown_m2={reason: round(area_m2, 1) for reason, area_m2 in reading.unknown_m2.items()},
             cuts=reading.cuts,
         ),
-        counts={name: int(counts.get(name, 0)) for name in taxonomy.names},
+        counts={name: int(counts.get(name, 0)) for name in spec.class_names},
         graph_counts={str(name): int(count) for name, count in sorted(kinds.items())}
         | {f"edges_{name}": int(count) for name, count in sorted(graph.edges["relation"].value_counts().items())},
         hidden=reading.hidden,

@@ -32,6 +32,7 @@ _DPI: Final = 110
 _LEGEND_INCHES: Final = 2.9
 _MAP_INCHES: Final = 9.6
 _LEAST_INCHES: Final = 4.6
+_LEAST_WIDTH_INCHES: Final = 7.4  # the line of facts is about as long
 _TITLE_INCHES: Final = 0.85
 _FOOT_INCHES: Final = 0.95
 _STRIP_INCHES: Final = 0.5  # under the map, for scale and north
@@ -44,7 +45,7 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
     rows, cols = overview.shape[1:]
     scale = _MAP_INCHES / max(rows, cols)
     width, height = max(cols * scale, 2.0), max(rows * scale, _LEAST_INCHES)
-    total = (width + _LEGEND_INCHES + 0.6, height + _TITLE_INCHES + _FOOT_INCHES)
+    total = (max(width + _LEGEND_INCHES + 0.6, _LEAST_WIDTH_INCHES), height + _TITLE_INCHES + _FOOT_INCHES)
     figure = PlainFigure(figsize=total, dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     chart = figure.add_axes((0.3 / total[0], _FOOT_INCHES / total[1], width / total[0], height / total[1]))
@@ -174,6 +175,8 @@ def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, 
         for name in manifest.classes
         if manifest.counts.get(name)
     ]
+    if len(manifest.classes) < len(titles):
+        entries.append(Patch(facecolor="none", edgecolor="none", label="all other classes: unknown"))
     if (overview[0] == OUTSIDE).any():
         hatched = Patch(
             facecolor=_UNMAPPED[0], edgecolor=_UNMAPPED[1], hatch="////", lw=0.4, label="not mapped (unknown)"

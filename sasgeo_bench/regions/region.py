@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar, cast
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from sasgeo_bench.config import Document
 from sasgeo_bench.files.folders import FileRecord
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.regions.imagery import Imagery, OrthoRecord
 from sasgeo_bench.texts import FOLDER
 
 if TYPE_CHECKING:
@@ -37,13 +38,20 @@ class _Record(Document):
 
 
 class ExtractRecord(_Record):
-    """The extract a region was built from."""
+    """The extract a region was built from; `also` are its further files with their SHA-256."""
 
     file: str
     sha256: str
     bytes: Count
     date: dt.date
     osm_timestamp: dt.datetime | None
+    also: dict[str, str] = {}
+
+    @model_serializer(mode="wrap")
+    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `also` where there is none, as regions of older versions do."""
+        fields: dict[str, Any] = write(self)
+        return fields if self.also else {name: value for name, value in fields.items() if name != "also"}
 
 
 class CoverageRecord(_Record):
@@ -71,7 +79,8 @@ class Manifest(_Record):
     """`region.json`: identity and provenance of a region, and the hashes of its files.
 
     `counts` are objects by class within the grid; `hidden`, `drops` and `notes` are objects in and around the grid by
-    reason: not visible from above, not used, repaired.
+    reason: not visible from above, not used, repaired. `classes` are those that the map knows of: whatever is of
+    another class is unknown everywhere. `imagery` is None in a region without.
     """
 
     schema_version: int
@@ -100,6 +109,13 @@ class Manifest(_Record):
     files: dict[str, FileRecord]
     licence: str
     attribution: str
+    imagery: OrthoRecord | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `imagery` where there is none, as regions of older versions do."""
+        fields: dict[str, Any] = write(self)
+        return fields if self.imagery else {name: value for name, value in fields.items() if name != "imagery"}
 
     @property
     def grid(self) -> Grid:
@@ -174,7 +190,7 @@ class Region:
 
     `layers` is uint8 of shape (C, rows, cols), PRESENT, ABSENT or OUTSIDE, bands in the order of `classes`, read-only;
     `coverage` is the mapped area in the region's CRS. `features` and `graph` of a stored region are read when they are
-    first asked for.
+    first asked for. `imagery` reads windows of the aerial imagery; None if there is none.
     """
 
     manifest: Manifest
@@ -182,6 +198,7 @@ class Region:
     features: Late["gpd.GeoDataFrame"] = Late()
     graph: Late[MapGraph] = Late()
     coverage: shapely.Geometry
+    imagery: Imagery | None = None
 
     @property
     def grid(self) -> Grid:

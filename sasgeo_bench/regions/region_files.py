@@ -15,6 +15,7 @@ from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
 from sasgeo_bench.osm.features import check_features
+from sasgeo_bench.regions.imagery import ORTHO, Imagery
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, Manifest, MapGraph, Region
 from sasgeo_bench.texts import json_text
 
@@ -118,7 +119,42 @@ def read_region(path: str | Path, *, around: Callable[[], AbstractContextManager
         features=features,
         graph=graph,
         coverage=shapely.from_wkt(manifest.coverage.wkt),
+        imagery=_imagery(folder, manifest),
     )
+
+
+def read_imagery(path: str | Path) -> Imagery | None:
+    """Return the imagery of a region without reading its map; None if it has none.
+
+    Raise `StoreError` if the folder is no region, or its imagery is missing or changed.
+    """
+    folder = Path(path)
+    imagery = _imagery(folder, read_manifest(folder))
+    if imagery is not None:
+        imagery.check()
+    return imagery
+
+
+def check_publishable(folder: Path, manifest: Manifest) -> None:
+    """Raise `StoreError` if the imagery of a map must not be passed on; call it before imagery leaves this machine."""
+    if manifest.imagery is None or manifest.imagery.is_publishable:
+        return
+    kept = next(item for item in manifest.imagery.pictures if not item.publish)
+    message = (
+        f"{folder / ORTHO} holds {kept.file}, whose region file says publish = false (licence: {kept.licence}): leave "
+        f"{manifest.id} out, or build it from a region file without [[imagery]]"
+    )
+    raise StoreError(message)
+
+
+def _imagery(folder: Path, manifest: Manifest) -> Imagery | None:
+    """Return what reads the imagery; its file is not opened."""
+    if manifest.imagery is None:
+        return None
+    if ORTHO not in manifest.files:
+        message = f"{folder / MANIFEST} is damaged (its files lack {ORTHO}): {_MEND}"
+        raise StoreError(message)
+    return Imagery(path=folder / ORTHO, file=manifest.files[ORTHO], record=manifest.imagery, epsg=manifest.epsg)
 
 
 def read_features(folder: Path) -> "gpd.GeoDataFrame":

@@ -5,20 +5,31 @@ import datetime as dt
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Any, Final, Literal, Self
 
 import pyproj
-from pydantic import Field, StringConstraints, field_validator, model_validator
+import shapely
+from pydantic import (
+    Field,
+    SerializerFunctionWrapHandler,
+    StringConstraints,
+    field_validator,
+    model_serializer,
+    model_validator,
+)
 
 from sasgeo_bench.config import Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.osm.locate import Extract
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.imagery_files import ImageryEntry
 
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
 MAX_AREA_KM2: Final = 100_000.0
 MAX_CELLS: Final = 4e9
 _EDGE_POINTS: Final = 21
+_NEWER: Final = ("coverage_parts_lonlat", "classes", "largest_view_m", "imagery")  # keys since the first edition
 
 Scene = Literal["urban", "suburban", "industrial", "riverside", "agricultural", "alpine", "coastal", "forest"]
 Corner = Annotated[tuple[float, float], Field(strict=False)]
@@ -54,7 +65,18 @@ class RegionFile(NamedDocument):
     cell_size_m: float
     epsg: int | None = None
     coverage_lonlat: list[Corner] | None = None
+    coverage_parts_lonlat: Annotated[list[list[Corner]], Field(min_length=1)] | None = None
+    classes: Annotated[list[str], Field(min_length=1)] | None = None
+    largest_view_m: Annotated[float, Field(gt=0)] | None = None
     extract: Annotated[list[Extract], Field(min_length=1)]
+    imagery: list[ImageryEntry] = []
+
+    @model_serializer(mode="wrap")
+    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out newer keys where they are not set: such regions keep the hash of older versions."""
+        fields: dict[str, Any] = write(self)
+        newer = {name for name in _NEWER if not fields.get(name)}
+        return {name: value for name, value in fields.items() if name not in newer}
 
     @field_validator("cell_size_m")
     @classmethod
@@ -83,11 +105,36 @@ class RegionFile(NamedDocument):
     @field_validator("coverage_lonlat")
     @classmethod
     def _coverage_is_a_ring(cls, ring: list[Corner] | None) -> list[Corner] | None:
-        least = 3
-        if ring is not None and len(set(ring)) < least:
-            message = f"coverage_lonlat needs at least {least} different corners [lon, lat], got {len(set(ring))}"
+        return ring if ring is None else _checked_ring(ring, "coverage_lonlat")
+
+    @field_validator("coverage_parts_lonlat")
+    @classmethod
+    def _coverage_parts_are_rings(cls, rings: list[list[Corner]] | None) -> list[list[Corner]] | None:
+        return rings if rings is None else [_checked_ring(ring, "each of coverage_parts_lonlat") for ring in rings]
+
+    @field_validator("classes")
+    @classmethod
+    def _classes_are_known(cls, names: list[str] | None) -> list[str] | None:
+        known = load_taxonomy().names
+        strange = next((name for name in names or () if name not in known), None)
+        if strange is not None:
+            message = f"classes has {strange!r}, which is no class: there are {', '.join(known)}"
             raise ValueError(message)
-        return ring
+        return names
+
+    @model_validator(mode="after")
+    def _coverage_is_stated_once(self) -> Self:
+        if self.coverage_lonlat is not None and self.coverage_parts_lonlat is not None:
+            message = "the mapped area is given twice: keep coverage_lonlat or coverage_parts_lonlat"
+            raise ValueError(message)
+        is_labelled = any(item.format == "geojson" for item in self.extract)
+        if is_labelled and (self.stated_coverage() is None or self.classes is None):
+            message = (
+                "an extract of format 'geojson' holds some classes in some places: say which by classes and "
+                "coverage_parts_lonlat; all else is unknown"
+            )
+            raise ValueError(message)
+        return self
 
     @model_validator(mode="after")
     def _is_placed_once(self) -> Self:
@@ -112,6 +159,18 @@ class RegionFile(NamedDocument):
             message = f"two extracts have the date {twice[0]}: keep one of them"
             raise ValueError(message)
         return self
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Return the classes of the map, in the order of their ids: those of `classes`, or all."""
+        return tuple(name for name in load_taxonomy().names if self.classes is None or name in self.classes)
+
+    def stated_coverage(self) -> shapely.Geometry | None:
+        """Return the mapped area as stated, in longitude and latitude; None if it is to be estimated."""
+        if self.coverage_lonlat is not None:
+            return shapely.Polygon(self.coverage_lonlat)
+        rings = self.coverage_parts_lonlat
+        return None if rings is None else shapely.union_all([shapely.Polygon(ring) for ring in rings])
 
     def lonlat_box(self) -> tuple[float, float, float, float]:
         """Return west, south, east, north as written, degrees; for a centre, that point twice."""
@@ -158,6 +217,14 @@ class RegionFile(NamedDocument):
             message = f"{self.id} has no extract of {date.isoformat()}; there are {known}"
             raise ConfigError(message)
         return found
+
+
+def _checked_ring(ring: list[Corner], key: str) -> list[Corner]:
+    least = 3
+    if len(set(ring)) < least:
+        message = f"{key} needs at least {least} different corners [lon, lat], got {len(set(ring))}"
+        raise ValueError(message)
+    return ring
 
 
 def _check_lonlat(box: tuple[float, float, float, float]) -> None:

@@ -2,7 +2,7 @@
 """Training on views of known place: rates and rules at the true pose, weights from the modes of a search."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import groupby
@@ -15,6 +15,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Training
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
@@ -100,16 +101,22 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     Raises
     ------
     ConfigError
-        If no view lies on its map, or maps have different classes.
+        If no view lies on its map.
+
+    Notes
+    -----
+    Maps may know of different classes. Each class is fitted to the views on maps that know of it: elsewhere it is
+    unknown, and counts nothing.
     """
     views = views_by_map(training)
     if not switches.learns_from_old:
         views = on_maps_of_the_day(views, training.regions)
-    model = _fit_classes(training, views, switches) if switches.learns else _even(training, views)
+    classes = classes_of(training.regions[name] for name in views)
+    model = _fit_classes(training, views, switches, classes) if switches.learns else _even(views, classes)
     lists: list[_ScoredModes] = []
     for name, some in views.items():
         reader = Reader.of(training.regions[name], model, replace(switches, has_graph=False))
-        lists += [_list(query, _pose(truth), reader, plan or Plan()) for query, truth in some]
+        lists += [_list(query, _pose(truth), reader, plan or Plan(), classes) for query, truth in some]
     lists = [one for one in lists if len(one.by_class) > 1]
     if not lists:
         return model
@@ -121,23 +128,34 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     return replace(model, blend=_fit_blend(lists, model, training.regions))
 
 
-def _fit_classes(training: Training, views: ViewsByMap, switches: Switches) -> ScorerModel:
+def classes_of(regions: Iterable[Region]) -> tuple[str, ...]:
+    """Return the classes that any of some maps knows of, in the order of their ids.
+
+    >>> from types import SimpleNamespace as Map
+    >>> classes_of([Map(classes=("building",)), Map(classes=("road_minor", "building"))])
+    ('road_minor', 'building')
+    """
+    known = {name for region in regions for name in region.classes}
+    return tuple(name for name in load_taxonomy().names if name in known)
+
+
+def _fit_classes(training: Training, views: ViewsByMap, switches: Switches, classes: tuple[str, ...]) -> ScorerModel:
     """Fit rates, likeness, seasons and trust of classes."""
     tallies: dict[str, list[Tally]] = {"": []}
     stamps: list[StampTally] = []
     for name, some in views.items():
         region = training.regions[name]
-        stamps += _stamps(region, some, switches) if switches.is_stamped else ()
+        stamps += _stamps(region, some, switches, classes) if switches.is_stamped else ()
         for query, truth in some:
-            tallies.setdefault(query.season, []).append(_tally(query, truth, region, switches))
+            tallies.setdefault(query.season, []).append(_tally(query, truth, region, switches, classes))
     model = ScorerModel.of(tallies)
     return replace(model, trust=fit_trust(stamps)) if switches.is_stamped else model
 
 
-def _even(training: Training, views: ViewsByMap) -> ScorerModel:
+def _even(views: ViewsByMap, classes: tuple[str, ...]) -> ScorerModel:
     """Return the model set by hand for the classes of the maps."""
     truths = [truth for some in views.values() for _, truth in some]
-    model = ScorerModel.by_hand(training.regions[next(iter(views))].classes)
+    model = ScorerModel.by_hand(classes)
     return replace(model, views=len(truths), blocks=len({truth.block for truth in truths}))
 
 
@@ -231,40 +249,48 @@ class _Footprint:
         return np.where(self.is_inside, near[:, self.row - top, self.col - left], np.uint8(NOWHERE))
 
 
-def _tally(query: Query, truth: Truth, region: Region, switches: Switches) -> Tally:
-    """Count cells seen against the map at the true place."""
+def _tally(query: Query, truth: Truth, region: Region, switches: Switches, classes: tuple[str, ...]) -> Tally:
+    """Count cells seen against the map at the true place, in some classes, of which the map may lack some."""
     seen = switches.seen(query.evidence)
     under = _Footprint.of(region.grid, _pose(truth), seen).rings(region)
     age = age_years(query, region) if switches.knows_age else 0.0  # who cannot tell ages learns none
-    return tally(region.classes, _on_map(region, seen), under, age_years=age, block=truth.block)
+    views = _in_classes(seen.cells, seen.classes, classes), _in_classes(under, region.classes, classes)
+    return tally(classes, *views, age_years=age, block=truth.block)
 
 
-def _stamps(region: Region, views: Sequence[tuple[Query, Truth]], switches: Switches) -> list[StampTally]:
+def _stamps(
+    region: Region, views: Sequence[tuple[Query, Truth]], switches: Switches, classes: tuple[str, ...]
+) -> list[StampTally]:
     """Count cells seen by edit age on one map, in views without a season."""
     stratum, found = strata(region), []
     for query, truth in views:
         if not query.season:
             seen = switches.seen(query.evidence)
             there = _Footprint.of(region.grid, _pose(truth), seen)
-            stamped = there.of_layers(stratum)
-            found.append(stamp_tally(_on_map(region, seen), there.rings(region), stamped, FAR))
+            under, stamped = (
+                _in_classes(layers, region.classes, classes)
+                for layers in (there.rings(region), there.of_layers(stratum))
+            )
+            found.append(stamp_tally(_in_classes(seen.cells, seen.classes, classes), under, stamped, FAR))
     return found
 
 
-def _on_map(region: Region, seen: Evidence) -> NDArray[np.uint8]:
-    """Return a view in the classes of a map; NOWHERE where the view lacks a class."""
-    cells = np.full((len(region.classes), *seen.shape), NOWHERE, dtype=np.uint8)
-    for at, name in enumerate(region.classes):
-        if name in seen.classes:
-            cells[at] = seen.layer(name)
+def _in_classes(layers: NDArray[np.uint8], own: Sequence[str], classes: Sequence[str]) -> NDArray[np.uint8]:
+    """Return layers in the order of other classes; NOWHERE for a class that they lack."""
+    cells = np.full((len(classes), *layers.shape[1:]), NOWHERE, dtype=np.uint8)
+    for at, name in enumerate(classes):
+        if name in own:
+            cells[at] = layers[own.index(name)]
     return cells
 
 
-def _list(query: Query, pose: Pose, reader: Reader, plan: Plan) -> _ScoredModes:
-    """Score the true pose of a view and the wrong modes that a search finds."""
+def _list(query: Query, pose: Pose, reader: Reader, plan: Plan, classes: tuple[str, ...]) -> _ScoredModes:
+    """Score the true pose of a view and the wrong modes that a search finds; 0 in classes that the map lacks."""
     reading = reader.read(query)
     modes = search(reader.field, reading.template, query.prior, plan, count=MODES).modes
     here = (pose.easting_m, pose.northing_m)
     wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
     poses = [pose, *wrong]
-    return _ScoredModes(query=query, poses=poses, by_class=reading.by_class(poses))
+    by_class = np.zeros((len(poses), len(classes)))
+    by_class[:, [classes.index(name) for name in reader.region.classes]] = reading.by_class(poses)
+    return _ScoredModes(query=query, poses=poses, by_class=by_class)

@@ -32,7 +32,7 @@ from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
 from sasgeo_bench.tasks.suites.all_suites import find_suite
-from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, State, Suite
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, State, Suite, no_larger
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.suites.synthetic_age import ageing_of
 from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
@@ -151,6 +151,7 @@ def _request_sha256(request: Request) -> str:
 
 def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     suite = find_suite(request.suite)
+    suite = replace(suite, variants=no_larger(suite.variants, request.region.largest_view_m))
     refusal = None if request.group is None else suite.refusal(request.group)
     if refusal is not None:
         message = f"suite {suite.card.name!r} {refusal}"
@@ -200,7 +201,8 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
             for date in aged_dates(request.region)
         )
     if "another region" in needs and request.elsewhere is not None:
-        elsewhere = State.of(_built(request, request.elsewhere, None, tell))
+        # A view that shows more than the region's map knows of would give away that it is of another place.
+        elsewhere = State.of(_built(request, request.elsewhere, None, tell)).of_classes(base.classes)
     scene = Scene(
         map=state,
         world=state,

@@ -2,7 +2,7 @@
 """Contact sheets: the views of queries, the map at the true place, the difference, and the map at a twin or decoy."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
@@ -95,7 +95,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
     legend = "view against map   pink: only seen   blue: only mapped   light grey: both   white: none   grey: unknown"
     figure.text(0.15 / width, 1 - 0.45 / height, legend, va="top", fontsize=9.5, color="#444444")
-    _draw_legend(figure, width, height)
+    _draw_legend(figure, width, height, {name for panel in panels for name in panel.query.evidence.classes})
     for at, panel in enumerate(panels):
         bottom = height - 1.15 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
         text = "\n".join(line for part in _text(panel) for line in wrap(part, _LETTERS))
@@ -118,9 +118,9 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     return figure
 
 
-def _draw_legend(figure: Figure, width: float, height: float) -> None:
+def _draw_legend(figure: Figure, width: float, height: float, classes: Collection[str]) -> None:
     left = 0.15
-    for item in load_taxonomy().classes:
+    for item in (one for one in load_taxonomy().classes if one.name in classes):
         name = item.name.replace("_", " ")
         figure.text(left / width, 1 - 0.66 / height, "\u25a0", va="top", fontsize=11, color=item.colour)
         figure.text((left + 0.15) / width, 1 - 0.67 / height, name, va="top", fontsize=8.5, color="#444444")

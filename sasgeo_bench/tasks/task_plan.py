@@ -9,14 +9,14 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.errors import ConfigError, ExtractError
+from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import PriorGroup
-from sasgeo_bench.tasks.split import Split, find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.split import Split, find_split_file, list_split_files, make_split, read_split_file
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice
 from sasgeo_bench.tasks.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
@@ -95,7 +95,7 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
             tell(f"{len(left)} regions have no extract on this machine and are left out: {', '.join(left)}")
     stranger = next((item.id for item in named if item.id not in split.spec.region_ids), None)
     if stranger is not None:
-        message = f"split {split.spec.id!r} does not speak of region {stranger!r}: add it to a split file of your own"
+        message = f"split {split.spec.id!r} does not speak of region {stranger!r}: {_other_split(stranger)}"
         raise ConfigError(message)
     settings = {item.name: getattr(wanted, item.name) for item in fields(Settings)}
     return tuple(
@@ -109,6 +109,14 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
         for item in _without_sealed({item.id: item for item in named}, split, wanted, tell)
         for name in dict.fromkeys(wanted.suites)
     )
+
+
+def _other_split(region: str) -> str:
+    """Say which shipped split holds a region, or what to do if none does."""
+    found = next(
+        (name for name, path in list_split_files().items() if region in read_split_file(path).region_ids), None
+    )
+    return "add it to a split file of your own" + (f", or use --split {found}" if found else "")
 
 
 def _without_sealed(
@@ -158,11 +166,11 @@ def check_separate(tasks: Path, truth: Path) -> None:
 
 
 def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -> bool:
-    """Return whether a region is synthetic, or its newest extract is on this machine."""
+    """Return whether a region is synthetic, or its newest extract and its pictures are on this machine."""
     offline = spec.model_copy(update={"extract": [item.model_copy(update={"urls": ()}) for item in spec.extract]})
     try:
         plan_build(offline, out=out, extract_folders=request_folders)
-    except ExtractError:
+    except (ExtractError, ImageryError):
         return False
     return True
 
@@ -170,24 +178,33 @@ def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -
 def wrong_place(split: Split, region: RegionFile, known: Mapping[str, RegionFile]) -> RegionFile | None:
     """Return the region for views of a wrong place: the next place of the split of the same kind, synthetic or real.
 
+    Its map knows of all classes that the region's knows of; beside a region that knows of few, a town will do where no
+    real place does.
     It depends on the split alone, so that asking for more regions changes no query. In a hold-out it is of the same
     part, so that nobody learns from views of a test place; and of another country, whose places calibrate others. No
     view is of a sealed place.
     """
-    places = [[name for name in place.region_ids if name in known] for place in split.spec.place]
-    at = next((index for index, names in enumerate(places) if region.id in names), None)
+    places = split.spec.place
+    at = next((index for index, place in enumerate(places) if region.id in place.region_ids), None)
     if at is None:
         return None
-    own, is_town = split.spec.place[at], region.pick(None).town is not None
-    for step in range(1, len(places)):
-        other = (at + step) % len(places)
-        place = split.spec.place[other]
-        if place.sealed or place.part != own.part or (own.country and place.country == own.country):
-            continue
-        for name in places[other]:
-            if (known[name].pick(None).town is not None) == is_town:
-                return known[name]
-    return None
+    own = split.spec.place[at]
+    others = [split.spec.place[(at + step) % len(places)] for step in range(1, len(places))]
+    fitting = [
+        known[name]
+        for place in others
+        if not place.sealed and place.part == own.part and not (own.country and place.country == own.country)
+        for name in place.region_ids
+        if name in known and set(region.class_names) <= set(known[name].class_names)
+    ]
+    alike = [one for one in fitting if _is_town(one) == _is_town(region)]
+    if not alike and region.classes is not None:
+        alike = fitting
+    return alike[0] if alike else None
+
+
+def _is_town(region: RegionFile) -> bool:
+    return region.pick(None).town is not None
 
 
 def aged_dates(spec: RegionFile) -> tuple[dt.date, ...]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A dataset release: public libraries load it without this package, validators accept it, what is unfit is refused."""
 
+import datetime as dt
 import errno
 import filecmp
 import json
@@ -23,23 +24,29 @@ import pystac
 import pytest
 import rasterio
 import shapely
+from affine import Affine
 from PIL import Image
 from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from rio_cogeo.cogeo import cog_validate
 
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import file_record
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.publishing import release as release_module
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.publishing.release_files import Release, open_release
 from sasgeo_bench.publishing.release_metadata import footprint
+from sasgeo_bench.regions.imagery import ORTHO, OrthoRecord
+from sasgeo_bench.regions.imagery_files import ImageryEntry
 from sasgeo_bench.regions.layers import read_overview
+from sasgeo_bench.regions.ortho import check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running.plan import RunRequest, reach_of
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
+from tests.regions.imagery_place import write_picture
 
 GRID, RIVERSIDE = "town-grid", "town-riverside"
 FOLDER = "release"
@@ -129,6 +136,63 @@ def _python(code: str, folder: Path, *words: str) -> str:
     )
     assert done.returncode == 0, done.stderr
     return done.stdout
+
+
+# --- imagery --------------------------------------------------------------------------------------------------------
+
+
+def _with_imagery(source: Path, out: Path, *, publish: bool) -> Path:
+    """Copy a root, and give one of its maps a picture."""
+    out = Path(shutil.copytree(source, out))
+    folder = out / "regions" / RIVERSIDE
+    manifest = read_manifest(folder)
+    west, _, _, north = manifest.bounds_m
+    pixels = np.random.default_rng(0).integers(1, 250, (3, 128, 128), dtype=np.uint8)
+    write_picture(out / "a.tif", pixels, crs=f"EPSG:{manifest.epsg}", transform=Affine(1, 0, west, 0, -1, north))
+    entry = ImageryEntry(
+        file="a.tif",
+        sha256=("0" * 64,),
+        date=dt.date(2024, 1, 1),
+        licence="CC-BY-4.0",
+        attribution="(c) a pilot",
+        publish=publish,
+    )
+    picture = check_picture(out / "a.tif", entry, manifest.grid)
+    grid = ortho_grid([picture], manifest.grid)
+    write_ortho(folder / ORTHO, [picture], grid)
+    record = OrthoRecord(
+        pictures=(picture.record(),),
+        gsd_m=grid.cell_size_m,
+        bounds_m=grid.bounds_m,
+        rows=grid.rows,
+        cols=grid.cols,
+        share=0.5,
+        offset=None,
+    )
+    files = {**manifest.files, ORTHO: file_record(folder / ORTHO)}
+    write_manifest(folder, manifest.model_copy(update={"files": files, "imagery": record}))
+    return out
+
+
+def test_imagery_travels_with_its_own_licence_and_author(source: Path, tmp_path: Path) -> None:
+    into = tmp_path / FOLDER
+    _release(_with_imagery(source, tmp_path / "out", publish=True), into, regions=(RIVERSIDE,), suites=("clean",))
+    note = (into / "imagery" / "README.md").read_text()
+    assert f"| `regions/{RIVERSIDE}/ortho.tif` | a.tif | 2024-01-01 | CC-BY-4.0 | (c) a pilot |" in note
+    assert "not under the ODbL" in (into / "README.md").read_text()
+    with rasterio.open(into / "regions" / RIVERSIDE / ORTHO) as ortho:
+        assert ortho.tags()["attribution"] == "(c) a pilot"
+    (item,) = into.glob("stac/regions/*/*.json")
+    asset = json.loads(item.read_text())["assets"]["ortho"]
+    assert (asset["license"], asset["attribution"], asset["gsd"]) == ("CC-BY-4.0", "(c) a pilot (CC-BY-4.0)", 1.0)
+    assert "ortho.tif" in (into / "croissant.json").read_text()
+
+
+def test_imagery_that_must_not_be_passed_on_is_refused_before_anything_is_written(source: Path, tmp_path: Path) -> None:
+    out, into = _with_imagery(source, tmp_path / "out", publish=False), tmp_path / FOLDER
+    with pytest.raises(StoreError, match=r"ortho.tif holds a.tif, whose region file says publish = false"):
+        _release(out, into, regions=(RIVERSIDE,), suites=("clean",))
+    assert not into.exists()
 
 
 # --- others load it -------------------------------------------------------------------------------------------------

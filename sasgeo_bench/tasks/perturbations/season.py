@@ -20,6 +20,12 @@ Layers = dict[str, NDArray[np.uint8]]
 _UNDER_LEAVES: Final = ("path_track", "road_minor", "waterway", "field_boundary")
 _SNOWED_UNDER: Final = ("path_track", "field_boundary")
 _WHITE: Final = ("farmland", "green", "parking")
+CHANGED: Final[dict[Kind, tuple[str, ...]]] = {  # classes that a season changes, or hides
+    "leaf_on": _UNDER_LEAVES,
+    "snow": (*_SNOWED_UNDER, *_WHITE),
+    "low_water": ("water", "waterway"),
+    "harvest": ("farmland", "green", "field_boundary"),
+}
 _PATCH_M: Final = 25.0  # width of the patches that change; fields change as a whole
 _RETREAT_M: Final = 12.0  # of the waterline at strength 1, from a gentle bank
 _LARGEST_MEADOW: Final = 0.25  # of the view

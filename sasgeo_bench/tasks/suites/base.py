@@ -75,6 +75,19 @@ class State:
         inside = half <= row < self.grid.rows - half and half <= col < self.grid.cols - half
         return inside and bool(self.known[row - half : row + half + 1, col - half : col + half + 1].all())
 
+    def of_classes(self, classes: Sequence[str]) -> "State":
+        """Return the state with some of its classes alone, in their order: a view of it shows nothing of the others.
+
+        Raise `ValueError` if it lacks one.
+        """
+        if tuple(classes) == self.classes:
+            return self
+        bits = np.where(self.known, np.uint32(0), self.bits.bits & np.uint32(1 << 31))
+        for at, name in enumerate(classes):
+            bits |= (self.bits.bits >> np.uint32(self.classes.index(name)) & np.uint32(1)) << np.uint32(at)
+        bits[~self.known] = np.uint32(1 << 31)
+        return replace(self, classes=tuple(classes), bits=LayerBits(bits=bits, count=len(classes)))
+
     def has(self, class_name: str) -> NDArray[np.bool_]:
         """Return where one class is present, shape (rows, cols)."""
         bit, unknown = 1 << self.classes.index(class_name), 1 << 31
@@ -417,6 +430,27 @@ def ladder(
         for cells, listed in ((MAIN_VIEW_CELLS, strengths), (min(VIEW_CELLS), small), (max(VIEW_CELLS), large))
         for strength in listed
     )
+
+
+def no_larger(variants: Sequence[Variant], largest_m: float | None) -> tuple[Variant, ...]:
+    """Return variants whose views are no larger: larger ones shrink to the largest view that fits, each drawn once.
+
+    For places where little ground is mapped: a view must lie on it whole. None is no limit.
+
+    Examples
+    --------
+    >>> some = (*controls(), Variant(role="falsifier", kind="no error"))
+    >>> [(item.role, item.view_cells) for item in no_larger(some, 128.0)]
+    [('control', 96), ('falsifier', 96)]
+    """
+    if largest_m is None:
+        return tuple(variants)
+    fitting = {
+        item: max((cells for cells in VIEW_CELLS if cells * item.cell_size_m <= largest_m), default=min(VIEW_CELLS))
+        for item in variants
+    }
+    shrunk = (replace(item, view_cells=min(item.view_cells, cells)) for item, cells in fitting.items())
+    return tuple(dict.fromkeys(shrunk))
 
 
 def pair(control: str, stress: str, falsifier: str) -> tuple[Variant, ...]:

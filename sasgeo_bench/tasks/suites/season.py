@@ -4,24 +4,39 @@
 from typing import Final, get_args
 
 from sasgeo_bench.tasks.perturbations.base import share_changed
-from sasgeo_bench.tasks.perturbations.season import Kind, Season
+from sasgeo_bench.tasks.perturbations.season import CHANGED, Kind, Season
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 STRENGTHS: Final = (0.3, 0.6, 0.9)
 SMALL_STRENGTHS: Final = (0.6, 0.9)
-NEEDS: Final = {"leaf_on": ("green",), "snow": (), "low_water": ("water", "waterway"), "harvest": ("farmland",)}
+NEEDS: Final[dict[Kind, tuple[str, ...]]] = {
+    "leaf_on": ("green",),
+    "snow": (),
+    "low_water": ("water", "waterway"),
+    "harvest": ("farmland",),
+}
 _LEAST_SHARE: Final = 0.003  # of the mapped cells that the classes of a season cover
 
 
 class SeasonSuite(Suite):
     """The query gives the season; in the falsifier it does so without any change."""
 
+    def lack(self, scene: Scene) -> str | None:
+        """Refuse a map that knows of no class that a season changes."""
+        known = set(scene.map.classes)
+        if not any(known.intersection(changed) for changed in CHANGED.values()):
+            return "no season changes any class that its map knows of"
+        return super().lack(scene)
+
     def usable(self, scene: Scene) -> tuple[Variant, ...]:
         """Return the seasons whose classes the map has."""
         cells = float(scene.map.known.sum())
         shares = {name: float(scene.map.has(name).sum()) / max(1.0, cells) for name in scene.map.classes}
         able = {
-            kind for kind, names in NEEDS.items() if not names or sum(shares[name] for name in names) > _LEAST_SHARE
+            kind
+            for kind, names in NEEDS.items()
+            if shares.keys() & CHANGED[kind]
+            and (not names or sum(shares.get(name, 0.0) for name in names) > _LEAST_SHARE)
         }
         return tuple(item for item in self.variants if item.role == "control" or item.kind in able)
 

@@ -1,0 +1,202 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Aerial imagery of a region: what is known of it, and windows of it at any ground resolution."""
+
+import datetime as dt
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import ConfigDict, Field
+
+from sasgeo_bench.config import Document
+from sasgeo_bench.errors import ImageryError, StoreError
+from sasgeo_bench.files.folders import FileRecord, file_record
+from sasgeo_bench.geometry.grid import Grid
+
+ORTHO: Final = "ortho.tif"
+MOST_WINDOW_PIXELS: Final = 64_000_000  # 256 MB as colours and mask
+BANDS: Final = (1, 2, 3)  # red, green, blue
+
+Bounds = tuple[float, float, float, float]
+Share = Annotated[float, Field(ge=0, le=1)]
+Metres = Annotated[float, Field(ge=0)]
+
+
+class _Record(Document):
+    """Base of JSON records: JSON has no tuples and no dates, so ordinary conversion is allowed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
+
+
+class PictureRecord(_Record):
+    """One picture that the imagery was made of; `gsd_m` is its own ground resolution."""
+
+    file: str
+    sha256: str
+    bytes: Annotated[int, Field(ge=0)]
+    date: dt.date
+    licence: str
+    attribution: str
+    publish: bool
+    source: str | None
+    gsd_m: Metres
+
+
+class OffsetRecord(_Record):
+    """Measured offset of the imagery against the map: where a thing of the map is seen, less where the map has it.
+
+    `east_m` and `north_m` with their 95 % intervals are of all tiles together; `residual_m` is the median distance of
+    the offset of single tiles from it, `sharpness` the height of the peak in standard deviations of the correlation.
+    """
+
+    east_m: float
+    north_m: float
+    east_interval_m: tuple[float, float]
+    north_interval_m: tuple[float, float]
+    residual_m: Metres
+    sharpness: float
+    tiles: Annotated[int, Field(ge=1)]
+
+    def to_text(self) -> str:
+        """Describe in one line by how much the imagery is off."""
+        (west, east), (south, north) = self.east_interval_m, self.north_interval_m
+        return (
+            f"{self.east_m:+.2f} m east ({west:+.2f} to {east:+.2f}), {self.north_m:+.2f} m north ({south:+.2f} to "
+            f"{north:+.2f}), residual {self.residual_m:.2f} m, n = {self.tiles}"
+        )
+
+
+class OrthoRecord(_Record):
+    """The imagery of a region as `region.json` holds it: its pictures, lattice and offset against the map.
+
+    `bounds_m` are west, south, east, north; `share` is the fraction of the mapped ground that it shows.
+    """
+
+    pictures: Annotated[tuple[PictureRecord, ...], Field(min_length=1)]
+    gsd_m: Annotated[float, Field(gt=0)]
+    bounds_m: Bounds
+    rows: Annotated[int, Field(ge=1)]
+    cols: Annotated[int, Field(ge=1)]
+    share: Share
+    offset: OffsetRecord | None
+
+    @property
+    def is_publishable(self) -> bool:
+        """Return whether every picture may be passed on."""
+        return all(picture.publish for picture in self.pictures)
+
+    @property
+    def attribution(self) -> str:
+        """Return the attributions of all pictures with their licences, each once."""
+        return "; ".join(dict.fromkeys(f"{item.attribution} ({item.licence})" for item in self.pictures))
+
+    def to_text(self) -> str:
+        """Describe in one line what there is, how far it is off the map, and whether it may be passed on."""
+        files = ", ".join(f"{item.file} of {item.date}" for item in self.pictures)
+        off = f"off the map by {self.offset.to_text()}" if self.offset else "its offset is not known"
+        rights = "may be passed on" if self.is_publishable else "must not be passed on"
+        shown = f"pixels of {self.gsd_m:.3f} m show {self.share:.1%} of the mapped ground"
+        return f"{files}; {shown}, {off}; {self.attribution}, {rights}"
+
+    def grid(self, *, epsg: int) -> Grid:
+        """Return the lattice of the pixels."""
+        west_m, _, _, north_m = self.bounds_m
+        return Grid(epsg=epsg, west_m=west_m, north_m=north_m, cell_size_m=self.gsd_m, rows=self.rows, cols=self.cols)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageryWindow:
+    """A part of the imagery: `rgb`, uint8 of shape (rows, cols, 3), and where it holds a picture, (rows, cols)."""
+
+    grid: Grid
+    rgb: NDArray[np.uint8]
+    is_known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Imagery:
+    """Aerial imagery of a region on disk; nothing is read before a window is asked for.
+
+    `file` is what `region.json` says of the file; a different one is refused at the first window.
+
+    Examples
+    --------
+    `read_region("out/regions/zanzibar").imagery.read((553000.0, 9332000.0, 553064.0, 9332064.0), gsd_m=0.25)` gives
+    256 x 256 pixels around a place, and `imagery.record.offset` how far they are off the map.
+    """
+
+    path: Path
+    file: FileRecord
+    record: OrthoRecord
+    epsg: int
+
+    @property
+    def grid(self) -> Grid:
+        """Return the lattice of the pixels."""
+        return self.record.grid(epsg=self.epsg)
+
+    def check(self) -> None:
+        """Raise `StoreError` if the file is missing or differs from its record in `region.json`."""
+        if not self.path.is_file() or file_record(self.path) != self.file:
+            message = f"{self.path} is missing, or not what region.json says: build the region again"
+            raise StoreError(message)
+
+    def read(self, bounds_m: Bounds, *, gsd_m: float | None = None) -> ImageryWindow:
+        """Read the smallest window that covers west, south, east, north, metres in the region's CRS.
+
+        Its pixels are `gsd_m` wide, by default those of the file; coarser ones are averaged. Beyond the imagery
+        nothing is known, and `rgb` is 0.
+
+        Raises
+        ------
+        ImageryError
+            If the window has more than `MOST_WINDOW_PIXELS` pixels.
+        StoreError
+            If the file is missing or damaged.
+        GridError
+            If the bounds or the resolution define no lattice.
+        """
+        grid = Grid.from_bounds(*bounds_m, cell_size_m=gsd_m or self.record.gsd_m, epsg=self.epsg)
+        if grid.rows * grid.cols > MOST_WINDOW_PIXELS:
+            message = (
+                f"a window of {grid.rows} x {grid.cols} pixels is too large, the most is {MOST_WINDOW_PIXELS:,}: read "
+                "a smaller one, or a coarser gsd_m"
+            )
+            raise ImageryError(message)
+        return read_window(self.path, grid, is_coarser=grid.cell_size_m > self.record.gsd_m)
+
+
+def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
+    """Read a window of an ortho image on a lattice in its CRS; raise `StoreError` if the file cannot be read."""
+    import rasterio  # noqa: PLC0415 - GDAL is slow to import, and few regions have imagery
+    from affine import Affine  # noqa: PLC0415
+    from rasterio.enums import Resampling  # noqa: PLC0415
+    from rasterio.errors import RasterioError  # noqa: PLC0415
+    from rasterio.vrt import WarpedVRT  # noqa: PLC0415
+
+    try:
+        with rasterio.open(path) as whole:
+            fitting = [factor for factor in whole.overviews(1) if factor * whole.res[0] <= grid.cell_size_m]
+        level = {"overview_level": len(fitting) - 1} if fitting else {}
+        with (
+            rasterio.open(path, **level) as source,
+            WarpedVRT(
+                source,
+                crs=source.crs,
+                transform=Affine(*grid.transform),
+                height=grid.rows,
+                width=grid.cols,
+                resampling=Resampling.average if is_coarser else Resampling.bilinear,
+                add_alpha=True,
+            ) as view,
+        ):
+            bands = view.read()  # at once: each call warps anew
+    except RasterioError as error:
+        message = f"{path} cannot be read ({error}): build the region again"
+        raise StoreError(message) from error
+    rgb, is_known = bands[:-1], np.asarray(bands[-1] > 0)
+    return ImageryWindow(
+        grid=grid, rgb=np.moveaxis(rgb, 0, -1) * is_known[..., None].astype(np.uint8), is_known=is_known
+    )

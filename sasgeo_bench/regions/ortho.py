@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures from outside -> `ortho.tif`: checked, cut to the region, reprojected, as a cloud-optimized GeoTIFF."""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import rasterio
+import rasterio.shutil
+from affine import Affine
+from numpy.typing import NDArray
+from pyproj import Transformer
+from pyproj.exceptions import ProjError
+from rasterio.enums import ColorInterp, MaskFlags, Resampling
+from rasterio.errors import CRSError, RasterioError
+from rasterio.vrt import WarpedVRT
+from rasterio.warp import transform_bounds
+from rasterio.windows import Window
+
+from sasgeo_bench.errors import GridError, ImageryError
+from sasgeo_bench.files.folders import file_record
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.regions.imagery import BANDS, PictureRecord
+from sasgeo_bench.regions.imagery_files import ImageryEntry
+
+MOST_PIXELS: Final = 4_000_000_000  # of a picture
+MOST_ORTHO_PIXELS: Final = 2_000_000_000  # of what is cut out of all; what holds no picture counts too
+FINEST_M: Final = 0.01
+COARSEST_M: Final = 30.0
+_WINDOW_PIXELS: Final = 1024
+_BLOCK_PIXELS: Final = 512
+_CACHE_BYTES: Final = 64 * 2**20
+_JPEG_QUALITY: Final = 90
+_EMPTY_M: Final = 10.0  # a disc of one colour this wide is no roof, but a hole in a mosaic
+_EMPTY_LEVELS: Final = 4  # by which JPEG changes that colour
+_EDGE_POINTS: Final = 21
+_SNAP: Final = 0.05  # of a pixel: a little coarser will do, rather than a third finer
+
+
+@dataclass(frozen=True, kw_only=True)
+class Picture:
+    """A checked picture: its file, its entry in the region file, its bounds in the region's CRS and its resolution."""
+
+    path: Path
+    entry: ImageryEntry
+    bounds_m: tuple[float, float, float, float]
+    gsd_m: float
+
+    def record(self) -> PictureRecord:
+        """Return what `region.json` says of the picture."""
+        entry, found = self.entry, file_record(self.path)
+        return PictureRecord(
+            file=entry.file,
+            sha256=found.sha256,
+            bytes=found.bytes,
+            date=entry.date,
+            licence=entry.licence,
+            attribution=entry.attribution,
+            publish=entry.publish,
+            source=entry.source,
+            gsd_m=round(self.gsd_m, 4),
+        )
+
+
+def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
+    """Check a picture before any pixel is decoded.
+
+    Raises
+    ------
+    ImageryError
+        If it is no GeoTIFF, has no CRS, no 8-bit red, green and blue, too many pixels, or does not show the region.
+    """
+    try:
+        with _opened(path) as source:
+            _check_kind(path, source)
+            bounds_m = transform_bounds(source.crs, f"EPSG:{grid.epsg}", *source.bounds, densify_pts=_EDGE_POINTS)
+            gsd_m = max(_ground_resolution_m(source, grid.epsg), entry.gsd_m or 0.0)
+    except (CRSError, ProjError) as error:
+        message = f"{path} cannot be projected to EPSG:{grid.epsg} ({error}): check its coordinate reference system"
+        raise ImageryError(message) from error
+    if not FINEST_M <= gsd_m <= COARSEST_M:
+        message = (
+            f"{path} has pixels of {gsd_m:.3g} m, imagery has {FINEST_M:g} to {COARSEST_M:g} m: check its georeference"
+        )
+        raise ImageryError(message)
+    if not _overlaps(bounds_m, grid.bounds_m):
+        message = (
+            f"{path} shows {_text(bounds_m)}, the region is {_text(grid.bounds_m)} (EPSG:{grid.epsg}): leave it out"
+        )
+        raise ImageryError(message)
+    return Picture(path=path, entry=entry, bounds_m=bounds_m, gsd_m=gsd_m)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
+    """Open a GeoTIFF, and no other format; turn what GDAL says of it into one line."""
+    try:
+        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES), rasterio.open(path, driver="GTiff") as source:
+            yield source
+    except (RasterioError, OSError) as error:
+        if isinstance(error, ImageryError | CRSError):
+            raise
+        message = (
+            f"{path} cannot be read as a GeoTIFF ({str(error)[:200]}): it is damaged or of another kind; get it again"
+        )
+        raise ImageryError(message) from error
+
+
+def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
+    if source.crs is None or source.transform.is_identity:
+        message = f"{path} says no place (a CRS and a transform): get a georeferenced one, or write them with gdal_edit"
+        raise ImageryError(message)
+    if source.count < len(BANDS) or set(source.dtypes[: len(BANDS)]) != {"uint8"}:
+        message = (
+            f"{path} has {source.count} band(s) of {source.dtypes[0]}, imagery is 8-bit red, green and blue: convert "
+            "it (gdal_translate -ot Byte -scale, or -expand rgb for a palette)"
+        )
+        raise ImageryError(message)
+    if source.width * source.height > MOST_PIXELS:
+        message = (
+            f"{path} has {source.width} x {source.height} pixels, the most is {MOST_PIXELS:,}: cut it to the region"
+        )
+        raise ImageryError(message)
+
+
+def _ground_resolution_m(source: rasterio.io.DatasetReader, epsg: int) -> float:
+    """Return the side of a square with the ground area of the middle pixel, metres in the region's CRS."""
+    col, row = source.width / 2, source.height / 2
+    across, down = source.transform @ (np.array([col, col + 1, col]), np.array([row, row, row + 1]))
+    to_grid = Transformer.from_crs(source.crs.to_wkt(), epsg, always_xy=True)
+    (x, across_x, down_x), (y, across_y, down_y) = to_grid.transform(across, down, errcheck=True)
+    area_m2 = abs((across_x - x) * (down_y - y) - (across_y - y) * (down_x - x))
+    return math.sqrt(area_m2)
+
+
+def _overlaps(one: tuple[float, float, float, float], two: tuple[float, float, float, float]) -> bool:
+    return one[0] < two[2] and two[0] < one[2] and one[1] < two[3] and two[1] < one[3]
+
+
+def _text(bounds_m: Sequence[float]) -> str:
+    return ", ".join(f"{value:.0f}" for value in bounds_m)
+
+
+def ortho_grid(pictures: Sequence[Picture], region: Grid) -> Grid:
+    """Return the lattice of the imagery: its edges are edges of map cells, its pixels whole fractions of them.
+
+    The pixels are about as fine as the finest picture, or finer; of pictures coarser than the map a whole multiple of
+    its cells. Raise `ImageryError` if it has too many pixels.
+
+    >>> region = Grid(epsg=32632, west_m=0.0, north_m=100.0, cell_size_m=1.0, rows=100, cols=100)
+    >>> entry = ImageryEntry.model_construct(file="a.tif")
+    >>> picture = Picture(path=Path("a.tif"), entry=entry, bounds_m=(10.5, -50.0, 200.0, 49.5), gsd_m=0.3)
+    >>> found = ortho_grid([picture], region)
+    >>> found.bounds_m, found.cell_size_m, found.shape
+    ((10.0, 0.0, 100.0, 50.0), 0.25, (200, 360))
+    """
+    finest_m, cell_m = min(picture.gsd_m for picture in pictures), region.cell_size_m
+    if finest_m <= cell_m:
+        gsd_m = cell_m / math.ceil(cell_m / finest_m - _SNAP)
+    else:
+        gsd_m = cell_m * math.floor(finest_m / cell_m + _SNAP)
+    bounds = np.array([picture.bounds_m for picture in pictures])
+    edges_m = np.array(region.bounds_m)
+    low, high = np.maximum(bounds[:, :2].min(axis=0), edges_m[:2]), np.minimum(bounds[:, 2:].max(axis=0), edges_m[2:])
+    cells = Grid.from_bounds(*low.tolist(), *high.tolist(), cell_size_m=max(cell_m, gsd_m), epsg=region.epsg)
+    west, south, east, north = cells.bounds_m
+    rows, cols = round((north - south) / gsd_m), round((east - west) / gsd_m)
+    if rows * cols > MOST_ORTHO_PIXELS:
+        message = (
+            f"the imagery of the region has {cols:,} x {rows:,} pixels of {gsd_m:.3g} m, the most is "
+            f"{MOST_ORTHO_PIXELS:,}: make the region smaller, or give its [[imagery]] a coarser gsd_m"
+        )
+        raise ImageryError(message)
+    return Grid(epsg=region.epsg, west_m=west, north_m=north, cell_size_m=gsd_m, rows=rows, cols=cols)
+
+
+def write_ortho(path: Path, pictures: Sequence[Picture], grid: Grid) -> None:
+    """Write the pictures on one lattice, later ones over earlier ones, with a mask of what none of them shows.
+
+    The file is a cloud-optimized GeoTIFF with JPEG tiles; parts without a picture take no space. Raise `ImageryError`
+    if a picture is damaged, none shows any ground of the region, or the file cannot be written.
+    """
+    draft = path.with_name(f".{path.name}.draft")
+    try:
+        if not _write_draft(draft, pictures, grid):
+            message = f"{', '.join(item.entry.file for item in pictures)}: no pixel lies in the region: leave it out"
+            raise ImageryError(message)
+        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
+            rasterio.shutil.copy(
+                draft,
+                path,
+                driver="COG",
+                compress="JPEG",
+                quality=_JPEG_QUALITY,
+                blocksize=_BLOCK_PIXELS,
+                overview_resampling="AVERAGE",
+                sparse_ok=True,
+            )
+    except (RasterioError, OSError, GridError) as error:
+        if isinstance(error, ImageryError):
+            raise
+        message = f"{path} cannot be written ({str(error)[:200]}): check the free space and the pictures"
+        raise ImageryError(message) from error
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def _write_draft(path: Path, pictures: Sequence[Picture], grid: Grid) -> bool:
+    """Write colours and mask window by window; return whether any pixel is known."""
+    is_any = False
+    notices = {name: "; ".join(dict.fromkeys(getattr(item.entry, name) for item in pictures)) for name in ("licence",)}
+    with ExitStack() as stack:
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK=True))
+        views = [_Warped(item, stack, grid) for item in pictures]
+        target = stack.enter_context(rasterio.open(path, "w", **_draft_profile(grid)))
+        who = "; ".join(dict.fromkeys(item.entry.attribution for item in pictures))
+        target.update_tags(TIFFTAG_COPYRIGHT=who, attribution=who, **notices)
+        for row, col, part in grid.windows(_WINDOW_PIXELS):
+            window = Window(col, row, part.cols, part.rows)
+            rgb = np.zeros((3, *part.shape), dtype=np.uint8)
+            is_known = np.zeros(part.shape, dtype=bool)
+            for view in views:
+                view.lay(window, part, rgb, is_known)
+            if is_known.any():
+                is_any = True
+                target.write(rgb * is_known, window=window)
+                target.write_mask(is_known, window=window)
+    return is_any
+
+
+def _draft_profile(grid: Grid) -> dict[str, object]:
+    return {
+        "driver": "GTiff",
+        "height": grid.rows,
+        "width": grid.cols,
+        "count": len(BANDS),
+        "dtype": "uint8",
+        "crs": f"EPSG:{grid.epsg}",
+        "transform": Affine(*grid.transform),
+        "photometric": "RGB",
+        "tiled": True,
+        "blockxsize": _BLOCK_PIXELS,
+        "blockysize": _BLOCK_PIXELS,
+        "compress": "zstd",
+        "zstd_level": 1,
+        "sparse_ok": True,
+        "bigtiff": "IF_SAFER",
+    }
+
+
+class _Warped:
+    """One picture on the lattice of the imagery, read window by window."""
+
+    def __init__(self, picture: Picture, stack: ExitStack, grid: Grid) -> None:
+        self._picture = picture
+        source = stack.enter_context(_opened(picture.path))
+        has_alpha = MaskFlags.alpha in source.mask_flag_enums[0]
+        self._view = stack.enter_context(
+            WarpedVRT(
+                source,
+                crs=f"EPSG:{grid.epsg}",
+                transform=Affine(*grid.transform),
+                height=grid.rows,
+                width=grid.cols,
+                resampling=Resampling.cubic,
+                add_alpha=not has_alpha,
+                warp_mem_limit=64,
+            )
+        )
+        self._alpha = self._view.colorinterp.index(ColorInterp.alpha) + 1
+
+    def lay(self, window: Window, part: Grid, rgb: NDArray[np.uint8], is_known: NDArray[np.bool_]) -> None:
+        """Write the picture's pixels of a window over what is there; arrays of shape (3, rows, cols), (rows, cols)."""
+        if not _overlaps(self._picture.bounds_m, part.bounds_m):
+            return
+        empty, margin = self._picture.entry.empty_rgb, 0
+        if empty is not None:
+            margin = math.ceil(_EMPTY_M / part.cell_size_m)
+        top, left = min(margin, int(window.row_off)), min(margin, int(window.col_off))
+        wide = Window(
+            window.col_off - left,
+            window.row_off - top,
+            min(left + part.cols + margin, self._view.width - window.col_off + left),
+            min(top + part.rows + margin, self._view.height - window.row_off + top),
+        )
+        try:
+            bands = self._view.read((*BANDS, self._alpha), window=wide)  # at once: each call warps anew
+        except RasterioError as error:
+            message = f"{self._picture.path} is damaged ({str(error)[:200]}): get it again"
+            raise ImageryError(message) from error
+        colours, mask = bands[:3], bands[3] > 0
+        if empty is not None:
+            mask = mask & ~is_empty(colours, empty, diameter_px=margin)
+        here = (slice(top, top + part.rows), slice(left, left + part.cols))
+        shown = mask[here]
+        rgb[:, shown] = colours[:, *here][:, shown]
+        is_known |= shown
+
+
+def is_empty(rgb: NDArray[np.uint8], colour: Sequence[int], *, diameter_px: int) -> NDArray[np.bool_]:
+    """Return where a whole disc has one colour, within what JPEG does to it; `rgb` is of shape (3, rows, cols).
+
+    >>> mosaic = np.zeros((3, 9, 9), dtype=np.uint8)
+    >>> mosaic[:, :, :5], mosaic[:, 4, 7] = 254, 254
+    >>> is_empty(mosaic, (255, 255, 255), diameter_px=3)[4].astype(int)
+    array([1, 1, 1, 1, 1, 0, 0, 0, 0])
+    """
+    target = np.array(colour, dtype=np.int16)[:, None, None]
+    is_near = (np.abs(rgb.astype(np.int16) - target) <= _EMPTY_LEVELS).all(axis=0)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter_px, diameter_px))
+    opened = cv2.morphologyEx(is_near.view(np.uint8), cv2.MORPH_OPEN, kernel, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(opened > 0)

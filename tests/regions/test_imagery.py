@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Aerial pictures of a place: cut, reprojected, held against the map, read window by window; bad ones are refused."""
+
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from affine import Affine
+from rio_cogeo.cogeo import cog_validate
+
+from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError, StoreError
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.imagery import ORTHO
+from sasgeo_bench.regions.region_files import (
+    check_publishable,
+    differing_files,
+    read_imagery,
+    read_manifest,
+    read_region,
+)
+from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from tests.regions.imagery_place import GSD_M, SOUTH, WEST, Hamlet, make_hamlet, write_picture
+
+OFF_M = (1.3, -0.7)
+
+
+@pytest.fixture(scope="module")
+def hamlet(tmp_path_factory: pytest.TempPathFactory) -> Hamlet:
+    """The place's files, on which the picture is off the map."""
+    return make_hamlet(tmp_path_factory.mktemp("hamlet"), off_m=OFF_M)
+
+
+@pytest.fixture(scope="module")
+def built(hamlet: Hamlet, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of the built region."""
+    return build(hamlet, tmp_path_factory.mktemp("out"))
+
+
+def build(hamlet: Hamlet, out: Path) -> Path:
+    folders = {"extract_folders": [hamlet.folder], "imagery_folders": [hamlet.folder]}
+    plan = plan_build(hamlet.spec(), out=out, **folders)
+    build_region(plan, tell=lambda _: None, with_preview=False)
+    return plan.folder
+
+
+def refusal(hamlet: Hamlet, out: Path) -> str:
+    """Build, and return the one line of the error; nothing may be left behind."""
+    with pytest.raises(ImageryError) as found:
+        build(hamlet, out)
+    assert not list(out.rglob("*.tif"))
+    assert not list(out.rglob("*.draft"))
+    assert not list(out.rglob("region.json"))
+    assert "\n" not in str(found.value)
+    return str(found.value)
+
+
+def test_a_picture_becomes_a_cloud_optimized_file_beside_the_layers(built):
+    assert cog_validate(built / ORTHO, quiet=True)[0]
+    assert differing_files(built) == []
+    assert ORTHO in read_manifest(built).files
+    with rasterio.open(built / ORTHO) as ortho:
+        assert ortho.tags()["attribution"] == "(c) somebody with a drone"
+        assert ortho.tags()["licence"] == "CC-BY-4.0"
+        assert (ortho.count, ortho.dtypes[0], ortho.crs.to_epsg()) == (3, "uint8", 32632)
+
+
+def test_its_pixels_fit_into_the_cells_of_the_map(built):
+    region = read_region(built)
+    grid, cells = region.imagery.grid, region.grid
+    assert grid.cell_size_m == pytest.approx(0.5)
+    assert ((grid.west_m - cells.west_m) / cells.cell_size_m) % 1 == 0
+    assert grid.bounds_m == cells.bounds_m  # the picture is larger than the place, and cut
+
+
+def test_the_offset_of_the_picture_is_measured(built):
+    offset = read_manifest(built).imagery.offset
+    assert (offset.east_m, offset.north_m) == pytest.approx(OFF_M, abs=0.15)
+    assert offset.east_interval_m[0] - 0.1 <= OFF_M[0] <= offset.east_interval_m[1] + 0.1
+    assert offset.residual_m < 0.5
+    assert offset.tiles >= 9
+
+
+def test_of_a_picture_of_elsewhere_no_offset_is_given(hamlet, tmp_path):
+    other = make_hamlet(tmp_path / "other", seed=8)
+    shutil.copy(hamlet.folder / "houses.geojson", other.folder / "houses.geojson")
+    assert read_manifest(build(other, tmp_path)).imagery.offset is None
+
+
+def test_houses_are_where_the_picture_shows_them(hamlet, built):
+    imagery = read_region(built).imagery
+    window = imagery.read((WEST + 64, SOUTH + 64, WEST + 320, SOUTH + 320))
+    to_map = window.grid.to_centres_m(np.argwhere(window.is_known)) - OFF_M
+    is_roof = shapely.intersects_xy(shapely.union_all(hamlet.houses), to_map).reshape(window.grid.shape)
+    grey = window.rgb.mean(axis=2)
+    assert grey[is_roof].mean() - grey[~is_roof].mean() > 75
+
+
+def test_a_coarser_window_is_the_mean_of_the_finer_one(built):
+    imagery = read_imagery(built)
+    bounds_m = (WEST + 64, SOUTH + 64, WEST + 128, SOUTH + 128)
+    fine, coarse = imagery.read(bounds_m), imagery.read(bounds_m, gsd_m=2.0)
+    assert coarse.rgb.shape == (32, 32, 3)
+    means = fine.rgb.reshape(32, 4, 32, 4, 3).mean(axis=(1, 3))
+    assert np.abs(coarse.rgb - means).mean() < 4  # JPEG
+
+
+def test_beyond_the_imagery_nothing_is_known(built):
+    window = read_imagery(built).read((WEST - 10, SOUTH, WEST + 10, SOUTH + 20), gsd_m=1.0)
+    assert not window.is_known[:, :10].any()
+    assert window.is_known[:, 10:].all()
+    assert (window.rgb[:, :10] == 0).all()
+
+
+def test_a_window_of_too_many_pixels_is_refused(built):
+    with pytest.raises(ImageryError, match="read a smaller one, or a coarser gsd_m"):
+        read_imagery(built).read((0.0, 0.0, 1e5, 1e5))
+
+
+def test_reading_the_region_opens_no_pixel_and_a_changed_file_is_found(built, tmp_path):
+    mine = Path(shutil.copytree(built, tmp_path / "mine"))
+    (mine / ORTHO).write_bytes(b"no picture")
+    assert read_region(mine).imagery is not None
+    with pytest.raises(StoreError, match="build the region again"):
+        read_imagery(mine)
+    with pytest.raises(StoreError, match="build the region again"):
+        read_region(mine).imagery.read((WEST, SOUTH, WEST + 10, SOUTH + 10))
+
+
+def test_a_region_without_pictures_has_no_imagery(tiny):
+    assert tiny.region.imagery is None
+    assert read_imagery(tiny.map_folder) is None
+    assert '"imagery"' not in (tiny.map_folder / "region.json").read_text()
+
+
+def test_a_second_build_is_skipped_until_the_picture_changes(hamlet, built):
+    out = built.parent.parent
+    assert plan_build(
+        hamlet.spec(), out=out, imagery_folders=[hamlet.folder], extract_folders=[hamlet.folder]
+    ).is_current
+    other = hamlet.but(publish=False)
+    assert not plan_build(
+        other.spec(), out=out, imagery_folders=[hamlet.folder], extract_folders=[hamlet.folder]
+    ).is_current
+
+
+def test_a_hole_of_one_colour_is_no_picture_but_a_small_white_roof_is(hamlet, tmp_path):
+    place = Hamlet(folder=tmp_path / "place", houses=hamlet.houses, extra="empty_rgb = [255, 255, 255]\n")
+    shutil.copytree(hamlet.folder, place.folder)
+    with rasterio.open(place.folder / "mosaic.tif", "r+") as mosaic:
+        bands = mosaic.read()
+        bands[:, 300:400, 300:400] = 255
+        bands[:, 500:508, 500:508] = 255
+        mosaic.write(bands)
+    imagery = read_imagery(build(place, tmp_path))
+    window = imagery.read(imagery.record.bounds_m)
+    hole_m2 = (~window.is_known).sum() * GSD_M**2
+    assert hole_m2 == pytest.approx(100 * 100 * GSD_M**2, rel=0.06)
+
+
+@pytest.mark.parametrize("how", ["alpha", "nodata", "mask"])
+def test_parts_without_a_picture_are_unknown_however_the_file_says_so(how, hamlet, tmp_path):
+    place = hamlet.but(folder=tmp_path / "place")
+    shutil.copytree(hamlet.folder, place.folder)
+    with rasterio.open(place.folder / "mosaic.tif") as mosaic:
+        bands, transform = mosaic.read(), mosaic.transform
+    is_known = np.ones(bands.shape[1:], dtype=bool)
+    is_known[:, : bands.shape[2] // 2] = False
+    path = place.folder / "mosaic.tif"
+    if how == "alpha":
+        bands = np.concatenate((bands, 255 * is_known[None].astype(np.uint8)))
+        write_picture(path, bands, transform=transform, photometric="RGB", alpha="YES")
+    elif how == "nodata":
+        write_picture(path, bands * is_known.astype(np.uint8), transform=transform, nodata=0)
+    else:
+        with rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True):
+            write_picture(path, bands, transform=transform)
+            with rasterio.open(path, "r+") as mosaic:
+                mosaic.write_mask(is_known)
+    record = read_manifest(build(place, tmp_path)).imagery
+    assert record.share == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_picture_that_is_nowhere_is_named_with_the_places_to_put_it(hamlet, tmp_path, monkeypatch):
+    monkeypatch.setenv("SASGEO_IMAGERY", str(tmp_path / "named"))
+    with pytest.raises(
+        ImageryError, match=r"mosaic.tif .* was not found: put it into .*named.* --imagery or SASGEO_IMAG"
+    ):
+        plan_build(hamlet.spec(), out=tmp_path, extract_folders=[hamlet.folder])
+
+
+def test_a_region_that_is_up_to_date_needs_its_pictures_no_more(hamlet, built):
+    plan = plan_build(hamlet.spec(), out=built.parent.parent, extract_folders=[hamlet.folder])
+    assert plan.is_current
+    assert plan.pictures == ()
+
+
+def test_pictures_are_found_one_folder_deeper_and_beside_the_extracts(hamlet, tmp_path):
+    (tmp_path / "imagery" / "hamlet").mkdir(parents=True)
+    (tmp_path / "osm").mkdir()
+    shutil.copy(hamlet.folder / "houses.geojson", tmp_path / "imagery" / "hamlet")
+    shutil.copy(hamlet.folder / "mosaic.tif", tmp_path / "imagery" / "hamlet")
+    plan = plan_build(hamlet.spec(), out=tmp_path, extract_folders=[tmp_path / "osm"])
+    assert plan.pictures[0].path == tmp_path / "imagery" / "hamlet" / "mosaic.tif"
+
+
+def test_a_picture_with_another_hash_is_not_taken(hamlet, tmp_path):
+    spec = hamlet.spec()
+    (tmp_path / "mosaic.tif").write_bytes(b"other")
+    with pytest.raises(ImageryError, match="none of those accepted"):
+        plan_build(spec, out=tmp_path, extract_folders=[hamlet.folder], imagery_folders=[tmp_path])
+
+
+GROUND = np.full((3, 64, 64), 90, dtype=np.uint8)
+THERE = {"transform": Affine(1.0, 0, 1_000_900, 0, -1.0, 5_959_000)}
+BAD = {
+    "no CRS": (lambda path: write_picture(path, GROUND, crs=None, **THERE), "says no place"),
+    "no transform": (lambda path: write_picture(path, GROUND), "says no place"),
+    "16-bit": (lambda path: write_picture(path, GROUND.astype(np.uint16), **THERE), "uint16, imagery is 8-bit red"),
+    "one band": (lambda path: write_picture(path, GROUND[:1], **THERE), r"1 band\(s\) of uint8"),
+    "elsewhere": (
+        lambda path: write_picture(path, GROUND, transform=Affine(1.0, 0, 4e6, 0, -1.0, 5e6)),
+        r"the region is .*: leave it out",
+    ),
+    "empty": (lambda path: path.write_bytes(b""), "cannot be read as a GeoTIFF"),
+    "no raster": (lambda path: path.write_text("<html>not found</html>"), "cannot be read as a GeoTIFF"),
+    "absurd scale": (
+        lambda path: write_picture(path, GROUND, transform=Affine(5e4, 0, 0, 0, -5e4, 7e6)),
+        "check its georeference",
+    ),
+    "absurdly fine": (
+        lambda path: write_picture(
+            path, np.zeros((3, 1, 1), np.uint8), transform=Affine(1e-4, 0, 1_000_900, 0, -1e-4, 5_959_000)
+        ),
+        "check its georeference",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", BAD)
+def test_a_bad_picture_is_refused_in_one_line_and_nothing_is_left(fault, hamlet, tmp_path):
+    place = hamlet.but(folder=tmp_path / "place")
+    place.folder.mkdir()
+    shutil.copy(hamlet.folder / "houses.geojson", place.folder)
+    make, words = BAD[fault]
+    make(place.folder / "mosaic.tif")
+    message = refusal(place, tmp_path / "out")
+    assert re.search(words, message), message
+    assert "mosaic.tif" in message
+
+
+def test_a_picture_of_too_many_pixels_is_refused_before_it_is_decoded(hamlet, tmp_path):
+    place = hamlet.but(folder=tmp_path / "place")
+    place.folder.mkdir()
+    shutil.copy(hamlet.folder / "houses.geojson", place.folder)
+    about = {"driver": "GTiff", "count": 3, "height": 70_000, "width": 70_000, "dtype": "uint8", "sparse_ok": True}
+    with rasterio.open(place.folder / "mosaic.tif", "w", crs="EPSG:3857", tiled=True, **about, **THERE):
+        pass
+    assert "the most is 4,000,000,000: cut it to the region" in refusal(place, tmp_path / "out")
+
+
+def test_a_truncated_picture_is_refused_and_an_older_region_stays(hamlet, built, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(built, out / "regions" / "hamlet")
+    place = hamlet.but(folder=tmp_path / "place")
+    shutil.copytree(hamlet.folder, place.folder)
+    whole = (place.folder / "mosaic.tif").read_bytes()
+    (place.folder / "mosaic.tif").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(ImageryError, match=r"mosaic.tif"):
+        build(place, out)
+    assert differing_files(out / "regions" / "hamlet") == []
+    assert [path.name for path in (out / "regions").iterdir() if "partial" in path.name] == []
+
+
+def test_a_line_says_what_there_is_and_whose_it_is(built):
+    text = read_manifest(built).imagery.to_text()
+    assert text.startswith(
+        "mosaic.tif of 2023-06-01; pixels of 0.500 m show 100.0% of the mapped ground, off the map by"
+    )
+    assert text.endswith("(c) somebody with a drone (CC-BY-4.0), may be passed on")
+
+
+def test_imagery_that_must_not_be_passed_on_is_refused(hamlet, tmp_path):
+    folder = build(hamlet.but(publish=False), tmp_path)
+    with pytest.raises(
+        StoreError, match=r"publish = false .*: leave hamlet out, or build it .* without \[\[imagery\]\]"
+    ):
+        check_publishable(folder, read_manifest(folder))
+
+
+def test_an_entry_must_say_whether_it_may_be_published(hamlet):
+    with pytest.raises(ConfigError, match=r"'imagery.1.publish' is missing"):
+        hamlet.but(extra='[[imagery]]\nfile = "b.tif"\n').spec()
+
+
+def test_the_mapped_ground_shown_is_counted(built):
+    manifest = read_manifest(built)
+    record = manifest.imagery
+    assert record.share == 1.0
+    assert record.pictures[0].gsd_m == pytest.approx(GSD_M, rel=0.05)
+    assert (record.rows, record.cols) == (2 * manifest.rows, 2 * manifest.cols)
+
+
+@pytest.mark.real
+@pytest.mark.parametrize(("name", "most_m", "tiles"), [("zanzibar", 0.3, 6), ("banepa", 0.1, 40)])
+def test_a_real_mosaic_lies_on_its_map(name, most_m, tiles, tmp_path):
+    spec = read_region_file(list_region_files()[name])
+    if name == "zanzibar":  # its southern part is enough
+        ring = spec.coverage_parts_lonlat[1]
+        box = shapely.Polygon(ring).bounds
+        changes = {"bounds_lonlat": box, "coverage_parts_lonlat": [ring], "imagery": spec.imagery[1:]}
+        spec = spec.model_copy(update=changes)
+    try:
+        plan = plan_build(spec, out=tmp_path)
+    except (ExtractError, ImageryError) as error:
+        pytest.skip(f"real imagery: {error}")
+    manifest = build_region(plan, tell=lambda _: None, with_preview=False)
+    assert manifest.classes == ("building",)
+    assert manifest.imagery.share > 0.98
+    assert max(abs(manifest.imagery.offset.east_m), abs(manifest.imagery.offset.north_m)) < most_m
+    assert manifest.imagery.offset.tiles >= tiles
+    assert manifest.imagery.is_publishable == (name == "banepa")

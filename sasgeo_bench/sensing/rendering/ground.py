@@ -1,0 +1,223 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Paint open ground: country between the mapped things, yards around houses, green areas, fields, water."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.sensing.rendering.buildings import rectangles
+from sasgeo_bench.sensing.rendering.plan import WATER, Canvas, Cells, Mask, Shapes, blurred, burn_numbers, inside_m
+from sasgeo_bench.sensing.rendering.seasons import GROWTH
+from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, fractal, grain, noise
+
+WOOD, PARK, MEADOW, ROUGH = range(4)
+_YARD_M: Final = 16.0  # from a wall to the end of its ground
+_PARCEL_EDGE_M: Final = 0.7
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cover:
+    """What grows where, shape (rows, cols): kind of green by number (-1 none), orchards, and whose yard a cell is."""
+
+    green: NDArray[np.int8]
+    orchard: Mask
+    yard: Cells
+    edge: Mask
+
+
+def paint_ground(canvas: Canvas, numbers: Cells) -> Cover:
+    """Paint everything that lies flat and is neither road nor roof; `numbers` are those of the buildings, 0 elsewhere."""
+    canvas.built = blurred((numbers > 0).astype(np.float32), 28.0, canvas.grid)
+    soil = _paint_country(canvas)
+    yard, edge = _paint_yards(canvas, numbers, soil)
+    green = _paint_green(canvas)
+    orchard = _paint_fields(canvas)
+    _paint_water(canvas)
+    canvas.shade(np.ones(canvas.grid.shape, dtype=bool), _roughness(canvas))
+    return Cover(green=green, orchard=orchard, yard=np.where(green >= 0, 0, yard), edge=edge & (green < 0) & ~orchard)
+
+
+def _roughness(canvas: Canvas) -> Field:
+    """Return brightness of the ground: grain, tufts and wide patches."""
+    seed, rough = canvas.plan.seed("ground"), canvas.plan.palette.unevenness
+    fine = 0.04 * grain(canvas.grid) + 0.05 * noise(canvas.grid, 0.8, seed) + 0.05 * noise(canvas.grid, 2.3, seed + 1)
+    return np.asarray(1 + rough * (fine + 0.05 * fractal(canvas.grid, 35.0, seed + 2)), dtype=np.float32)
+
+
+def _grass(canvas: Canvas) -> tuple[Numbers, Numbers]:
+    """Return the fresh and the dry colour of grass in the season."""
+    growth = GROWTH[canvas.season]
+    fresh, dry = (np.array(colour) for colour in canvas.plan.palette.grass)
+    return tuple(colour + growth.grass_share * (np.array(growth.grass) - colour) for colour in (fresh, dry))
+
+
+def _paint_country(canvas: Canvas) -> Field:
+    """Paint grass, fresh and dry, with bare patches; return where soil shows, 0 to 1."""
+    grid, palette, seed = canvas.grid, canvas.plan.palette, canvas.plan.seed("country")
+    fresh, dry = _grass(canvas)
+    wide = fractal(grid, 60.0, seed, octaves=4)
+    near = fractal(grid, 7.0, seed + 10, octaves=4)
+    dryness = np.clip(0.45 + 0.7 * wide + 0.5 * near, 0, 1)[..., None]
+    ground = fresh.astype(np.float32) * (1 - dryness) + dry.astype(np.float32) * dryness
+    soil = np.clip((near + 0.6 * wide + 0.35 * canvas.built * 3 - 0.62 + 0.22 * palette.unevenness) * 2.2, 0, 1)
+    dark, light = (np.array(colour, dtype=np.float32) for colour in palette.soil)
+    part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)[..., None]
+    earth = dark * (1 - part) + light * part
+    ground += soil[..., None] * (earth - ground)
+    canvas.colour[...] = np.clip(ground, 0, 255).astype(np.uint8)
+    return np.asarray(soil, dtype=np.float32)
+
+
+def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Mask]:
+    """Give each house the ground next to it; return whose ground each cell is (0 none) and where two grounds meet."""
+    grid, plan = canvas.grid, canvas.plan
+    outside = (numbers == 0).astype(np.uint8)
+    if outside.all():
+        return np.zeros(grid.shape, dtype=np.int32), np.zeros(grid.shape, dtype=bool)
+    away, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    away *= np.float32(grid.cell_size_m)
+    owners = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
+    owners[nearest[numbers > 0]] = numbers[numbers > 0]
+    ragged_m = _YARD_M * (0.75 + 0.25 * noise(grid, 9.0, plan.seed("ragged")))
+    yard = np.where((away < ragged_m) & (outside > 0), owners[nearest], 0).astype(np.int32)
+    keys = np.concatenate([[0], plan.of("building").key])
+    style = np.searchsorted(np.cumsum(plan.palette.yards) / sum(plan.palette.yards), draw(plan.seed("yard"), keys))
+    _paint_yard_styles(canvas, yard, style, soil)
+    worn = np.clip(1.3 - away / (1.0 + 2.0 * plan.palette.unevenness), 0, 1) * np.clip(0.6 + soil, 0, 1)
+    canvas.tint((yard > 0) & (worn > 0.03), plan.palette.soil[1], np.asarray(worn * 0.7, dtype=np.float32))
+    terrace = (away < 3.4) & (yard > 0) & (draw(5, keys) < 0.3)[yard] & (noise(grid, 7.0, plan.seed("terrace")) > 0.05)
+    canvas.tint(terrace, plan.palette.paving, 0.85)
+    edge = np.zeros(grid.shape, dtype=bool)
+    for axis in (0, 1):
+        edge |= (owners[nearest] != np.roll(owners[nearest], 1, axis=axis)) & (yard > 0)
+    edge &= draw(plan.seed("fences"), np.arange(len(owners)))[nearest % len(owners)] < 2
+    return yard, edge & (away > 1.5)
+
+
+def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], soil: Field) -> None:
+    """Paint lawns, bare soil, paving and beds."""
+    palette, grid, seed = canvas.plan.palette, canvas.grid, canvas.plan.seed("beds")
+    fresh, dry = _grass(canvas)
+    kind = np.where(yard > 0, style[yard] + 1, 0)
+    near = np.clip(0.5 + fractal(grid, 5.0, seed), 0, 1)
+    lawn = fresh * 1.05 + 0.35 * bell(seed, yard[kind == 1].astype(np.int64))[:, None] * (dry - fresh)
+    canvas.tint(kind == 1, lawn, 0.75)
+    canvas.tint(kind == 2, palette.soil[1], np.asarray(0.35 + 0.6 * near, dtype=np.float32))  # noqa: PLR2004
+    canvas.tint(kind == 3, palette.paving, np.asarray(0.6 + 0.35 * near, dtype=np.float32))  # noqa: PLR2004
+    rows = np.sin(2 * np.pi * _stripe_m(canvas, yard) / 1.7) > 0.1
+    beds = (kind == 4) & (noise(grid, 11.0, seed + 5) > -0.1)  # noqa: PLR2004
+    canvas.tint(beds & rows, np.array(fresh) * 0.85, 0.75)
+    canvas.tint(beds & ~rows, palette.soil[0], np.asarray(0.4 + 0.3 * soil, dtype=np.float32))
+
+
+def _stripe_m(canvas: Canvas, numbers: Cells) -> Field:
+    """Return the distance across rows whose direction belongs to each number, metres, shape (rows, cols)."""
+    grid = canvas.grid
+    turn = np.pi * draw(canvas.plan.seed("rows"), np.arange(int(numbers.max()) + 1))
+    cos, sin = (part.astype(np.float32)[numbers] for part in (np.cos(turn), np.sin(turn)))
+    across = (np.arange(grid.cols, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
+    down = (np.arange(grid.rows, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
+    return np.asarray(cos * across[None, :] + sin * down[:, None], dtype=np.float32)
+
+
+def green_kinds(shapes: Shapes, seed: int) -> NDArray[np.int8]:
+    """Return wood, park, meadow or rough ground for each green area: the map's class tells no more than "green".
+
+    Large areas are mostly woods and meadows, small ones lawns with trees.
+    """
+    hectares = shapely.area(shapes.geometry) / 1e4
+    luck = draw(seed, shapes.key)
+    wood = np.clip(0.12 + 0.22 * np.log10(np.maximum(hectares, 0.01) / 0.3), 0.08, 0.7)
+    park = np.clip(0.6 - 0.25 * np.log10(np.maximum(hectares, 0.01) / 0.2), 0.1, 0.8)
+    park = np.minimum(park, 1 - wood)
+    return np.where(luck < wood, WOOD, np.where(luck < wood + park, PARK, np.where(luck < 0.9, MEADOW, ROUGH))).astype(
+        np.int8
+    )
+
+
+def _paint_green(canvas: Canvas) -> NDArray[np.int8]:
+    shapes = canvas.plan.of("green")
+    found = np.full(canvas.grid.shape, -1, dtype=np.int8)
+    if not len(shapes):
+        return found
+    shapes = shapes.part(np.argsort(-shapely.area(shapes.geometry), kind="stable"))  # a pitch within a park
+    numbers = burn_numbers(shapes.areas(), canvas.grid)
+    kinds = np.concatenate([[-1], green_kinds(shapes, canvas.plan.seed("green"))]).astype(np.int8)
+    found = kinds[numbers]
+    fresh, dry = _grass(canvas)
+    tone = bell(canvas.plan.seed("tone"), np.concatenate([[0], shapes.key]))
+    patches = np.clip(0.5 + fractal(canvas.grid, 14.0, canvas.plan.seed("meadow")), 0, 1)
+    for kind, dryness, share in ((PARK, 0.1, 0.8), (MEADOW, 0.4, 0.7), (ROUGH, 0.6, 0.4)):
+        cells = found == kind
+        mixed = np.clip(dryness + 0.5 * (patches[cells] - 0.5) + 0.12 * tone[numbers[cells]], 0, 1)[:, None]
+        canvas.tint(cells, (fresh * (1 - mixed) + dry * mixed) * (1 + 0.05 * tone[numbers[cells]])[:, None], share)
+    mown = (found == PARK) & (draw(3, np.arange(len(kinds))) < 0.4)[numbers]
+    stripes = np.sign(np.sin(np.pi * _stripe_m(canvas, numbers) / 2.4)) * 0.035
+    canvas.shade(mown, np.asarray(1 + stripes, dtype=np.float32))
+    floor = np.array(canvas.plan.palette.soil[0]) * 0.55 + fresh * 0.2
+    canvas.tint(found == WOOD, floor, 0.75)
+    return found
+
+
+def _paint_fields(canvas: Canvas) -> Mask:
+    """Paint fields: a crop for each, rows along its longer side, tractor tracks; return where orchards stand."""
+    shapes, plan = canvas.plan.of("farmland"), canvas.plan
+    if not len(shapes):
+        return np.zeros(canvas.grid.shape, dtype=bool)
+    numbers = burn_numbers(shapes.areas(), canvas.grid)
+    growth, palette, luck = GROWTH[canvas.season], plan.palette, plan.chance("crop", shapes.key)
+    crops, ripe, soil = (np.array(part) for part in (palette.crops, palette.ripe, palette.soil))
+    colour = crops[(luck * 977 % 1 * len(crops)).astype(int)]
+    state = luck * 331 % 1
+    is_bare, is_ripe = state < growth.ploughed_share, state > 1 - growth.ripe_share
+    colour = np.where(is_bare[:, None], soil[(luck * 577 % 1 * 2).astype(int)] * 0.92, colour)
+    colour = np.where(is_ripe[:, None], ripe[(luck * 757 % 1 * len(ripe)).astype(int)], colour)
+    colour = colour * (1 + 0.07 * bell(plan.seed("field"), shapes.key))[:, None]
+    colour = np.vstack([np.zeros((1, 3)), colour])
+    cells = numbers > 0
+    canvas.tint(cells, colour[numbers[cells]], np.asarray(0.82 + 0.12 * noise(canvas.grid, 12.0, 5), dtype=np.float32))
+    across = _field_rows_m(canvas, shapes, numbers)
+    pitch = np.concatenate([[1.0], 0.75 + 1.6 * luck])[numbers]
+    wander = 0.5 * noise(canvas.grid, 25.0, plan.seed("wander"))
+    rows = 0.06 * np.sin(2 * np.pi * (across + wander) / pitch)
+    tracks = np.where(np.mod(across + wander, 18.0) < 0.7, -0.13, 0.0)
+    patches = 0.12 * fractal(canvas.grid, 40.0, plan.seed("growth"), octaves=4)
+    canvas.shade(cells, np.asarray(1 + rows + tracks + patches, dtype=np.float32))
+    is_orchard = np.concatenate([[False], (luck * 131 % 1 < 0.16) & (shapely.area(shapes.geometry) < 4e4)])
+    return np.asarray(is_orchard[numbers])
+
+
+def _field_rows_m(canvas: Canvas, shapes: Shapes, numbers: Cells) -> Field:
+    """Return the distance across the rows of each field, which run along its longer side, metres."""
+    axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[numbers]
+    grid = canvas.grid
+    east = (np.arange(grid.cols, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
+    north = -(np.arange(grid.rows, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
+    # From a corner that is fixed to the ground, so that windows agree.
+    east += np.float32(grid.west_m % 5000)
+    north += np.float32(grid.north_m % 5000)
+    return np.asarray(axis[..., 0] * north[:, None] - axis[..., 1] * east[None, :], dtype=np.float32)
+
+
+def _paint_water(canvas: Canvas) -> None:
+    """Paint standing and running water and the sea: darker where deep, with a wet or stony edge."""
+    grid, palette, seed = canvas.grid, canvas.plan.palette, canvas.plan.seed("water")
+    waters = [canvas.plan.of(name) for name in ("water", "waterway")]
+    water = np.zeros(grid.shape, dtype=bool)
+    for shapes in waters:
+        water |= burn_numbers(shapes.areas(), grid) > 0
+    if not water.any():
+        return
+    depth_m = inside_m(water, grid)
+    bank_m = inside_m(~water, grid)
+    bank = (bank_m > 0) & (bank_m < 1.2 + 1.5 * noise(grid, 6.0, seed))
+    canvas.tint(bank, np.array(palette.soil[0]) * 0.8, 0.6)
+    deep, shallow = (np.array(colour, dtype=np.float32) for colour in palette.water)
+    share = np.clip(np.exp(-depth_m / 4.0) + 0.25 * fractal(grid, 25.0, seed + 3), 0, 1)[water][:, None]
+    ripples = (1 + 0.04 * noise(grid, 1.6, seed + 7) + 0.03 * grain(grid, 5))[water][:, None]
+    canvas.tint(water, (deep * (1 - share) + shallow * share) * ripples)
+    canvas.kind[water] = WATER

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What stands where in one window of a region: shapes by class, each with a seed of its own, before any paint."""
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Final
+
+import cv2
+import numpy as np
+import rasterio.features
+import shapely
+from affine import Affine
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.features import SEA
+from sasgeo_bench.sensing.rendering.palettes import Palette
+from sasgeo_bench.sensing.rendering.seasons import Colour, Season
+from sasgeo_bench.sensing.rendering.texture import Field, Numbers, draw, seed_of
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+
+Cells = NDArray[np.int32]
+Mask = NDArray[np.bool_]
+Picture = NDArray[np.uint8]
+
+# What a cell shows. A higher number hides a lower one.
+GROUND, ROAD, WATER, CAR, CROWN, WALL, ROOF = range(7)
+_KINDS: Final = {"way": 0, "relation": 1, SEA: 2}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shapes:
+    """Visible features of one class: geometry in the CRS of the region, and arrays of shape (N,).
+
+    `width_m` is NaN for areas; `key` is the identity of a feature as a number, for `draw`.
+    """
+
+    geometry: NDArray[np.object_]
+    width_m: Numbers
+    key: NDArray[np.int64]
+    level: NDArray[np.int64]
+    is_bridge: Mask
+    is_sea: Mask
+
+    def __len__(self) -> int:
+        """Return the number of features."""
+        return len(self.geometry)
+
+    def part(self, chosen: Mask) -> "Shapes":
+        """Return the chosen features."""
+        names = ("geometry", "width_m", "key", "level", "is_bridge", "is_sea")
+        return Shapes(**{name: getattr(self, name)[chosen] for name in names})
+
+    def areas(self, more_m: float = 0.0) -> NDArray[np.object_]:
+        """Return lines buffered to their width and areas as they are, each grown by `more_m` on every side."""
+        half_m = np.nan_to_num(self.width_m) / 2 + more_m
+        return np.asarray(shapely.buffer(self.geometry, half_m, quad_segs=3, cap_style="flat"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Plan:
+    """One window of a region, a palette, and the seed of the place."""
+
+    grid: Grid
+    place: str
+    palette: Palette
+    shapes: dict[str, Shapes]
+
+    def of(self, class_name: str) -> Shapes:
+        """Return the features of a class; none if the region has no such class."""
+        return self.shapes[class_name] if class_name in self.shapes else no_shapes()
+
+    def seed(self, purpose: str) -> int:
+        """Return the seed of the place for one purpose."""
+        return seed_of(self.place, purpose)
+
+    def chance(self, purpose: str, key: NDArray[np.int64]) -> Numbers:
+        """Return a number in [0, 1) for each feature, always the same for one place, feature and purpose."""
+        return draw(self.seed(purpose), key)
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Canvas:
+    """Rasters on the plan's grid while they are painted, shape (rows, cols): colour (x 3), height, kind, owner.
+
+    `height_m` is above the ground plane; `owner` is the number of a building from 1 on, or 0; `lamps` is the light of
+    street lamps; `built` is the share of built ground around each cell.
+    """
+
+    plan: Plan
+    season: Season
+    colour: Picture
+    height_m: Field
+    kind: Picture
+    owner: Cells
+    lamps: Field = field(default_factory=lambda: np.zeros((1, 1), dtype=np.float32))
+    built: Field = field(default_factory=lambda: np.zeros((1, 1), dtype=np.float32))
+
+    @property
+    def grid(self) -> Grid:
+        """Return the lattice."""
+        return self.plan.grid
+
+    def tint(self, cells: Mask, colour: NDArray[np.floating] | Colour, share: Field | float = 1.0) -> None:
+        """Mix a colour (one, or one for each chosen cell) into the chosen cells by a share (one, or a raster)."""
+        rows, cols = np.nonzero(cells)
+        if not len(rows):
+            return
+        old = self.colour[rows, cols].astype(np.float32)
+        part = share[rows, cols][:, None] if isinstance(share, np.ndarray) else np.float32(share)
+        new = old + part * (np.asarray(colour, dtype=np.float32) - old)
+        self.colour[rows, cols] = np.clip(new, 0, 255).astype(np.uint8)
+
+    def shade(self, cells: Mask, factor: Field) -> None:
+        """Multiply the colour of the chosen cells by a raster."""
+        rows, cols = np.nonzero(cells)
+        new = self.colour[rows, cols].astype(np.float32) * factor[rows, cols][:, None]
+        self.colour[rows, cols] = np.clip(new, 0, 255).astype(np.uint8)
+
+
+def no_shapes() -> Shapes:
+    """Return a class without features."""
+    none = np.zeros(0)
+    return Shapes(
+        geometry=np.zeros(0, dtype=object),
+        width_m=none,
+        key=none.astype(np.int64),
+        level=none.astype(np.int64),
+        is_bridge=none.astype(bool),
+        is_sea=none.astype(bool),
+    )
+
+
+def shapes_of(features: "gpd.GeoDataFrame", box: shapely.Geometry) -> dict[str, Shapes]:
+    """Return the visible features that reach into a box, by class, ordered by level and identity."""
+    near = features[features["is_visible"].to_numpy() & shapely.intersects(features.geometry.to_numpy(), box)]
+    kind = near["osm_type"].map(_KINDS).fillna(3).to_numpy(dtype=np.int64)
+    key = near["osm_id"].to_numpy(dtype=np.int64) * 4 + kind
+    names, level = near["class"].to_numpy(), near["level"].to_numpy(dtype=np.int64)
+    order = np.lexsort((key, level))
+    found = {}
+    for name in sorted(set(names)):
+        chosen = order[names[order] == name]
+        found[str(name)] = Shapes(
+            geometry=near.geometry.to_numpy()[chosen],
+            width_m=near["width_m"].to_numpy(dtype=np.float64)[chosen],
+            key=key[chosen],
+            level=level[chosen],
+            is_bridge=near["is_bridge"].to_numpy()[chosen],
+            is_sea=kind[chosen] == _KINDS[SEA],
+        )
+    return found
+
+
+def burn_numbers(geometry: NDArray[np.object_], grid: Grid) -> Cells:
+    """Return the number from 1 on of the last area that covers each cell's centre, shape (rows, cols); else 0."""
+    kept = np.flatnonzero(~(shapely.is_empty(geometry) | shapely.is_missing(geometry)))
+    if not len(kept):
+        return np.zeros(grid.shape, dtype=np.int32)
+    pairs = [(geometry[number], int(number) + 1) for number in kept]
+    burnt = rasterio.features.rasterize(pairs, grid.shape, transform=Affine(*grid.transform), fill=0, dtype=np.int32)
+    return np.asarray(burnt, dtype=np.int32)
+
+
+def inside_m(mask: Mask, grid: Grid) -> Field:
+    """Return how far each cell of a mask is from its edge, metres; 0 outside."""
+    found = cv2.distanceTransform(mask.astype(np.uint8), cv2.DIST_L2, 3)
+    return np.asarray(found * np.float32(grid.cell_size_m), dtype=np.float32)
+
+
+def blurred(values: Field, sigma_m: float, grid: Grid) -> Field:
+    """Return a raster blurred by a Gaussian of a width in metres; wide ones are made on coarser cells."""
+    factor = max(1, int(sigma_m / grid.cell_size_m / 4))
+    small = values
+    if factor > 1:
+        size = (max(1, grid.cols // factor), max(1, grid.rows // factor))
+        small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+    sigma = sigma_m / grid.cell_size_m / factor
+    small = cv2.GaussianBlur(small, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    if factor > 1:
+        small = cv2.resize(small, (grid.cols, grid.rows), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(small, dtype=np.float32)
+
+
+def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Numbers:
+    """Return points along a line with the direction there: easting, northing, cos, sin; shape (N, 4).
+
+    The first point lies `offset_m` from the start. Rings of areas count as lines.
+    """
+    found = [np.zeros((0, 4))]
+    for part in shapely.get_parts(line):
+        path = shapely.get_exterior_ring(part) if shapely.get_type_id(part) == 3 else part  # noqa: PLR2004 - a polygon
+        at = np.arange(offset_m, shapely.length(path), spacing_m)
+        if not len(at):
+            continue
+        here = shapely.get_coordinates(shapely.line_interpolate_point(path, at))
+        ahead = shapely.get_coordinates(shapely.line_interpolate_point(path, at + 0.5))
+        behind = shapely.get_coordinates(shapely.line_interpolate_point(path, np.maximum(at - 0.5, 0.0)))
+        step = ahead - behind
+        found.append(np.column_stack([here, step / np.maximum(np.hypot(*step.T), 1e-9)[:, None]]))
+    return np.concatenate(found)
+
+
+def fill_boxes(
+    target: NDArray, boxes_m: Numbers, grid: Grid, values: NDArray
+) -> None:
+    """Fill rotated rectangles, rows of (easting, northing, cos, sin, half length, half width), each with its value."""
+    for (east, north, cos, sin, half_long, half_wide), value in zip(boxes_m.tolist(), values.tolist(), strict=True):
+        ahead, left = np.array([cos, sin]) * half_long, np.array([-sin, cos]) * half_wide
+        corners = np.array([east, north]) + np.stack([ahead + left, ahead - left, -ahead - left, left - ahead])
+        uv = np.round((grid.to_uv(corners) - 0.5) * 8).astype(np.int32)
+        cv2.fillConvexPoly(target, uv, value, lineType=cv2.LINE_8, shift=3)

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find what each pixel of a camera sees first: rays marched over a height raster, all at once."""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.intrinsics import Intrinsics
+from sasgeo_bench.sensing.rendering.plan import Mask
+from sasgeo_bench.sensing.rendering.texture import Field
+
+_STRIDE: Final = 8  # pixels between the rays for which the highest thing is looked up
+_STEP_CELLS: Final = 0.9
+_LOW_M: Final = 0.05  # what is lower casts no ray off its way
+_FLATTEST: Final = 0.035  # a ray that falls less than this per metre sees no ground
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Hits:
+    """First surfaces that the pixels of a picture see, all of shape (H, W), float32.
+
+    `col` and `row` are continuous cells of the scene (pixel-is-area), `z_m` the height there, `cells_px` how many cells
+    a pixel is wide on the ground, `fall` how steeply a ray falls (sine). `is_side` marks walls and the flanks of crowns;
+    `is_ground` is False above the horizon. `ahead` (2, H, W) is the direction of the ray in plan, cells (col, row) per
+    metre of fall.
+    """
+
+    col: Field
+    row: Field
+    z_m: Field
+    cells_px: Field
+    fall: Field
+    ahead: Field
+    is_side: Mask
+    is_ground: Mask
+
+
+class HeightPyramid:
+    """A height raster and, for each level, the highest cell in and around every block of 2 ** level cells."""
+
+    def __init__(self, height_m: Field) -> None:
+        self.height_m = height_m.copy()
+        self.height_m[[0, -1]] = 0
+        self.height_m[:, [0, -1]] = 0
+        self.levels: list[Field] = []
+        level = self.height_m
+        while max(level.shape) > 4:  # noqa: PLR2004 - blocks
+            level = _halved(level)
+            self.levels.append(cv2.dilate(level, np.ones((3, 3), np.uint8)))
+
+    @property
+    def highest_m(self) -> float:
+        """Return the height of the highest cell."""
+        return float(self.levels[-1].max()) if self.levels else float(self.height_m.max())
+
+    def highest_within(self, col: Field, row: Field, radius: Field) -> Field:
+        """Return at least the highest cell within a radius (cells) of each point; 0 far outside."""
+        level = np.clip(np.ceil(np.log2(np.maximum(radius, 1))), 1, len(self.levels)).astype(np.int64)
+        found = np.full(col.shape, self.highest_m, dtype=np.float32)
+        for number, blocks in enumerate(self.levels, start=1):
+            chosen = (level == number) & (radius <= 2**number)
+            if chosen.any():
+                at_row, at_col = (np.floor(part[chosen] / 2**number).astype(np.int64) for part in (row, col))
+                rows, cols = blocks.shape
+                value = blocks[at_row.clip(0, rows - 1), at_col.clip(0, cols - 1)]
+                near = (at_row >= -1) & (at_row <= rows) & (at_col >= -1) & (at_col <= cols)
+                found[chosen] = np.where(near, value, 0)
+        return found
+
+
+def _halved(values: Field) -> Field:
+    rows, cols = (-(-count // 2) * 2 for count in values.shape)
+    padded = np.zeros((rows, cols), dtype=np.float32)
+    padded[: values.shape[0], : values.shape[1]] = values
+    return np.asarray(padded.reshape(rows // 2, 2, cols // 2, 2).max(axis=(1, 3)))
+
+
+@lru_cache(maxsize=4)
+def _slopes(lens: Intrinsics) -> NDArray[np.float32]:
+    """Return the slopes of all pixel centres, shape (2, H, W)."""
+    down, right = np.mgrid[0 : lens.height_px, 0 : lens.width_px].astype(np.float64) + 0.5
+    found = lens.to_slopes(np.stack([right.ravel(), down.ravel()], axis=1))
+    slopes = np.ascontiguousarray(found.T.reshape(2, lens.height_px, lens.width_px), dtype=np.float32)
+    slopes.flags.writeable = False
+    return slopes
+
+
+def trace(camera: Camera, grid: Grid, heights: HeightPyramid) -> Hits:
+    """Return what the pixels of a camera see of a height raster on a grid; the ground plane is at 0.
+
+    Notes
+    -----
+    A point of a ray is linear in its height z. For blocks of 8 x 8 pixels a pyramid of maxima bounds the highest thing
+    that their rays can meet; from there rays go down in steps of about a cell (or of a pixel, where that is wider) until
+    the raster is above them. Rays over open ground need no step at all.
+    """
+    right, down = _slopes(camera.intrinsics)
+    matrix = camera.matrix.astype(np.float32)
+    east, north, up = (right * matrix[0, axis] + down * matrix[1, axis] + matrix[2, axis] for axis in range(3))
+    flat = np.hypot(east, north)
+    is_ground = up < -_FLATTEST * np.maximum(flat, 1e-6)
+    falling = np.where(is_ground, -up, 1.0).astype(np.float32)
+    cell = np.float32(grid.cell_size_m)
+    ahead = np.stack([east / falling / cell, -north / falling / cell])
+    fall = falling / np.sqrt(flat * flat + up * up)
+    at = grid.to_uv(np.array([[camera.east_m, camera.north_m]]))[0]
+    height = np.float32(camera.height_m)
+    col, row = (np.float32(at[axis]) + ahead[axis] * height for axis in (0, 1))
+    col, row = (np.clip(part, -1e6, 1e6) for part in (col, row))
+    return _march(
+        Hits(
+            col=col,
+            row=row,
+            z_m=np.zeros_like(col),
+            cells_px=_pixel_cells(col, row),
+            fall=fall,
+            ahead=ahead,
+            is_side=np.zeros(col.shape, dtype=bool),
+            is_ground=is_ground,
+        ),
+        heights,
+    )
+
+
+def _pixel_cells(col: Field, row: Field) -> Field:
+    """Return the width of a pixel on the ground plane in cells: the mean of its two sides."""
+    small = [cv2.resize(part, None, fx=1 / _STRIDE, fy=1 / _STRIDE, interpolation=cv2.INTER_NEAREST) for part in (col, row)]
+    if min(small[0].shape) < 2:  # noqa: PLR2004 - a picture too small for a difference
+        return np.ones_like(col)
+    down, right = (np.hypot(np.gradient(small[0], axis=axis), np.gradient(small[1], axis=axis)) for axis in (0, 1))
+    size = ((down + right) / 2 / _STRIDE).astype(np.float32)
+    return np.asarray(cv2.resize(size, (col.shape[1], col.shape[0]), interpolation=cv2.INTER_LINEAR))
+
+
+def _ceiling(hits: Hits, heights: HeightPyramid) -> Field:
+    """Return a height above everything that the ray of each pixel can meet, shape (H, W)."""
+    middle = np.s_[_STRIDE // 2 :: _STRIDE, _STRIDE // 2 :: _STRIDE]
+    if min(hits.col.shape) <= _STRIDE:
+        return np.full_like(hits.col, heights.highest_m)
+    col, row, size = hits.col[middle], hits.row[middle], hits.cells_px[middle]
+    ahead = hits.ahead[:, *middle]
+    run = np.hypot(ahead[0], ahead[1])
+    ceiling = np.full(col.shape, heights.highest_m, dtype=np.float32)
+    for _ in range(4):
+        half = ceiling / 2
+        radius = 0.8 * _STRIDE * size + run * half
+        ceiling = np.minimum(ceiling, heights.highest_within(col - ahead[0] * half, row - ahead[1] * half, radius))
+    whole = np.repeat(np.repeat(ceiling, _STRIDE, axis=0), _STRIDE, axis=1)
+    rows, cols = hits.col.shape
+    return np.pad(whole, ((0, max(0, rows - whole.shape[0])), (0, max(0, cols - whole.shape[1]))), mode="edge")[
+        :rows, :cols
+    ]
+
+
+def _march(hits: Hits, heights: HeightPyramid) -> Hits:
+    """Follow the rays that may meet something down to it; fill in column, row, height and side of what they meet."""
+    ceiling = np.where(hits.is_ground, _ceiling(hits, heights), 0)
+    pixel = np.flatnonzero(ceiling > _LOW_M)
+    if not len(pixel):
+        return hits
+    top = ceiling.ravel()[pixel]
+    ahead_col, ahead_row = hits.ahead[0].ravel()[pixel], hits.ahead[1].ravel()[pixel]
+    step = np.maximum(_STEP_CELLS, 0.75 * hits.cells_px.ravel()[pixel])
+    steps = np.ceil(np.hypot(ahead_col, ahead_row) * top / step) + 1
+    fall = top / steps
+    col = hits.col.ravel()[pixel] - ahead_col * top
+    row = hits.row.ravel()[pixel] - ahead_row * top
+    rays = np.stack([col, row, top, ahead_col * fall, ahead_row * fall, fall])
+    raster = heights.height_m
+    for _ in range(int(steps.max()) + 2):
+        found = _heights_at(raster, rays[0], rays[1])
+        met = found >= rays[2] - np.float32(1e-3)
+        done = pixel[met]
+        hits.col.ravel()[done], hits.row.ravel()[done] = rays[0, met], rays[1, met]
+        hits.z_m.ravel()[done] = np.maximum(rays[2, met], 0)
+        hits.is_side.ravel()[done] = found[met] - rays[2, met] > rays[5, met] + np.float32(0.6)
+        open_ = ~met
+        if not open_.any():
+            break
+        pixel, rays = pixel[open_], rays[:, open_]
+        rays[0] += rays[3]
+        rays[1] += rays[4]
+        rays[2] -= rays[5]
+    return hits
+
+
+def _heights_at(raster: Field, col: Field, row: Field) -> Field:
+    """Return the heights of the cells under points; 0 outside, where the border of the raster is level ground."""
+    rows, cols = raster.shape
+    at = np.clip(row, 0, rows - 1).astype(np.int32) * np.int32(cols) + np.clip(col, 0, cols - 1).astype(np.int32)
+    return np.asarray(raster.ravel().take(at))

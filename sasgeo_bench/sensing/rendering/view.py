@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The picture of a scene that a camera takes, and what each of its pixels shows of the map."""
+
+import math
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import CameraError
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
+from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.rendering.conditions import Conditions
+from sasgeo_bench.sensing.rendering.light import Exposure, Light, expose
+from sasgeo_bench.sensing.rendering.plan import CROWN, ROOF, WATER, Mask, Picture
+from sasgeo_bench.sensing.rendering.scene import Painting, Scene
+from sasgeo_bench.sensing.rendering.seasons import Season
+from sasgeo_bench.sensing.rendering.sensor import expose_sensor
+from sasgeo_bench.sensing.rendering.texture import Field, draw
+from sasgeo_bench.sensing.rendering.trace import Hits, trace
+
+_GLASS: Final = np.array([54, 62, 70], dtype=np.float32)
+_BEHIND: Final = frozenset({"building", "green"})  # classes that stand up themselves
+
+
+def render(scene: Scene, camera: Camera, conditions: Conditions, rng: np.random.Generator) -> Picture:
+    """Return the picture that a camera takes of a scene, uint8 of shape (H, W, 3), RGB.
+
+    The camera is in the CRS of the scene, its height above the ground plane. Beyond the scene's window the ground goes
+    on without things; above the horizon is sky. `rng` draws the noise of the sensor alone: all else belongs to the
+    place. Raise `CameraError` for a camera that is not above the scene.
+    """
+    painting = scene.painting(conditions.season)
+    _check(camera, painting)
+    light, exposure = scene.light(conditions.season, conditions.sun), expose(conditions)
+    hits = trace(camera, scene.grid, painting.heights)
+    kind = _nearest(painting.kind, hits)
+    albedo = _sampled(painting.colours, hits)
+    shares = _light_shares(light, hits)
+    if hits.is_side.any():
+        _paint_sides(scene, painting, light, hits, kind, albedo, shares)
+    seen = _lit(albedo, shares, exposure)
+    if exposure.lamp.any():
+        seen += (albedo * albedo) * (_linear(painting.lamps, hits) * (0.9 / 65025))[..., None] * exposure.lamp
+    _reflect(scene, hits, kind, seen, conditions, exposure)
+    _add_air(seen, camera, hits, conditions, exposure)
+    return expose_sensor(seen, conditions, exposure.dark, rng)
+
+
+def labels(scene: Scene, camera: Camera, *, season: Season = "summer") -> Picture:
+    """Return what each pixel shows, uint8 of shape (C, H, W): ABSENT, PRESENT or UNKNOWN, classes as in the scene.
+
+    A pixel shows the surface that its ray meets first. A roof shows the classes of the ground under it, a wall shows
+    "building" alone. Under a crown, a class of the ground that the map has there is UNKNOWN, as it is hidden; beyond the
+    mapped area, outside the scene and above the horizon all is UNKNOWN.
+    """
+    painting = scene.painting(season)
+    _check(camera, painting)
+    hits = trace(camera, scene.grid, painting.heights)
+    rows, cols = scene.grid.shape
+    row, col = (np.floor(part).astype(np.int32) for part in (hits.row, hits.col))
+    inside = hits.is_ground & (row >= 0) & (col >= 0) & (row < rows) & (col < cols)
+    at = (row.clip(0, rows - 1), col.clip(0, cols - 1))
+    known = inside & scene.is_mapped[at]
+    bits, kind = scene.class_bits[at], painting.kind[at]
+    is_wall, is_crown = hits.is_side & (kind == ROOF), kind == CROWN
+    found = np.full((len(scene.classes), *row.shape), UNKNOWN, dtype=np.uint8)
+    for number, name in enumerate(scene.classes):
+        band = np.where(bits & np.uint32(1 << number), PRESENT, ABSENT).astype(np.uint8)
+        if name == "building":
+            band[is_wall] = PRESENT
+        else:
+            band[is_wall] = ABSENT
+        if name != "green":
+            band[is_crown & (band == PRESENT)] = UNKNOWN
+        found[number][known] = band[known]
+    return found
+
+
+def _check(camera: Camera, painting: Painting) -> None:
+    highest_m = painting.heights.highest_m
+    if camera.height_m <= highest_m:
+        message = (
+            f"a camera is above everything in its scene, {highest_m:.1f} m, got height_m {camera.height_m!r}: fly higher"
+        )
+        raise CameraError(message)
+
+
+def _maps(hits: Hits, level: int = 0) -> tuple[Field, Field]:
+    """Return columns and rows for cv2.remap, which counts from cell centres, on a coarser level of a raster."""
+    factor = np.float32(1 / 2**level)
+    return hits.col * factor - np.float32(0.5), hits.row * factor - np.float32(0.5)
+
+
+def _linear(values: Field | Picture, hits: Hits, level: int = 0) -> NDArray[np.generic]:
+    col, row = _maps(hits, level)
+    return cv2.remap(values, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+
+
+def _nearest(values: NDArray[np.generic], hits: Hits) -> NDArray[np.generic]:
+    col, row = _maps(hits)
+    return cv2.remap(values, col, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def _sampled(colours: tuple[Picture, ...], hits: Hits) -> Field:
+    """Return the colour at each hit, float32 of shape (H, W, 3), 0-255, from the level as fine as the pixel."""
+    level = np.clip(np.log2(np.maximum(hits.cells_px, 0.25)) + 0.3, 0, len(colours) - 1)
+    first, last = int(np.floor(level.min() + 0.2)), int(np.ceil(level.max() - 0.2))
+    found = _linear(colours[first], hits, first).astype(np.float32)
+    for number in range(first + 1, last + 1):
+        share = np.clip(level - (number - 1), 0, 1)[..., None]
+        finer = _linear(colours[number], hits, number).astype(np.float32)
+        finer -= found
+        finer *= share
+        found += finer
+    return found
+
+
+def _light_shares(light: Light, hits: Hits) -> Field:
+    """Return light of sun and sky at each hit, float32 of shape (H, W, 2), 0-1."""
+    return _linear(light.shares, hits).astype(np.float32) * np.float32(1 / 255)
+
+
+def _paint_sides(
+    scene: Scene, painting: Painting, light: Light, hits: Hits, kind: Picture, albedo: Field, shares: Field
+) -> None:
+    """Give walls their paint, windows and own light, and darken the flanks of crowns towards the ground."""
+    side = np.nonzero(hits.is_side)
+    col, row, z_m = hits.col[side], hits.row[side], hits.z_m[side]
+    owner = painting.owner[_clipped(row, col, painting.owner.shape)]
+    is_wall = (owner > 0) & (kind[side] == ROOF)
+    normal = _normals(painting.heights.height_m, row, col)
+    east, north, _ = light.sun.direction
+    facing = np.maximum(normal[0] * east + normal[1] * north, 0)
+    outside = _clipped(row - 2.5 * normal[1], col + 2.5 * normal[0], painting.owner.shape)
+    is_lit = light.shade_m[outside] < z_m + 0.3
+    high = painting.heights.height_m[_clipped(row, col, painting.owner.shape)]
+    deep = 0.5 + 0.5 * z_m / np.maximum(high, 0.5)
+    paint = albedo[side] * deep[:, None]
+    walls = np.flatnonzero(is_wall)
+    paint[walls] = _wall_paint(scene, owner[walls] - 1, row[walls], col[walls], z_m[walls])
+    albedo[side] = paint
+    sun, sky = shares[..., 0], shares[..., 1]
+    sun[side] = facing * is_lit * np.where(is_wall, 1.0, 0.7)
+    sky[side] = 0.45 + 0.2 * np.minimum(z_m / 8, 1)
+
+
+def _clipped(row: Field, col: Field, shape: tuple[int, ...]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    return np.clip(row, 0, shape[0] - 1).astype(np.int32), np.clip(col, 0, shape[1] - 1).astype(np.int32)
+
+
+def _normals(height_m: Field, row: Field, col: Field) -> Field:
+    """Return unit vectors (east, north) out of a wall, shape (2, N), from the heights on four sides."""
+    shape, reach = height_m.shape, 3.0
+    east = height_m[_clipped(row, col - reach, shape)] - height_m[_clipped(row, col + reach, shape)]
+    north = height_m[_clipped(row + reach, col, shape)] - height_m[_clipped(row - reach, col, shape)]
+    normal = np.stack([east, north])
+    return np.asarray(normal / np.maximum(np.hypot(east, north), 1e-3))
+
+
+def _wall_paint(scene: Scene, owner: NDArray[np.int32], row: Field, col: Field, z_m: Field) -> Field:
+    """Return the colour of points on walls, shape (N, 3): plaster with rows of windows, darker at the foot."""
+    buildings, cell = scene.buildings, np.float32(scene.grid.cell_size_m)
+    axis = buildings.axis[owner].astype(np.float32)
+    east, north = col * cell, -row * cell
+    # Along a wall that follows one of the building's axes, this changes by a metre for each metre.
+    along_m = east * (axis[:, 0] - axis[:, 1]) + north * (axis[:, 1] + axis[:, 0])
+    paint = buildings.wall[owner].astype(np.float32) * (0.82 + 0.18 * np.minimum(z_m / 2.5, 1))[:, None]
+    storey = np.float32(scene.plan.palette.storey_m)
+    up, across = np.mod((z_m - 0.2) / storey, 1), np.mod(along_m / 2.7, 1)
+    is_glass = (up > 0.32) & (up < 0.78) & (across < 0.45) & (z_m < buildings.eave_m[owner] - 0.4)
+    is_glass &= draw(7, owner.astype(np.int64), np.floor(along_m / 2.7).astype(np.int64)) < 0.8
+    paint[is_glass] = _GLASS
+    return paint
+
+
+def _lit(albedo: Field, shares: Field, exposure: Exposure) -> Field:
+    """Return the light that comes from each hit, linear, float32 of shape (H, W, 3)."""
+    seen = np.multiply.outer(shares[..., 0], exposure.sun)
+    seen += np.multiply.outer(shares[..., 1], exposure.sky)
+    seen *= albedo
+    seen *= albedo  # colours are stored as the square root of what they reflect
+    seen *= np.float32(1 / 65025)
+    return seen
+
+
+def _reflect(
+    scene: Scene, hits: Hits, kind: Picture, seen: Field, conditions: Conditions, exposure: Exposure
+) -> None:
+    """Mirror sky and sun in water that ripples."""
+    at = np.nonzero((kind == WATER) & hits.is_ground)
+    if not len(at[0]):
+        return
+    cell = scene.grid.cell_size_m
+    east, north = hits.col[at] * cell, hits.row[at] * cell
+    wave_e = 0.035 * np.sin(1.9 * east + 0.8 * north + 1.7 * np.sin(0.7 * north)) + 0.02 * np.sin(5.1 * east - 3.3 * north)
+    wave_n = 0.035 * np.sin(1.3 * north - 1.1 * east + 1.3 * np.sin(0.9 * east)) + 0.02 * np.sin(4.3 * north + 3.7 * east)
+    fall = hits.fall[at]
+    flat = np.sqrt(np.maximum(1 - fall * fall, 0))
+    run = np.maximum(np.hypot(hits.ahead[0][at], hits.ahead[1][at]), 1e-6)
+    ray = np.stack([flat * hits.ahead[0][at] / run, -flat * hits.ahead[1][at] / run, -fall])
+    normal = np.stack([wave_e, wave_n, np.ones_like(wave_e)])
+    normal /= np.sqrt((normal**2).sum(axis=0))
+    cosine = -(ray * normal).sum(axis=0)
+    mirrored = ray + 2 * cosine * normal
+    share = (0.02 + 0.98 * np.clip(1 - cosine, 0, 1) ** 5)[:, None]
+    toward = np.clip(np.tensordot(np.array(conditions.sun.direction), mirrored, axes=1), 0, 1)
+    glint = 9.0 * (toward**350)[:, None] * exposure.sun
+    seen[at] += share * (1.1 * exposure.air - seen[at]) + share * glint * 6
+
+
+def _add_air(seen: Field, camera: Camera, hits: Hits, conditions: Conditions, exposure: Exposure) -> None:
+    """Mix haze in by distance (Koschmieder's law: contrast falls to 2 % at the visibility), and paint the sky."""
+    extinction = -math.log(0.02) / conditions.visibility_m
+    away_m = (np.float32(camera.height_m) - hits.z_m) / np.maximum(hits.fall, 1e-3)
+    clear = np.exp(-np.float32(extinction) * away_m)
+    clear[~hits.is_ground] = 0
+    seen *= clear[..., None]
+    seen += np.multiply.outer(1 - clear, exposure.air)
+
+
+def seen_buildings(scene: Scene, camera: Camera, *, season: Season = "summer") -> Mask:
+    """Return which pixels show a roof or a wall, shape (H, W)."""
+    return np.asarray(labels(scene, camera, season=season)[scene.classes.index("building")] == PRESENT)

@@ -37,15 +37,17 @@ def paint_ground(canvas: Canvas, numbers: Cells) -> Cover:
     green = _paint_green(canvas)
     orchard = _paint_fields(canvas)
     _paint_water(canvas)
-    canvas.shade(np.ones(canvas.grid.shape, dtype=bool), _roughness(canvas))
+    _roughen(canvas)
     return Cover(green=green, orchard=orchard, yard=np.where(green >= 0, 0, yard), edge=edge & (green < 0) & ~orchard)
 
 
-def _roughness(canvas: Canvas) -> Field:
-    """Return brightness of the ground: grain, tufts and wide patches."""
+def _roughen(canvas: Canvas) -> None:
+    """Make the ground uneven: grain, tufts and wide patches."""
     seed, rough = canvas.plan.seed("ground"), canvas.plan.palette.unevenness
-    fine = 0.04 * grain(canvas.grid) + 0.05 * noise(canvas.grid, 0.8, seed) + 0.05 * noise(canvas.grid, 2.3, seed + 1)
-    return np.asarray(1 + rough * (fine + 0.05 * fractal(canvas.grid, 35.0, seed + 2)), dtype=np.float32)
+    for strip, grid in canvas.strips():
+        fine = 0.04 * grain(grid) + 0.05 * noise(grid, 0.8, seed) + 0.05 * noise(grid, 2.3, seed + 1)
+        factor = 1 + rough * (fine + 0.05 * fractal(grid, 35.0, seed + 2))
+        canvas.colour[strip] = np.clip(canvas.colour[strip] * factor[..., None], 0, 255)
 
 
 def _grass(canvas: Canvas) -> tuple[Numbers, Numbers]:
@@ -57,19 +59,20 @@ def _grass(canvas: Canvas) -> tuple[Numbers, Numbers]:
 
 def _paint_country(canvas: Canvas) -> Field:
     """Paint grass, fresh and dry, with bare patches; return where soil shows, 0 to 1."""
-    grid, palette, seed = canvas.grid, canvas.plan.palette, canvas.plan.seed("country")
-    fresh, dry = _grass(canvas)
-    wide = fractal(grid, 60.0, seed, octaves=4)
-    near = fractal(grid, 7.0, seed + 10, octaves=4)
-    dryness = np.clip(0.45 + 0.7 * wide + 0.5 * near, 0, 1)[..., None]
-    ground = fresh.astype(np.float32) * (1 - dryness) + dry.astype(np.float32) * dryness
-    soil = np.clip((near + 0.6 * wide + 0.35 * canvas.built * 3 - 0.62 + 0.22 * palette.unevenness) * 2.2, 0, 1)
+    palette, seed = canvas.plan.palette, canvas.plan.seed("country")
+    fresh, dry = (colour.astype(np.float32) for colour in _grass(canvas))
     dark, light = (np.array(colour, dtype=np.float32) for colour in palette.soil)
-    part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)[..., None]
-    earth = dark * (1 - part) + light * part
-    ground += soil[..., None] * (earth - ground)
-    canvas.colour[...] = np.clip(ground, 0, 255).astype(np.uint8)
-    return np.asarray(soil, dtype=np.float32)
+    found = np.empty(canvas.grid.shape, dtype=np.float32)
+    for strip, grid in canvas.strips():
+        wide, near = fractal(grid, 60.0, seed, octaves=4), fractal(grid, 7.0, seed + 10, octaves=4)
+        dryness = np.clip(0.45 + 0.7 * wide + 0.5 * near, 0, 1)[..., None]
+        soil = near + 0.6 * wide + 1.05 * canvas.built[strip] - 0.62 + 0.22 * palette.unevenness
+        found[strip] = np.clip(soil * 2.2, 0, 1)
+        part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)[..., None]
+        ground = fresh + dryness * (dry - fresh)
+        ground += found[strip][..., None] * (dark + part * (light - dark) - ground)
+        canvas.colour[strip] = np.clip(ground, 0, 255)
+    return found
 
 
 def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Mask]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What stands where in one window of a region: shapes by class, each with a seed of its own, before any paint."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -26,6 +27,7 @@ Picture = NDArray[np.uint8]
 
 # What a cell shows. A higher number hides a lower one.
 GROUND, ROAD, WATER, CAR, CROWN, WALL, ROOF = range(7)
+_STRIP_ROWS: Final = 256
 _KINDS: Final = {"way": 0, "relation": 1, SEA: 2}
 
 
@@ -102,21 +104,33 @@ class Canvas:
         """Return the lattice."""
         return self.plan.grid
 
+    def strips(self) -> Iterator[tuple[slice, Grid]]:
+        """Yield strips of rows with their lattice: what is computed strip by strip needs little memory."""
+        for row in range(0, self.grid.rows, _STRIP_ROWS):
+            rows = min(_STRIP_ROWS, self.grid.rows - row)
+            yield slice(row, row + rows), self.grid.window(row, 0, rows, self.grid.cols)
+
     def tint(self, cells: Mask, colour: NDArray[np.floating] | Colour, share: Field | float = 1.0) -> None:
         """Mix a colour (one, or one for each chosen cell) into the chosen cells by a share (one, or a raster)."""
-        rows, cols = np.nonzero(cells)
-        if not len(rows):
-            return
-        old = self.colour[rows, cols].astype(np.float32)
-        part = share[rows, cols][:, None] if isinstance(share, np.ndarray) else np.float32(share)
-        new = old + part * (np.asarray(colour, dtype=np.float32) - old)
-        self.colour[rows, cols] = np.clip(new, 0, 255).astype(np.uint8)
+        colours, used = np.asarray(colour, dtype=np.float32), 0
+        for strip, _ in self.strips():
+            at = np.flatnonzero(cells[strip])
+            if not len(at):
+                continue
+            here = self.colour[strip].reshape(-1, 3)
+            old = here[at].astype(np.float32)
+            part = share[strip].ravel()[at][:, None] if isinstance(share, np.ndarray) else np.float32(share)
+            new = colours if colours.ndim == 1 else colours[used : used + len(at)]
+            old += part * (new - old)
+            here[at] = np.clip(old, 0, 255)
+            used += len(at)
 
     def shade(self, cells: Mask, factor: Field) -> None:
         """Multiply the colour of the chosen cells by a raster."""
-        rows, cols = np.nonzero(cells)
-        new = self.colour[rows, cols].astype(np.float32) * factor[rows, cols][:, None]
-        self.colour[rows, cols] = np.clip(new, 0, 255).astype(np.uint8)
+        for strip, _ in self.strips():
+            at = np.flatnonzero(cells[strip])
+            here = self.colour[strip].reshape(-1, 3)
+            here[at] = np.clip(here[at] * factor[strip].ravel()[at][:, None].astype(np.float32), 0, 255)
 
 
 def no_shapes() -> Shapes:
@@ -202,12 +216,13 @@ def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Nu
     return np.concatenate(found)
 
 
-def fill_boxes(
-    target: NDArray, boxes_m: Numbers, grid: Grid, values: NDArray
-) -> None:
+def fill_boxes(target: NDArray[np.generic], boxes_m: Numbers, grid: Grid, values: NDArray[np.generic]) -> None:
     """Fill rotated rectangles, rows of (easting, northing, cos, sin, half length, half width), each with its value."""
-    for (east, north, cos, sin, half_long, half_wide), value in zip(boxes_m.tolist(), values.tolist(), strict=True):
-        ahead, left = np.array([cos, sin]) * half_long, np.array([-sin, cos]) * half_wide
-        corners = np.array([east, north]) + np.stack([ahead + left, ahead - left, -ahead - left, left - ahead])
-        uv = np.round((grid.to_uv(corners) - 0.5) * 8).astype(np.int32)
-        cv2.fillConvexPoly(target, uv, value, lineType=cv2.LINE_8, shift=3)
+    west, south, east, north = grid.bounds_m
+    near = (boxes_m[:, 0] > west) & (boxes_m[:, 0] < east) & (boxes_m[:, 1] > south) & (boxes_m[:, 1] < north)
+    boxes, kept = boxes_m[near], values[near].tolist()
+    ahead, left = boxes[:, 2:4] * boxes[:, 4:5], np.stack([-boxes[:, 3], boxes[:, 2]], axis=1) * boxes[:, 5:6]
+    corners = boxes[:, None, :2] + np.stack([ahead + left, ahead - left, -ahead - left, left - ahead], axis=1)
+    points = np.round((grid.to_uv(corners.reshape(-1, 2)) - 0.5) * 8).astype(np.int32).reshape(-1, 4, 2)
+    for box, value in zip(points, kept, strict=True):
+        cv2.fillConvexPoly(target, box, value, lineType=cv2.LINE_8, shift=3)

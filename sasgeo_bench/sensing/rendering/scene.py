@@ -199,16 +199,18 @@ def paint(plan: Plan, buildings: Buildings, season: Season) -> Painting:
 
 def _paint_snow(canvas: Canvas) -> None:
     """Cover ground and roofs with snow; roads are half cleared, some roofs have let it slide off."""
-    grid, seed = canvas.grid, canvas.plan.seed("snow")
-    share = np.full(grid.shape, GROWTH[canvas.season].snow, dtype=np.float32)
-    road = canvas.kind == ROAD
-    share[road] = np.clip(0.4 + 0.7 * fractal(grid, 8.0, seed), 0.05, 0.9)[road]
+    seed = canvas.plan.seed("snow")
     slid = draw(seed, np.concatenate([[0], canvas.plan.of("building").key])) < 0.15
-    share[(canvas.kind == ROOF) & slid[canvas.owner]] = 0.25
-    share[canvas.kind == WATER] = 0.0
-    share *= np.clip(1.02 + 0.16 * noise(grid, 1.4, seed + 9), 0, 1)
-    white = np.array(_SNOW) * (1 + 0.03 * fractal(grid, 12.0, seed + 5))[..., None]
-    canvas.tint(np.ones(grid.shape, dtype=bool), white.reshape(-1, 3), share)
+    for strip, grid in canvas.strips():
+        kind = canvas.kind[strip]
+        share = np.full(grid.shape, GROWTH[canvas.season].snow, dtype=np.float32)
+        share[kind == ROAD] = np.clip(0.4 + 0.7 * fractal(grid, 8.0, seed), 0.05, 0.9)[kind == ROAD]
+        share[(kind == ROOF) & slid[canvas.owner[strip]]] = 0.25
+        share[kind == WATER] = 0.0
+        share *= np.clip(1.02 + 0.16 * noise(grid, 1.4, seed + 9), 0, 1)
+        white = np.array(_SNOW, dtype=np.float32) * (1 + 0.03 * fractal(grid, 12.0, seed + 5))[..., None]
+        old = canvas.colour[strip].astype(np.float32)
+        canvas.colour[strip] = np.clip(old + share[..., None] * (white - old), 0, 255)
 
 
 def _paint_greenery(canvas: Canvas, cover: Cover) -> None:

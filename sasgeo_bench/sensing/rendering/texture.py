@@ -5,6 +5,7 @@ import hashlib
 from functools import lru_cache
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -57,8 +58,15 @@ def bell(seed: int, *keys: NDArray[np.int64]) -> Numbers:
 def noise(grid: Grid, wavelength_m: float, seed: int) -> Field:
     """Return smooth noise in [-1, 1], shape (rows, cols), whose bumps are about a wavelength wide.
 
-    Values are drawn at the crossings of a lattice that is fixed to the ground, and joined by a smooth step.
+    Values are drawn at the crossings of a lattice that is fixed to the ground, and joined by a smooth step. Wide bumps
+    are made on coarser cells.
     """
+    factor = min(8, int(wavelength_m / grid.cell_size_m / 10))
+    if factor > 1:
+        coarse = noise(grid.coarsen(factor), wavelength_m, seed)
+        rows, cols = coarse.shape
+        wide = cv2.resize(coarse, (cols * factor, rows * factor), interpolation=cv2.INTER_LINEAR)
+        return np.asarray(wide[: grid.rows, : grid.cols])
     west, _, _, north = grid.bounds_m
     across = (west + (np.arange(grid.cols) + 0.5) * grid.cell_size_m) / wavelength_m
     down = -(north - (np.arange(grid.rows) + 0.5) * grid.cell_size_m) / wavelength_m

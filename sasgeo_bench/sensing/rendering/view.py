@@ -18,7 +18,7 @@ from sasgeo_bench.sensing.rendering.scene import Painting, Scene
 from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.sensing.rendering.sensor import expose_sensor
 from sasgeo_bench.sensing.rendering.texture import Field, draw
-from sasgeo_bench.sensing.rendering.trace import Hits, trace
+from sasgeo_bench.sensing.rendering.trace import Hits, strips, trace
 
 _GLASS: Final = np.array([54, 62, 70], dtype=np.float32)
 _BEHIND: Final = frozenset({"building", "green"})  # classes that stand up themselves
@@ -34,18 +34,29 @@ def render(scene: Scene, camera: Camera, conditions: Conditions, rng: np.random.
     painting = scene.painting(conditions.season)
     _check(camera, painting)
     light, exposure = scene.light(conditions.season, conditions.sun), expose(conditions)
-    hits = trace(camera, scene.grid, painting.heights)
-    kind = _nearest(painting.kind, hits)
-    albedo = _sampled(painting.colours, hits)
-    shares = _light_shares(light, hits)
-    if hits.is_side.any():
-        _paint_sides(scene, painting, light, hits, kind, albedo, shares)
-    seen = _lit(albedo, shares, exposure)
-    if exposure.lamp.any():
-        seen += (albedo * albedo) * (_linear(painting.lamps, hits) * (0.9 / 65025))[..., None] * exposure.lamp
-    _reflect(scene, hits, kind, seen, conditions, exposure)
-    _add_air(seen, camera, hits, conditions, exposure)
+    size = (camera.intrinsics.height_px, camera.intrinsics.width_px, 3)
+    seen = np.empty(size, dtype=np.float32)
+    for rows in strips(camera):
+        hits = trace(camera, scene.grid, painting.heights, rows)
+        seen[rows] = _shaded(scene, painting, light, exposure, hits)
+        _reflect(scene, painting, hits, seen[rows], conditions, exposure)
+        _add_air(seen[rows], camera, hits, conditions, exposure)
     return expose_sensor(seen, conditions, exposure.dark, rng)
+
+
+def _shaded(scene: Scene, painting: Painting, light: Light, exposure: Exposure, hits: Hits) -> Field:
+    """Return the light that comes from each hit, linear, float32 of shape (H, W, 3)."""
+    albedo, shares = _sampled(painting.colours, hits), _light_shares(light, hits)
+    if hits.is_side.any():
+        _paint_sides(scene, painting, light, hits, albedo, shares)
+    seen = shares[..., :1] * exposure.sun
+    seen += shares[..., 1:] * exposure.sky
+    if exposure.lamp.any():
+        seen += (_linear(painting.lamps, hits) * np.float32(0.9))[..., None] * exposure.lamp
+    seen *= albedo
+    seen *= albedo  # colours are stored as the square root of what they reflect
+    seen *= np.float32(1 / 65025)
+    return seen
 
 
 def labels(scene: Scene, camera: Camera, *, season: Season = "summer") -> Picture:
@@ -57,25 +68,31 @@ def labels(scene: Scene, camera: Camera, *, season: Season = "summer") -> Pictur
     """
     painting = scene.painting(season)
     _check(camera, painting)
-    hits = trace(camera, scene.grid, painting.heights)
-    rows, cols = scene.grid.shape
-    row, col = (np.floor(part).astype(np.int32) for part in (hits.row, hits.col))
-    inside = hits.is_ground & (row >= 0) & (col >= 0) & (row < rows) & (col < cols)
-    at = (row.clip(0, rows - 1), col.clip(0, cols - 1))
-    known = inside & scene.is_mapped[at]
+    size = (camera.intrinsics.height_px, camera.intrinsics.width_px)
+    found = np.full((len(scene.classes), *size), UNKNOWN, dtype=np.uint8)
+    for rows in strips(camera):
+        _label(scene, painting, trace(camera, scene.grid, painting.heights, rows), found[:, rows])
+    return found
+
+
+def _label(scene: Scene, painting: Painting, hits: Hits, found: Picture) -> None:
+    """Fill in what each hit shows, uint8 of shape (C, H, W)."""
+    at = _clipped(hits.row, hits.col, scene.grid.shape)
+    known = _inside(hits, scene.grid.shape) & scene.is_mapped[at]
     bits, kind = scene.class_bits[at], painting.kind[at]
     is_wall, is_crown = hits.is_side & (kind == ROOF), kind == CROWN
-    found = np.full((len(scene.classes), *row.shape), UNKNOWN, dtype=np.uint8)
     for number, name in enumerate(scene.classes):
         band = np.where(bits & np.uint32(1 << number), PRESENT, ABSENT).astype(np.uint8)
-        if name == "building":
-            band[is_wall] = PRESENT
-        else:
-            band[is_wall] = ABSENT
+        band[is_wall] = PRESENT if name == "building" else ABSENT
         if name != "green":
             band[is_crown & (band == PRESENT)] = UNKNOWN
         found[number][known] = band[known]
-    return found
+
+
+def _inside(hits: Hits, shape: tuple[int, ...]) -> Mask:
+    """Return which hits lie on the scene, shape (H, W)."""
+    rows, cols = shape
+    return hits.is_ground & (hits.row >= 0) & (hits.col >= 0) & (hits.row < rows) & (hits.col < cols)
 
 
 def _check(camera: Camera, painting: Painting) -> None:
@@ -123,19 +140,20 @@ def _light_shares(light: Light, hits: Hits) -> Field:
 
 
 def _paint_sides(
-    scene: Scene, painting: Painting, light: Light, hits: Hits, kind: Picture, albedo: Field, shares: Field
+    scene: Scene, painting: Painting, light: Light, hits: Hits, albedo: Field, shares: Field
 ) -> None:
     """Give walls their paint, windows and own light, and darken the flanks of crowns towards the ground."""
     side = np.nonzero(hits.is_side)
     col, row, z_m = hits.col[side], hits.row[side], hits.z_m[side]
-    owner = painting.owner[_clipped(row, col, painting.owner.shape)]
-    is_wall = (owner > 0) & (kind[side] == ROOF)
+    at = _clipped(row, col, painting.owner.shape)
+    owner = painting.owner[at]
+    is_wall = (owner > 0) & (painting.kind[at] == ROOF)
     normal = _normals(painting.heights.height_m, row, col)
     east, north, _ = light.sun.direction
     facing = np.maximum(normal[0] * east + normal[1] * north, 0)
     outside = _clipped(row - 2.5 * normal[1], col + 2.5 * normal[0], painting.owner.shape)
     is_lit = light.shade_m[outside] < z_m + 0.3
-    high = painting.heights.height_m[_clipped(row, col, painting.owner.shape)]
+    high = painting.heights.height_m[at]
     deep = 0.5 + 0.5 * z_m / np.maximum(high, 0.5)
     paint = albedo[side] * deep[:, None]
     walls = np.flatnonzero(is_wall)
@@ -175,21 +193,11 @@ def _wall_paint(scene: Scene, owner: NDArray[np.int32], row: Field, col: Field, 
     return paint
 
 
-def _lit(albedo: Field, shares: Field, exposure: Exposure) -> Field:
-    """Return the light that comes from each hit, linear, float32 of shape (H, W, 3)."""
-    seen = np.multiply.outer(shares[..., 0], exposure.sun)
-    seen += np.multiply.outer(shares[..., 1], exposure.sky)
-    seen *= albedo
-    seen *= albedo  # colours are stored as the square root of what they reflect
-    seen *= np.float32(1 / 65025)
-    return seen
-
-
 def _reflect(
-    scene: Scene, hits: Hits, kind: Picture, seen: Field, conditions: Conditions, exposure: Exposure
+    scene: Scene, painting: Painting, hits: Hits, seen: Field, conditions: Conditions, exposure: Exposure
 ) -> None:
     """Mirror sky and sun in water that ripples."""
-    at = np.nonzero((kind == WATER) & hits.is_ground)
+    at = np.nonzero((_nearest(painting.kind, hits) == WATER) & hits.is_ground)
     if not len(at[0]):
         return
     cell = scene.grid.cell_size_m
@@ -218,8 +226,3 @@ def _add_air(seen: Field, camera: Camera, hits: Hits, conditions: Conditions, ex
     clear[~hits.is_ground] = 0
     seen *= clear[..., None]
     seen += np.multiply.outer(1 - clear, exposure.air)
-
-
-def seen_buildings(scene: Scene, camera: Camera, *, season: Season = "summer") -> Mask:
-    """Return which pixels show a roof or a wall, shape (H, W)."""
-    return np.asarray(labels(scene, camera, season=season)[scene.classes.index("building")] == PRESENT)

@@ -146,7 +146,7 @@ def _materials(plan: Plan, key: NDArray[np.int64], is_flat: Mask) -> tuple[Numbe
         for number, roofing in enumerate(roofings):
             mine = np.flatnonzero(chosen & (pick == number))
             tone = 1 + roofing.spread * bell(plan.seed("tone"), key[mine])
-            hue = 0.035 * np.stack([bell(plan.seed(f"hue{band}"), key[mine]) for band in range(3)], axis=1)
+            hue = 0.016 * np.stack([bell(plan.seed(f"hue{band}"), key[mine]) for band in range(3)], axis=1)
             colour[mine] = np.array(roofing.colour) * (tone[:, None] + hue)
             cover[mine] = COVERS.index(roofing.cover)
             rust[mine] = roofing.rust * plan.chance("rust", key[mine])

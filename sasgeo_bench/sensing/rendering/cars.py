@@ -23,9 +23,9 @@ def paint_cars(canvas: Canvas) -> None:
     """Paint cars on roads and in car parks; they stand 1.5 m high."""
     streets = street_points(canvas, 7.0, -1.1, ("road_minor", "road_major"))
     built = _sample(canvas.built, canvas, streets)
-    parked = streets[streets[:, 4] < 0.5 * np.clip(built * 3.5, 0.02, 0.5)]
+    parked = streets[streets[:, 4] < canvas.plan.palette.cars * np.clip(built * 1.6 - 0.06, 0.004, 0.28)]
     moving = street_points(canvas, 31.0, -1.9, ("road_major", "road_minor"))
-    moving = moving[moving[:, 4] < 0.16]
+    moving = moving[moving[:, 4] < 0.1 * canvas.plan.palette.cars]
     for cars in (parked, moving, _parked_in_bays(canvas)):
         _paint(canvas, cars)
 

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.sensing.rendering.buildings import rectangles
 from sasgeo_bench.sensing.rendering.plan import WATER, Canvas, Cells, Mask, Shapes, blurred, burn_numbers, inside_m
 from sasgeo_bench.sensing.rendering.seasons import GROWTH
@@ -34,10 +35,10 @@ def paint_ground(canvas: Canvas, numbers: Cells) -> Cover:
     canvas.built = blurred((numbers > 0).astype(np.float32), 28.0, canvas.grid)
     soil = _paint_country(canvas)
     yard, edge = _paint_yards(canvas, numbers, soil)
-    green = _paint_green(canvas)
-    orchard = _paint_fields(canvas)
-    _paint_water(canvas)
+    green = np.concatenate([_paint_green(part) for part in canvas.parts()])
+    orchard = np.concatenate([_paint_fields(part) for part in canvas.parts()])
     _roughen(canvas)
+    _paint_water(canvas)
     return Cover(green=green, orchard=orchard, yard=np.where(green >= 0, 0, yard), edge=edge & (green < 0) & ~orchard)
 
 
@@ -45,8 +46,9 @@ def _roughen(canvas: Canvas) -> None:
     """Make the ground uneven: grain, tufts and wide patches."""
     seed, rough = canvas.plan.seed("ground"), canvas.plan.palette.unevenness
     for strip, grid in canvas.strips():
-        fine = 0.04 * grain(grid) + 0.05 * noise(grid, 0.8, seed) + 0.05 * noise(grid, 2.3, seed + 1)
-        factor = 1 + rough * (fine + 0.05 * fractal(grid, 35.0, seed + 2))
+        fine = 0.075 * grain(grid) + 0.08 * noise(grid, 0.7, seed) + 0.06 * noise(grid, 1.7, seed + 1)
+        tufts = -0.2 * np.clip(fractal(grid, 3.0, seed + 5) * (1 + noise(grid, 30.0, seed + 6)) - 0.3, 0, 0.7)
+        factor = 1 + rough * (fine + tufts + 0.07 * fractal(grid, 35.0, seed + 2))
         canvas.colour[strip] = np.clip(canvas.colour[strip] * factor[..., None], 0, 255)
 
 
@@ -71,8 +73,28 @@ def _paint_country(canvas: Canvas) -> Field:
         part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)[..., None]
         ground = fresh + dryness * (dry - fresh)
         ground += found[strip][..., None] * (dark + part * (light - dark) - ground)
+        _add_plots(canvas, grid, ground, found[strip])
         canvas.colour[strip] = np.clip(ground, 0, 255)
     return found
+
+
+def _add_plots(canvas: Canvas, grid: Grid, ground: Field, soil: Field) -> None:
+    """Change open ground plot by plot: what is on no map still belongs to somebody, who mows, sows or lets it lie."""
+    seed, palette = canvas.plan.seed("plots"), canvas.plan.palette
+    bend = 22 * noise(grid, 170.0, seed), 22 * noise(grid, 170.0, seed + 1)
+    turn = np.pi * draw(seed, np.array([0]))[0]
+    east, north = ground_m(grid)
+    east, north = east[None, :] + bend[0], north[:, None] + bend[1]
+    across, down = east * np.cos(turn) + north * np.sin(turn), north * np.cos(turn) - east * np.sin(turn)
+    plot = np.floor(across / 34).astype(np.int64), np.floor(down / 52).astype(np.int64)
+    luck, use = draw(seed + 2, *plot).astype(np.float32), draw(seed + 3, *plot)
+    tone = (1 + 0.28 * palette.patchwork * (luck - 0.5))[..., None]
+    ground *= tone
+    is_tilled = use < 0.22 * palette.patchwork
+    row_m = np.where(luck < 0.5, across, down) * 2 * np.pi / (1.2 + 0.8 * luck)
+    share = np.where(is_tilled, 0.45 + 0.25 * np.sin(row_m), 0)[..., None].astype(np.float32)
+    ground += share * (np.array(palette.soil[int(turn * 10) % 2], dtype=np.float32) - ground)
+    soil[is_tilled] = np.maximum(soil[is_tilled], 0.5)
 
 
 def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Mask]:
@@ -89,7 +111,9 @@ def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Ma
     yard = np.where((away < ragged_m) & (outside > 0), owners[nearest], 0).astype(np.int32)
     keys = np.concatenate([[0], plan.of("building").key])
     style = np.searchsorted(np.cumsum(plan.palette.yards) / sum(plan.palette.yards), draw(plan.seed("yard"), keys))
-    _paint_yard_styles(canvas, yard, style, soil)
+    reach_m = np.array([_YARD_M, _YARD_M, 6.0, _YARD_M, _YARD_M])  # paving ends near the house
+    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        _paint_yard_styles(part, np.where(away[strip] < reach_m[style[yard[strip]]], yard[strip], 0), style, soil[strip])
     worn = np.clip(1.3 - away / (1.0 + 2.0 * plan.palette.unevenness), 0, 1) * np.clip(0.6 + soil, 0, 1)
     canvas.tint((yard > 0) & (worn > 0.03), plan.palette.soil[1], np.asarray(worn * 0.7, dtype=np.float32))
     terrace = (away < 3.4) & (yard > 0) & (draw(5, keys) < 0.3)[yard] & (noise(grid, 7.0, plan.seed("terrace")) > 0.05)
@@ -120,11 +144,19 @@ def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], so
 def _stripe_m(canvas: Canvas, numbers: Cells) -> Field:
     """Return the distance across rows whose direction belongs to each number, metres, shape (rows, cols)."""
     grid = canvas.grid
-    turn = np.pi * draw(canvas.plan.seed("rows"), np.arange(int(numbers.max()) + 1))
+    turn = np.pi * draw(canvas.plan.seed("rows"), np.arange(int(numbers.max(initial=0)) + 1))
     cos, sin = (part.astype(np.float32)[numbers] for part in (np.cos(turn), np.sin(turn)))
-    across = (np.arange(grid.cols, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    down = (np.arange(grid.rows, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    return np.asarray(cos * across[None, :] + sin * down[:, None], dtype=np.float32)
+    east, north = ground_m(grid)
+    return np.asarray(cos * east[None, :] - sin * north[:, None], dtype=np.float32)
+
+
+def ground_m(grid: Grid) -> tuple[Field, Field]:
+    """Return eastings (cols,) and northings (rows,) of cell centres from a corner fixed to the ground, so that windows
+    agree; float32 holds them to a millimetre.
+    """
+    east = (np.arange(grid.cols) + 0.5) * grid.cell_size_m + grid.west_m % 5000
+    north = grid.north_m % 5000 - (np.arange(grid.rows) + 0.5) * grid.cell_size_m
+    return east.astype(np.float32), north.astype(np.float32)
 
 
 def green_kinds(shapes: Shapes, seed: int) -> NDArray[np.int8]:
@@ -197,12 +229,7 @@ def _paint_fields(canvas: Canvas) -> Mask:
 def _field_rows_m(canvas: Canvas, shapes: Shapes, numbers: Cells) -> Field:
     """Return the distance across the rows of each field, which run along its longer side, metres."""
     axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[numbers]
-    grid = canvas.grid
-    east = (np.arange(grid.cols, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    north = -(np.arange(grid.rows, dtype=np.float32) + 0.5) * np.float32(grid.cell_size_m)
-    # From a corner that is fixed to the ground, so that windows agree.
-    east += np.float32(grid.west_m % 5000)
-    north += np.float32(grid.north_m % 5000)
+    east, north = ground_m(canvas.grid)
     return np.asarray(axis[..., 0] * north[:, None] - axis[..., 1] * east[None, :], dtype=np.float32)
 
 

@@ -139,9 +139,9 @@ def expose(conditions: Conditions) -> Exposure:
     grey = np.array([1.0, 1.0, 1.02]) * (0.18 + 0.62 * up)
     sky = day * ((1 - conditions.cloud) * clear + conditions.cloud * grey)
     level = float((sun * up + sky) @ (0.3, 0.6, 0.1))
-    gain = 0.78 / level ** (5 / 6) * 2**conditions.exposure_ev
-    gain = min(gain, 60.0 * 2**conditions.exposure_ev)
-    air = gain * (0.55 * sky + 0.28 * sun * up) * np.array([0.95, 1.0, 1.08])
+    gain = 1.5 / level ** (5 / 6) * 2**conditions.exposure_ev
+    gain = min(gain, 110.0 * 2**conditions.exposure_ev)
+    air = gain * (0.42 * sky + 0.22 * sun * up) * np.array([0.95, 1.0, 1.08])
     night = max(0.0, min(1.0, (3.0 - elevation) / 6))
     warm = np.array([1.0 + 0.16 * conditions.warmth, 1.0, 1.0 - 0.16 * conditions.warmth])
     lamp = night * np.array([1.1, 0.78, 0.42]) * 2**conditions.exposure_ev

@@ -29,7 +29,8 @@ class Palette:
     """Colours (sRGB, 0-255) and shares of one family of places.
 
     `yards` are weights of lawn, bare soil, paving and garden beds; `paved_share` is that of minor roads; `flat_share`
-    is that of small buildings with a flat roof; `tree_density` multiplies the number of trees in yards and streets.
+    is that of small buildings with a flat roof; `tree_density` and `cars` multiply the numbers of trees and cars;
+    `patchwork` says how much unmapped open ground falls into plots of different use.
     """
 
     family: Family
@@ -55,6 +56,8 @@ class Palette:
     roof_pitch: tuple[float, float]
     storey_m: float
     unevenness: float
+    cars: float
+    patchwork: float
 
 
 PALETTES: Final[dict[Family, Palette]] = {
@@ -95,6 +98,8 @@ PALETTES: Final[dict[Family, Palette]] = {
         roof_pitch=(0.45, 0.95),
         storey_m=2.9,
         unevenness=1.0,
+        cars=1.0,
+        patchwork=0.5,
     ),
     # Shingles in grey and brown, white flat roofs, wide concrete: North America.
     "calibration": Palette(
@@ -130,6 +135,8 @@ PALETTES: Final[dict[Family, Palette]] = {
         roof_pitch=(0.3, 0.6),
         storey_m=3.0,
         unevenness=0.9,
+        cars=1.2,
+        patchwork=0.35,
     ),
     # Concrete slabs, painted sheets, dusty ground: much of Asia.
     "test": Palette(
@@ -167,6 +174,8 @@ PALETTES: Final[dict[Family, Palette]] = {
         roof_pitch=(0.2, 0.5),
         storey_m=3.0,
         unevenness=1.2,
+        cars=0.8,
+        patchwork=0.7,
     ),
     # Sheets with rust, thatch, red ground, few paved roads: villages of the tropics.
     "shifted": Palette(
@@ -201,5 +210,7 @@ PALETTES: Final[dict[Family, Palette]] = {
         roof_pitch=(0.2, 0.4),
         storey_m=2.8,
         unevenness=1.5,
+        cars=0.3,
+        patchwork=1.0,
     ),
 }

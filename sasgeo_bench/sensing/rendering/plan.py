@@ -2,7 +2,7 @@
 """What stands where in one window of a region: shapes by class, each with a seed of its own, before any paint."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import cv2
@@ -109,6 +109,20 @@ class Canvas:
         for row in range(0, self.grid.rows, _STRIP_ROWS):
             rows = min(_STRIP_ROWS, self.grid.rows - row)
             yield slice(row, row + rows), self.grid.window(row, 0, rows, self.grid.cols)
+
+    def parts(self) -> Iterator["Canvas"]:
+        """Yield the canvas in strips of rows, each a canvas that paints into this one."""
+        for strip, grid in self.strips():
+            is_whole = self.built.shape == self.grid.shape
+            yield Canvas(
+                plan=replace(self.plan, grid=grid),
+                season=self.season,
+                colour=self.colour[strip],
+                height_m=self.height_m[strip],
+                kind=self.kind[strip],
+                owner=self.owner[strip],
+                built=self.built[strip] if is_whole else self.built,
+            )
 
     def tint(self, cells: Mask, colour: NDArray[np.floating] | Colour, share: Field | float = 1.0) -> None:
         """Mix a colour (one, or one for each chosen cell) into the chosen cells by a share (one, or a raster)."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.sensing.rendering.plan import (
     ROAD,
     WALL,
+    WATER,
     Canvas,
     Cells,
     Mask,
@@ -84,7 +85,7 @@ def _spread(numbers: Cells, reach: Mask) -> Cells:
 
 def _paint_verges(canvas: Canvas, shapes: Shapes, mask: Mask) -> None:
     """Paint pavements in built-up quarters and worn strips elsewhere."""
-    beside = (burn_numbers(shapes.areas(2.2), canvas.grid) > 0) & ~mask
+    beside = (burn_numbers(shapes.areas(2.2), canvas.grid) > 0) & ~mask & (canvas.kind != WATER)
     is_town = canvas.built > 0.13 / max(canvas.plan.palette.paved_share, 0.1)
     canvas.tint(beside & is_town, canvas.plan.palette.paving, 0.8)
     worn = np.clip(0.35 + 0.6 * noise(canvas.grid, 3.0, canvas.plan.seed("verge")), 0, 0.8)
@@ -93,9 +94,15 @@ def _paint_verges(canvas: Canvas, shapes: Shapes, mask: Mask) -> None:
 
 def _wear(canvas: Canvas, mask: Mask, is_paved: Mask) -> None:
     """Make a road uneven: long stains, repaired patches, cracks, wheel tracks, grass in the middle of earth roads."""
+    edge_m = inside_m(mask, canvas.grid)
+    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        if mask[strip].any():
+            _wear_part(part, mask[strip], is_paved[strip], edge_m[strip])
+
+
+def _wear_part(canvas: Canvas, mask: Mask, is_paved: Mask, edge_m: Field) -> None:
     grid, seed, rough = canvas.grid, canvas.plan.seed("wear"), canvas.plan.palette.unevenness
-    edge_m = inside_m(mask, grid)
-    stains = 0.05 * fractal(grid, 9.0, seed) + 0.025 * grain(grid) + 0.03 * noise(grid, 1.0, seed + 4)
+    stains = 0.06 * fractal(grid, 9.0, seed) + 0.045 * grain(grid) + 0.045 * noise(grid, 1.0, seed + 4)
     patches = np.where(noise(grid, 5.0, seed + 5) > 0.72, -0.09, 0.0)
     cracks = np.where(np.abs(noise(grid, 6.0, seed + 6)) < 0.018, -0.12, 0.0)
     wheels = 0.035 * np.cos(2 * np.pi * edge_m / 1.75)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.sensing.rendering.buildings import COVERS, FLAT, HIP, Buildings
 from sasgeo_bench.sensing.rendering.plan import ROOF, Canvas, Mask, burn_numbers, inside_m
-from sasgeo_bench.sensing.rendering.texture import Numbers, bell, draw, fractal, grain, noise
+from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, fractal, grain, noise
 
 _RUST: Final = np.array([128.0, 74.0, 50.0])
 _MOSS: Final = np.array([86.0, 88.0, 62.0])
@@ -35,11 +35,23 @@ class _Cells:
 def paint_buildings(canvas: Canvas, buildings: Buildings) -> None:
     """Paint all buildings on a canvas and set their heights."""
     numbers = burn_numbers(buildings.shapes.geometry, canvas.grid)
-    rows, cols = np.nonzero(numbers)
+    if not numbers.any():
+        return
+    canvas.owner[...] = numbers
+    inner = numbers > 0
+    for axis in (0, 1):  # the line between two houses of a row is an edge of both
+        inner &= (numbers == np.roll(numbers, 1, axis=axis)) | (numbers == 0)
+    edge_m = inside_m(inner, canvas.grid)
+    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        _paint_part(part, buildings, edge_m[strip])
+
+
+def _paint_part(canvas: Canvas, buildings: Buildings, edge_m: Field) -> None:
+    """Paint the roofs of one strip; `edge_m` is the distance of each cell to the outline of its building."""
+    rows, cols = np.nonzero(canvas.owner)
     if not len(rows):
         return
-    cells = _cells(canvas, buildings, numbers, rows, cols)
-    canvas.owner[...] = numbers
+    cells = _cells(canvas, buildings, edge_m, rows, cols)
     canvas.kind[rows, cols] = ROOF
     colour = buildings.roof[cells.owner]
     height_m = _heights(buildings, cells)
@@ -53,12 +65,9 @@ def paint_buildings(canvas: Canvas, buildings: Buildings) -> None:
 
 
 def _cells(
-    canvas: Canvas, buildings: Buildings, numbers: NDArray[np.int32], rows: NDArray[np.int64], cols: NDArray[np.int64]
+    canvas: Canvas, buildings: Buildings, edge_m: Field, rows: NDArray[np.int64], cols: NDArray[np.int64]
 ) -> _Cells:
-    inner = numbers > 0
-    for axis in (0, 1):  # the line between two houses of a row is an edge of both
-        inner &= (numbers == np.roll(numbers, 1, axis=axis)) | (numbers == 0)
-    owner = numbers[rows, cols].astype(np.int64) - 1
+    owner = canvas.owner[rows, cols].astype(np.int64) - 1
     at = canvas.grid.to_centres_m(np.stack([rows, cols], axis=1)) - buildings.centre_m[owner]
     axis_u = buildings.axis[owner]
     return _Cells(
@@ -68,7 +77,7 @@ def _cells(
         key=buildings.shapes.key[owner],
         u_m=at[:, 0] * axis_u[:, 0] + at[:, 1] * axis_u[:, 1],
         v_m=at[:, 1] * axis_u[:, 0] - at[:, 0] * axis_u[:, 1],
-        edge_m=inside_m(inner, canvas.grid)[rows, cols].astype(np.float64),
+        edge_m=edge_m[rows, cols].astype(np.float64),
     )
 
 
@@ -97,7 +106,7 @@ def _weather(canvas: Canvas, buildings: Buildings, cells: _Cells) -> Numbers:
     is_sheet = cover == COVERS.index("sheets")
     is_tile = (cover == COVERS.index("tiles")) | (cover == COVERS.index("slates"))
     pattern = np.where(is_sheet, 0.045 * strip, np.where(is_tile, 0.03 * course + 0.03 * lumps, 0.025 * lumps))
-    stained = (0.08 + 0.1 * draw(29, cells.key)) * patches + 0.035 * fine + 0.025 * grain(canvas.grid)[at]
+    stained = (0.08 + 0.1 * draw(29, cells.key)) * patches + 0.05 * fine + 0.045 * grain(canvas.grid)[at]
     edge = np.where(cells.edge_m < 0.4, np.where(buildings.form[cells.owner] == FLAT, 0.1, -0.12), 0.0)
     return np.asarray(1 + rough * (pattern + stained) + edge)
 

@@ -218,7 +218,7 @@ def _paint_greenery(canvas: Canvas, cover: Cover) -> None:
     grid, plan = canvas.grid, canvas.plan
     is_free = (canvas.kind == GROUND).astype(np.uint8)
     room = np.asarray(cv2.erode(is_free, np.ones((5, 5), np.uint8)), dtype=bool)
-    clumps = np.clip(0.5 + 0.9 * fractal(grid, 30.0, plan.seed("clumps")), 0, 1)
+    clumps = np.clip(0.55 + 1.6 * fractal(grid, 45.0, plan.seed("clumps")), 0, 1.6)
     dense = plan.palette.tree_density
     wood = np.where(room & (cover.green == WOOD), 0.95, 0).astype(np.float32)
     paint_trees(canvas, make_trees(canvas, scatter(grid, wood, plan.seed("wood")), size=(2.0, 4.4), is_wood=True))
@@ -234,7 +234,7 @@ def _paint_greenery(canvas: Canvas, cover: Cover) -> None:
     sparse[cover.orchard] = 0.45
     sparse *= clumps * near * room * np.where(cover.orchard, 1 / np.maximum(clumps, 0.2), 1)
     paint_trees(canvas, make_trees(canvas, scatter(grid, sparse.astype(np.float32), plan.seed("single")), size=(1.6, 4.6)))
-    bushes = np.where(room & ((cover.yard > 0) | (cover.green == ROUGH) | cover.edge), 0.16 * dense, 0.012 * dense)
+    bushes = np.where(room & ((cover.yard > 0) | (cover.green == ROUGH) | cover.edge), 0.16 * dense, 0.03 * dense * clumps**2)
     bushes[cover.edge & room] = 0.55 * np.minimum(dense, 1.2)
     bushes *= np.where(in_field, 0, 1) * room
     paint_trees(canvas, make_trees(canvas, scatter(grid, bushes.astype(np.float32), plan.seed("bush")), size=(0.6, 1.3)))

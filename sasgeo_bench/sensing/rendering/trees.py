@@ -64,7 +64,7 @@ def make_trees(canvas: Canvas, points: Numbers, *, size: tuple[float, float], is
     form = np.where(pick < palette.palm_share, PALM, np.where(pick > 1 - conifer, CONIFER, BROAD))
     form = np.where(radius_m < 1.2, BUSH, form)
     radius_m = np.where(form == CONIFER, radius_m * 0.75, np.where(form == PALM, np.maximum(radius_m, 2.4), radius_m))
-    height_m = radius_m * np.choose(form, [2.5, 4.6, 3.0, 1.5]) * (0.85 + 0.3 * draw(3, key))
+    height_m = radius_m * np.choose(form, [2.0, 3.5, 2.3, 1.2]) * (0.85 + 0.3 * draw(3, key))
     return Trees(
         at_m=points[:, :2],
         radius_m=radius_m,
@@ -165,7 +165,7 @@ def _crown(form: int, size: int, shape: int, cell_m: float) -> tuple[Field, Fiel
         rim = 1.0 + wavy + 0.07 * lumps
         inside = far < rim
         bulge = np.clip(1 - (far / np.maximum(rim, 0.2)) ** 2, 0, 1)
-        rise = bulge**0.5 * 0.55 + 0.4 if form != CONIFER else np.clip(1 - far / np.maximum(rim, 0.2), 0, 1) * 0.85 + 0.12
-        dome = np.where(inside, np.clip(rise + 0.035 * lumps, 0.05, 1.05), 0.0)
-        tone = 0.82 + 0.22 * bulge + 0.09 * lumps
+        rise = bulge**0.6 * 0.68 + 0.28 if form != CONIFER else np.clip(1 - far / np.maximum(rim, 0.2), 0, 1) * 0.85 + 0.12
+        dome = np.where(inside, np.clip(rise + 0.055 * lumps, 0.05, 1.05), 0.0)
+        tone = 0.84 + 0.2 * bulge + 0.15 * lumps
     return dome.astype(np.float32), np.asarray(tone, dtype=np.float32)

@@ -154,14 +154,15 @@ def _paint_sides(
     outside = _clipped(row - 2.5 * normal[1], col + 2.5 * normal[0], painting.owner.shape)
     is_lit = light.shade_m[outside] < z_m + 0.3
     high = painting.heights.height_m[at]
-    deep = 0.5 + 0.5 * z_m / np.maximum(high, 0.5)
+    leaves = draw(11, *(np.floor(part).astype(np.int64) for part in (row / 2, col / 2, z_m * 2.5)))
+    deep = (0.55 + 0.45 * z_m / np.maximum(high, 0.5)) * (0.72 + 0.5 * leaves).astype(np.float32)
     paint = albedo[side] * deep[:, None]
     walls = np.flatnonzero(is_wall)
     paint[walls] = _wall_paint(scene, owner[walls] - 1, row[walls], col[walls], z_m[walls])
     albedo[side] = paint
     sun, sky = shares[..., 0], shares[..., 1]
     sun[side] = facing * is_lit * np.where(is_wall, 1.0, 0.7)
-    sky[side] = 0.45 + 0.2 * np.minimum(z_m / 8, 1)
+    sky[side] = 0.55 + 0.2 * np.minimum(z_m / 8, 1)
 
 
 def _clipped(row: Field, col: Field, shape: tuple[int, ...]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

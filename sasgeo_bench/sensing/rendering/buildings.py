@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Buildings as blocks with a roof: heights, forms and materials estimated from outline and surroundings.
 
-Features keep no tags beyond their class, so `building:levels` and `height` are not at hand: storeys follow from the area
-of the outline and from how densely the ground around is built, with a spread drawn for each building.
+Features keep no tags beyond their class, so `building:levels` and `height` are not at hand: storeys follow from the
+area of the outline and from how densely the ground around is built, with a spread drawn for each building.
 """
 
 from dataclasses import dataclass
@@ -61,7 +61,9 @@ def style_buildings(plan: Plan, relief: float) -> Buildings:
     pitch = np.minimum(pitch, _MOST_RISE_M / np.maximum(half_m[:, 1], 1e-6))
     roof, cover, rust = _materials(plan, key, form == FLAT)
     walls = np.array(plan.palette.walls)
-    wall = walls[(plan.chance("wall", key) * len(walls)).astype(int)] * (1 + 0.1 * bell(plan.seed("paint"), key))[:, None]
+    wall = (
+        walls[(plan.chance("wall", key) * len(walls)).astype(int)] * (1 + 0.1 * bell(plan.seed("paint"), key))[:, None]
+    )
     eave_m = plan.palette.storey_m * storeys * (1 + 0.06 * bell(plan.seed("eave"), key)) + 0.3
     return Buildings(
         shapes=shapes,
@@ -108,12 +110,12 @@ def crowding(outlines: NDArray[np.object_]) -> Numbers:
 def estimate_storeys(area_m2: Numbers, crowded: Numbers, *, seed: int, key: NDArray[np.int64]) -> Numbers:
     """Return a likely number of storeys, at least 0.8, for buildings of an area on ground built to a share.
 
-    Sheds have one storey, houses one or two, blocks in dense quarters three to seven, halls one or two high ones; one in
-    25 of the middling buildings of a dense quarter is a tower.
+    Sheds have one storey, houses one or two, blocks in dense quarters three to seven, halls one or two high ones;
+    one in 25 of the middling buildings of a dense quarter is a tower.
 
     >>> area_m2, crowded = np.array([12.0, 120.0, 600.0]), np.array([0.1, 0.1, 0.4])
     >>> estimate_storeys(area_m2, crowded, seed=1, key=np.arange(3)).round(1).tolist()
-    [0.8, 2.2, 5.4]
+    [0.8, 2.2, 4.5]
     """
     dense = np.clip((crowded - 0.12) / 0.25, 0.0, 1.0)
     house = np.clip(0.9 + (area_m2 - 30) / 90, 0.8, 2.2) + 1.2 * dense * (area_m2 > 60)

@@ -7,12 +7,21 @@ import numpy as np
 import shapely
 
 from sasgeo_bench.sensing.rendering.buildings import rectangles
-from sasgeo_bench.sensing.rendering.plan import CAR, ROAD, Canvas, fill_boxes
+from sasgeo_bench.sensing.rendering.plan import CAR, ROAD, Canvas, Raster, fill_boxes
 from sasgeo_bench.sensing.rendering.roads import street_points
 from sasgeo_bench.sensing.rendering.texture import Numbers, draw
 
 _PAINTS: Final = np.array(
-    [(222, 222, 222), (40, 42, 46), (148, 150, 154), (96, 100, 106), (190, 190, 188), (128, 36, 34), (44, 66, 112), (188, 180, 160)]
+    [
+        (222, 222, 222),
+        (40, 42, 46),
+        (148, 150, 154),
+        (96, 100, 106),
+        (190, 190, 188),
+        (128, 36, 34),
+        (44, 66, 112),
+        (188, 180, 160),
+    ]
 )
 _WEIGHTS: Final = np.cumsum([0.28, 0.18, 0.16, 0.14, 0.1, 0.05, 0.06, 0.03])
 _BAY_M: Final = (2.6, 5.2)
@@ -30,10 +39,10 @@ def paint_cars(canvas: Canvas) -> None:
         _paint(canvas, cars)
 
 
-def _sample(values: np.ndarray, canvas: Canvas, points: Numbers) -> Numbers:
+def _sample(values: Raster, canvas: Canvas, points: Numbers) -> Numbers:
     """Return the values of a raster at points; 0 outside."""
     cells = canvas.grid.to_cells(points[:, :2])
-    inside = ((cells >= 0) & (cells < canvas.grid.shape)).all(axis=1)
+    inside = np.asarray(((cells >= 0) & (cells < canvas.grid.shape)).all(axis=1))
     safe = np.where(inside[:, None], cells, 0)
     return np.where(inside, values[safe[:, 0], safe[:, 1]], 0).astype(np.float64)
 
@@ -50,7 +59,9 @@ def _parked_in_bays(canvas: Canvas) -> Numbers:
         rows = np.concatenate([across, across + _BAY_M[1]])
         u, v = (part.ravel() for part in np.meshgrid(along_m, rows[np.abs(rows) < half_m[number, 1] - 2.6]))
         at = centre_m[number] + u[:, None] * axis[number] + v[:, None] * (axis[number][::-1] * (-1, 1))
-        inside = shapely.contains_xy(shapely.buffer(area, -2.2), at[:, 0], at[:, 1]) & (_sample(canvas.kind, canvas, at) == ROAD)
+        inside = shapely.contains_xy(shapely.buffer(area, -2.2), at[:, 0], at[:, 1]) & (
+            _sample(canvas.kind, canvas, at) == ROAD
+        )
         at = at[inside]
         heading = np.tile(axis[number][::-1] * (-1, 1), (len(at), 1))
         side = at - (_BAY_M[0] / 2) * axis[number]

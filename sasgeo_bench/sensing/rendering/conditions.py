@@ -115,7 +115,7 @@ class Conditions:
             if not low <= value <= high:
                 message = f"{name} lies within {low:g} and {high:g}, got {value!r}"
                 raise ConfigError(message)
-        if not (0 <= self.jpeg_quality <= 100 and 0 <= self.motion_px <= 100):  # noqa: PLR2004 - percent, pixels
+        if not (0 <= self.jpeg_quality <= 100 and 0 <= self.motion_px <= 100):
             message = (
                 f"jpeg_quality and motion_px lie within 0 and 100, got {self.jpeg_quality!r} and {self.motion_px!r}"
             )
@@ -141,10 +141,10 @@ def draw_conditions(rng: np.random.Generator, *, season: Season | None = None) -
         season=chosen,
         cloud=float(rng.beta(0.6, 1.0)),
         visibility_m=float(10 ** rng.uniform(3.7, 4.7)),
-        exposure_ev=float(rng.normal(0, 0.3).clip(-1, 1)),
+        exposure_ev=float(np.clip(rng.normal(0, 0.3), -1, 1)),
         blur_px=float(rng.uniform(0.4, 1.1)),
-        motion_px=float(rng.exponential(0.6).clip(0, 4)),
+        motion_px=float(min(rng.exponential(0.6), 4)),
         noise=float(rng.uniform(0.004, 0.02)),
-        warmth=float(rng.normal(0, 0.3).clip(-1, 1)),
+        warmth=float(np.clip(rng.normal(0, 0.3), -1, 1)),
         jpeg_quality=int(rng.integers(70, 96)),
     )

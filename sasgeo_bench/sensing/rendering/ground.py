@@ -31,7 +31,7 @@ class Cover:
 
 
 def paint_ground(canvas: Canvas, numbers: Cells) -> Cover:
-    """Paint everything that lies flat and is neither road nor roof; `numbers` are those of the buildings, 0 elsewhere."""
+    """Paint what lies flat and is neither road nor roof; `numbers` are those of the buildings, 0 elsewhere."""
     canvas.built = blurred((numbers > 0).astype(np.float32), 28.0, canvas.grid)
     soil = _paint_country(canvas)
     yard, edge = _paint_yards(canvas, numbers, soil)
@@ -113,7 +113,9 @@ def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Ma
     style = np.searchsorted(np.cumsum(plan.palette.yards) / sum(plan.palette.yards), draw(plan.seed("yard"), keys))
     reach_m = np.array([_YARD_M, _YARD_M, 6.0, _YARD_M, _YARD_M])  # paving ends near the house
     for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
-        _paint_yard_styles(part, np.where(away[strip] < reach_m[style[yard[strip]]], yard[strip], 0), style, soil[strip])
+        _paint_yard_styles(
+            part, np.where(away[strip] < reach_m[style[yard[strip]]], yard[strip], 0), style, soil[strip]
+        )
     worn = np.clip(1.3 - away / (1.0 + 2.0 * plan.palette.unevenness), 0, 1) * np.clip(0.6 + soil, 0, 1)
     canvas.tint((yard > 0) & (worn > 0.03), plan.palette.soil[1], np.asarray(worn * 0.7, dtype=np.float32))
     terrace = (away < 3.4) & (yard > 0) & (draw(5, keys) < 0.3)[yard] & (noise(grid, 7.0, plan.seed("terrace")) > 0.05)
@@ -133,10 +135,10 @@ def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], so
     near = np.clip(0.5 + fractal(grid, 5.0, seed), 0, 1)
     lawn = fresh * 1.05 + 0.35 * bell(seed, yard[kind == 1].astype(np.int64))[:, None] * (dry - fresh)
     canvas.tint(kind == 1, lawn, 0.75)
-    canvas.tint(kind == 2, palette.soil[1], np.asarray(0.35 + 0.6 * near, dtype=np.float32))  # noqa: PLR2004
-    canvas.tint(kind == 3, palette.paving, np.asarray(0.6 + 0.35 * near, dtype=np.float32))  # noqa: PLR2004
+    canvas.tint(kind == 2, palette.soil[1], np.asarray(0.35 + 0.6 * near, dtype=np.float32))
+    canvas.tint(kind == 3, palette.paving, np.asarray(0.6 + 0.35 * near, dtype=np.float32))
     rows = np.sin(2 * np.pi * _stripe_m(canvas, yard) / 1.7) > 0.1
-    beds = (kind == 4) & (noise(grid, 11.0, seed + 5) > -0.1)  # noqa: PLR2004
+    beds = (kind == 4) & (noise(grid, 11.0, seed + 5) > -0.1)
     canvas.tint(beds & rows, np.array(fresh) * 0.85, 0.75)
     canvas.tint(beds & ~rows, palette.soil[0], np.asarray(0.4 + 0.3 * soil, dtype=np.float32))
 
@@ -151,8 +153,9 @@ def _stripe_m(canvas: Canvas, numbers: Cells) -> Field:
 
 
 def ground_m(grid: Grid) -> tuple[Field, Field]:
-    """Return eastings (cols,) and northings (rows,) of cell centres from a corner fixed to the ground, so that windows
-    agree; float32 holds them to a millimetre.
+    """Return eastings (cols,) and northings (rows,) of cell centres, metres.
+
+    They count from a corner that is fixed to the ground, so that windows agree, and near enough for float32.
     """
     east = (np.arange(grid.cols) + 0.5) * grid.cell_size_m + grid.west_m % 5000
     north = grid.north_m % 5000 - (np.arange(grid.rows) + 0.5) * grid.cell_size_m
@@ -179,7 +182,9 @@ def _paint_green(canvas: Canvas) -> NDArray[np.int8]:
     found = np.full(canvas.grid.shape, -1, dtype=np.int8)
     if not len(shapes):
         return found
-    shapes = shapes.part(np.argsort(-shapely.area(shapes.geometry), kind="stable"))  # a pitch within a park
+    shapes = shapes.part(
+        np.argsort(-shapely.area(shapes.geometry), kind="stable").astype(np.int64)
+    )  # a pitch within a park
     numbers = burn_numbers(shapes.areas(), canvas.grid)
     kinds = np.concatenate([[-1], green_kinds(shapes, canvas.plan.seed("green"))]).astype(np.int8)
     found = kinds[numbers]

@@ -25,8 +25,8 @@ Rgb = NDArray[np.float32]
 class Light:
     """Light on the cells of a scene for one position of the sun.
 
-    `shares` is uint8 of shape (rows, cols, 2): light of the sun (255 where it falls at right angles) and of the sky (255
-    where all of it is seen). `shade_m`, shape (rows, cols), is the height below which a point there is in shadow.
+    `shares` is uint8 of shape (rows, cols, 2): light of the sun (255 where it falls at right angles) and of the sky
+    (255 where all of it is seen). `shade_m`, shape (rows, cols), is the height below which a point there is in shadow.
     """
 
     sun: Sun
@@ -38,7 +38,7 @@ def cast_light(height_m: Field, cell_size_m: float, sun: Sun) -> Light:
     """Return the light on a height raster, shape (rows, cols)."""
     shade_m = cast_shadows(height_m, cell_size_m, sun)
     lit = (height_m >= shade_m - _EPS_M).astype(np.float32)
-    lit = cv2.GaussianBlur(lit, (0, 0), max(0.3 / cell_size_m, 0.4))
+    lit = np.asarray(cv2.GaussianBlur(lit, (0, 0), max(0.3 / cell_size_m, 0.4)), dtype=np.float32)
     lit *= _facing(height_m, cell_size_m, sun)
     shares = np.empty((*height_m.shape, 2), dtype=np.uint8)
     shares[..., 0] = np.clip(lit * 255, 0, 255)
@@ -127,23 +127,28 @@ def expose(conditions: Conditions) -> Exposure:
     """Return the light of the conditions, scaled by a camera that makes level ground as bright as it can.
 
     The sun reddens and weakens towards the horizon; twilight falls to a hundredth at -8 degrees. The camera follows the
-    light for five sixths of its change in stops, so that night-fall is dark, bluish and (`dark` > 0) grainy.
+    light for three quarters of its change in stops, so that night-fall is dark, bluish and (`dark` > 0) grainy.
     """
     elevation = conditions.sun.elevation_deg
     up = max(0.0, conditions.sun.direction[2])
     through = math.exp(-0.11 / (up + 0.04)) if up > 0 else 0.0
     red = 1 / (1 + 4.0 * up)
-    sun = 1.15 * (1 - conditions.cloud) ** 1.5 * through * np.array([1.0 + 0.2 * red, 1.0 - 0.12 * red, 0.95 - 0.5 * red])
+    sun = (
+        1.15 * (1 - conditions.cloud) ** 1.5 * through * np.array([1.0 + 0.2 * red, 1.0 - 0.12 * red, 0.95 - 0.5 * red])
+    )
     day = min(1.0, 10 ** ((elevation - 6) / 7)) if elevation < 6 else 1.0
     clear = np.array([0.78, 0.93, 1.22]) * (0.16 + 0.12 * up)
     grey = np.array([1.0, 1.0, 1.02]) * (0.18 + 0.62 * up)
     sky = day * ((1 - conditions.cloud) * clear + conditions.cloud * grey)
     level = float((sun * up + sky) @ (0.3, 0.6, 0.1))
-    gain = 1.5 / level ** (5 / 6) * 2**conditions.exposure_ev
+    bright = 0.72 if conditions.season == "snow" else 1.0
+    gain = bright * 1.5 / level**0.75 * 2**conditions.exposure_ev
     gain = min(gain, 110.0 * 2**conditions.exposure_ev)
     air = gain * (0.42 * sky + 0.22 * sun * up) * np.array([0.95, 1.0, 1.08])
     night = max(0.0, min(1.0, (3.0 - elevation) / 6))
     warm = np.array([1.0 + 0.16 * conditions.warmth, 1.0, 1.0 - 0.16 * conditions.warmth])
     lamp = night * np.array([1.1, 0.78, 0.42]) * 2**conditions.exposure_ev
     parts = (np.asarray(part * warm, dtype=np.float32) for part in (gain * sun, gain * sky, air, lamp))
-    return Exposure(**dict(zip(("sun", "sky", "air", "lamp"), parts, strict=True)), dark=min(1.0, math.log2(max(1.0, gain)) / 6))
+    return Exposure(
+        **dict(zip(("sun", "sky", "air", "lamp"), parts, strict=True)), dark=min(1.0, math.log2(max(1.0, gain)) / 6)
+    )

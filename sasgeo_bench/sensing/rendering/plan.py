@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 Cells = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 Picture = NDArray[np.uint8]
+Raster = NDArray[np.integer] | NDArray[np.floating]
 
 # What a cell shows. A higher number hides a lower one.
 GROUND, ROAD, WATER, CAR, CROWN, WALL, ROOF = range(7)
@@ -49,7 +50,7 @@ class Shapes:
         """Return the number of features."""
         return len(self.geometry)
 
-    def part(self, chosen: Mask) -> "Shapes":
+    def part(self, chosen: Mask | NDArray[np.int64]) -> "Shapes":
         """Return the chosen features."""
         names = ("geometry", "width_m", "key", "level", "is_bridge", "is_sea")
         return Shapes(**{name: getattr(self, name)[chosen] for name in names})
@@ -203,12 +204,12 @@ def blurred(values: Field, sigma_m: float, grid: Grid) -> Field:
     small = values
     if factor > 1:
         size = (max(1, grid.cols // factor), max(1, grid.rows // factor))
-        small = cv2.resize(values, size, interpolation=cv2.INTER_AREA)
+        small = np.asarray(cv2.resize(values, size, interpolation=cv2.INTER_AREA), dtype=np.float32)
     sigma = sigma_m / grid.cell_size_m / factor
-    small = cv2.GaussianBlur(small, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+    wide = cv2.GaussianBlur(small, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
     if factor > 1:
-        small = cv2.resize(small, (grid.cols, grid.rows), interpolation=cv2.INTER_LINEAR)
-    return np.asarray(small, dtype=np.float32)
+        wide = cv2.resize(wide, (grid.cols, grid.rows), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(wide, dtype=np.float32)
 
 
 def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Numbers:
@@ -218,7 +219,7 @@ def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Nu
     """
     found = [np.zeros((0, 4))]
     for part in shapely.get_parts(line):
-        path = shapely.get_exterior_ring(part) if shapely.get_type_id(part) == 3 else part  # noqa: PLR2004 - a polygon
+        path = shapely.get_exterior_ring(part) if shapely.get_type_id(part) == 3 else part
         at = np.arange(offset_m, shapely.length(path), spacing_m)
         if not len(at):
             continue
@@ -230,7 +231,7 @@ def along(line: shapely.Geometry, spacing_m: float, offset_m: float = 0.0) -> Nu
     return np.concatenate(found)
 
 
-def fill_boxes(target: NDArray[np.generic], boxes_m: Numbers, grid: Grid, values: NDArray[np.generic]) -> None:
+def fill_boxes(target: Raster, boxes_m: Numbers, grid: Grid, values: Raster) -> None:
     """Fill rotated rectangles, rows of (easting, northing, cos, sin, half length, half width), each with its value."""
     west, south, east, north = grid.bounds_m
     near = (boxes_m[:, 0] > west) & (boxes_m[:, 0] < east) & (boxes_m[:, 1] > south) & (boxes_m[:, 1] < north)

@@ -124,8 +124,8 @@ def _paint_markings(canvas: Canvas, shapes: Shapes) -> None:
                 edge = along(line, 2.0)
                 edge[:, :2] += side * (width_m / 2 - 0.35) * np.stack([-edge[:, 3], edge[:, 2]], axis=1)
                 fill_boxes(drawn, _boxes(edge, 1.05, 0.06), canvas.grid, np.full(len(edge), 190))
-    share = cv2.GaussianBlur(drawn, (0, 0), 0.6).astype(np.float32) / 255
-    share *= np.clip(0.85 + 0.6 * noise(canvas.grid, 5.0, canvas.plan.seed("paint")), 0.15, 1)
+    worn = np.clip(0.85 + 0.6 * noise(canvas.grid, 5.0, canvas.plan.seed("paint")), 0.15, 1)
+    share = np.asarray(cv2.GaussianBlur(drawn, (0, 0), 0.6) * worn / 255, dtype=np.float32)
     canvas.tint(share > 0.02, _WHITE, share)
 
 
@@ -190,12 +190,12 @@ def _paint_parapets(canvas: Canvas) -> None:
     """Raise parapets along bridges; the deck itself lies on the ground plane."""
     for name in ("road_major", "road_minor", "path_track"):
         shapes = canvas.plan.of(name)
-        for line, width_m in zip(
-            shapes.geometry[shapes.is_bridge], shapes.width_m[shapes.is_bridge], strict=True
-        ):
+        for line, width_m in zip(shapes.geometry[shapes.is_bridge], shapes.width_m[shapes.is_bridge], strict=True):
             for side in (-1, 1):
                 at = along(line, 1.0, 0.5)
-                at[:, :2] += side * (np.nan_to_num(width_m, nan=5.0) / 2 + 0.2) * np.stack([-at[:, 3], at[:, 2]], axis=1)
+                at[:, :2] += (
+                    side * (np.nan_to_num(width_m, nan=5.0) / 2 + 0.2) * np.stack([-at[:, 3], at[:, 2]], axis=1)
+                )
                 _raise(canvas, _boxes(at, 0.55, 0.17), 1.0, (176, 172, 166))
 
 
@@ -232,7 +232,7 @@ def _lamps(canvas: Canvas) -> Field:
             lit[cells[:, 0], cells[:, 1]] = canvas.built[cells[:, 0], cells[:, 1]] > 0.05
     sigma_m = 6.0
     spread = blurred(lit, sigma_m, canvas.grid) * np.float32(2 * np.pi * (sigma_m / canvas.grid.cell_size_m) ** 2)
-    return np.minimum(spread, np.float32(1.3))
+    return np.asarray(np.minimum(spread, 1.3), dtype=np.float32)
 
 
 def street_points(canvas: Canvas, spacing_m: float, beside_m: float, names: tuple[str, ...]) -> NDArray[np.float64]:

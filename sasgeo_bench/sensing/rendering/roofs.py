@@ -58,7 +58,7 @@ def _paint_part(canvas: Canvas, buildings: Buildings, edge_m: Field) -> None:
     colour *= _weather(canvas, buildings, cells)[:, None]
     colour = _aged(canvas, buildings, cells, colour)
     _add_panels(canvas, buildings, cells, colour)
-    height_m += _add_plant(canvas, buildings, cells, colour)
+    height_m += _add_plant(buildings, cells, colour)
     height_m += _add_chimneys(canvas, buildings, cells, colour)
     canvas.colour[rows, cols] = np.clip(colour, 0, 255).astype(np.uint8)
     canvas.height_m[rows, cols] = height_m
@@ -150,7 +150,7 @@ def _lots(cells: _Cells, size_m: float, seed: int) -> tuple[Mask, Numbers]:
     return (off_u < half[0]) & (off_v < half[1]), draw(seed, cells.key, *lots)
 
 
-def _add_plant(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
+def _add_plant(buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
     """Put machines, skylights and stairheads on flat roofs; return how much higher each cell becomes."""
     is_flat = (buildings.form[cells.owner] == FLAT) & (cells.edge_m > 1.2) & (buildings.half_m[cells.owner, 1] > 3.5)
     inside, luck = _lots(cells, 6.5, 71)

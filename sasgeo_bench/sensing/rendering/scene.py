@@ -190,11 +190,10 @@ def paint(plan: Plan, buildings: Buildings, season: Season) -> Painting:
     _paint_greenery(canvas, cover)
     colours = [canvas.colour]
     for _ in range(4):
-        colours.append(cv2.resize(colours[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
+        half = cv2.resize(colours[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+        colours.append(np.asarray(half, dtype=np.uint8))
     heights = HeightPyramid(canvas.height_m)
-    return Painting(
-        colours=tuple(colours), heights=heights, kind=canvas.kind, owner=canvas.owner, lamps=canvas.lamps
-    )
+    return Painting(colours=tuple(colours), heights=heights, kind=canvas.kind, owner=canvas.owner, lamps=canvas.lamps)
 
 
 def _paint_snow(canvas: Canvas) -> None:
@@ -233,11 +232,17 @@ def _paint_greenery(canvas: Canvas, cover: Cover) -> None:
     sparse[in_field] = 0.0
     sparse[cover.orchard] = 0.45
     sparse *= clumps * near * room * np.where(cover.orchard, 1 / np.maximum(clumps, 0.2), 1)
-    paint_trees(canvas, make_trees(canvas, scatter(grid, sparse.astype(np.float32), plan.seed("single")), size=(1.6, 4.6)))
-    bushes = np.where(room & ((cover.yard > 0) | (cover.green == ROUGH) | cover.edge), 0.16 * dense, 0.03 * dense * clumps**2)
+    paint_trees(
+        canvas, make_trees(canvas, scatter(grid, sparse.astype(np.float32), plan.seed("single")), size=(1.6, 4.6))
+    )
+    bushes = np.where(
+        room & ((cover.yard > 0) | (cover.green == ROUGH) | cover.edge), 0.16 * dense, 0.03 * dense * clumps**2
+    )
     bushes[cover.edge & room] = 0.55 * np.minimum(dense, 1.2)
     bushes *= np.where(in_field, 0, 1) * room
-    paint_trees(canvas, make_trees(canvas, scatter(grid, bushes.astype(np.float32), plan.seed("bush")), size=(0.6, 1.3)))
+    paint_trees(
+        canvas, make_trees(canvas, scatter(grid, bushes.astype(np.float32), plan.seed("bush")), size=(0.6, 1.3))
+    )
     paint_trees(canvas, hedge_trees(canvas))
 
 

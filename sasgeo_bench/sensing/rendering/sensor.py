@@ -27,8 +27,7 @@ def expose_sensor(light: Field, conditions: Conditions, dark: float, rng: np.ran
     """
     blurred = _blurred(light, conditions)
     blurred *= _vignette(*light.shape[:2])
-    tone = cv2.sqrt(np.maximum(blurred, 0, out=blurred))
-    tone = _curve(tone)
+    tone = _curve(np.sqrt(np.maximum(blurred, 0, out=blurred)))
     sigma = conditions.noise * (1 + 4 * dark)
     if sigma > 0:
         tone += _noise(tone.shape[:2], rng) * np.float32(255 * sigma)
@@ -38,11 +37,11 @@ def expose_sensor(light: Field, conditions: Conditions, dark: float, rng: np.ran
 
 def _blurred(light: Field, conditions: Conditions) -> Field:
     if conditions.blur_px > 0.2:
-        light = cv2.GaussianBlur(light, (0, 0), conditions.blur_px)
+        light = np.asarray(cv2.GaussianBlur(light, (0, 0), conditions.blur_px), dtype=np.float32)
     length = round(conditions.motion_px)
     if length > 1:  # the drone flies up the picture
         kernel = np.full((length, 1), 1 / length, dtype=np.float32)
-        light = cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REPLICATE)
+        light = np.asarray(cv2.filter2D(light, -1, kernel, borderType=cv2.BORDER_REPLICATE), dtype=np.float32)
     return light
 
 
@@ -84,4 +83,5 @@ def _stored(picture: Picture, quality: int) -> Picture:
     if not quality:
         return picture
     _, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return np.asarray(cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+    stored = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
+    return np.ascontiguousarray(stored[..., ::-1])

@@ -41,7 +41,7 @@ def draw(seed: int, *keys: NDArray[np.int64]) -> Numbers:
     >>> draw(7, np.arange(3)).round(3).tolist() == draw(7, np.arange(5))[:3].round(3).tolist()
     True
     """
-    state = np.uint64(seed)
+    state: NDArray[np.uint64] = np.asarray(seed, dtype=np.uint64)
     for key in keys:
         mixed = (np.asarray(key, dtype=np.int64).astype(np.uint64) ^ state) + _STEP
         mixed = (mixed ^ (mixed >> np.uint64(30))) * _MIX[0]
@@ -74,11 +74,11 @@ def noise(grid: Grid, wavelength_m: float, seed: int) -> Field:
     cols = np.arange(first_col, int(np.floor(across[-1])) + 2)
     rows = np.arange(first_row, int(np.floor(down[-1])) + 2)
     values = (2 * draw(seed, rows[:, None], cols[None, :]) - 1).astype(np.float32)
-    wide = _joined(values.T, across - first_col).T
-    return _joined(np.ascontiguousarray(wide), down - first_row)
+    wide = _joined(values.T, np.asarray(across - first_col)).T
+    return _joined(np.ascontiguousarray(wide), np.asarray(down - first_row))
 
 
-def _joined(values: Field, at: Numbers) -> Field:
+def _joined(values: Field, at: NDArray[np.floating]) -> Field:
     """Interpolate along the first axis with a smooth step."""
     low = np.floor(at).astype(np.int64)
     part = (at - low).astype(np.float32)

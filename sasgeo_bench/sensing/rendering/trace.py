@@ -31,9 +31,9 @@ class Hits:
     """First surfaces that the pixels of a picture see, all of shape (H, W), float32.
 
     `col` and `row` are continuous cells of the scene (pixel-is-area), `z_m` the height there, `cells_px` how many cells
-    a pixel is wide on the ground, `fall` how steeply a ray falls (sine). `is_side` marks walls and the flanks of crowns;
-    `is_ground` is False above the horizon. `ahead` (2, H, W) is the direction of the ray in plan, cells (col, row) per
-    metre of fall.
+    a pixel is wide on the ground, `fall` how steeply a ray falls (sine). `is_side` marks walls and flanks of crowns;
+    `is_ground` is False above the horizon. `ahead` (2, H, W) is the direction of the ray in plan, cells (col, row)
+    per metre of fall.
     """
 
     col: Field
@@ -55,9 +55,9 @@ class HeightPyramid:
         self.height_m[:, [0, -1]] = 0
         self.levels: list[Field] = []
         level = self.height_m
-        while max(level.shape) > 4:  # noqa: PLR2004 - blocks
+        while max(level.shape) > 4:
             level = _halved(level)
-            self.levels.append(cv2.dilate(level, np.ones((3, 3), np.uint8)))
+            self.levels.append(np.asarray(cv2.dilate(level, np.ones((3, 3), np.uint8)), dtype=np.float32))
 
     @property
     def highest_m(self) -> float:
@@ -108,7 +108,7 @@ def trace(camera: Camera, grid: Grid, heights: HeightPyramid, rows: slice) -> Hi
     Notes
     -----
     A point of a ray is linear in its height z. For blocks of 8 x 8 pixels a pyramid of maxima bounds the highest thing
-    that their rays can meet; from there rays go down in steps of about a cell (or of a pixel, where that is wider) until
+    that their rays can meet; from there rays go down in steps of about a cell (or of a pixel, if that is wider) until
     the raster is above them. Rays over open ground need no step at all.
     """
     right, down = _slopes(camera.intrinsics)[:, rows]
@@ -141,8 +141,10 @@ def trace(camera: Camera, grid: Grid, heights: HeightPyramid, rows: slice) -> Hi
 
 def _pixel_cells(col: Field, row: Field) -> Field:
     """Return the width of a pixel on the ground plane in cells: the mean of its two sides."""
-    small = [cv2.resize(part, None, fx=1 / _STRIDE, fy=1 / _STRIDE, interpolation=cv2.INTER_NEAREST) for part in (col, row)]
-    if min(small[0].shape) < 2:  # noqa: PLR2004 - a picture too small for a difference
+    small = [
+        cv2.resize(part, None, fx=1 / _STRIDE, fy=1 / _STRIDE, interpolation=cv2.INTER_NEAREST) for part in (col, row)
+    ]
+    if min(small[0].shape) < 2:
         return np.ones_like(col)
     down, right = (np.hypot(np.gradient(small[0], axis=axis), np.gradient(small[1], axis=axis)) for axis in (0, 1))
     size = ((down + right) / 2 / _STRIDE).astype(np.float32)
@@ -189,7 +191,8 @@ def _march(hits: Hits, heights: HeightPyramid) -> Hits:
 
 def _rays(hits: Hits, pixel: NDArray[np.int64]) -> tuple[Field, Field, Field, Field]:
     """Return where rays meet the ground plane, column and row, and how far they go per metre of fall."""
-    return tuple(part.ravel()[pixel] for part in (hits.col, hits.row, hits.ahead[0], hits.ahead[1]))
+    ahead_col, ahead_row = hits.ahead[0].ravel()[pixel], hits.ahead[1].ravel()[pixel]
+    return hits.col.ravel()[pixel], hits.row.ravel()[pixel], ahead_col, ahead_row
 
 
 def _follow(hits: Hits, raster: Field, pixel: NDArray[np.int64], top: Field) -> None:

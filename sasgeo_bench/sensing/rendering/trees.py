@@ -22,7 +22,7 @@ _SHAPES: Final = 6  # different crowns of one size
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Trees:
-    """N crowns: easting and northing (N, 2), radius, height of the top, form, colour (N, 3), and a draw of their own."""
+    """N crowns: easting and northing (N, 2), radius, height of the top, form, colour (N, 3), a draw of their own."""
 
     at_m: Numbers
     radius_m: Numbers
@@ -33,7 +33,7 @@ class Trees:
 
 
 def scatter(grid: Grid, density: Field, seed: int) -> Numbers:
-    """Return points on the ground, shape (N, 3): easting, northing, draw; `density` is the chance of each lattice point.
+    """Return points on the ground, shape (N, 3): easting, northing, draw; `density` is the chance of a lattice point.
 
     Points lie on a lattice that is fixed to the ground, each moved within its cell.
     """
@@ -59,7 +59,9 @@ def make_trees(canvas: Canvas, points: Numbers, *, size: tuple[float, float], is
     if is_wood:  # conifers stand together
         blocks = np.floor(points[:, :2] / 90).astype(np.int64)
         stand = draw(canvas.plan.seed("stand"), blocks[:, 0], blocks[:, 1])
-    conifer = np.clip(palette.conifer_share * (0.4 + 2.2 * stand * (1 + is_wood)), 0, 0.95) * (palette.conifer_share > 0)
+    conifer = np.clip(palette.conifer_share * (0.4 + 2.2 * stand * (1 + is_wood)), 0, 0.95) * (
+        palette.conifer_share > 0
+    )
     pick = draw(2, key)
     form = np.where(pick < palette.palm_share, PALM, np.where(pick > 1 - conifer, CONIFER, BROAD))
     form = np.where(radius_m < 1.2, BUSH, form)
@@ -79,7 +81,9 @@ def _leaves(canvas: Canvas, key: NDArray[np.int64], form: NDArray[np.int64]) -> 
     """Return the colour of each crown in its season."""
     growth, crowns = GROWTH[canvas.season], np.array(canvas.plan.palette.crowns)
     colour = crowns[(draw(4, key) * len(crowns)).astype(int)]
-    colour = colour * (1 + 0.12 * bell(5, key))[:, None] + 5.0 * np.stack([bell(part, key) for part in (6, 7, 8)], axis=1)
+    colour = colour * (1 + 0.12 * bell(5, key))[:, None] + 5.0 * np.stack(
+        [bell(part, key) for part in (6, 7, 8)], axis=1
+    )
     share = growth.crown_share * (0.3 + 0.9 * draw(9, key)) * (form != CONIFER) * (form != PALM)
     turned = np.array(growth.crown) + np.array([18.0, -14.0, -4.0]) * bell(10, key)[:, None]
     colour = colour + share[:, None] * (turned - colour)
@@ -92,18 +96,20 @@ def hedge_trees(canvas: Canvas) -> Trees:
     found = [np.zeros((0, 5))]
     boundary = canvas.plan.of("field_boundary")
     for line, width_m, key in zip(boundary.geometry, boundary.width_m, boundary.key, strict=True):
-        if not width_m >= 1.4:  # noqa: PLR2004 - fences, walls and outlines of fields carry no leaves
+        if not width_m >= 1.4:
             continue
-        spacing_m = 6.5 if width_m >= 3.5 else 1.1  # noqa: PLR2004 - a row of trees
+        spacing_m = 6.5 if width_m >= 3.5 else 1.1
         at = along(line, spacing_m, 0.5)
         number = np.arange(len(at))
         shift = (draw(int(key) & 0xFFFFFFFF, number)[:, None] - 0.5) * 0.25 * spacing_m
         points = at[:, :2] + shift * at[:, 2:4]
         radius = np.full(len(at), width_m / 2 + 0.25) * (0.8 + 0.5 * draw(int(key) & 0xFFFFFFFF, number, number))
-        found.append(np.column_stack([points, draw(seed_of("hedge", key), number), radius, np.full(len(at), spacing_m)]))
+        found.append(
+            np.column_stack([points, draw(seed_of("hedge", key), number), radius, np.full(len(at), spacing_m)])
+        )
     rows = np.concatenate(found)
     trees = make_trees(canvas, rows[:, :3], size=(1.0, 1.1))
-    is_tree = rows[:, 4] > 2  # noqa: PLR2004 - metres apart
+    is_tree = rows[:, 4] > 2
     return Trees(
         at_m=trees.at_m,
         radius_m=np.where(is_tree, rows[:, 3] * 1.3, rows[:, 3]),
@@ -121,8 +127,10 @@ def paint_trees(canvas: Canvas, trees: Trees) -> None:
     corner = canvas.grid.to_cells(trees.at_m)
     sizes = np.abs(trees.radius_m[:, None] - np.array(_RADII_M)).argmin(axis=1)
     is_evergreen = (trees.form == CONIFER) | (trees.form == PALM)
-    sleeps = ~is_evergreen & (np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1))
-    twigs = np.abs(grain(canvas.grid, 3)) > 1.05
+    sleeps = ~is_evergreen & (
+        np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1)
+    )
+    twigs = np.abs(grain(canvas.grid, 3)) > 1.3
     order = np.argsort(trees.height_m, kind="stable")
     for tree in order.tolist():
         shape = int(trees.luck[tree] * 1e6) % _SHAPES
@@ -139,7 +147,7 @@ def paint_trees(canvas: Canvas, trees: Trees) -> None:
         canvas.height_m[part][higher] = crown_m[higher]
         canvas.kind[part][higher] = CROWN
         canvas.owner[part][higher] = 0
-        paint = np.array((118, 108, 96)) if sleeps[tree] else trees.colour[tree]
+        paint = np.array((134, 122, 108)) if sleeps[tree] else trees.colour[tree]
         canvas.colour[part][higher] = np.clip(tone[higher][:, None] * paint, 0, 255)
 
 
@@ -165,7 +173,9 @@ def _crown(form: int, size: int, shape: int, cell_m: float) -> tuple[Field, Fiel
         rim = 1.0 + wavy + 0.07 * lumps
         inside = far < rim
         bulge = np.clip(1 - (far / np.maximum(rim, 0.2)) ** 2, 0, 1)
-        rise = bulge**0.6 * 0.68 + 0.28 if form != CONIFER else np.clip(1 - far / np.maximum(rim, 0.2), 0, 1) * 0.85 + 0.12
+        rise = (
+            bulge**0.6 * 0.68 + 0.28 if form != CONIFER else np.clip(1 - far / np.maximum(rim, 0.2), 0, 1) * 0.85 + 0.12
+        )
         dome = np.where(inside, np.clip(rise + 0.055 * lumps, 0.05, 1.05), 0.0)
         tone = 0.84 + 0.2 * bulge + 0.15 * lumps
     return dome.astype(np.float32), np.asarray(tone, dtype=np.float32)

@@ -63,8 +63,8 @@ def labels(scene: Scene, camera: Camera, *, season: Season = "summer") -> Pictur
     """Return what each pixel shows, uint8 of shape (C, H, W): ABSENT, PRESENT or UNKNOWN, classes as in the scene.
 
     A pixel shows the surface that its ray meets first. A roof shows the classes of the ground under it, a wall shows
-    "building" alone. Under a crown, a class of the ground that the map has there is UNKNOWN, as it is hidden; beyond the
-    mapped area, outside the scene and above the horizon all is UNKNOWN.
+    "building" alone. Under a crown, a class of the ground that the map has there is UNKNOWN, as it is hidden; beyond
+    the mapped area, outside the scene and above the horizon all is UNKNOWN.
     """
     painting = scene.painting(season)
     _check(camera, painting)
@@ -99,7 +99,7 @@ def _check(camera: Camera, painting: Painting) -> None:
     highest_m = painting.heights.highest_m
     if camera.height_m <= highest_m:
         message = (
-            f"a camera is above everything in its scene, {highest_m:.1f} m, got height_m {camera.height_m!r}: fly higher"
+            f"the highest thing of the scene ends at {highest_m:.1f} m, got height_m {camera.height_m!r}: fly higher"
         )
         raise CameraError(message)
 
@@ -110,24 +110,26 @@ def _maps(hits: Hits, level: int = 0) -> tuple[Field, Field]:
     return hits.col * factor - np.float32(0.5), hits.row * factor - np.float32(0.5)
 
 
-def _linear(values: Field | Picture, hits: Hits, level: int = 0) -> NDArray[np.generic]:
+def _linear(values: Field | Picture, hits: Hits, level: int = 0) -> Field:
     col, row = _maps(hits, level)
-    return cv2.remap(values, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    found = cv2.remap(values, col, row, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT_101)
+    return np.asarray(found, dtype=np.float32)
 
 
-def _nearest(values: NDArray[np.generic], hits: Hits) -> NDArray[np.generic]:
+def _nearest(values: Picture, hits: Hits) -> Picture:
     col, row = _maps(hits)
-    return cv2.remap(values, col, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    found = cv2.remap(values, col, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    return np.asarray(found, dtype=np.uint8)
 
 
 def _sampled(colours: tuple[Picture, ...], hits: Hits) -> Field:
     """Return the colour at each hit, float32 of shape (H, W, 3), 0-255, from the level as fine as the pixel."""
     level = np.clip(np.log2(np.maximum(hits.cells_px, 0.25)) + 0.3, 0, len(colours) - 1)
     first, last = int(np.floor(level.min() + 0.2)), int(np.ceil(level.max() - 0.2))
-    found = _linear(colours[first], hits, first).astype(np.float32)
+    found = _linear(colours[first], hits, first)
     for number in range(first + 1, last + 1):
         share = np.clip(level - (number - 1), 0, 1)[..., None]
-        finer = _linear(colours[number], hits, number).astype(np.float32)
+        finer = _linear(colours[number], hits, number)
         finer -= found
         finer *= share
         found += finer
@@ -136,12 +138,10 @@ def _sampled(colours: tuple[Picture, ...], hits: Hits) -> Field:
 
 def _light_shares(light: Light, hits: Hits) -> Field:
     """Return light of sun and sky at each hit, float32 of shape (H, W, 2), 0-1."""
-    return _linear(light.shares, hits).astype(np.float32) * np.float32(1 / 255)
+    return _linear(light.shares, hits) * np.float32(1 / 255)
 
 
-def _paint_sides(
-    scene: Scene, painting: Painting, light: Light, hits: Hits, albedo: Field, shares: Field
-) -> None:
+def _paint_sides(scene: Scene, painting: Painting, light: Light, hits: Hits, albedo: Field, shares: Field) -> None:
     """Give walls their paint, windows and own light, and darken the flanks of crowns towards the ground."""
     side = np.nonzero(hits.is_side)
     col, row, z_m = hits.col[side], hits.row[side], hits.z_m[side]
@@ -191,7 +191,7 @@ def _wall_paint(scene: Scene, owner: NDArray[np.int32], row: Field, col: Field, 
     is_glass = (up > 0.32) & (up < 0.78) & (across < 0.45) & (z_m < buildings.eave_m[owner] - 0.4)
     is_glass &= draw(7, owner.astype(np.int64), np.floor(along_m / 2.7).astype(np.int64)) < 0.8
     paint[is_glass] = _GLASS
-    return paint
+    return np.asarray(paint, dtype=np.float32)
 
 
 def _reflect(
@@ -203,8 +203,12 @@ def _reflect(
         return
     cell = scene.grid.cell_size_m
     east, north = hits.col[at] * cell, hits.row[at] * cell
-    wave_e = 0.035 * np.sin(1.9 * east + 0.8 * north + 1.7 * np.sin(0.7 * north)) + 0.02 * np.sin(5.1 * east - 3.3 * north)
-    wave_n = 0.035 * np.sin(1.3 * north - 1.1 * east + 1.3 * np.sin(0.9 * east)) + 0.02 * np.sin(4.3 * north + 3.7 * east)
+    wave_e = 0.035 * np.sin(1.9 * east + 0.8 * north + 1.7 * np.sin(0.7 * north)) + 0.02 * np.sin(
+        5.1 * east - 3.3 * north
+    )
+    wave_n = 0.035 * np.sin(1.3 * north - 1.1 * east + 1.3 * np.sin(0.9 * east)) + 0.02 * np.sin(
+        4.3 * north + 3.7 * east
+    )
     fall = hits.fall[at]
     flat = np.sqrt(np.maximum(1 - fall * fall, 0))
     run = np.maximum(np.hypot(hits.ahead[0][at], hits.ahead[1][at]), 1e-6)

@@ -2,7 +2,7 @@
 """Paint open ground: country between the mapped things, yards around houses, green areas, fields, water."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -98,33 +98,51 @@ def _add_plots(canvas: Canvas, grid: Grid, ground: Field, soil: Field) -> None:
 
 
 def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Mask]:
-    """Give each house the ground next to it; return whose ground each cell is (0 none) and where two grounds meet."""
+    """Give each house the ground next to it; return whose ground each cell is (0 none) and where two grounds meet.
+
+    Distances are those of every second cell, which is exact enough for a garden.
+    """
     grid, plan = canvas.grid, canvas.plan
-    outside = (numbers == 0).astype(np.uint8)
-    if outside.all():
+    if not numbers.any():
         return np.zeros(grid.shape, dtype=np.int32), np.zeros(grid.shape, dtype=bool)
-    away, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
-    away *= np.float32(grid.cell_size_m)
-    owners = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
-    owners[nearest[numbers > 0]] = numbers[numbers > 0]
-    ragged_m = _YARD_M * (0.75 + 0.25 * noise(grid, 9.0, plan.seed("ragged")))
-    yard = np.where((away < ragged_m) & (outside > 0), owners[nearest], 0).astype(np.int32)
+    away, owner, edge = _nearest_house(numbers[::2, ::2], 2 * grid.cell_size_m)
     keys = np.concatenate([[0], plan.of("building").key])
     style = np.searchsorted(np.cumsum(plan.palette.yards) / sum(plan.palette.yards), draw(plan.seed("yard"), keys))
     reach_m = np.array([_YARD_M, _YARD_M, 6.0, _YARD_M, _YARD_M])  # paving ends near the house
-    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
-        _paint_yard_styles(
-            part, np.where(away[strip] < reach_m[style[yard[strip]]], yard[strip], 0), style, soil[strip]
-        )
-    worn = np.clip(1.3 - away / (1.0 + 2.0 * plan.palette.unevenness), 0, 1) * np.clip(0.6 + soil, 0, 1)
-    canvas.tint((yard > 0) & (worn > 0.03), plan.palette.soil[1], np.asarray(worn * 0.7, dtype=np.float32))
-    terrace = (away < 3.4) & (yard > 0) & (draw(5, keys) < 0.3)[yard] & (noise(grid, 7.0, plan.seed("terrace")) > 0.05)
-    canvas.tint(terrace, plan.palette.paving, 0.85)
-    edge = np.zeros(grid.shape, dtype=bool)
-    for axis in (0, 1):
-        edge |= (owners[nearest] != np.roll(owners[nearest], 1, axis=axis)) & (yard > 0)
-    edge &= draw(plan.seed("fences"), np.arange(len(owners)))[nearest % len(owners)] < 2
-    return yard, edge & (away > 1.5)
+    has_terrace = draw(5, keys) < 0.3
+    yard = np.zeros(grid.shape, dtype=np.int32)
+    for (strip, part_grid), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        away_m, near = (_whole(values, strip, grid.cols) for values in (away, owner))
+        ragged_m = _YARD_M * (0.75 + 0.25 * noise(part_grid, 9.0, plan.seed("ragged")))
+        mine = np.where((away_m < ragged_m) & (numbers[strip] == 0), near, 0)
+        yard[strip] = mine
+        _paint_yard_styles(part, np.where(away_m < reach_m[style[mine]], mine, 0), style, soil[strip])
+        worn = np.clip(1.3 - away_m / (1.0 + 2.0 * plan.palette.unevenness), 0, 1) * np.clip(0.6 + soil[strip], 0, 1)
+        part.tint((mine > 0) & (worn > 0.03), plan.palette.soil[1], np.asarray(worn * 0.7, dtype=np.float32))
+        terrace = (away_m < 3.4) & has_terrace[mine] & (mine > 0)
+        part.tint(terrace & (noise(part_grid, 7.0, plan.seed("terrace")) > 0.05), plan.palette.paving, 0.85)
+    whole = np.concatenate([_whole(edge, strip, grid.cols) for strip, _ in canvas.strips()])
+    return yard, whole & (yard > 0)
+
+
+def _nearest_house(numbers: Cells, cell_size_m: float) -> tuple[Field, Cells, Mask]:
+    """Return distance to the nearest house, its number, and where two houses are equally near."""
+    outside = np.ascontiguousarray(numbers == 0).astype(np.uint8)
+    away, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    owners = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
+    owners[nearest[numbers > 0]] = numbers[numbers > 0]
+    owner = owners[nearest]
+    away_m = np.asarray(away, dtype=np.float32) * np.float32(cell_size_m)
+    edge = np.zeros(owner.shape, dtype=bool)
+    edge[1:] |= owner[1:] != owner[:-1]
+    edge[:, 1:] |= owner[:, 1:] != owner[:, :-1]
+    return away_m, owner, edge & (away_m > 1.5)
+
+
+def _whole(values: NDArray[Any], strip: slice, cols: int) -> NDArray[Any]:
+    """Return a strip of rows of a raster of which only every second cell is known."""
+    half = values[strip.start // 2 : (strip.stop + 1) // 2]
+    return np.repeat(np.repeat(half, 2, axis=0), 2, axis=1)[: strip.stop - strip.start, :cols]
 
 
 def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], soil: Field) -> None:

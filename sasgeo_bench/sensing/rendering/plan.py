@@ -97,7 +97,7 @@ class Canvas:
     height_m: Field
     kind: Picture
     owner: Cells
-    lamps: Field = field(default_factory=lambda: np.zeros((1, 1), dtype=np.float32))
+    lamps: Picture = field(default_factory=lambda: np.zeros((1, 1), dtype=np.uint8))
     built: Field = field(default_factory=lambda: np.zeros((1, 1), dtype=np.float32))
 
     @property

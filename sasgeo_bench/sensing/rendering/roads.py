@@ -15,6 +15,7 @@ from sasgeo_bench.sensing.rendering.plan import (
     Canvas,
     Cells,
     Mask,
+    Picture,
     Shapes,
     along,
     blurred,
@@ -220,8 +221,8 @@ def paint_barriers(canvas: Canvas, edge: Mask, yard: Cells) -> None:
     canvas.kind[walls] = WALL
 
 
-def _lamps(canvas: Canvas) -> Field:
-    """Return the light of lamps along roads in built-up quarters: 1 below a lamp, nothing 25 m away."""
+def _lamps(canvas: Canvas) -> Picture:
+    """Return the light of lamps along roads in built-up quarters: 210 below a lamp, nothing 25 m away."""
     lit = np.zeros(canvas.grid.shape, dtype=np.float32)
     for name in ("road_major", "road_minor"):
         for line in canvas.plan.of(name).geometry:
@@ -232,7 +233,7 @@ def _lamps(canvas: Canvas) -> Field:
             lit[cells[:, 0], cells[:, 1]] = canvas.built[cells[:, 0], cells[:, 1]] > 0.05
     sigma_m = 6.0
     spread = blurred(lit, sigma_m, canvas.grid) * np.float32(2 * np.pi * (sigma_m / canvas.grid.cell_size_m) ** 2)
-    return np.asarray(np.minimum(spread, 1.3), dtype=np.float32)
+    return np.asarray(np.minimum(spread, 1.2) * 210, dtype=np.uint8)
 
 
 def street_points(canvas: Canvas, spacing_m: float, beside_m: float, names: tuple[str, ...]) -> NDArray[np.float64]:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scene: one window of a region, ready to be looked at from any camera in any season and light."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
 
@@ -35,7 +36,7 @@ from sasgeo_bench.sensing.rendering.plan import (
 from sasgeo_bench.sensing.rendering.roads import paint_barriers, paint_roads
 from sasgeo_bench.sensing.rendering.roofs import paint_buildings
 from sasgeo_bench.sensing.rendering.seasons import GROWTH, Season
-from sasgeo_bench.sensing.rendering.texture import Field, draw, fractal, noise
+from sasgeo_bench.sensing.rendering.texture import Numbers, draw, fractal, noise
 from sasgeo_bench.sensing.rendering.trace import HeightPyramid
 from sasgeo_bench.sensing.rendering.trees import hedge_trees, make_trees, paint_trees, scatter
 
@@ -59,7 +60,7 @@ class Painting:
     heights: HeightPyramid
     kind: Picture
     owner: Cells
-    lamps: Field
+    lamps: Picture
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,38 +215,44 @@ def _paint_snow(canvas: Canvas) -> None:
 
 def _paint_greenery(canvas: Canvas, cover: Cover) -> None:
     """Plant woods, parks, yards, streets, hedges and single trees where no road, roof or water is."""
-    grid, plan = canvas.grid, canvas.plan
-    is_free = (canvas.kind == GROUND).astype(np.uint8)
-    room = np.asarray(cv2.erode(is_free, np.ones((5, 5), np.uint8)), dtype=bool)
-    clumps = np.clip(0.55 + 1.6 * fractal(grid, 45.0, plan.seed("clumps")), 0, 1.6)
-    dense = plan.palette.tree_density
-    wood = np.where(room & (cover.green == WOOD), 0.95, 0).astype(np.float32)
-    paint_trees(canvas, make_trees(canvas, scatter(grid, wood, plan.seed("wood")), size=(2.0, 4.4), is_wood=True))
-    near = np.clip(inside_m(canvas.kind != ROOF, grid) - 2.5, 0, 1)
-    sparse = np.zeros(grid.shape, dtype=np.float32)
-    sparse[cover.yard > 0] = 0.085 * dense
-    open_country = (cover.yard == 0) & (cover.green < 0)
-    sparse[open_country] = 0.035 * dense
-    sparse[cover.green == PARK] = 0.07
-    sparse[cover.green == ROUGH] = 0.12
-    in_field = plan_mask(plan, "farmland", grid)
-    sparse[in_field] = 0.0
-    sparse[cover.orchard] = 0.45
-    sparse *= clumps * near * room * np.where(cover.orchard, 1 / np.maximum(clumps, 0.2), 1)
-    paint_trees(
-        canvas, make_trees(canvas, scatter(grid, sparse.astype(np.float32), plan.seed("single")), size=(1.6, 4.6))
-    )
-    bushes = np.where(
-        room & ((cover.yard > 0) | (cover.green == ROUGH) | cover.edge), 0.16 * dense, 0.03 * dense * clumps**2
-    )
-    bushes[cover.edge & room] = 0.55 * np.minimum(dense, 1.2)
-    bushes *= np.where(in_field, 0, 1) * room
-    paint_trees(
-        canvas, make_trees(canvas, scatter(grid, bushes.astype(np.float32), plan.seed("bush")), size=(0.6, 1.3))
-    )
+    grid, plan, dense = canvas.grid, canvas.plan, canvas.plan.palette.tree_density
+    room = cv2.erode((canvas.kind == GROUND).astype(np.uint8), np.ones((5, 5), np.uint8))
+    wall_m = inside_m(canvas.kind != ROOF, grid)
+    clumps = fractal(grid, 45.0, plan.seed("clumps"))
+    field_numbers = burn_numbers(plan.of("farmland").areas(), grid)
+
+    def sown(purpose: str, chance: Callable[..., Numbers]) -> Numbers:
+        """Return the places of a scatter that are taken by a chance of green, yard, orchard, field, edge, clump."""
+        points, cells = scatter(grid, plan.seed(purpose))
+        at = (cells[:, 0], cells[:, 1])
+        clump = np.clip(0.55 + 1.6 * clumps[at], 0, 1.6)
+        share = chance(
+            cover.green[at], cover.yard[at] > 0, cover.orchard[at], field_numbers[at] > 0, cover.edge[at], clump
+        )
+        away = np.clip(wall_m[at] - 2.5, 0, 1) if purpose == "single" else 1.0
+        return points[points[:, 3] < share * away * room[at]]
+
+    wood = sown("wood", lambda green, *_: np.where(green == WOOD, 0.95, 0.0))
+    paint_trees(canvas, make_trees(canvas, wood, size=(2.0, 4.4), is_wood=True))
+    single = sown("single", lambda *about: _single_trees(*about, dense=dense))
+    paint_trees(canvas, make_trees(canvas, single, size=(1.6, 4.6)))
+    bushes = sown("bush", lambda *about: _bushes(*about, dense=dense))
+    paint_trees(canvas, make_trees(canvas, bushes, size=(0.6, 1.3)))
     paint_trees(canvas, hedge_trees(canvas))
 
 
-def plan_mask(plan: Plan, class_name: str, grid: Grid) -> Mask:
-    """Return where a class of areas lies, shape (rows, cols)."""
-    return np.asarray(burn_numbers(plan.of(class_name).areas(), grid) > 0)
+def _single_trees(
+    green: NDArray[np.int8], yard: Mask, orchard: Mask, field: Mask, _edge: Mask, clump: Numbers, *, dense: float
+) -> Numbers:
+    """Return the chance of a tree at each place: in yards, parks, open country; in rows of an orchard nearly always."""
+    country = np.where(yard, 0.085 * dense, 0.035 * dense)
+    kinds = np.select([green == PARK, green == ROUGH, green >= 0], [0.07, 0.12, 0.015], country)
+    return np.where(orchard, 0.45, np.where(field, 0.0, kinds * clump))
+
+
+def _bushes(
+    green: NDArray[np.int8], yard: Mask, _orchard: Mask, field: Mask, edge: Mask, clump: Numbers, *, dense: float
+) -> Numbers:
+    """Return the chance of a bush at each place: between yards, in yards, on rough ground."""
+    country = np.where(yard | (green == ROUGH), 0.16 * dense, 0.03 * dense * clump**2)
+    return np.where(field, 0.0, np.where(edge, 0.55 * min(dense, 1.2), country))

@@ -73,7 +73,10 @@ def _bank() -> Field:
 
 
 def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Field:
-    row, col = rng.integers(0, _BANK, 2)
+    if max(shape) <= _BANK:
+        row, col = (int(rng.integers(0, _BANK - count + 1)) for count in shape)
+        return _bank()[row : row + shape[0], col : col + shape[1]]
+    row, col = rng.integers(0, _BANK, 2).tolist()
     rows, cols = (row + np.arange(shape[0])) % _BANK, (col + np.arange(shape[1])) % _BANK
     return np.asarray(_bank()[rows[:, None], cols[None, :]])
 

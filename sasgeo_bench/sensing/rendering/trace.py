@@ -47,43 +47,40 @@ class Hits:
 
 
 class HeightPyramid:
-    """A height raster and, for each level, the highest cell in and around every block of 2 ** level cells."""
+    """A height raster and, for each level, the highest cell in and around every block of 2 ** level cells.
+
+    The raster is taken over, not copied; its border is made level ground.
+    """
 
     def __init__(self, height_m: Field) -> None:
-        self.height_m = height_m.copy()
-        self.height_m[[0, -1]] = 0
-        self.height_m[:, [0, -1]] = 0
-        self.levels: list[Field] = []
-        level = self.height_m
-        while max(level.shape) > 4:
+        height_m[[0, -1]] = 0
+        height_m[:, [0, -1]] = 0
+        self.height_m = height_m
+        level, levels = height_m, []
+        while max(level.shape) > 4 or not levels:
             level = _halved(level)
-            self.levels.append(np.asarray(cv2.dilate(level, np.ones((3, 3), np.uint8)), dtype=np.float32))
-
-    @property
-    def highest_m(self) -> float:
-        """Return the height of the highest cell."""
-        return float(self.levels[-1].max()) if self.levels else float(self.height_m.max())
+            levels.append(np.asarray(cv2.dilate(level, np.ones((3, 3), np.uint8)), dtype=np.float32))
+        self._rows, self._cols = (np.array([1, *(part.shape[axis] for part in levels)], np.int32) for axis in (0, 1))
+        self._start = np.cumsum([0, 0, *(part.size for part in levels)], dtype=np.int32)
+        self._blocks = np.concatenate([part.ravel() for part in levels])
+        self.highest_m = float(levels[-1].max())
 
     def highest_within(self, col: Field, row: Field, radius: Field) -> Field:
-        """Return at least the highest cell within a radius (cells) of each point; 0 far outside."""
-        level = np.clip(np.ceil(np.log2(np.maximum(radius, 1))), 1, len(self.levels)).astype(np.int64)
-        found = np.full(col.shape, self.highest_m, dtype=np.float32)
-        for number, blocks in enumerate(self.levels, start=1):
-            chosen = (level == number) & (radius <= 2**number)
-            if chosen.any():
-                at_row, at_col = (np.floor(part[chosen] / 2**number).astype(np.int64) for part in (row, col))
-                rows, cols = blocks.shape
-                value = blocks[at_row.clip(0, rows - 1), at_col.clip(0, cols - 1)]
-                near = (at_row >= -1) & (at_row <= rows) & (at_col >= -1) & (at_col <= cols)
-                found[chosen] = np.where(near, value, 0)
-        return found
+        """Return at least the highest cell within a radius (cells) of each point; far outside, that of the edge."""
+        # The exponent of a number x in [1, inf) is the least n with x < 2 ** n.
+        level = np.minimum(np.frexp(np.maximum(radius, 1))[1], len(self._rows) - 1)
+        rows, cols = self._rows[level], self._cols[level]
+        at_row = np.minimum(np.maximum(row, 0).astype(np.int32) >> level, rows - 1)
+        at_col = np.minimum(np.maximum(col, 0).astype(np.int32) >> level, cols - 1)
+        found = self._blocks.take(self._start[level] + at_row * cols + at_col)
+        return np.where(radius <= np.float32(2.0) ** (len(self._rows) - 1), found, np.float32(self.highest_m))
 
 
 def _halved(values: Field) -> Field:
-    rows, cols = (-(-count // 2) * 2 for count in values.shape)
-    padded = np.zeros((rows, cols), dtype=np.float32)
-    padded[: values.shape[0], : values.shape[1]] = values
-    return np.asarray(padded.reshape(rows // 2, 2, cols // 2, 2).max(axis=(1, 3)))
+    if values.shape[0] % 2 or values.shape[1] % 2:
+        values = np.pad(values, [(0, count % 2) for count in values.shape])
+    rows = np.maximum(values[::2], values[1::2])
+    return np.maximum(rows[:, ::2], rows[:, 1::2])
 
 
 @lru_cache(maxsize=4)

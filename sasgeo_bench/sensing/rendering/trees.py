@@ -32,10 +32,10 @@ class Trees:
     luck: Numbers
 
 
-def scatter(grid: Grid, density: Field, seed: int) -> Numbers:
-    """Return points on the ground, shape (N, 3): easting, northing, draw; `density` is the chance of a lattice point.
+def scatter(grid: Grid, seed: int) -> tuple[Numbers, NDArray[np.int64]]:
+    """Return places for trees: easting, northing, two draws, shape (N, 4); and the cell of each, shape (N, 2).
 
-    Points lie on a lattice that is fixed to the ground, each moved within its cell.
+    Places lie on a lattice that is fixed to the ground, each moved within its square.
     """
     west, south, east, north = grid.bounds_m
     cols = np.arange(int(np.floor(west / _SPACING_M)), int(np.ceil(east / _SPACING_M)))
@@ -44,9 +44,8 @@ def scatter(grid: Grid, density: Field, seed: int) -> Numbers:
     at_m = np.stack([col + draw(seed, row, col), row + draw(seed + 1, row, col)], axis=1) * _SPACING_M
     cells = grid.to_cells(at_m)
     inside = ((cells >= 0) & (cells < grid.shape)).all(axis=1)
-    at_m, cells, row, col = at_m[inside], cells[inside], row[inside], col[inside]
-    kept = draw(seed + 2, row, col) < density[cells[:, 0], cells[:, 1]]
-    return np.column_stack([at_m, draw(seed + 3, row, col)])[kept]
+    points = np.column_stack([at_m, draw(seed + 3, row, col), draw(seed + 2, row, col)])
+    return points[inside], cells[inside]
 
 
 def make_trees(canvas: Canvas, points: Numbers, *, size: tuple[float, float], is_wood: bool = False) -> Trees:

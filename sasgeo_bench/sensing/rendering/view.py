@@ -49,13 +49,11 @@ def _shaded(scene: Scene, painting: Painting, light: Light, exposure: Exposure, 
     albedo, shares = _sampled(painting.colours, hits), _light_shares(light, hits)
     if hits.is_side.any():
         _paint_sides(scene, painting, light, hits, albedo, shares)
-    seen = shares[..., :1] * exposure.sun
-    seen += shares[..., 1:] * exposure.sky
+    seen = np.asarray(cv2.transform(shares, np.stack([exposure.sun, exposure.sky], axis=1)), dtype=np.float32)
     if exposure.lamp.any():
-        seen += (_linear(painting.lamps, hits) * np.float32(0.9))[..., None] * exposure.lamp
-    seen *= albedo
-    seen *= albedo  # colours are stored as the square root of what they reflect
-    seen *= np.float32(1 / 65025)
+        seen += cv2.transform(_linear(painting.lamps, hits), exposure.lamp[:, None] * np.float32(0.9 / 255))
+    cv2.multiply(seen, albedo, dst=seen)
+    cv2.multiply(seen, albedo, dst=seen, scale=1 / 65025)  # colours are stored as the square root of what they reflect
     return seen
 
 
@@ -201,26 +199,22 @@ def _reflect(
     at = np.nonzero((_nearest(painting.kind, hits) == WATER) & hits.is_ground)
     if not len(at[0]):
         return
-    cell = scene.grid.cell_size_m
-    east, north = hits.col[at] * cell, hits.row[at] * cell
-    wave_e = 0.035 * np.sin(1.9 * east + 0.8 * north + 1.7 * np.sin(0.7 * north)) + 0.02 * np.sin(
-        5.1 * east - 3.3 * north
+    cell = np.float32(scene.grid.cell_size_m)
+    east, north = hits.col[at] * cell, hits.row[at] * -cell
+    wave_e = 0.035 * np.sin(1.9 * east + 0.8 * north) + 0.03 * np.sin(5.1 * east - 3.3 * north)
+    wave_n = 0.035 * np.sin(1.3 * north - 1.1 * east) + 0.03 * np.sin(4.3 * north + 3.7 * east)
+    fall, scale = hits.fall[at], hits.fall[at] * cell
+    ray = np.stack([hits.ahead[0][at] * scale, -hits.ahead[1][at] * scale, -fall])
+    cosine = fall - ray[0] * wave_e - ray[1] * wave_n  # of a normal that leans by the waves
+    share = 0.02 + 0.98 * np.maximum(1 - cosine, 0) ** 5
+    sun = [np.float32(part) for part in conditions.sun.direction]
+    toward = (
+        ray[0] * sun[0] + ray[1] * sun[1] + ray[2] * sun[2] + 2 * cosine * (wave_e * sun[0] + wave_n * sun[1] + sun[2])
     )
-    wave_n = 0.035 * np.sin(1.3 * north - 1.1 * east + 1.3 * np.sin(0.9 * east)) + 0.02 * np.sin(
-        4.3 * north + 3.7 * east
-    )
-    fall = hits.fall[at]
-    flat = np.sqrt(np.maximum(1 - fall * fall, 0))
-    run = np.maximum(np.hypot(hits.ahead[0][at], hits.ahead[1][at]), 1e-6)
-    ray = np.stack([flat * hits.ahead[0][at] / run, -flat * hits.ahead[1][at] / run, -fall])
-    normal = np.stack([wave_e, wave_n, np.ones_like(wave_e)])
-    normal /= np.sqrt((normal**2).sum(axis=0))
-    cosine = -(ray * normal).sum(axis=0)
-    mirrored = ray + 2 * cosine * normal
-    share = (0.02 + 0.98 * np.clip(1 - cosine, 0, 1) ** 5)[:, None]
-    toward = np.clip(np.tensordot(np.array(conditions.sun.direction), mirrored, axes=1), 0, 1)
-    glint = 9.0 * (toward**350)[:, None] * exposure.sun
-    seen[at] += share * (1.1 * exposure.air - seen[at]) + share * glint * 6
+    glint = np.maximum(toward, 0)
+    for _ in range(8):  # to the power of 256
+        glint *= glint
+    seen[at] += share[:, None] * (1.1 * exposure.air - seen[at]) + (54 * share * glint)[:, None] * exposure.sun
 
 
 def _add_air(seen: Field, camera: Camera, hits: Hits, conditions: Conditions, exposure: Exposure) -> None:
@@ -229,5 +223,5 @@ def _add_air(seen: Field, camera: Camera, hits: Hits, conditions: Conditions, ex
     away_m = (np.float32(camera.height_m) - hits.z_m) / np.maximum(hits.fall, 1e-3)
     clear = np.exp(-np.float32(extinction) * away_m)
     clear[~hits.is_ground] = 0
-    seen *= clear[..., None]
-    seen += np.multiply.outer(1 - clear, exposure.air)
+    cv2.multiply(seen, cv2.merge([clear, clear, clear]), dst=seen)
+    seen += cv2.transform(1 - clear, exposure.air[:, None])

@@ -265,12 +265,14 @@ def _paint_water(canvas: Canvas) -> None:
         water |= burn_numbers(shapes.areas(), grid) > 0
     if not water.any():
         return
-    depth_m = inside_m(water, grid)
-    bank_m = inside_m(~water, grid)
-    bank = (bank_m > 0) & (bank_m < 1.2 + 1.5 * noise(grid, 6.0, seed))
-    canvas.tint(bank, np.array(palette.soil[0]) * 0.8, 0.6)
+    depth_m, bank_m = inside_m(water, grid), inside_m(~water, grid)
     deep, shallow = (np.array(colour, dtype=np.float32) for colour in palette.water)
-    share = np.clip(np.exp(-depth_m / 4.0) + 0.25 * fractal(grid, 25.0, seed + 3), 0, 1)[water][:, None]
-    ripples = (1 + 0.04 * noise(grid, 1.6, seed + 7) + 0.03 * grain(grid, 5))[water][:, None]
-    canvas.tint(water, (deep * (1 - share) + shallow * share) * ripples)
-    canvas.kind[water] = WATER
+    for (strip, strip_grid), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        here = water[strip]
+        bank = ~here & (bank_m[strip] < 1.2 + 1.5 * noise(strip_grid, 6.0, seed))
+        part.tint(bank, np.array(palette.soil[0]) * 0.8, 0.6)
+        share = np.exp(-depth_m[strip] / 4.0) + 0.25 * fractal(strip_grid, 25.0, seed + 3)
+        share = np.clip(share, 0, 1)[here][:, None]
+        ripples = (1 + 0.04 * noise(strip_grid, 1.6, seed + 7) + 0.03 * grain(strip_grid, 5))[here][:, None]
+        part.tint(here, (deep * (1 - share) + shallow * share) * ripples)
+        part.kind[here] = WATER

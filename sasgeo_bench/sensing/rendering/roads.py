@@ -69,19 +69,20 @@ def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:
     colour = np.where(is_paved[:, None], paved, np.array(palette.track) * tone[:, None])
     colour = np.vstack([colour[:1], colour])
     cover = _soft(mask, canvas, 0.35 if is_major else 0.3 + 0.5 * (1 - palette.paved_share), "edges")
-    reach = cover > 0.02
-    owner = _spread(numbers, reach)
-    canvas.tint(reach, colour[owner[reach]], cover)
+    _tint_each(canvas, numbers, colour, cover)
     canvas.kind[mask] = ROAD
     _wear(canvas, mask, np.concatenate([[True], is_paved])[numbers])
     lined = is_paved & (shapes.width_m >= _MARKED_M) & (plan.chance("lines", shapes.key) < palette.markings)
     _paint_markings(canvas, shapes.part(lined))
 
 
-def _spread(numbers: Cells, reach: Mask) -> Cells:
-    """Give the cells just beside a numbered area its number."""
-    grown = cv2.dilate(numbers.astype(np.float32), np.ones((5, 5), np.uint8)).astype(np.int32)
-    return np.where(numbers > 0, numbers, np.where(reach, grown, 0))
+def _tint_each(canvas: Canvas, numbers: Cells, colours: Numbers, cover: Field) -> None:
+    """Tint numbered areas and the cells just beside them, each in its colour, by how much of a cell they cover."""
+    grown = cv2.dilate(numbers.astype(np.uint16), np.ones((5, 5), np.uint8))
+    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        reach = cover[strip] > 0.02
+        number = np.where(numbers[strip] > 0, numbers[strip], grown[strip])[reach]
+        part.tint(reach, colours[number], cover[strip])
 
 
 def _paint_verges(canvas: Canvas, shapes: Shapes, mask: Mask) -> None:
@@ -142,13 +143,11 @@ def _paint_tracks(canvas: Canvas) -> None:
         return
     numbers = burn_numbers(shapes.areas(), canvas.grid)
     cover = _soft(numbers > 0, canvas, 0.7, "path edges")
-    reach = cover > 0.03
-    owner = _spread(numbers, reach)
     is_paved = plan.chance("path", shapes.key) < 0.55 * plan.palette.paved_share
     colour = np.where(is_paved[:, None], np.array(plan.palette.paving) * 0.92, np.array(plan.palette.track))
     colour = np.vstack([colour[:1], colour * (1 + 0.08 * bell(plan.seed("tone"), shapes.key))[:, None]])
     faint = np.clip(0.8 + 0.35 * noise(canvas.grid, 14.0, plan.seed("faint")), 0.35, 1)
-    canvas.tint(reach, colour[owner[reach]], cover * faint)
+    _tint_each(canvas, numbers, colour, np.asarray(cover * faint, dtype=np.float32))
     _wear(canvas, numbers > 0, np.zeros(canvas.grid.shape, dtype=bool))
     canvas.kind[numbers > 0] = ROAD
 

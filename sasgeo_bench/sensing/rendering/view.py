@@ -2,6 +2,7 @@
 """The picture of a scene that a camera takes, and what each of its pixels shows of the map."""
 
 import math
+from functools import lru_cache
 from typing import Final
 
 import cv2
@@ -21,7 +22,7 @@ from sasgeo_bench.sensing.rendering.texture import Field, draw
 from sasgeo_bench.sensing.rendering.trace import Hits, strips, trace
 
 _GLASS: Final = np.array([54, 62, 70], dtype=np.float32)
-_BEHIND: Final = frozenset({"building", "green"})  # classes that stand up themselves
+_WAVES: Final = 256  # cells of a tile of rippled water
 
 
 def render(scene: Scene, camera: Camera, conditions: Conditions, rng: np.random.Generator) -> Picture:
@@ -192,19 +193,30 @@ def _wall_paint(scene: Scene, owner: NDArray[np.int32], row: Field, col: Field, 
     return np.asarray(paint, dtype=np.float32)
 
 
+@lru_cache(maxsize=1)
+def _waves() -> tuple[Field, Field]:
+    """Return the slopes of rippled water to the east and north, each a tile of 85 m that repeats."""
+    rng, tiles = np.random.default_rng(3), []
+    for _ in range(2):
+        rough = np.pad(rng.standard_normal((_WAVES, _WAVES)).astype(np.float32), 16, mode="wrap")
+        smooth = np.asarray(cv2.GaussianBlur(rough, (0, 0), 1.6), dtype=np.float32)[16:-16, 16:-16]
+        tiles.append(np.asarray(0.045 * smooth / smooth.std(), dtype=np.float32))
+    return tiles[0], tiles[1]
+
+
 def _reflect(
     scene: Scene, painting: Painting, hits: Hits, seen: Field, conditions: Conditions, exposure: Exposure
 ) -> None:
     """Mirror sky and sun in water that ripples."""
-    at = np.nonzero((_nearest(painting.kind, hits) == WATER) & hits.is_ground)
-    if not len(at[0]):
+    at = np.flatnonzero((_nearest(painting.kind, hits) == WATER) & hits.is_ground)
+    if not len(at):
         return
     cell = np.float32(scene.grid.cell_size_m)
-    east, north = hits.col[at] * cell, hits.row[at] * -cell
-    wave_e = 0.035 * np.sin(1.9 * east + 0.8 * north) + 0.03 * np.sin(5.1 * east - 3.3 * north)
-    wave_n = 0.035 * np.sin(1.3 * north - 1.1 * east) + 0.03 * np.sin(4.3 * north + 3.7 * east)
-    fall, scale = hits.fall[at], hits.fall[at] * cell
-    ray = np.stack([hits.ahead[0][at] * scale, -hits.ahead[1][at] * scale, -fall])
+    place = [(part.ravel()[at] * cell * 3).astype(np.int32) % _WAVES for part in (hits.row, hits.col)]
+    wave_e, wave_n = (tile[place[0], place[1]] for tile in _waves())
+    fall = hits.fall.ravel()[at]
+    scale = fall * cell
+    ray = (hits.ahead[0].ravel()[at] * scale, -hits.ahead[1].ravel()[at] * scale, -fall)
     cosine = fall - ray[0] * wave_e - ray[1] * wave_n  # of a normal that leans by the waves
     share = 0.02 + 0.98 * np.maximum(1 - cosine, 0) ** 5
     sun = [np.float32(part) for part in conditions.sun.direction]
@@ -214,7 +226,9 @@ def _reflect(
     glint = np.maximum(toward, 0)
     for _ in range(8):  # to the power of 256
         glint *= glint
-    seen[at] += share[:, None] * (1.1 * exposure.air - seen[at]) + (54 * share * glint)[:, None] * exposure.sun
+    light = seen.reshape(-1, 3)
+    mirrored = np.multiply.outer(share, 1.1 * exposure.air) + np.multiply.outer(54 * share * glint, exposure.sun)
+    light[at] = light[at] * (1 - share)[:, None] + mirrored
 
 
 def _add_air(seen: Field, camera: Camera, hits: Hits, conditions: Conditions, exposure: Exposure) -> None:

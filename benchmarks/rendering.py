@@ -33,7 +33,7 @@ from sasgeo_bench.sensing.rendering.conditions import Conditions, draw_condition
 from sasgeo_bench.sensing.rendering.scene import Scene, make_scene
 from sasgeo_bench.sensing.rendering.view import render
 
-SIZE_M, CELL_SIZE_M = 512.0, 0.25
+SIZE_M, CELL_SIZE_M = 400.0, 0.25
 TILTS_DEG = (0.0, 20.0, 45.0)
 
 

@@ -56,7 +56,8 @@ class HeightPyramid:
         height_m[[0, -1]] = 0
         height_m[:, [0, -1]] = 0
         self.height_m = height_m
-        level, levels = height_m, []
+        level = height_m
+        levels: list[Field] = []
         while max(level.shape) > 4 or not levels:
             level = _halved(level)
             levels.append(np.asarray(cv2.dilate(level, np.ones((3, 3), np.uint8)), dtype=np.float32))

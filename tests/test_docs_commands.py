@@ -66,6 +66,7 @@ ONLY_PARSED = {
 OTHERS = {
     r"^pip install -e my-(matcher|segmenter)$": "done by hand: an installation needs the package registry",
     r"^sha256sum ": "a program of the system",
+    r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",
     r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
     r"^pip install 'sasgeo-bench\[publish\]'$": "an installation needs the package registry",
 }

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that look at what was made, and hold it against what it should be."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -8,12 +9,13 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
-from sasgeo_bench.cli.options import Out, RegionFolders
+from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
 from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
+from sasgeo_bench.leaderboard.strip_plot import strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest
@@ -22,6 +24,7 @@ from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.build import check_task, has_truths
 from sasgeo_bench.tasks.duplicates import constellations, search_split
 from sasgeo_bench.tasks.panels import panels
+from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.sheet import write_sheet
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.split_map import write_split_map
@@ -32,45 +35,53 @@ SOME_CASES: Final = 3
 SHOWN_LETTERS: Final = 10  # of a query's id: enough to name it
 
 
+@dataclass(frozen=True, kw_only=True)
+class InspectOptions(Options):
+    """Flags of inspect."""
+
+    query: Annotated[
+        str | None, typer.Option(help="of a task or a run: this query alone, by the beginning of its id")
+    ] = None
+    rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries on the contact sheet")] = 12
+    strip: Annotated[
+        int | None,
+        typer.Option(min=1, max=20, help="of a run on pictures: draw so many queries, half of them failures"),
+    ] = None
+    rejector: Annotated[
+        list[str] | None, typer.Option(help="of a run: what says which answers are accepted; may be repeated")
+    ] = None
+    split: Annotated[str, typer.Option(help="of a run: says which places calibrate rejectors")] = "crossfit"
+    region_folders: RegionFolders = None
+    out: Out = Path("out")
+
+
 def inspect_command(
     target: Annotated[
         str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one or of a run")
     ],
-    *,
-    query: Annotated[
-        str | None, typer.Option(help="of a task or a run: this query alone, by the beginning of its id")
-    ] = None,
-    rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries on the contact sheet")] = 12,
-    rejector: Annotated[
-        list[str] | None, typer.Option(help="of a run: what says which answers are accepted; may be repeated")
-    ] = None,
-    split: Annotated[str, typer.Option(help="of a run: says which places calibrate rejectors")] = "crossfit",
-    region_folders: RegionFolders = None,
-    out: Out = Path("out"),
+    options: InspectOptions,
 ) -> None:
     """Print the content of a region, task, split or run; draw a task's sheet, a split's map, a query and its answer."""
+    out, query, folders = options.out, options.query, options.region_folders or []
     task_folder, region_folder = find_task(target, out), find_built(target, out)
     if task_folder is not None:
-        _inspect_task(task_folder, out, query=query, rows=rows)
+        _inspect_task(task_folder, out, query=query, rows=options.rows)
         return
     if Path(target).is_dir() and is_run(Path(target)):
-        grids = {
-            name: read_region_file(path).grid()
-            for name, path in list_region_files(folders=region_folders or []).items()
-        }
-        chosen = make_split(read_split_file(find_split_file(split)), grids)
-        cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=rejector or (), tell=tell)
-        _inspect_run(cases, out, query)
+        grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
+        chosen = make_split(read_split_file(find_split_file(options.split)), grids)
+        cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=options.rejector or (), tell=tell)
+        _inspect_run(cases, out, query, options.strip)
         return
     if region_folder is None and not is_split(target):
-        raise no_target(target, out, region_folders or [])
+        raise no_target(target, out, folders)
     if query is not None:
         message = (
             f"--query draws a query of a task or a run, and {target} is neither: leave it out, or name one of these"
         )
         raise ConfigError(message)
     if region_folder is None:
-        _inspect_split(target, out, region_folders or [])
+        _inspect_split(target, out, folders)
         return
     manifest = read_manifest(region_folder)
     print_table(_summary(manifest, region_folder))
@@ -103,8 +114,15 @@ def _text_of(value: object) -> str:
     return ", ".join(map(_text_of, value)) if isinstance(value, list) else str(value)
 
 
-def _inspect_run(cases: RunCases, out: Path, query: str | None) -> None:
-    """Count the failures of a run by class, with some to look at; or draw one query and its answer."""
+def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | None) -> None:
+    """Count the failures of a run by class, with some to look at; or draw one query and its answer, or a strip."""
+    if strip is not None:
+        name = cases.entry.name.replace(" ", "-")
+        suites = ", ".join(sorted({suite for suite, _ in cases.tasks if suite != CONTROLS}))
+        path = out / "sheets" / f"strip-{name}.png"
+        write_png(path, strip_pixels(strip_of(cases, strip), title=f"{cases.entry.name} on {suites}"))
+        say(f"strip: {path}")
+        return
     if query is not None:
         query_id, picture = picture_of(cases, query)
         path = out / "sheets" / f"{cases.entry.name.replace(' ', '-')}-{query_id}.png"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The picture of one query and its answer; small PNG and WebP pictures for web pages."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -143,6 +144,8 @@ class CasePicture:
         Lines on what the answer and the integrity model say.
     attribution : str
         Of the map.
+    what : str
+        Kind and strength of the stress.
     picture : ndarray of uint8, shape (H, W, 3), optional
         The newest picture that the evidence was made of, RGB.
     """
@@ -158,7 +161,16 @@ class CasePicture:
     disc: tuple[float, float, float] | None
     lines: Sequence[str]
     attribution: str
+    what: str = ""
     picture: NDArray[np.uint8] | None = None
+
+    @property
+    def error_m(self) -> float | None:
+        """Return the distance of the first place from the true one; None without either."""
+        if self.true is None or not self.modes:
+            return None
+        first = self.modes[0][0]
+        return math.hypot(first.easting_m - self.true.easting_m, first.northing_m - self.true.northing_m)
 
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
@@ -172,10 +184,10 @@ def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
         panels = [("view", case.view), (where, case.at_true), ("map at the answer", case.at_answer)]
         charts = list(above.subplots(1, len(panels) + (case.picture is not None)))
         if case.picture is not None:
-            _picture(charts.pop(0), case.picture)
+            draw_picture(charts.pop(0), case.picture)
         for chart, (name, evidence) in zip(charts, panels, strict=True):
-            _panel(chart, name, evidence)
-        _draw_map(right.subplots(), case)
+            draw_panel(chart, name, evidence)
+        draw_map(right.subplots(), case)
         modes, text = below.subplots(1, 2)
         _draw_modes(modes, case)
         text.axis("off")
@@ -183,7 +195,8 @@ def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
         return pixels_of(figure)
 
 
-def _panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
+def draw_panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
+    """Draw evidence, or that there is none."""
     without_ticks(chart)
     chart.set_title(name, fontsize=7.5)
     if evidence is None:
@@ -192,13 +205,14 @@ def _panel(chart: Axes, name: str, evidence: Evidence | None) -> None:
         chart.imshow(paint(evidence), interpolation="antialiased")
 
 
-def _picture(chart: Axes, picture: NDArray[np.uint8]) -> None:
+def draw_picture(chart: Axes, picture: NDArray[np.uint8]) -> None:
+    """Draw the newest picture of a query."""
     without_ticks(chart)
     chart.set_title("picture", fontsize=7.5)
     chart.imshow(picture, interpolation="antialiased")
 
 
-def _draw_map(chart: Axes, case: CasePicture) -> None:
+def draw_map(chart: Axes, case: CasePicture) -> None:
     """Draw the map, north up, in metres from the lower left corner."""
     part = case.part
     width_m, height_m = part.east_m - part.west_m, part.north_m - part.south_m

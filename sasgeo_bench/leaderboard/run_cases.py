@@ -146,6 +146,7 @@ def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePict
         disc=_disc(query),
         lines=_lines(case),
         attribution=manifest.attribution,
+        what=_what(case),
         picture=query.frames[-1].image().rgb if query.frames else None,
     )
 
@@ -195,12 +196,15 @@ def _seen_at(pose: Pose | None, case: Case, bits: LayerBits, grid: Grid, manifes
 
 
 def _title(case: Case) -> str:
-    truth, query = case.truth, case.query
-    what = truth.kind if truth.role == "control" else f"{truth.kind}, {strength_text(truth)}"
-    return (
-        f"{case.failure or 'no failure'}: {case.matcher} on {query.suite} / {query.region} ({what}; {query.track})\n"
-        f"query {query.query_id}"
-    )
+    query = case.query
+    where = f"{query.suite} / {query.region} ({_what(case)}; {query.track})"
+    return f"{case.failure or 'no failure'}: {case.matcher} on {where}\nquery {query.query_id}"
+
+
+def _what(case: Case) -> str:
+    """Return kind and strength of the stress."""
+    truth = case.truth
+    return truth.kind if truth.role == "control" else f"{truth.kind}, {strength_text(truth)}"
 
 
 def _lines(case: Case) -> list[str]:

@@ -34,6 +34,10 @@ class MeasuredErrors:
     object is half as likely to be missed as a tiny one; they are `small_share` of the lost cells at most. `outline` is
     the fraction of the false alarms that continue the outline of something seen, with bulges about `bulge_m` deep.
     `alarms_on` names where the others lie.
+
+    A measured profile (`perception_profile`) has two further rates: `of_ground` is the fraction of all empty ground
+    that is seen as the class, in place of `of_yards`; `also` holds the fractions of the class that are seen as other
+    classes besides.
     """
 
     recall: float
@@ -46,6 +50,8 @@ class MeasuredErrors:
     bulge_m: float = 1.5
     width_m: float = 3.0  # of a false line
     alarms_on: Where = "ground"
+    of_ground: float | None = None
+    also: Mapping[str, float] = field(default_factory=dict)
 
 
 # Measured, a 26-class U-Net on drone images of the same ground that it was trained on, so optimistic: recall and
@@ -107,10 +113,12 @@ _ROADS: Final = ("road_major", "road_minor")
 
 @dataclass(frozen=True, kw_only=True)
 class MeasuredPerception:
-    """See a clean view with the errors of the detector "measured".
+    """See a clean view with the errors of the detector "measured", or of a segmenter's profile.
 
     `error_factor` multiplies the errors of every class; 0 is a perfect detector. At most 0.95 of a class is lost, and
-    at most half of the yards becomes one class.
+    at most half of the yards, or of the ground, becomes one class. `errors` are those of each class, by default the
+    table of this file; a class without any is seen as it is. Those of a segmenter come from its profile:
+    `MeasuredPerception(errors=read_profile(path).errors())`.
 
     Notes
     -----
@@ -121,6 +129,7 @@ class MeasuredPerception:
     """
 
     error_factor: float = 1.0
+    errors: Mapping[str, MeasuredErrors] = field(default_factory=lambda: MEASURED, repr=False, hash=False)
 
     def __post_init__(self) -> None:
         """Check the range."""
@@ -130,7 +139,7 @@ class MeasuredPerception:
         """Lose cells of each class, then gain: a class first gains what another one is called."""
         if self.error_factor == 0:
             return evidence
-        view = _View.of(evidence)
+        view = _View.of(evidence, self.errors)
         factors = self.error_factor * _spread(len(evidence.classes), rng)
         seen: dict[str, Mask] = {}
         called: dict[str, list[Mask]] = {}
@@ -160,10 +169,11 @@ class _View:
     ground: Mask
     yards: Mask
     pool: NoisePool
+    errors: Mapping[str, MeasuredErrors]
     outlines: dict[str, Field] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, evidence: Evidence) -> "_View":
+    def of(cls, evidence: Evidence, errors: Mapping[str, MeasuredErrors]) -> "_View":
         """Split a view into masks."""
         masks, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
         ground = ~(masks | unknown).any(axis=0)
@@ -177,6 +187,7 @@ class _View:
             ground=ground,
             yards=ground & beside,
             pool=NoisePool(evidence.shape),
+            errors=errors,
         )
 
     def noise(self, width_m: float, rng: np.random.Generator) -> Field:
@@ -198,7 +209,7 @@ class _View:
         self, name: str, mask: Mask, factor: float, called: dict[str, list[Mask]], rng: np.random.Generator
     ) -> Mask:
         """Return what is still seen of a class; add to `called` what is seen as another one."""
-        errors, total = MEASURED.get(name), np.count_nonzero(mask)
+        errors, total = self.errors.get(name), np.count_nonzero(mask)
         if errors is None or total == 0:
             return mask.copy()
         lost = min(factor * (1 - errors.recall), _MOST_ERROR)
@@ -207,6 +218,9 @@ class _View:
             confused = self._confused(kept, lost * share / (1 - errors.recall) * total, rng)
             called.setdefault(other, []).append(confused)
             kept &= ~confused
+        for other, share in errors.also.items():
+            both = self._confused(kept, min(factor * share, _MOST_ERROR) * total, rng)
+            called.setdefault(other, []).append(both)
         budget = lost * total - (total - np.count_nonzero(kept))
         limit = errors.small_share * max(budget, 1.0)
         kept &= ~self._small(kept, errors.small_m2, min(factor, 1.0), limit, rng)
@@ -247,17 +261,13 @@ class _View:
 
     def gain(self, name: str, mask: Mask, seen: Mask, factor: float, rng: np.random.Generator) -> None:
         """Add false alarms to the seen cells of a class, in place."""
-        errors = MEASURED.get(name)
+        errors = self.errors.get(name)
         if errors is None:
             return
         free = ~(self.unknown[self.at[name]] | mask)
-        if errors.of_yards is not None:
+        budget = self._alarms(errors, np.count_nonzero(mask), factor)
+        if errors.of_ground is not None or errors.of_yards is not None:
             free &= self.ground
-            yards = np.count_nonzero(self.yards)
-            places = yards + FAR_SHARE * (np.count_nonzero(self.ground) - yards)
-            budget = min(factor * errors.of_yards, _MOST_GROUND) * places
-        else:
-            budget = factor * errors.recall / errors.precision * (1 - errors.precision) * np.count_nonzero(mask)
         if errors.alarms_on == "roads":
             free &= self.any_of(_ROADS)
         if budget < 1 or not free.any():
@@ -279,6 +289,16 @@ class _View:
         else:
             patch, beyond = self.noise(PATCH_M, rng), free & ~seen
             seen |= beyond & (patch >= highest_within(patch, beyond, left, rng))
+
+    def _alarms(self, errors: MeasuredErrors, count: int, factor: float) -> float:
+        """Return the expected number of false cells of a class that has `count` true ones."""
+        ground = np.count_nonzero(self.ground)
+        if errors.of_ground is not None:
+            return min(factor * errors.of_ground, _MOST_GROUND) * ground
+        if errors.of_yards is not None:
+            yards = np.count_nonzero(self.yards)
+            return min(factor * errors.of_yards, _MOST_GROUND) * (yards + FAR_SHARE * (ground - yards))
+        return factor * errors.recall / errors.precision * (1 - errors.precision) * count
 
     def _add_blocks(self, seen: Mask, free: Mask, budget: float, rng: np.random.Generator) -> None:
         """Add false buildings, of any direction and smaller than most houses."""

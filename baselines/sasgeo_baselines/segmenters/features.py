@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Features of the pixels of an aerial image: colour, texture and gradients at scales that are metres on the ground."""
+
+from collections.abc import Iterator
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import sasgeo_bench as sgb
+
+Plane = NDArray[np.float32]
+
+FINEST_M: Final = 0.5  # side of a pixel that features are computed from; a coarser picture keeps its own
+_BLURS_M: Final = (0.5, 1.0, 2.0, 4.0, 8.0)  # standard deviations of the Gaussians
+_PLAIN_M: Final = (0.5, 4.0)
+_SHAPES_M: Final = (1.0, 2.0, 4.0)
+_SPREADS_M: Final = (1.0, 2.0, 4.0, 8.0)
+_REACHES_M: Final = (1.5, 3.0, 6.0)  # radii of openings and closings: roofs, roads, shadows beside them
+_CUT: Final = (2.0, 98.0)  # percentiles that the normalization of colours ignores beyond
+_LEAST_SPREAD: Final = 4.0  # of 0..255: a picture of one colour is not stretched to a pattern
+_TARGET_SPREAD: Final = 40.0
+_ENOUGH: Final = 50_000  # pixels, for percentiles
+_SHRUNK: Final = 4.0  # pixels: a wider blur is computed on a smaller picture
+_EMPTY: Final = (3, 252)  # bytes: all bands below or above are taken for no data
+_HOLE_M: Final = 10.0  # radius
+
+
+def ground_pixel_m(image: sgb.AerialImage) -> float:
+    """Return the ground sampling distance in the middle of a picture, metres; NaN where no ground is seen there."""
+    middle = np.array([[image.shape[1] / 2, image.shape[0] / 2]])
+    return float(image.camera.gsd_m(middle, sgb.Plane())[0])
+
+
+def working_size(image: sgb.AerialImage) -> tuple[int, int, float]:
+    """Return rows, columns and the pixel's side in metres of the picture that features are computed from.
+
+    No pixel is finer than `FINEST_M`; a picture is never enlarged. Where no ground is seen, pixels count as `FINEST_M`.
+    """
+    gsd_m = ground_pixel_m(image)
+    if not np.isfinite(gsd_m) or gsd_m >= FINEST_M:
+        return (*image.shape, gsd_m if np.isfinite(gsd_m) else FINEST_M)
+    rows, cols = (max(1, round(side * gsd_m / FINEST_M)) for side in image.shape)
+    return rows, cols, gsd_m * image.shape[0] / rows
+
+
+def normalized(rgb: NDArray[np.uint8]) -> Plane:
+    """Return lightness, green-red and blue-yellow, shape (3, H, W), relative to the picture's own medians and spread.
+
+    Sun, haze, season and sensor move all colours of a picture together: the median of each band becomes 0. One factor
+    for lightness and one for both colours bring the spread between percentiles to that of a usual picture, so that
+    a grey picture stays grey.
+    """
+    lab = _lab(rgb)
+    some = lab.reshape(3, -1)[:, :: max(1, lab[0].size // _ENOUGH)]
+    low, middle, high = np.percentile(some, [_CUT[0], 50, _CUT[1]], axis=1)
+    spread = np.maximum(high - low, _LEAST_SPREAD)
+    spread[1:] = spread[1:].max()
+    factor = np.array([4.0, 1.0, 1.0]) * _TARGET_SPREAD / spread
+    return np.ascontiguousarray((lab - middle[:, None, None]) * factor[:, None, None], dtype=np.float32)
+
+
+def _lab(rgb: NDArray[np.uint8]) -> Plane:
+    """Return lightness (0..255), green-red and blue-yellow as they are, shape (3, H, W)."""
+    lab = cv2.cvtColor(np.asarray(rgb, dtype=np.float32) / 255, cv2.COLOR_RGB2LAB).transpose(2, 0, 1)
+    lab[0] *= 2.55
+    return np.ascontiguousarray(lab, dtype=np.float32)
+
+
+def features(rgb: NDArray[np.uint8], pixel_m: float) -> tuple[tuple[str, ...], Plane]:
+    """Return the names of F features and their values, shape (F, H, W).
+
+    Most are of colours relative to the picture, which travel between cameras; a few are of the colours as they are,
+    without which a picture of a lake alone would look like one of a field alone.
+    """
+    named = [*_named(normalized(rgb), pixel_m), *_plain(_lab(rgb), pixel_m)]
+    return tuple(name for name, _ in named), np.stack([plane for _, plane in named])
+
+
+def _named(bands: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
+    """Yield every feature with its name."""
+    light = bands[0]
+    yield from (("light", light), ("green_red", bands[1]), ("blue_yellow", bands[2]))
+    for sigma_m in _BLURS_M:
+        for name, band in zip(("light", "green_red", "blue_yellow"), bands, strict=True):
+            yield f"{name}_{sigma_m:g}", blurred(band, sigma_m / pixel_m)
+    for sigma_m in _SHAPES_M:
+        smooth = blurred(light, sigma_m / pixel_m)
+        yield from ((f"{name}_{sigma_m:g}", plane) for name, plane in _shape(smooth, sigma_m / pixel_m))
+    for sigma_m in _SPREADS_M:
+        for name, band in (("light", light), ("green_red", bands[1])):
+            mean = blurred(band, sigma_m / pixel_m)
+            square = blurred(band * band, sigma_m / pixel_m)
+            yield f"{name}_spread_{sigma_m:g}", np.sqrt(np.maximum(square - mean * mean, 0))
+    for reach_m in _REACHES_M:
+        kernel = _disc(reach_m / pixel_m)
+        yield f"bright_{reach_m:g}", light - cv2.morphologyEx(light, cv2.MORPH_OPEN, kernel)
+        yield f"dark_{reach_m:g}", cv2.morphologyEx(light, cv2.MORPH_CLOSE, kernel) - light
+        yield f"darkest_{reach_m:g}", cv2.erode(light, kernel) - light
+
+
+def _plain(lab: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
+    """Yield the colours as they are, near a pixel and around it."""
+    for sigma_m in _PLAIN_M:
+        for name, band in zip(("light", "green_red", "blue_yellow"), lab, strict=True):
+            yield f"plain_{name}_{sigma_m:g}", blurred(band, sigma_m / pixel_m)
+
+
+def blurred(band: Plane, sigma_px: float) -> Plane:
+    """Return a band after a Gaussian, of a smaller picture where it is wide."""
+    if sigma_px < 0.3:  # noqa: PLR2004 - pixels; it would move nothing
+        return band
+    shrink = int(sigma_px // _SHRUNK)
+    if shrink < 2 or min(band.shape) < 2 * shrink:  # noqa: PLR2004 - nothing to gain
+        return np.asarray(cv2.GaussianBlur(band, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), dtype=np.float32)
+    size = (-(-band.shape[1] // shrink), -(-band.shape[0] // shrink))
+    small = cv2.resize(band, size, interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), sigma_px / shrink, borderType=cv2.BORDER_REFLECT)
+    return np.asarray(cv2.resize(small, band.shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def _shape(smooth: Plane, sigma_px: float) -> Iterator[tuple[str, Plane]]:
+    """Yield strength of the gradient, how far it keeps to one direction, and both curvatures; none has a heading."""
+    across, along = (cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3, scale=1 / 8) for order in ((1, 0), (0, 1)))
+    yield "gradient", np.hypot(across, along) * np.float32(max(sigma_px, 1))
+    around = 2 * sigma_px
+    xx, yy, xy = (blurred(product, around) for product in (across * across, along * along, across * along))
+    apart = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
+    yield "edges", np.sqrt(np.maximum(xx + yy, 0)) * np.float32(max(sigma_px, 1))
+    yield "one_way", apart / (xx + yy + np.float32(0.1))
+    second = [cv2.Sobel(smooth, cv2.CV_32F, *order, ksize=3) for order in ((2, 0), (0, 2), (1, 1))]
+    half, turn = (second[0] + second[1]) / 2, np.hypot((second[0] - second[1]) / 2, second[2])
+    factor = np.float32(max(sigma_px, 1) ** 2)
+    yield "ridge", np.asarray((half + turn) * factor, dtype=np.float32)
+    yield "valley", np.asarray((half - turn) * factor, dtype=np.float32)
+
+
+def _disc(radius_px: float) -> NDArray[np.uint8]:
+    """Return the mask of a disc, at least 3 pixels wide."""
+    reach = max(1, round(radius_px))
+    side = np.arange(-reach, reach + 1)
+    return (side[:, None] ** 2 + side**2 <= (reach + 0.5) ** 2).astype(np.uint8)
+
+
+def has_data(rgb: NDArray[np.uint8], pixel_m: float) -> NDArray[np.bool_]:
+    """Return where a picture shows something, shape (H, W): not a hole of pure black or white, as mosaics have.
+
+    A roof may be overexposed; a hole is larger, so a disc of `_HOLE_M` must fit into it.
+    """
+    is_empty = (rgb <= _EMPTY[0]).all(axis=2) | (rgb >= _EMPTY[1]).all(axis=2)
+    deep = np.asarray(_distance(is_empty) * pixel_m >= _HOLE_M)
+    return np.asarray(_distance(~deep) * pixel_m > _HOLE_M) if deep.any() else np.ones(is_empty.shape, dtype=bool)
+
+
+def _distance(mask: NDArray[np.bool_]) -> Plane:
+    """Return how far each pixel of a mask lies from the rest, pixels."""
+    return np.asarray(cv2.distanceTransform(mask.view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5), dtype=np.float32)

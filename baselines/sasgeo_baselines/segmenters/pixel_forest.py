@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`pixel_forest`: boosted trees on multi-scale colour, texture and gradients of every pixel, class by class."""
+
+import json
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Final, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import sasgeo_bench as sgb
+from sasgeo_baselines.segmenters.features import Plane, features, has_data, working_size
+
+FORMAT: Final = "pixel_forest 1"
+_PIXELS: Final = 3000  # drawn from each picture
+_ROUNDS: Final = 100
+_LEAST_PRESENT: Final = 50  # drawn pixels of a class: fewer teach nothing
+_SURE: Final = 7.0  # log-odds: P = 0.001 or 0.999; further trees move no byte that matters
+_SETTINGS: Final[dict[str, Any]] = {
+    "objective": "binary",
+    "learning_rate": 0.1,
+    "num_leaves": 31,
+    "min_data_in_leaf": 100,
+    "lambda_l2": 1.0,
+    "max_bin": 63,
+    "feature_fraction": 0.5,
+    "seed": 1,
+    "deterministic": True,
+    "force_row_wise": True,
+    "num_threads": 1,
+    "verbosity": -1,
+}
+
+
+class PixelForest:
+    """Probability of each class at a pixel, from what surrounds it within metres; learned from labelled pictures."""
+
+    card = sgb.SegmenterCard(
+        name="pixel_forest",
+        version="1",
+        title="Boosted trees on multi-scale pixel features",
+        source="Ke et al., LightGBM, NeurIPS 2017; features as in Arganda-Carreras et al., Bioinformatics 33, 2017",
+        ours=(
+            "Lab colours, mostly relative to each picture; Gaussians, gradients, structure tensor, Hessian, spread, "
+            "openings and closings at 0.5 to 8 m on the ground; 100 trees of 31 leaves a class on 3,000 pixels a "
+            "picture, rare classes drawn more often and weighed less"
+        ),
+        licence="Apache-2.0",
+        needs=("training",),
+        limits="Sees at most some 16 m around a pixel: no houses, roads or fields as objects",
+    )
+
+    def learn(self, training: sgb.ImageTraining) -> str:
+        """Return the trees of each class that the pictures show, as text."""
+        drawn = [_Drawn.of(labelled, at) for at, labelled in enumerate(training.images)]
+        values = np.concatenate([some.values for some in drawn])
+        labels, weights = (np.concatenate([getattr(some, name) for some in drawn]) for name in ("labels", "weights"))
+        models = {}
+        for at, name in enumerate(training.classes):
+            known = labels[:, at] != sgb.UNKNOWN
+            present = labels[known, at] == sgb.PRESENT
+            if min(present.sum(), (~present).sum()) >= _LEAST_PRESENT:
+                models[name] = _trees(values[known], present, weights[known])
+        if not models:
+            message = (
+                f"no class has {_LEAST_PRESENT} labelled pixels of either kind: give more pictures, or larger ones"
+            )
+            raise ValueError(message)
+        return json.dumps({"format": FORMAT, "features": drawn[0].names, "models": models})
+
+    def segment(self, image: sgb.AerialImage, *, learned: str | None) -> sgb.Segmentation:
+        """Return probabilities at every pixel; silent on patches of pure black or white."""
+        if learned is None:
+            message = f"{self.card.name} needs training: learn from labelled pictures first"
+            raise ValueError(message)
+        forest = _forest(learned)
+        small, pixel_m = _working(image)
+        names, planes = features(small, pixel_m)
+        if list(names) != forest.features:
+            message = f"the learned text has other features than this version of {self.card.name}: learn again"
+            raise ValueError(message)
+        table = np.ascontiguousarray(planes.reshape(len(names), -1).T)
+        seen = has_data(small, pixel_m)
+        found = np.empty((len(forest.models), *image.shape), dtype=np.float32)
+        for plane, model in zip(found, forest.models.values(), strict=True):
+            chances = np.asarray(model.predict(table, num_threads=1, **_STOPS), dtype=np.float32)
+            plane[:] = _enlarged(chances.reshape(seen.shape), image.shape)
+        found[:, ~_enlarged_mask(seen, image.shape)] = np.nan
+        return sgb.Segmentation.of_probabilities(tuple(forest.models), found)
+
+
+_STOPS: Final = {"pred_early_stop": True, "pred_early_stop_freq": 20, "pred_early_stop_margin": _SURE}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Drawn:
+    """Pixels drawn from a picture: features (N, F), labels (N, C), and how many pixels each stands for (N,)."""
+
+    names: tuple[str, ...]
+    values: Plane
+    labels: NDArray[np.uint8]
+    weights: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, labelled: sgb.LabelledImage, seed: int) -> Self:
+        """Draw half of the pixels evenly, and half evenly over the classes in the picture; weights undo the second."""
+        small, pixel_m = _working(labelled.image)
+        names, planes = features(small, pixel_m)
+        labels = np.stack([_reduced(plane, small.shape[:2]) for plane in labelled.labels])
+        usable = (labels != sgb.UNKNOWN).any(axis=0) & has_data(small, pixel_m)
+        at = np.flatnonzero(usable)
+        if not len(at):
+            empty = np.empty((0, len(names)), dtype=np.float32)
+            return cls(names=names, values=empty, labels=np.empty((0, len(labels)), np.uint8), weights=np.empty(0))
+        chosen = labels.reshape(len(labels), -1)[:, at]
+        present = chosen == sgb.PRESENT
+        counts = present.sum(axis=1)
+        even = np.full(len(at), 1 / len(at))
+        by_class = (present[counts > 0] / counts[counts > 0, None]).mean(axis=0) if counts.any() else even
+        chance = (even + by_class) / 2
+        picked = np.random.default_rng(seed).choice(len(at), size=_PIXELS, p=chance / chance.sum())
+        values = planes.reshape(len(names), -1)[:, at[picked]].T
+        weights = 1 / (len(at) * chance[picked])
+        return cls(names=names, values=values, labels=chosen[:, picked].T, weights=weights)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Forest:
+    """Trees by class, ready to answer."""
+
+    features: list[str]
+    models: dict[str, Any]
+
+
+@lru_cache(maxsize=1)
+def _forest(learned: str) -> _Forest:
+    """Read the learned text; every call of a process gets the same."""
+    content = json.loads(learned)
+    if content.get("format") != FORMAT:
+        message = f"the learned text is not of {FORMAT}: learn again"
+        raise ValueError(message)
+    make = _lightgbm().Booster
+    return _Forest(
+        features=content["features"],
+        models={name: make(model_str=text) for name, text in content["models"].items()},
+    )
+
+
+def _trees(values: Plane, present: NDArray[np.bool_], weights: NDArray[np.float64]) -> str:
+    """Boost the trees of one class; the same pixels give the same text."""
+    lightgbm = _lightgbm()
+    data = lightgbm.Dataset(values, label=present.astype(np.float32), weight=weights)
+    return str(lightgbm.train(_SETTINGS, data, num_boost_round=_ROUNDS).model_to_string())
+
+
+def _lightgbm() -> Any:  # noqa: ANN401 - a module
+    """Import LightGBM, which needs a library of the system."""
+    try:
+        import lightgbm  # noqa: PLC0415 - the other segmenters work without it
+    except OSError as error:
+        message = f"LightGBM cannot be loaded ({error}): install libgomp1 (Debian, Ubuntu) or libomp (macOS)"
+        raise RuntimeError(message) from error
+    return lightgbm
+
+
+def _working(image: sgb.AerialImage) -> tuple[NDArray[np.uint8], float]:
+    """Return the picture that features are computed from, and the side of its pixels, metres."""
+    rows, cols, pixel_m = working_size(image)
+    if (rows, cols) == image.shape:
+        return image.rgb, pixel_m
+    return np.asarray(cv2.resize(image.rgb, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8), pixel_m
+
+
+def _reduced(labels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return labels of a smaller picture: what covers half of a pixel; unknown where any of it is."""
+    if labels.shape == shape:
+        return labels
+    parts = [
+        cv2.resize((labels == state).astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
+        for state in (sgb.PRESENT, sgb.UNKNOWN)
+    ]
+    found = np.asarray(parts[0] >= 0.5, dtype=np.uint8)  # noqa: PLR2004 - half
+    found[parts[1] > 0] = sgb.UNKNOWN
+    return found
+
+
+def _enlarged(plane: Plane, shape: tuple[int, int]) -> Plane:
+    return np.asarray(cv2.resize(plane, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def _enlarged_mask(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    return np.asarray(cv2.resize(mask.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)).view(np.bool_)

@@ -1,0 +1,100 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure the confusions of a segmenter from its counts of pixels: a profile that views can be drawn with.
+
+False alarms are told apart by what lies there: ground without any class, or each other class. A precision alone would
+change with how common the class is; these rates do not.
+"""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+
+from sasgeo_bench.errors import MetricError, named
+from sasgeo_bench.scoring.base import Floats
+from sasgeo_bench.scoring.segmentation import precision, recall_said, told_classes
+from sasgeo_bench.scoring.segmentation_counts import PixelCounts
+from sasgeo_bench.tasks.perturbations.perception_profile import ClassConfusions, PerceptionProfile
+
+_LEAST_SHARE: Final = 0.0005  # rarer confusions are left out
+
+
+def measure_profile(counts: Sequence[PixelCounts], *, segmenter: str, learned_from: str) -> PerceptionProfile:
+    """Return the confusions of a segmenter on some labelled images.
+
+    Parameters
+    ----------
+    counts : sequence of PixelCounts
+        One for each image; all label the same classes.
+    segmenter, learned_from : str
+        What the profile says of itself, beside the places of the images.
+
+    Raises
+    ------
+    MetricError
+        If the images label different classes, or none of the classes that the segmenter tells is there.
+
+    Notes
+    -----
+    Only pixels of which something is said count: silence is no error, and a view is made unknown by other means. Lines
+    are scored without the cell of tolerance that the detector "measured" has, so their rates are worse than on a map.
+
+    Examples
+    --------
+    A segmenter that always says "perhaps" sees everything everywhere:
+
+    >>> from sasgeo_bench.sensing.segmentation import Segmentation
+    >>> from sasgeo_bench.sensing.tiny_images import tiny_images
+    >>> labelled = tiny_images()[0]
+    >>> bytes_ = np.full(labelled.labels.shape, 127, dtype=np.uint8)
+    >>> half = Segmentation(classes=labelled.classes, probability_bytes=bytes_)
+    >>> some = measure_profile([PixelCounts.of(labelled, half, image="1")], segmenter="half", learned_from="nothing")
+    >>> water = some.classes["water"]
+    >>> water.recall, water.of_ground, water.called, water.also["building"]
+    (1.0, 1.0, {}, 1.0)
+    """
+    classes = counts[0].classes if counts else ()
+    if not counts or any(one.classes != classes for one in counts):
+        message = "a profile is measured on images that all label the same classes, and on one at least"
+        raise MetricError(message)
+    told = told_classes(counts)
+    shares = {key: _shares(counts, key) for key in ("instead", "besides")}
+    found = {}
+    for name in told:
+        total = np.sum([one.of_class(name) for one in counts], axis=0).astype(np.float64)
+        said = int(total[1, :-1].sum())
+        if said:
+            found[name] = _of_class(name, classes, total, shares).model_copy(update={"pixels": said})
+    if not found:
+        message = f"no class that {segmenter} tells is there in {named([one.image for one in counts], 'image')}"
+        raise MetricError(message)
+    places = ", ".join(sorted({one.place for one in counts}))
+    about = {"segmenter": segmenter, "learned_from": learned_from, "tested_on": places, "images": len(counts)}
+    return PerceptionProfile.model_validate(about | {"class": found})
+
+
+def _of_class(name: str, classes: tuple[str, ...], total: Floats, shares: dict[str, Floats]) -> ClassConfusions:
+    """Return the rates of one class; `total` has shape (2, 256), the shares have shape (C + 1, C)."""
+    at = classes.index(name)
+    recall, right = float(recall_said(total)), float(np.nan_to_num(precision(total)))
+    called, also = (
+        {other: share for other, share in zip(classes, shares[key][at].tolist(), strict=True) if share >= _LEAST_SHARE}
+        for key in ("instead", "besides")
+    )
+    # A pixel may be called two classes at once; together they cannot be more than what is missed.
+    most = (1 - recall) / max(sum(called.values()), 1e-12)
+    return ClassConfusions(
+        pixels=1,
+        recall=recall,
+        precision=right,
+        of_ground=float(shares["instead"][-1, at]),
+        called={other: share * min(1.0, most) for other, share in called.items()},
+        also=also,
+    )
+
+
+def _shares(counts: Sequence[PixelCounts], key: str) -> Floats:
+    """Return a kind of confusion over the pixels that are asked about, shape (C + 1, C); 0 where there is none."""
+    part = np.sum([getattr(one, key) for one in counts], axis=0).astype(np.float64)
+    asked = np.sum([one.asked for one in counts], axis=0)
+    return np.asarray(np.divide(part, asked, out=np.zeros_like(part), where=asked > 0))

@@ -1,0 +1,293 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores of segmenters: what is found, how far chances can be trusted, and what silence costs and saves.
+
+Every figure is computed from counts of pixels by label and probability (`segmentation_counts`), so images add up, and
+images that are drawn again add up as well. Pixels of one image are far from independent: intervals draw places with
+replacement, then images within them, and never pixels.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Literal
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.scoring.base import Floats
+from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
+from sasgeo_bench.scoring.intervals import percentile_interval
+from sasgeo_bench.scoring.segmentation_counts import BYTES, SEEN, PixelCounts
+from sasgeo_bench.sensing.segmentation import CERTAIN, SILENT
+
+DRAWS: Final = 1000  # of the bootstrap: percentiles of images need no more, and each draw is 512 counts
+BINS: Final = 10  # of a reliability table, equally wide
+KEPT: Final = 0.8  # coverage at which the error of the surest pixels is told
+GROUPS: Final = ("all", "place", "season")
+_CHANCES: Final = np.arange(SILENT) / CERTAIN
+_BIN: Final = np.minimum((_CHANCES * BINS).astype(int), BINS - 1)
+_LEVELS: Final = np.abs(np.arange(SILENT) - SEEN)  # how sure a byte is, 0 to 127
+_IN_LEVEL: Final = (_LEVELS[:, None] == np.arange(SEEN, -1, -1)).astype(np.float64)  # surest first
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PixelMetric:
+    """A figure of one class from counts of pixels.
+
+    `compute` maps counts by label and byte, shape (..., 2, 256), to values, shape (...); NaN where there is nothing to
+    divide by.
+    """
+
+    name: str
+    meaning: str
+    better: Literal["higher", "lower", ""]
+    compute: Callable[[Floats], Floats]
+
+
+def _ratio(part: Floats, whole: Floats) -> Floats:
+    return np.asarray(np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=whole > 0))
+
+
+def _seen(counts: Floats) -> Floats:
+    """Return the pixels that are seen, by label, shape (..., 2)."""
+    return np.asarray(counts[..., SEEN:SILENT].sum(axis=-1))
+
+
+def iou(counts: Floats) -> Floats:
+    """Return intersection over union of what is seen (P >= 0.5) and what is there; silence sees nothing.
+
+    >>> counts = np.zeros((2, 256))
+    >>> counts[1, 254], counts[1, 255], counts[0, 200] = 6, 2, 4  # found, silent, false alarm
+    >>> iou(counts).item(), recall(counts).item(), precision(counts).item()
+    (0.5, 0.75, 0.6)
+    """
+    seen = _seen(counts)
+    return _ratio(seen[..., 1], counts[..., 1, :].sum(axis=-1) + seen[..., 0])
+
+
+def recall(counts: Floats) -> Floats:
+    """Return the fraction of what is there that is seen; silence on it is a miss."""
+    return _ratio(_seen(counts)[..., 1], counts[..., 1, :].sum(axis=-1))
+
+
+def recall_said(counts: Floats) -> Floats:
+    """Return the fraction of what is there that is seen, of pixels of which something is said."""
+    return _ratio(_seen(counts)[..., 1], counts[..., 1, :SILENT].sum(axis=-1))
+
+
+def precision(counts: Floats) -> Floats:
+    """Return the fraction of what is seen that is there."""
+    seen = _seen(counts)
+    return _ratio(seen[..., 1], seen.sum(axis=-1))
+
+
+def silent_share(counts: Floats) -> Floats:
+    """Return the fraction of labelled pixels of which nothing is said."""
+    return _ratio(counts[..., SILENT].sum(axis=-1), counts.sum(axis=(-2, -1)))
+
+
+def auc(counts: Floats) -> Floats:
+    """Return the chance that a pixel of the class has a higher probability than one without it; ties count half.
+
+    >>> counts = np.zeros((2, 256))
+    >>> counts[1, [100, 200]], counts[0, [100, 50]] = 1, 1  # of four pairs three are in order, one is tied
+    >>> auc(counts).item()
+    0.875
+    """
+    absent, present = counts[..., 0, :SILENT], counts[..., 1, :SILENT]
+    below = np.cumsum(absent, axis=-1) - absent / 2
+    return _ratio((present * below).sum(axis=-1), present.sum(axis=-1) * absent.sum(axis=-1))
+
+
+def brier(counts: Floats) -> Floats:
+    """Return the mean squared difference of probability and truth, where something is said."""
+    absent, present = counts[..., 0, :SILENT], counts[..., 1, :SILENT]
+    total = absent @ _CHANCES**2 + present @ (1 - _CHANCES) ** 2
+    return _ratio(total, (absent + present).sum(axis=-1))
+
+
+def calibration_error(counts: Floats) -> Floats:
+    """Return the mean over pixels of |mean probability - fraction present| of their bin, of ten equally wide.
+
+    Guo et al., ICML 2017, Eq. (3), on the probability of the class rather than of the answer.
+
+    Of ten pixels with 0.75 five are present, and of ten with 0 none:
+
+    >>> counts = np.zeros((2, 256))
+    >>> counts[1, 190], counts[0, 190], counts[0, 0] = 5, 5, 10
+    >>> round(calibration_error(counts).item(), 3)
+    0.124
+    """
+    pixels, mass, hits = _binned(counts)
+    return _ratio(np.abs(mass - hits).sum(axis=-1), pixels.sum(axis=-1))
+
+
+def _binned(counts: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return pixels, sum of probabilities and present pixels by bin, shape (..., BINS) each."""
+    in_bin = (_BIN[:, None] == np.arange(BINS)).astype(np.float64)
+    both = counts[..., :SILENT].sum(axis=-2)
+    return both @ in_bin, (both * _CHANCES) @ in_bin, counts[..., 1, :SILENT] @ in_bin
+
+
+def share_gap(counts: Floats) -> Floats:
+    """Return the mean probability less the fraction present, where something is said."""
+    both = counts[..., :SILENT].sum(axis=-2)
+    return _ratio(both @ _CHANCES - counts[..., 1, :SILENT].sum(axis=-1), both.sum(axis=-1))
+
+
+def error_said(counts: Floats) -> Floats:
+    """Return the fraction of pixels that are taken for the wrong state, where something is said."""
+    wrong, said = _by_level(counts)
+    return _ratio(wrong.sum(axis=-1), said.sum(axis=-1))
+
+
+def error_kept(counts: Floats) -> Floats:
+    """Return the error of the surest 80 % of the labelled pixels; NaN where less is said.
+
+    This is what is left to go wrong once the rest becomes unknown. Pixels that are equally sure are kept together.
+    """
+    wrong, said = (np.cumsum(part, axis=-1) for part in _by_level(counts))
+    enough = said >= KEPT * counts.sum(axis=(-2, -1))[..., None]
+    first = np.argmax(enough, axis=-1)[..., None]
+    kept = _ratio(np.take_along_axis(wrong, first, -1)[..., 0], np.take_along_axis(said, first, -1)[..., 0])
+    return np.where(enough.any(axis=-1), kept, np.nan)
+
+
+def aurc(counts: Floats) -> Floats:
+    """Return the area under error over coverage, where something is said: pixels become unknown, least sure first.
+
+    Geifman et al., ICLR 2019. Pixels that are equally sure are kept together.
+
+    >>> counts = np.zeros((2, 256))
+    >>> counts[1, 254], counts[0, 130] = 1, 1  # the surer pixel is right, the other wrong: (0 + 1/2) / 2
+    >>> aurc(counts).item()
+    0.25
+    """
+    wrong, said = _by_level(counts)
+    error = np.nan_to_num(_ratio(np.cumsum(wrong, axis=-1), np.cumsum(said, axis=-1)))
+    return _ratio((said * error).sum(axis=-1), said.sum(axis=-1))
+
+
+def _by_level(counts: Floats) -> tuple[Floats, Floats]:
+    """Return wrong pixels and all of which something is said, by how sure they are, surest first, shape (..., 128)."""
+    wrong = np.concatenate((counts[..., 1, :SEEN], counts[..., 0, SEEN:SILENT]), axis=-1)
+    return wrong @ _IN_LEVEL, counts[..., :SILENT].sum(axis=-2) @ _IN_LEVEL
+
+
+PIXEL_METRICS: Final = (
+    PixelMetric(name="iou", meaning="intersection over union at P >= 0.5", better="higher", compute=iou),
+    PixelMetric(name="recall", meaning="fraction of the class that is seen", better="higher", compute=recall),
+    PixelMetric(name="precision", meaning="fraction of what is seen that is there", better="higher", compute=precision),
+    PixelMetric(name="auc", meaning="area under the ROC curve", better="higher", compute=auc),
+    PixelMetric(name="brier", meaning="mean squared error of the probability", better="lower", compute=brier),
+    PixelMetric(name="ece", meaning="expected calibration error, ten bins", better="lower", compute=calibration_error),
+    PixelMetric(name="share_gap", meaning="mean probability less fraction present", better="", compute=share_gap),
+    PixelMetric(name="silent", meaning="fraction of pixels of which nothing is said", better="", compute=silent_share),
+    PixelMetric(name="recall_said", meaning="recall where something is said", better="higher", compute=recall_said),
+    PixelMetric(name="error", meaning="wrong pixels where something is said", better="lower", compute=error_said),
+    PixelMetric(name="error_80", meaning="wrong pixels of the surest 80 %", better="lower", compute=error_kept),
+    PixelMetric(name="aurc", meaning="area under error over coverage", better="lower", compute=aurc),
+)
+
+
+def segmentation_scores(counts: Sequence[PixelCounts], *, draws: int = DRAWS, **about: str) -> pd.DataFrame:
+    """Return every metric of every class, over all images, by place and by season, with 95 % intervals.
+
+    Parameters
+    ----------
+    counts : sequence of PixelCounts
+        One for each image of a test, by one segmenter.
+    draws : int
+        Draws of the bootstrap.
+    **about : str
+        Columns that come first, as segmenter="pixel_forest", tested_on="shifted".
+
+    Returns
+    -------
+    DataFrame
+        `group` is "all", "place" or "season", `name` which one; then class, metric, value; `lo`, `hi` of draws of
+        places, then of images within them, NaN for a single place; `lo_images`, `hi_images` of draws of images alone,
+        NaN for a single one; the number of images and of places; and labelled pixels. A class of which nothing is said
+        in any image, since the segmenter cannot tell it, has no row.
+    """
+    rows = [row for group, name, part in _groups(counts) for row in _rows(group, name, part, draws)]
+    columns = ["group", "name", "class", "metric", "value", "lo", "hi", "lo_images", "hi_images"]
+    frame = pd.DataFrame(rows, columns=[*columns, "images", "places", "pixels"])
+    for at, (key, value) in enumerate(about.items()):
+        frame.insert(at, key, value)
+    return frame
+
+
+def _groups(counts: Sequence[PixelCounts]) -> Iterator[tuple[str, str, list[PixelCounts]]]:
+    """Yield the images of all, of each place and of each season that is told."""
+    yield "all", "", list(counts)
+    for group in GROUPS[1:]:
+        for name in sorted({getattr(one, group) for one in counts} - {""}):
+            yield group, name, [one for one in counts if getattr(one, group) == name]
+
+
+def told_classes(counts: Sequence[PixelCounts]) -> tuple[str, ...]:
+    """Return the classes of which something is said on a labelled pixel of any image, as they first come."""
+    names = dict.fromkeys(name for one in counts for name in one.classes)
+    return tuple(name for name in names if any(one.of_class(name)[:, :SILENT].any() for one in counts))
+
+
+def _rows(group: str, name: str, counts: list[PixelCounts], draws: int) -> Iterator[dict[str, Any]]:
+    places = [one.place for one in counts]
+    for told in told_classes(counts):
+        table = np.stack([one.of_class(told) for one in counts]).astype(np.float64)
+        used = table.sum(axis=(1, 2)) > 0
+        where = [place for place, is_used in zip(places, used, strict=True) if is_used]
+        head = {"group": group, "name": name, "class": told}
+        tail = {"images": len(where), "places": len(set(where)), "pixels": int(table.sum())}
+        seed = seed_of_text(f"{group}/{name}/{told}")
+        by_image = _drawn(table[used], ["all"] * len(where), seed, draws)
+        has_others = tail["places"] > 1  # one place says nothing of others
+        by_place = _drawn(table[used], where, seed, draws) if has_others else np.full_like(by_image, np.nan)
+        for metric, first, second in zip(PIXEL_METRICS, by_place, by_image, strict=True):
+            value = float(metric.compute(table.sum(axis=0)))
+            outer, inner = percentile_interval(value, first), percentile_interval(value, second)
+            ends = {"lo": outer.lo, "hi": outer.hi, "lo_images": inner.lo, "hi_images": inner.hi}
+            yield head | {"metric": metric.name, "value": value} | ends | tail
+
+
+def _drawn(table: Floats, blocks: list[str], seed: int, draws: int) -> Floats:
+    """Return every metric of every draw, shape (metrics, D); NaN for a single image."""
+    if len(table) < 2:  # noqa: PLR2004 - there is nothing to draw
+        return np.full((len(PIXEL_METRICS), 1), np.nan)
+    sums = ClusterDraws(blocks=blocks, seed=seed, draws=draws).sums(table.reshape(len(table), -1))
+    parts = (some.reshape(-1, 2, BYTES) for some in sums)
+    return np.concatenate([np.stack([metric.compute(part) for metric in PIXEL_METRICS]) for part in parts], axis=1)
+
+
+def reliability(counts: Sequence[PixelCounts], **about: str) -> pd.DataFrame:
+    """Return a reliability table: for each class and bin, pixels, mean probability and fraction present.
+
+    Chances can be trusted where the last two agree; bins without pixels are left out.
+    """
+    rows = []
+    for name in told_classes(counts):
+        pixels, mass, hits = _binned(_total(counts, name))
+        for at in np.flatnonzero(pixels).tolist():
+            row = {"class": name, "from": at / BINS, "to": (at + 1) / BINS, "pixels": int(pixels[at])}
+            rows.append({**about, **row, "probability": mass[at] / pixels[at], "present": hits[at] / pixels[at]})
+    return pd.DataFrame(rows)
+
+
+def error_over_coverage(counts: Sequence[PixelCounts], **about: str) -> pd.DataFrame:
+    """Return the error of what is kept when all pixels less sure than a confidence become unknown, for each class.
+
+    Columns: confidence (max of P and 1 - P), coverage of all labelled pixels, error, and recall, which falls with it.
+    """
+    rows = []
+    for name in told_classes(counts):
+        total = _total(counts, name)
+        wrong, said = (np.cumsum(part) for part in _by_level(total))
+        found = np.cumsum(np.concatenate((np.zeros(SEEN), total[1, SEEN:SILENT])) @ _IN_LEVEL)
+        for at in np.flatnonzero(np.diff(said, prepend=0.0)).tolist():
+            row = {"class": name, "confidence": 0.5 + (SEEN - at) / CERTAIN, "coverage": said[at] / total.sum()}
+            rows.append({**about, **row, "error": wrong[at] / said[at], "recall": found[at] / max(total[1].sum(), 1)})
+    return pd.DataFrame(rows)
+
+
+def _total(counts: Sequence[PixelCounts], name: str) -> Floats:
+    return np.asarray(np.sum([one.of_class(name) for one in counts], axis=0), dtype=np.float64)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The confusions of one segmenter, measured on labelled images, as a file that the detector "measured" reads.
+
+`sasgeo_bench.scoring.perception_profile` makes it. A view with the errors of a profile has the rates of a segmenter;
+how its errors lie together is that of the detector "measured". A scorer never reads a profile: it estimates its own
+rates from train blocks.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Final, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from sasgeo_bench.config import Document, Line, Short, parse_toml
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredErrors
+
+VERSION: Final = 1
+_MEND: Final = "name a .toml file that perception_profile.write_profile has written"
+_DIGITS: Final = 5
+_PLAIN: Final = MeasuredErrors(recall=1.0, precision=1.0)
+
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class ClassConfusions(Document):
+    """Rates of one class, of pixels of which something is said.
+
+    `recall` and `precision` as usual; `of_ground` is the fraction of the ground without any labelled class that is seen
+    as this one; `called` are fractions of this class that are seen as others instead, `also` those that are seen as
+    others besides. `pixels` counts those of the class.
+    """
+
+    pixels: Annotated[int, Field(gt=0)]
+    recall: Share
+    precision: Share
+    of_ground: Share
+    called: dict[str, Share] = {}
+    also: dict[str, Share] = {}
+
+    @model_validator(mode="after")
+    def _is_whole(self) -> Self:
+        if self.recall + sum(self.called.values()) > 1 + 10 ** (1 - _DIGITS):
+            message = "recall and called add up to more than 1"
+            raise ValueError(message)
+        return self
+
+
+class PerceptionProfile(Document):
+    """Confusions of a segmenter by class, and where they come from."""
+
+    version: int = VERSION
+    segmenter: Short
+    learned_from: Line
+    tested_on: Line
+    images: Annotated[int, Field(gt=0)]
+    classes: dict[str, ClassConfusions] = Field(alias="class")
+
+    @field_validator("version")
+    @classmethod
+    def _is_current(cls, version: int) -> int:
+        if version != VERSION:
+            message = f"measure the profile anew: this program reads version {VERSION}"
+            raise ValueError(message)
+        return version
+
+    def errors(self) -> Mapping[str, MeasuredErrors]:
+        """Return the errors by class for `MeasuredPerception(errors=...)`.
+
+        Sizes and widths, and how errors lie together, are those of the detector "measured". A class that the profile
+        does not have is seen without errors.
+        """
+        return {name: _errors(name, found) for name, found in self.classes.items()}
+
+
+def _errors(name: str, found: ClassConfusions) -> MeasuredErrors:
+    recall = min(found.recall, 1 - sum(found.called.values()))
+    return replace(
+        MEASURED.get(name, _PLAIN),
+        recall=recall,
+        precision=found.precision,
+        called=dict(found.called) if recall < 1 else {},
+        also=dict(found.also),
+        of_yards=None,
+        of_ground=found.of_ground,
+        alarms_on="ground",
+    )
+
+
+def read_profile(path: Path) -> PerceptionProfile:
+    """Read a profile; raise `ConfigError`, in one line, if it is missing or wrong."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        message = f"{path} cannot be read as a perception profile ({error}): {_MEND}"
+        raise ConfigError(message) from error
+    return parse_toml(text, PerceptionProfile, source=str(path))
+
+
+def write_profile(profile: PerceptionProfile, path: Path) -> None:
+    """Write a profile as TOML; raise `StoreError` if the file cannot be written."""
+    head = {name: getattr(profile, name) for name in ("version", "segmenter", "learned_from", "tested_on", "images")}
+    lines = ["# Confusions of a segmenter, measured on labelled images; not to be edited.", *_lines(head)]
+    for name, found in profile.classes.items():
+        rates = found.model_dump(exclude={"called", "also"})
+        lines += ["", f"[class.{name}]", *_lines(rates)]
+        for key in ("called", "also"):
+            shares = ", ".join(_lines(getattr(found, key)))
+            lines.append(f"{key} = {{ {shares} }}" if shares else f"{key} = {{}}")
+    try:
+        with fresh_file(path, mend="free some space and measure again") as scratch:
+            scratch.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    except OSError as error:
+        message = f"{path} cannot be written ({error.strerror or error}): name another place"
+        raise StoreError(message) from error
+
+
+def _lines(values: Mapping[str, object]) -> list[str]:
+    """Return keys and values as TOML; JSON's texts and numbers are TOML's."""
+    return [
+        f"{key} = {json.dumps(round(value, _DIGITS) if isinstance(value, float) else value)}"
+        for key, value in values.items()
+    ]

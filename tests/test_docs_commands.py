@@ -51,6 +51,8 @@ ONLY_PARSED = {
     r"--extracts|--extract ": "needs extracts",
     r"--imagery|zanzibar": "needs aerial pictures; tests/regions/test_imagery.py makes some",
     r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",
+    r"--segmenter my-segmenter": "needs tasks of pictures; tests/running/test_segment_tasks.py makes some",
+    r"--suite aerial|/aerial": "minutes of painting; tests/tasks/suites/test_pictures.py takes small ones",
     r"--dask": "needs a scheduler; tests/running does it",
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",
     r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/cli/test_cli_runs.py does it",

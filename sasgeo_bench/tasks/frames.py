@@ -7,19 +7,20 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from PIL import Image
 
 from sasgeo_bench.errors import ImageError
 from sasgeo_bench.files.parquet import open_table
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, pack, unpack
-from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.image import AerialImage, LabelledImage, decode_image
-from sasgeo_bench.sensing.intrinsics import Intrinsics
+
+# Every process of a matcher reads queries, and few look at pictures: what these need is imported where it is used.
+if TYPE_CHECKING:
+    from sasgeo_bench.sensing.camera import Camera
+    from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 
 LABELS: Final = "labels.parquet"  # beside the truths: what is on each pixel of each frame
 MOST_PICTURE_BYTES: Final = 150_000
@@ -72,7 +73,7 @@ class Frame:
     """
 
     picture: bytes
-    camera: Camera
+    camera: "Camera"
     height_sigma_m: float = 0.0
     attitude_sigma_deg: float = 0.0
     position_sigma_m: float = 0.0
@@ -89,8 +90,10 @@ class Frame:
                 message = f"{name} must be finite and not negative, got {value!r}"
                 raise ImageError(message)
 
-    def image(self, *, observed_on: dt.date | None = None, season: str = "") -> AerialImage:
+    def image(self, *, observed_on: dt.date | None = None, season: str = "") -> "AerialImage":
         """Decode the picture; its camera stands above the origin and looks as in the view's frame."""
+        from sasgeo_bench.sensing.image import AerialImage, decode_image  # noqa: PLC0415 - see above
+
         rgb = decode_image(self.picture, name="the picture of a frame", most_pixels=_MOST_PICTURE_PIXELS)
         return AerialImage(
             rgb=rgb,
@@ -128,8 +131,10 @@ class FrameLabels:
         most = -(-int(np.prod(shape)) // CELLS_PER_BYTE)
         return unpack(zlib.decompressobj().decompress(self.packed, most), shape)
 
-    def labelled(self, image: AerialImage, place: str) -> LabelledImage:
+    def labelled(self, image: "AerialImage", place: str) -> "LabelledImage":
         """Return an image of a place with these labels; raise `ImageError` if they do not fit."""
+        from sasgeo_bench.sensing.image import LabelledImage  # noqa: PLC0415 - see above
+
         return LabelledImage(image=image, classes=self.classes, labels=self.labels, place=place)
 
 
@@ -139,6 +144,8 @@ def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES)
     >>> len(encode_webp(np.zeros((32, 32, 3), dtype=np.uint8))) < 200
     True
     """
+    from PIL import Image  # noqa: PLC0415 - see above
+
     picture = Image.fromarray(np.ascontiguousarray(rgb))
     for quality in _QUALITIES:
         encoded = BytesIO()
@@ -167,6 +174,9 @@ def frame_row(frame: Frame) -> dict[str, Any]:
 
 def frame_of(row: Mapping[str, Any]) -> Frame:
     """Return the frame of a row of `FRAME`; raise as `Frame` and its camera do."""
+    from sasgeo_bench.sensing.camera import Camera  # noqa: PLC0415 - see above
+    from sasgeo_bench.sensing.intrinsics import Intrinsics  # noqa: PLC0415 - see above
+
     lens = Intrinsics(
         width_px=row["width_px"],
         height_px=row["height_px"],

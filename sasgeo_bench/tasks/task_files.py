@@ -12,7 +12,6 @@ from typing import Annotated, Any, Final, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import shapely
 from pydantic import Field
 
@@ -129,7 +128,7 @@ def write_task(
     groups: set[str] = set()
     frozen = hashlib.sha256()
     frames = 0
-    labels: pq.ParquetWriter | None = None  # opened at the first picture
+    labels: Any = None  # a writer, opened at the first picture
     with ExitStack() as stack:
         queries, truths = (
             stack.enter_context(table_writer(path, schema, compression_level=9))

@@ -226,17 +226,20 @@ def shipped(name):
     return make_split(read_split_file(find_split_file(name)), grids)
 
 
-@pytest.mark.parametrize("name", ["holdout", "crossfit"])
+OF_IMAGERY = {"banepa", "zanzibar"}  # of buildings alone, in a split of their own
+
+
+@pytest.mark.parametrize("name", ["crossfit", "holdout"])
 def test_the_shipped_splits_by_country_hold_the_same_regions_five_kilometres_apart(name):
     split = shipped(name)
     towns = {"canillo", "fuglafjordur", "runavik", "soldeu", "sorvagur", "tvoroyri", "vestmanna"}
-    assert set(split.spec.region_ids) == set(list_region_files()) - towns
+    assert set(split.spec.region_ids) == set(list_region_files()) - towns - OF_IMAGERY
     assert nearest_pair(split).gap_m >= 5000.0
 
 
 def test_the_split_by_towns_holds_every_shipped_region_and_their_views_never_meet():
     split = shipped("places")
-    assert sorted(split.spec.region_ids) == sorted(list_region_files())
+    assert set(split.spec.region_ids) == set(list_region_files()) - OF_IMAGERY
     assert nearest_pair(split).gap_m >= 2 * split.spec.reach_m + 800.0
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 import geopandas as gpd
 import numpy as np
 import pytest
+import shapely
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.grid import Grid
@@ -114,6 +115,7 @@ def town(*, rival=True, side=600, patch=112):
         bits=LayerBits.of(cells),
         features=nothing,
         graph=None,
+        coverage=shapely.box(0, 0, side, side),
     )
 
 

@@ -148,7 +148,7 @@ def has_data(rgb: NDArray[np.uint8], pixel_m: float) -> NDArray[np.bool_]:
 
     A roof may be overexposed; a hole is larger, so a disc of `_HOLE_M` must fit into it.
     """
-    is_empty = (rgb <= _EMPTY[0]).all(axis=2) | (rgb >= _EMPTY[1]).all(axis=2)
+    is_empty = np.asarray((rgb.max(axis=2) <= _EMPTY[0]) | (rgb.min(axis=2) >= _EMPTY[1]))
     shallow = np.asarray(_distance(is_empty) * pixel_m < _HOLE_M, dtype=np.bool_)
     return shallow if shallow.all() else np.asarray(_distance(shallow) * pixel_m > _HOLE_M)
 

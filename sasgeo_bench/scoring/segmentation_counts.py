@@ -142,8 +142,8 @@ def _read(part: pd.DataFrame) -> PixelCounts:
     classes = tuple(part["class"].iloc[:-1])
     if part["class"].iloc[-1] != GROUND or GROUND in classes:
         raise ValueError(part["image"].iloc[0])
-    shared = {key: np.stack(part[key]).astype(np.int64).reshape(len(part), len(classes)) for key in _SHARED}
-    pixels = np.stack([np.stack(part[key].iloc[:-1]) for key in _PIXELS], axis=1).astype(np.int64)
+    shared = {key: np.stack(list(part[key])).astype(np.int64).reshape(len(part), len(classes)) for key in _SHARED}
+    pixels = np.stack([np.stack(list(part[key])[:-1]) for key in _PIXELS], axis=1).astype(np.int64)
     image, place, season = (str(part[key].iloc[0]) for key in ("image", "place", "season"))
     return PixelCounts(
         image=image,

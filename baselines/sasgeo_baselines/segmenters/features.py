@@ -148,9 +148,9 @@ def has_data(rgb: NDArray[np.uint8], pixel_m: float) -> NDArray[np.bool_]:
 
     A roof may be overexposed; a hole is larger, so a disc of `_HOLE_M` must fit into it.
     """
-    is_empty = (rgb <= _EMPTY[0]).all(axis=2) | (rgb >= _EMPTY[1]).all(axis=2)
-    deep = np.asarray(_distance(is_empty) * pixel_m >= _HOLE_M)
-    return np.asarray(_distance(~deep) * pixel_m > _HOLE_M) if deep.any() else np.ones(is_empty.shape, dtype=bool)
+    is_empty = np.asarray((rgb.max(axis=2) <= _EMPTY[0]) | (rgb.min(axis=2) >= _EMPTY[1]))
+    shallow = np.asarray(_distance(is_empty) * pixel_m < _HOLE_M, dtype=np.bool_)
+    return shallow if shallow.all() else np.asarray(_distance(shallow) * pixel_m > _HOLE_M)
 
 
 def _distance(mask: NDArray[np.bool_]) -> Plane:

@@ -265,7 +265,7 @@ class _View:
         if errors is None:
             return
         free = ~(self.unknown[self.at[name]] | mask)
-        budget = self._alarms(errors, np.count_nonzero(mask), factor)
+        budget = self._alarms(errors, int(np.count_nonzero(mask)), factor)
         if errors.of_ground is not None or errors.of_yards is not None:
             free &= self.ground
         if errors.alarms_on == "roads":
@@ -292,11 +292,11 @@ class _View:
 
     def _alarms(self, errors: MeasuredErrors, count: int, factor: float) -> float:
         """Return the expected number of false cells of a class that has `count` true ones."""
-        ground = np.count_nonzero(self.ground)
+        ground = int(np.count_nonzero(self.ground))
         if errors.of_ground is not None:
             return min(factor * errors.of_ground, _MOST_GROUND) * ground
         if errors.of_yards is not None:
-            yards = np.count_nonzero(self.yards)
+            yards = int(np.count_nonzero(self.yards))
             return min(factor * errors.of_yards, _MOST_GROUND) * (yards + FAR_SHARE * (ground - yards))
         return factor * errors.recall / errors.precision * (1 - errors.precision) * count
 

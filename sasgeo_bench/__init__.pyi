@@ -61,9 +61,11 @@ from .search.chart import block_max as block_max
 from .search.chart import fade as fade
 from .search.plan import Disc as Disc
 from .search.plan import Mode as Mode
+from .search.plan import turns_of as turns_of
 from .search.vote_search import VotePlan as VotePlan
 from .search.votes import VoteGains as VoteGains
 from .search.votes import make_template as make_template
+from .sensing.birdseye import rectify as rectify
 from .sensing.camera import Attitude as Attitude
 from .sensing.camera import Camera as Camera
 from .sensing.camera import Mount as Mount
@@ -79,6 +81,7 @@ from .sensing.photos import read_photo as read_photo
 from .sensing.segmentation import Segmentation as Segmentation
 from .sensing.tiny_images import tiny_images as tiny_images
 from .sensing.tiny_images import with_picture as with_picture
+from .tasks.frames import Frame as Frame
 from .tasks.query import Query as Query
 from .tasks.query import Truth as Truth
 from .tasks.task_files import read_queries as read_queries

@@ -28,7 +28,7 @@ from sasgeo_bench.texts import (
     one_line,
 )
 
-Need = Literal["position", "yaw", "scale", "vectors", "image", "training"]
+Need = Literal["position", "yaw", "scale", "vectors", "image", "imagery", "training"]
 NEEDS: Final[tuple[Need, ...]] = get_args(Need)
 MOST_SAID: Final = 4000  # characters of a field of a card
 MOST_SHOWN: Final = 80  # of a wrong one
@@ -57,7 +57,8 @@ class MatcherCard:
     tracks : tuple of {"retrieval", "localization"}
         Tracks that it answers; on others its row is "not applicable".
     needs : tuple of str
-        Of `NEEDS`: what a query must hold; without it the row is "not applicable".
+        Of `NEEDS`: what a query must hold, or its map: "image" is a picture of the query, "imagery" that of the map;
+        without it the row is "not applicable".
     limits : str
         Known limits.
     trained_on : tuple of str
@@ -324,8 +325,11 @@ def _diagnostics(given: object) -> dict[str, float]:
     return found
 
 
-def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False) -> str | None:
-    """Return why a query is not applicable to a matcher, or None: its track, or a need of the card that it lacks."""
+def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False, is_pictured: bool = False) -> str | None:
+    """Return why a query is not applicable to a matcher, or None: its track, or a need of the card that it lacks.
+
+    `is_taught` says whether the matcher was trained, `is_pictured` whether the searched map has imagery.
+    """
     if query.track not in card.tracks:
         return f"track {query.track}"
     has = {
@@ -334,6 +338,7 @@ def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False) -> str | 
         "scale": True,
         "vectors": query.vectors is not None,
         "image": bool(query.frames),
+        "imagery": is_pictured,
         "training": is_taught,
     }
     return next((f"no {need}" for need in card.needs if not has[need]), None)

@@ -140,7 +140,7 @@ licence = "MIT"          # SPDX name, of the code
 trained_on = "none"
 # trained_elsewhere = "10,000 views of Zurich"    # what else taught it
 
-needs = ["position"]     # what a query must tell: position, yaw, scale, vectors, image, training
+needs = ["position"]     # what a query must tell: position, yaw, scale, vectors, image, imagery, training
 uses = []                # what it looks at besides query and map, as in "imagery"
 # limits = "knows no heading"
 # authors = ["A. Author"]

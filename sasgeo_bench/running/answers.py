@@ -246,6 +246,8 @@ class _Map:
     def __init__(self, plan: RunPlan, writers: Sequence["_Writer"]) -> None:
         self.count = sum(len(writer.part.left) for writer in writers)
         self._plan, self._writers = plan, writers
+        asks = "imagery" in plan.card.needs
+        self._is_pictured = asks and read_manifest(writers[0].part.region).imagery is not None
 
     def questions(self) -> Iterator[Question]:
         """Yield the queries of all tasks, each with the writer of its row; hold one row group in memory."""
@@ -271,7 +273,7 @@ class _Map:
                         return
                 if self._failed_training() is None:
                     writer.add_process(worker, ready)
-                reason = lacks(self._plan.card, query, is_taught=self._plan.training_set is not None)
+                reason = self._lacks(query)
                 if reason is not None:
                     writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
                     continue
@@ -283,6 +285,11 @@ class _Map:
                         is_warm = True
                     reply = guarded(self._plan, ask)
                 writer.add(self._row(query, reply), cpu_s=reply.cpu_s)
+
+    def _lacks(self, query: Query) -> str | None:
+        """Return why a query is not applicable to the matcher, or None."""
+        is_taught = self._plan.training_set is not None
+        return lacks(self._plan.card, query, is_taught=is_taught, is_pictured=self._is_pictured)
 
     def _row(self, query: Query, reply: Reply) -> Prediction:
         """Make a row of a reply, checked again in this process."""

@@ -54,6 +54,11 @@ class TinyPlace:
         """Return the folder of the map."""
         return self.folder / "regions" / self.region.manifest.id
 
+    @property
+    def is_pictured(self) -> bool:
+        """Return whether the map has imagery."""
+        return self.region.imagery is not None
+
 
 def tiny_place(path: str | Path) -> TinyPlace:
     """Make a small place to try a matcher on, in about a second, the same on every machine; nothing is downloaded.
@@ -152,7 +157,9 @@ def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
         return Check(name=name, outcome="not applicable", found="the card needs training")
     ready = worker.prepare(place.map_folder)
     fault = None if ready.status == "ok" else f"{ready.status}: {ready.message}"
-    queries = _one_of_each_track([query for query in place.queries if lacks(card, query) is None])
+    queries = _one_of_each_track(
+        [query for query in place.queries if lacks(card, query, is_pictured=place.is_pictured) is None]
+    )
     for query in queries if fault is None else ():
         fault = fault or _fault(worker.match(task_rows.query_bytes(query), top_k=TOP_K), query)
     worker.end()
@@ -213,7 +220,7 @@ class _Kit:
         yield self._cost(sound)
 
     def _lacks(self, query: Query) -> str | None:
-        return lacks(self.card, query, is_taught=self.is_taught)
+        return lacks(self.card, query, is_taught=self.is_taught, is_pictured=self.place.is_pictured)
 
     def _ask(self, query: Query, *, top_k: int = TOP_K) -> Reply:
         reply = self.worker.match(task_rows.query_bytes(query), top_k=top_k)

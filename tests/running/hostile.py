@@ -450,3 +450,7 @@ class BadCard(Plain):
 
 class WantsImages(Plain):
     card = MatcherCard(name="wants-images", tracks=("localization", "retrieval"), needs=("image",), **SAID)
+
+
+class WantsImagery(Plain):
+    card = MatcherCard(name="wants-imagery", tracks=("localization", "retrieval"), needs=("imagery",), **SAID)

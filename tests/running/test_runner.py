@@ -214,10 +214,11 @@ def test_a_full_disk_is_told_and_what_was_written_stays(task, tmp_path, monkeypa
 
 
 @pytest.mark.usefixtures("in_threads")
-def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path):
-    report, folder = run_all(request_of(task, tmp_path, name="WantsImages", limit=3))
+@pytest.mark.parametrize(("name", "message"), [("WantsImages", "no image"), ("WantsImagery", "no imagery")])
+def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path, name, message):
+    report, folder = run_all(request_of(task, tmp_path, name=name, limit=3))
     assert report.counts == {"not applicable": 3}
-    assert {item.message for item in table(folder)} == {"no image"}
+    assert {item.message for item in table(folder)} == {message}
 
 
 @pytest.mark.usefixtures("in_threads")

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exhaustive search: a view, turned and scaled, against every place of a map by normalized cross-correlation."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+import sasgeo_bench as sgb
+from sasgeo_baselines.global_descriptor import separate
+
+Planes = NDArray[np.float32]
+
+SPREAD: Final = 2.5  # standard deviations of heading and scale that are searched
+APART_M: Final = 25.0  # between two places of an answer
+AROUND_M: Final = 24.0  # a view may lie so far from its candidate
+MOST_PLACES: Final = 10  # of an answer
+_LEAST_SHARED: Final = 0.5  # of a view must lie on known imagery
+_NOTHING: Final = 1e-3  # of the greatest energy: places below have no texture
+
+
+@dataclass(frozen=True, kw_only=True)
+class Stack:
+    """Channels of a picture, float32 of shape (C, rows, cols), 0 where it is not known, and where it is."""
+
+    channels: Planes
+    is_known: NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Field:
+    """The best score of each place of a lattice, -inf where there is none, and which of `turns` has it."""
+
+    grid: sgb.Grid
+    scores: Planes
+    which: NDArray[np.int32]
+    turns: tuple[sgb.Pose, ...]
+
+    def mode(self, row: int, col: int) -> sgb.Mode:
+        """Return the best pose at a place, and its score."""
+        turn = self.turns[int(self.which[row, col])]
+        east_m, north_m = self.grid.to_centres_m(np.array([[row, col]]))[0].tolist()
+        pose = sgb.Pose(easting_m=east_m, northing_m=north_m, yaw_deg=turn.yaw_deg, scale=turn.scale)
+        return sgb.Mode(pose=pose, score=float(self.scores[row, col]))
+
+    def best(self, disc: sgb.Disc, *, most: int) -> list[sgb.Mode]:
+        """Return the best places within a disc, at least `APART_M` from each other, best first."""
+        cells, points_m = self._places()
+        allowed = disc.holds(points_m) & np.isfinite(self.scores.ravel())
+        cells, points_m = cells[allowed], points_m[allowed]
+        if not len(cells):
+            return []
+        chosen = separate(points_m, self.scores[cells[:, 0], cells[:, 1]], apart_m=APART_M, most=most)
+        return [self.mode(*cells[at].tolist()) for at in chosen]
+
+    def near(self, candidates: Sequence[sgb.Pose]) -> list[sgb.Mode | None]:
+        """Return the best pose near each candidate; None where no place of the lattice has a score."""
+        return [next(iter(self.best(_around(pose), most=1)), None) for pose in candidates]
+
+    def peak(self) -> float:
+        """Return by how many standard deviations of all places the best one lies above their mean, 0 if by none."""
+        known = self.scores[np.isfinite(self.scores)]
+        return float((known.max() - known.mean()) / known.std()) if len(known) and known.std() > 0 else 0.0
+
+    def _places(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        cells = np.column_stack([index.ravel() for index in np.indices(self.grid.shape)]).astype(np.int64)
+        return cells, self.grid.to_centres_m(cells)
+
+
+def _around(pose: sgb.Pose) -> sgb.Disc:
+    return sgb.Disc(center_m=(pose.easting_m, pose.northing_m), radius_m=AROUND_M)
+
+
+def disc_of(prior: sgb.Prior) -> sgb.Disc:
+    """Return the places that a prior allows."""
+    return sgb.Disc(center_m=prior.center_m, radius_m=prior.radius_m or 0.0)
+
+
+def turns_for(query: sgb.Query, *, reach_m: float, step_m: float) -> tuple[sgb.Pose, ...]:
+    """Return headings and scales so dense that what is `reach_m` from the middle is off by at most half of `step_m`."""
+    turns = sgb.turns_of(query.prior, spread=SPREAD, step=step_m / reach_m)
+    return tuple(
+        sgb.Pose(easting_m=0.0, northing_m=0.0, yaw_deg=base.yaw_deg + 360.0 * at / turns.quarters, scale=base.scale)
+        for at in range(turns.quarters)
+        for base in turns.bases
+    )
+
+
+def bounds_of(query: sgb.Query, grid: sgb.Grid) -> tuple[int, int, int, int]:
+    """Return first row and column and last row and column, excluded, of the places that a query leaves open."""
+    if query.track == "retrieval":
+        points_m, reach_m = sgb.points_of(query.candidates), AROUND_M
+    elif query.prior.center_m is not None:
+        points_m, reach_m = np.array([query.prior.center_m]), query.prior.radius_m or 0.0
+    else:
+        return 0, 0, *grid.shape
+    cells, reach = grid.to_cells(points_m), math.ceil(reach_m / grid.cell_size_m)
+    (top, left), (bottom, right) = cells.min(axis=0) - reach, cells.max(axis=0) + reach + 1
+    return max(int(top), 0), max(int(left), 0), min(int(bottom), grid.rows), min(int(right), grid.cols)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Search:
+    """Spectra of a part of a map: `place` is the lattice of the places that are asked about."""
+
+    place: sgb.Grid
+    margin: int
+    shape: tuple[int, int]
+    channels: NDArray[np.complex64]
+    energy: NDArray[np.complex64]
+    known: NDArray[np.complex64]
+    least_energy: float
+
+    @classmethod
+    def of(cls, stack: Stack, grid: sgb.Grid, bounds: tuple[int, int, int, int], *, margin: int) -> Self:
+        """Cut out the places of `bounds` with `margin` cells around them, half the side of a view."""
+        top, left, bottom, right = bounds
+        cut = tuple(slice(max(at - margin, 0), to + margin) for at, to in ((top, bottom), (left, right)))
+        before = [(max(margin - at, 0), 0) for at in (top, left)]
+        channels = np.pad(stack.channels[:, *cut], [(0, 0), *before])
+        known = np.pad(stack.is_known[cut], before).astype(np.float32)
+        sizes = (bottom - top + 2 * margin, right - left + 2 * margin)
+        shape = (fft.next_fast_len(sizes[0], real=True), fft.next_fast_len(sizes[1], real=True))
+        energy = (channels**2).sum(axis=0)
+        return cls(
+            place=grid.window(top, left, bottom - top, right - left),
+            margin=margin,
+            shape=shape,
+            channels=fft.rfft2(channels, shape),
+            energy=fft.rfft2(energy, shape),
+            known=fft.rfft2(known, shape),
+            least_energy=_NOTHING * float(energy.mean()),
+        )
+
+    def scores(self, view: Stack) -> Planes:
+        """Return the cosine of view and map at every place, -1..1; -inf where half of the view is off the map."""
+        mask = view.is_known.astype(np.float32)
+        weight, power = float(mask.sum()), float((view.channels**2).sum())
+        if weight == 0 or power == 0:
+            return np.full(self.place.shape, -np.inf, dtype=np.float32)
+        spectrum = np.conj(fft.rfft2(mask, self.shape))
+        energy, shared = self._at_places(self.energy * spectrum), self._at_places(self.known * spectrum)
+        product = self._at_places((self.channels * np.conj(fft.rfft2(view.channels, self.shape))).sum(axis=0))
+        floor = max(self.least_energy * weight, 1e-12)
+        cosine = np.where(energy > floor, product / np.sqrt(power * np.maximum(energy, floor)), 0.0)
+        return np.where(shared >= _LEAST_SHARED * weight, cosine, -np.inf).astype(np.float32)
+
+    def _at_places(self, spectrum: NDArray[np.complex64]) -> Planes:
+        rows, cols = self.place.shape
+        return np.asarray(fft.irfft2(spectrum, self.shape)[:rows, :cols], dtype=np.float32)
+
+    def field(self, turns: Sequence[sgb.Pose], view_of: Callable[[sgb.Pose], Stack]) -> Field:
+        """Return the best of all headings and scales at every place; of equal ones the first."""
+        best = np.full(self.place.shape, -np.inf, dtype=np.float32)
+        which = np.zeros(self.place.shape, dtype=np.int32)
+        for at, turn in enumerate(turns):
+            scores = self.scores(view_of(turn))
+            better = scores > best
+            best[better], which[better] = scores[better], at
+        return Field(grid=self.place, scores=best, which=which, turns=tuple(turns))
+
+
+def size_for(turns: Sequence[sgb.Pose], side_cells: float) -> int:
+    """Return the odd number of cells a side that holds a view at its largest scale."""
+    return 2 * math.ceil(side_cells / 2 * max(turn.scale for turn in turns)) + 1
+
+
+def answer_places(modes: Sequence[sgb.Mode], *, top_k: int, diagnostics: dict[str, float]) -> sgb.Match:
+    """Return the best modes of a localization query, and the margin of the best over the next."""
+    ordered = sorted(modes, key=lambda mode: -mode.score)
+    given = ordered[:top_k]
+    return sgb.Match(
+        poses=[mode.pose for mode in given],
+        scores=[mode.score for mode in given],
+        diagnostics=diagnostics | margin_of(ordered),
+    )
+
+
+def answer_candidates(
+    query: sgb.Query, found: Sequence[sgb.Mode | None], *, top_k: int, diagnostics: dict[str, float]
+) -> sgb.Match:
+    """Rank the candidates of a retrieval query by the mode found near each."""
+    ordered = sorted((mode for mode in found if mode is not None), key=lambda mode: -mode.score)
+    return sgb.ranked_candidates(
+        query,
+        [mode.score if mode else None for mode in found],
+        top_k=top_k,
+        poses=[mode.pose if mode else pose for pose, mode in zip(query.candidates, found, strict=True)],
+        diagnostics=diagnostics | margin_of(ordered),
+    )
+
+
+def margin_of(ordered: Sequence[sgb.Mode]) -> dict[str, float]:
+    """Return the number of modes and the margin of the best over the next, 0 where there is none."""
+    margin = ordered[0].score - ordered[1].score if len(ordered) > 1 else 0.0
+    return {"margin": margin, "modes": float(len(ordered))}

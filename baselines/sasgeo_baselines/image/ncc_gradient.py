@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`ncc_gradient`: directions of the gradients of a picture against those of the imagery, by cross-correlation."""
+
+from dataclasses import replace
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import sasgeo_bench as sgb
+from sasgeo_baselines.image.dense import (
+    MOST_PLACES,
+    Field,
+    Search,
+    Stack,
+    answer_candidates,
+    answer_places,
+    bounds_of,
+    disc_of,
+    size_for,
+    turns_for,
+)
+from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, grey_of, side_of, sight_of
+
+COARSE_M: Final = 2.0  # pixels of the search
+FINE_M: Final = 1.0  # of the local one that follows
+_REACH_M: Final = 4.0  # of the local one
+_STEPS: Final = (-0.5, -0.25, 0.0, 0.25, 0.5)  # of a step of heading
+_SCALES: Final = (-0.4, 0.0, 0.4)  # of a step of scale
+_RIM_PX: Final = 3  # beside what is not known, a gradient is that of the rim
+_STEP: Final = 2.0  # pixels at the edge of a view between two headings
+
+
+def directions(grey: NDArray[np.uint8], is_known: NDArray[np.bool_]) -> Stack:
+    """Return cosine and sine of twice the direction of the gradient, shape (2, rows, cols), softly of length 1.
+
+    A gradient of the median strength has length 1/2, so that neither brightness nor contrast counts; twice the
+    direction makes no difference between light on dark and dark on light.
+
+    >>> ramp = np.tile(np.arange(0, 160, 10, dtype=np.uint8), (16, 1))
+    >>> found = directions(ramp, np.ones((16, 16), dtype=bool)).channels[:, 8, 8]
+    >>> [round(float(value), 2) for value in found]
+    [0.5, 0.0]
+    """
+    smooth = cv2.GaussianBlur(grey.astype(np.float32), (0, 0), 1.0)
+    right, down = (np.asarray(cv2.Sobel(smooth, cv2.CV_32F, *way)) / 8 for way in ((1, 0), (0, 1)))
+    strength = np.hypot(right, down)
+    rim = np.ones((2 * _RIM_PX + 1,) * 2, dtype=np.uint8)
+    inside = np.asarray(cv2.erode(is_known.astype(np.uint8), rim)) > 0
+    usual = float(np.median(strength[inside])) if inside.any() else 0.0
+    length = np.where(inside, 1 / np.maximum(strength * (strength + usual), 1e-6), 0)
+    channels = np.stack([(right**2 - down**2) * length, 2 * right * down * length])
+    return Stack(channels=channels.astype(np.float32), is_known=inside)
+
+
+class NccGradient:
+    """Normalized cross-correlation of the directions of gradients, at every place, heading and scale."""
+
+    card = sgb.MatcherCard(
+        name="ncc_gradient",
+        version="1",
+        title="Directions of gradients against imagery, by cross-correlation",
+        source="Orientation correlation (Fitch et al., BMVC 2002), as normalized cross-correlation under a mask",
+        ours=(
+            f"{PICTURE}; twice the direction, its length strength / (strength + median); pixels of 2 m at every place, "
+            "heading and scale within 2.5 standard deviations, then pixels of 1 m around the best ten; candidates by "
+            "the best pose within 24 m, pixels of 2 m"
+        ),
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        needs=("image", "imagery"),
+        limits=f"Slow where the heading is unknown; half of the view must be on the imagery; {LIMITS}",
+    )
+
+    def __init__(self) -> None:
+        self._grey: NDArray[np.uint8] | None = None
+
+    def prepare(self, region: sgb.Region, learned: str | None) -> None:
+        """Read the imagery and take its gradients."""
+        del learned
+        fine, coarse = (Ortho.of(region, gsd_m=gsd_m) for gsd_m in (FINE_M, COARSE_M))
+        self._grey = None
+        if fine is None or coarse is None:
+            return
+        self._grey, self._known, self._fine = grey_of(fine.rgb, fine.is_known), fine.is_known, fine.grid
+        self._stack, self._grid = directions(grey_of(coarse.rgb, coarse.is_known), coarse.is_known), coarse.grid
+
+    def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
+        """Return the best poses, or rank the candidates by the best pose near each."""
+        sight = sight_of(query, gsd_m=COARSE_M)
+        if self._grey is None or sight is None:
+            return sgb.WITHHELD
+        bounds = bounds_of(query, self._grid)
+        if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
+            return sgb.WITHHELD
+        side_m = side_of(query)
+        turns = turns_for(query, reach_m=side_m / 2, step_m=_STEP * COARSE_M)
+        field = _search(self._stack, self._grid, bounds, sight, turns)
+        diagnostics = {"peak": field.peak(), "seen_share": float(sight.is_seen.mean())}
+        if query.track == "retrieval":
+            return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
+        disc = disc_of(query.prior)
+        modes = field.best(disc, most=min(top_k, MOST_PLACES) + 1)
+        finer = sight_of(query, gsd_m=FINE_M)
+        if finer is not None:
+            step = _STEP * COARSE_M / (side_m / 2)
+            modes = [self._refined(mode, finer, step, disc) for mode in modes]
+        return answer_places(modes, top_k=min(top_k, MOST_PLACES), diagnostics=diagnostics)
+
+    def _refined(self, mode: sgb.Mode, sight: Sight, step: float, disc: sgb.Disc) -> sgb.Mode:
+        """Return the best pose near a mode, on finer pixels and in finer steps."""
+        assert self._grey is not None  # noqa: S101 - match() has looked
+        pose = mode.pose
+        turns = tuple(
+            replace(pose, yaw_deg=pose.yaw_deg + float(np.degrees(part * step)), scale=pose.scale * (1 + more * step))
+            for part in _STEPS
+            for more in _SCALES
+        )
+        reach, margin = round(_REACH_M / FINE_M), size_for(turns, len(sight.rgb)) // 2
+        row, col = self._fine.to_cells(sgb.points_of([pose]))[0].tolist()
+        whole = reach + margin + 2 * _RIM_PX
+        top, left = max(row - whole, 0), max(col - whole, 0)
+        cut = (slice(top, row + whole + 1), slice(left, col + whole + 1))
+        stack = directions(self._grey[cut], self._known[cut])
+        part = self._fine.window(top, left, *stack.is_known.shape)
+        low, high = (row - top, col - left), stack.is_known.shape
+        bounds = (
+            *(max(at - reach, 0) for at in low),
+            *(min(at + reach + 1, end) for at, end in zip(low, high, strict=True)),
+        )
+        found = _search(stack, part, (bounds[0], bounds[1], bounds[2], bounds[3]), sight, turns).best(disc, most=1)
+        return found[0] if found else mode
+
+
+def _search(
+    stack: Stack,
+    grid: sgb.Grid,
+    bounds: tuple[int, int, int, int],
+    sight: Sight,
+    turns: tuple[sgb.Pose, ...],
+) -> Field:
+    """Correlate a picture with a part of a map, in all headings and scales."""
+    size_px = size_for(turns, len(sight.rgb))
+    search = Search.of(stack, grid, bounds, margin=size_px // 2)
+
+    def view_of(turn: sgb.Pose) -> Stack:
+        turned = sight.turned(turn, size_px)
+        return directions(turned.grey, turned.is_seen)
+
+    return search.field(turns, view_of)

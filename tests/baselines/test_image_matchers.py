@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matchers that look at pictures find views cut from the imagery of a made-up place, and say nothing of flat ones."""
+
+import datetime as dt
+import math
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+import sasgeo_bench as sgb
+from sasgeo_bench.matching.matcher import check_match, lacks
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.tasks.frames import encode_webp
+from tests.regions.imagery_place import SOUTH, WEST, make_hamlet
+
+NAMES = ("hog_colour", "ncc_gradient", "orb_homography", "orb_vlad")
+SIDE_M, PICTURE_PX, HEIGHT_M = 112.0, 400, 80.0
+TRUTH = sgb.Pose(easting_m=WEST + 205.0, northing_m=SOUTH + 172.0, yaw_deg=65.0, scale=1.03)
+PRIOR = sgb.Prior(
+    center_m=(WEST + 180.0, SOUTH + 190.0), radius_m=100.0, yaw_deg=60.0, yaw_sigma_deg=5.0, scale_sigma=0.03
+)
+
+
+@pytest.fixture(scope="module")
+def region(tmp_path_factory: pytest.TempPathFactory) -> sgb.Region:
+    """A hamlet with imagery."""
+    hamlet = make_hamlet(tmp_path_factory.mktemp("hamlet"))
+    out = tmp_path_factory.mktemp("out")
+    plan = plan_build(hamlet.spec(), out=out, extract_folders=[hamlet.folder], imagery_folders=[hamlet.folder])
+    build_region(plan, tell=lambda _: None, with_preview=False)
+    return sgb.read_region(plan.folder)
+
+
+@pytest.fixture(scope="module")
+def window(region: sgb.Region) -> sgb.ImageryWindow:
+    """All of its imagery."""
+    return region.imagery.read(region.imagery.record.bounds_m)
+
+
+@pytest.fixture(scope="module", params=NAMES)
+def matcher(request: pytest.FixtureRequest, region: sgb.Region) -> sgb.Matcher:
+    """Each matcher, prepared."""
+    made = sgb.load_matcher(request.param)
+    made.prepare(region, None)
+    return made
+
+
+def camera() -> sgb.Camera:
+    """Looks straight down on somewhat more than the view."""
+    wide_deg = 2 * math.degrees(math.atan(0.6 * SIDE_M / HEIGHT_M))
+    lens = sgb.Intrinsics.from_field_of_view(horizontal_deg=wide_deg, width_px=PICTURE_PX, height_px=PICTURE_PX)
+    return sgb.Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=HEIGHT_M, yaw_deg=0.0)
+
+
+def picture(window: sgb.ImageryWindow, pose: sgb.Pose, *, seed: int = 5) -> np.ndarray:
+    """What the camera sees from a pose: darker, flatter and noisier than the imagery."""
+    middles = np.arange(PICTURE_PX) + 0.5
+    pixels = np.column_stack([axis.ravel() for axis in np.meshgrid(middles, middles)])
+    places_m = pose.to_map(camera().unproject(pixels, sgb.Plane())[:, :2])
+    at = (window.grid.to_uv(places_m) - 0.5).astype(np.float32).reshape(PICTURE_PX, PICTURE_PX, 2)
+    seen = cv2.remap(window.rgb, at, None, cv2.INTER_LINEAR).astype(np.float64)
+    noise = np.random.default_rng(seed).normal(0, 6, seen.shape)
+    return np.clip(0.8 * seen + 25 + noise, 0, 255).astype(np.uint8)
+
+
+def query_of(rgb: np.ndarray, **changes: object) -> sgb.Query:
+    """A question about a picture; nothing of its evidence is known."""
+    cells = np.full((1, int(SIDE_M), int(SIDE_M)), UNKNOWN, dtype=np.uint8)
+    question = sgb.Query(
+        query_id="q",
+        track="localization",
+        suite="rendered",
+        suite_version=1,
+        part="crossfit",
+        region="hamlet",
+        evidence=Evidence(classes=("building",), cells=cells, cell_size_m=1.0),
+        observed_on=dt.date(2025, 1, 1),
+        season="",
+        prior=PRIOR,
+        prior_group="r100-known-s3",
+        frames=(sgb.Frame(picture=encode_webp(rgb), camera=camera()),),
+    )
+    return replace(question, **changes)
+
+
+def off_m(pose: sgb.Pose, truth: sgb.Pose = TRUTH) -> float:
+    return math.hypot(pose.easting_m - truth.easting_m, pose.northing_m - truth.northing_m)
+
+
+def test_each_finds_a_darker_noisier_view_within_ten_metres(matcher, window):
+    query = query_of(picture(window, TRUTH))
+    match = check_match(matcher.match(query, top_k=5), query, top_k=5)
+    assert off_m(match.poses[0]) < 10.0
+    assert match.diagnostics["margin"] >= 0.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_each_finds_views_at_drawn_places(matcher, window, seed):
+    rng = np.random.default_rng(seed)
+    east_m, north_m = rng.uniform(-60, 60, 2)
+    truth = sgb.Pose(
+        easting_m=PRIOR.center_m[0] + east_m,
+        northing_m=PRIOR.center_m[1] + north_m,
+        yaw_deg=60.0 + rng.uniform(-5, 5),
+        scale=1 + rng.uniform(-0.05, 0.05),
+    )
+    match = matcher.match(query_of(picture(window, truth, seed=seed)), top_k=1)
+    assert off_m(match.poses[0], truth) < 10.0
+
+
+def test_each_gives_the_same_answer_twice(matcher, window):
+    query = query_of(picture(window, TRUTH))
+    assert matcher.match(query, top_k=5) == matcher.match(query, top_k=5)
+
+
+def test_each_gives_no_more_than_top_k(matcher, window):
+    query = query_of(picture(window, TRUTH))
+    assert len(matcher.match(query, top_k=1).poses) == 1
+    assert matcher.match(query, top_k=1).poses[0] == matcher.match(query, top_k=5).poses[0]
+
+
+def test_each_withholds_where_the_picture_is_flat(matcher):
+    flat = np.full((PICTURE_PX, PICTURE_PX, 3), 120, dtype=np.uint8)
+    assert matcher.match(query_of(flat), top_k=5).poses == ()
+
+
+def test_each_scores_noise_lower_than_a_view(matcher, window):
+    noise = np.random.default_rng(1).normal(120, 12, (PICTURE_PX, PICTURE_PX, 3)).clip(0, 255).astype(np.uint8)
+    empty = matcher.match(query_of(noise), top_k=1)
+    whole = matcher.match(query_of(picture(window, TRUTH)), top_k=1)
+    assert not empty.scores or empty.scores[0] < 0.75 * whole.scores[0]
+
+
+def test_each_ranks_candidates_and_equal_ones_tie(matcher, window):
+    def at(east_m: float, north_m: float) -> sgb.Pose:
+        return sgb.Pose(easting_m=WEST + east_m, northing_m=SOUTH + north_m, yaw_deg=60.0)
+
+    candidates = (at(120, 120), at(206, 170), at(120, 120), at(290, 250))
+    query = query_of(picture(window, TRUTH), track="retrieval", candidates=candidates)
+    match = check_match(matcher.match(query, top_k=4), query, top_k=4)
+    assert off_m(match.poses[0]) < 5.0
+    same = [score for pose, score in zip(match.poses, match.scores, strict=True) if pose.easting_m == WEST + 120]
+    assert len(set(same)) <= 1
+    assert len(same) in (0, 2)
+
+
+def test_each_withholds_beyond_the_imagery(matcher, window):
+    away = replace(PRIOR, center_m=(WEST + 20_000.0, SOUTH))
+    assert not matcher.match(query_of(picture(window, TRUTH), prior=away), top_k=5).poses
+
+
+def test_each_searches_the_whole_map_without_a_disc(matcher, window):
+    bare = replace(PRIOR, center_m=None, radius_m=None)
+    match = matcher.match(query_of(picture(window, TRUTH), prior=bare), top_k=1)
+    assert off_m(match.poses[0]) < 10.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_needs_a_picture_and_imagery(name, window):
+    card = sgb.load_matcher(name).card
+    query = query_of(picture(window, TRUTH))
+    assert lacks(card, query, is_pictured=True) is None
+    assert lacks(card, query) == "no imagery"
+    assert lacks(card, replace(query, frames=()), is_pictured=True) == "no image"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_prepares_a_map_without_imagery_and_withholds(name, window):
+    made = sgb.load_matcher(name)
+    made.prepare(SimpleNamespace(imagery=None), None)
+    assert made.match(query_of(picture(window, TRUTH)), top_k=5) == sgb.WITHHELD
+
+
+def test_a_made_up_place_without_imagery_leaves_no_query(tmp_path: Path):
+    checks = sgb.check_matcher("ncc_gradient", place=sgb.tiny_place(tmp_path), is_shut_in=False)
+    assert not [check for check in checks if check.outcome == "fail"]

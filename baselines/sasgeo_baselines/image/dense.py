@@ -54,7 +54,8 @@ class Field:
         cells, points_m = cells[allowed], points_m[allowed]
         if not len(cells):
             return []
-        chosen = separate(points_m, self.scores[cells[:, 0], cells[:, 1]], apart_m=APART_M, most=most)
+        scores = self.scores[cells[:, 0], cells[:, 1]].astype(np.float64)
+        chosen = separate(points_m, scores, apart_m=APART_M, most=most)
         return [self.mode(*cells[at].tolist()) for at in chosen]
 
     def near(self, candidates: Sequence[sgb.Pose]) -> list[sgb.Mode | None]:

@@ -44,7 +44,7 @@ def detect(grey: NDArray[np.uint8], is_known: NDArray[np.bool_], *, most: int) -
         cv2.copyMakeBorder(is_known.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1),
         np.ones((2 * _RIM_PX + 1,) * 2, dtype=np.uint8),
     )[1:-1, 1:-1]
-    orb = cv2.ORB_create(nfeatures=most, scaleFactor=1.2, nlevels=6, edgeThreshold=19, fastThreshold=7)
+    orb = cv2.ORB.create(nfeatures=most, scaleFactor=1.2, nlevels=6, edgeThreshold=19, fastThreshold=7)
     smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX)
     found, descriptors = orb.detectAndCompute(smooth, np.ascontiguousarray(inside) * 255)
     if descriptors is None or not len(found):

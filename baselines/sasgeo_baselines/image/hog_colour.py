@@ -44,7 +44,8 @@ def descriptors(rgb: NDArray[np.uint8], is_known: NDArray[np.bool_]) -> Stack:
     planes = [_pooled(np.where(bins == at, length, 0).astype(np.float32)) / weight for at in range(BINS)]
     planes += [_pooled(np.where(is_known, lab[:, :, at], 0).astype(np.float32)) / weight for at in range(3)]
     there = cells > _HALF
-    return Stack(channels=np.stack([_standard(plane, there) for plane in planes]), is_known=there)
+    channels = np.stack([_standard(plane.astype(np.float32), there) for plane in planes])
+    return Stack(channels=channels, is_known=there)
 
 
 def _gradients(grey: NDArray[np.float32], is_known: NDArray[np.bool_]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:

@@ -146,7 +146,7 @@ class OrbHomography:
     ) -> sgb.Mode | None:
         """Match a view with a window of the imagery."""
         assert self._features is not None  # noqa: S101 - match() has looked
-        within = (np.abs(self._features.points - middle_m) <= _REACH * side_m).all(axis=1)
+        within = np.asarray((np.abs(self._features.points - middle_m) <= _REACH * side_m).all(axis=1))
         mapped = self._features.chosen(within)
         if min(len(seen), len(mapped)) < LEAST_MATCHES:
             return None

@@ -58,11 +58,9 @@ class Sight:
         shift = to_middle - turning @ (from_middle, from_middle)
         matrix = np.column_stack([turning, shift])
 
-        def warp(plane: NDArray[np.generic]) -> NDArray[np.generic]:
-            return np.asarray(cv2.warpAffine(plane, matrix, (size_px, size_px), flags=_HOW))
-
-        is_seen = warp(self.is_seen.astype(np.float32)) > _ALL
-        return type(self)(rgb=warp(self.rgb).astype(np.uint8), is_seen=is_seen, gsd_m=self.gsd_m)
+        seen = self.is_seen.astype(np.float32)
+        rgb, share = (cv2.warpAffine(plane, matrix, (size_px, size_px), flags=_HOW) for plane in (self.rgb, seen))
+        return type(self)(rgb=np.asarray(rgb, dtype=np.uint8), is_seen=np.asarray(share) > _ALL, gsd_m=self.gsd_m)
 
 
 _HOW: Final = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP

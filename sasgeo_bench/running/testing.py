@@ -278,7 +278,7 @@ class _Kit:
 
     def _unknown(self, query: Query) -> str | None:
         unseen = query.evidence.replace(np.full_like(query.evidence.cells, UNKNOWN))
-        blind = _changed(query, "unknown", evidence=unseen, vectors=None)
+        blind = _changed(query, "unknown", evidence=unseen, vectors=None, frames=())
         if self._lacks(blind) is not None:
             raise _NotApplicable
         reply = self._ask(blind)

@@ -44,7 +44,9 @@ class QueryOptions(Options):
     )
     detector: Annotated[
         list[str] | None,
-        typer.Option(help="published or measured: family of the errors of perception; may be repeated, for pairs"),
+        typer.Option(
+            help="family of errors: published or measured, of pictures rendered or shifted; may be repeated, for pairs"
+        ),
     ] = None
     extracts: ExtractFolders = None
     region_files: OwnRegionFolders = None
@@ -122,7 +124,8 @@ def _detectors(names: Sequence[str] | None) -> tuple[Detector, ...]:
 
 def _in_words(request: Request) -> str:
     suite = find_suite(request.suite)
-    queries = request.count * len(suite.variants) * len(suite.card.tracks) * len(request.choice.detectors)
+    queries = request.count * len(suite.variants) * len(suite.card.tracks)
+    queries *= len(suite.drawn_by(request.choice.detectors))
     most = f"at most {request.count} sites, {queries} queries"
     return f"{request.suite} on {request.region.id}: {most}, {_folder(request)}"
 

@@ -28,6 +28,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.degraded_map import DROPPED, WARP_M, degrade
 from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.private_seed import seed_record
@@ -198,6 +199,8 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
     needs = suite.card.needs
     others: tuple[State, ...] = ()
     elsewhere: State | None = None
+    if "degraded map" in needs and base.imagery is not None:
+        others = (_degraded(request, suite, base),)
     if "older maps" in needs:
         others = tuple(
             State.of(_built(request, request.region, date, tell), name=f"{request.region.id}@{date.isoformat()}")
@@ -214,10 +217,21 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         scenes=base.manifest.scenes,
         others=others,
         elsewhere=elsewhere,
+        imagery=base.imagery if "imagery" in needs else None,
         ageing=_ageing(request.region) if "rates of ageing" in needs else None,
         looks={block.id: _look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
     )
     return scene, base
+
+
+def _degraded(request: Request, suite: Suite, base: Region) -> State:
+    """Return the region's map with the faults of worse mapping, which is built next to it."""
+    plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
+    rng = Seeds(root=request.seed, names=(request.region.id, suite.card.name)).rng("degraded map")
+    features = degrade(base.features, base.grid, rng)
+    note = f"degraded: {DROPPED:.0%} of the buildings dropped, the rest {WARP_M:g} m off, for suite {suite.card.name}"
+    folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
+    return State.of(region_files.read_region(folder), name=folder.name)
 
 
 def _look_of(split: Split, block: Block) -> Family:

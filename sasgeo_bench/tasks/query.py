@@ -25,10 +25,12 @@ Track = Literal["retrieval", "localization"]
 Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
 # Families of errors of perception: two models of a detector, and two of the look of pictures, which a segmenter sees.
-Detector = Literal["published", "measured", "rendered", "shifted"]
+Detector = Literal["published", "measured", "rendered", "shifted", "real"]
 PUBLISHED: Final[Detector] = "published"  # the one that is meant where none is named
-RENDERED: Final[Detector] = "rendered"  # the one that is meant where a suite has pictures
-PICTURED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")
+RENDERED: Final[Detector] = "rendered"  # pictures of the ordinary look; from these segmenters learn
+REAL: Final[Detector] = "real"
+PERCEIVED: Final[tuple[Detector, ...]] = (PUBLISHED, "measured")  # models of perception, the first if none is chosen
+PAINTED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")  # looks of rendered pictures, the first if none is chosen
 BY: Final = "+"  # between a suite of pictures and the segmenter that made its evidence
 # Kinds of queries whose right score is known beforehand; the scorer knows them by these names.
 CONTROLS: Final = "controls"  # their suite

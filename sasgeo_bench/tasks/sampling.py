@@ -89,7 +89,7 @@ class Drawer:
                 track=track,
             )
             for site in sites
-            for detector in self.suite.detectors(self.choice.detectors)
+            for detector in self.suite.drawn_by(self.choice.detectors)
             for variant in (replace(item, detector=detector) for item in self.suite.variants)
             for track in self.suite.tracks(variant)
             if self.choice.takes(variant, track)

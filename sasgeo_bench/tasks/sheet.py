@@ -8,6 +8,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Final
 
+import cv2
 import numpy as np
 import shapely
 from matplotlib.axes import Axes
@@ -32,6 +33,7 @@ AGREE: Final = "#d9d9d9"
 TWIN: Final = "map at the twin"
 DECOY: Final = "map at the hardest decoy"
 _OF_TWIN: Final = (TWIN_EAST, TWIN_NORTH, RIVALS, IN_DISC, LISTED, TRUTH_LISTED, LEAD)  # told in words
+_PICTURE: Final = "newest picture"
 _COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
 _TEXT_INCHES: Final = 3.0  # width of the text column, readable when the sheet is shown smaller
@@ -89,7 +91,12 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     """Draw a contact sheet as a figure."""
     has_vectors = any(panel.query.vectors is not None for panel in panels)
     rivals = list(dict.fromkeys(panel.rival for panel in panels)) or [DECOY]
-    columns = (*_COLUMNS, " / ".join(rivals), *(("perceived vectors",) if has_vectors else ()))
+    has_pictures = any(panel.query.frames for panel in panels)
+    columns = (
+        *((_PICTURE,) if has_pictures else ()),
+        *(*_COLUMNS, " / ".join(rivals)),
+        *(("perceived vectors",) if has_vectors else ()),
+    )
     width, height = _TEXT_INCHES + 0.1 + _CELL_INCHES * len(columns), 1.2 + (_CELL_INCHES + 0.1) * len(panels)
     figure = PlainFigure(figsize=(width, height), dpi=dpi, facecolor="white")
     figure.text(0.15 / width, 1 - 0.12 / height, title, va="top", fontsize=13, fontweight="bold")
@@ -100,7 +107,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
         bottom = height - 1.15 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
         text = "\n".join(line for part in _text(panel) for line in wrap(part, _LETTERS))
         figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=10)
-        pictures = (*_pictures(panel), None)[: len(columns)]
+        pictures = (*((_photo(panel.query),) if has_pictures else ()), *_pictures(panel), None)[: len(columns)]
         for place, (name, picture) in enumerate(zip(columns, pictures, strict=True)):
             left = _TEXT_INCHES + _CELL_INCHES * place
             box = (left / width, bottom / height, (_CELL_INCHES - 0.1) / width, (_CELL_INCHES - 0.1) / height)
@@ -125,6 +132,15 @@ def _draw_legend(figure: Figure, width: float, height: float, classes: Collectio
         figure.text(left / width, 1 - 0.66 / height, "\u25a0", va="top", fontsize=11, color=item.colour)
         figure.text((left + 0.15) / width, 1 - 0.67 / height, name, va="top", fontsize=8.5, color="#444444")
         left += 0.28 + 0.075 * len(name)
+
+
+def _photo(query: Query) -> NDArray[np.float64] | None:
+    """Return the newest picture of a query, colours 0..1, about as fine as it is shown; None without one."""
+    if not query.frames:
+        return None
+    rgb = query.frames[-1].image().rgb
+    step = max(1, round(rgb.shape[0] / (_CELL_INCHES * _DPI)))
+    return np.asarray(cv2.resize(rgb, (rgb.shape[1] // step, rgb.shape[0] // step), interpolation=cv2.INTER_AREA) / 255)
 
 
 def _pictures(panel: Panel) -> tuple[NDArray[np.float64] | None, ...]:

@@ -22,6 +22,7 @@ from sasgeo_bench.tasks.suites import (
     oblique,
     occlusion,
     real_age,
+    real_image,
     relief,
     season,
     season_image,
@@ -63,6 +64,7 @@ PICTURE_SUITES: Final[dict[str, Suite]] = {
         light.SUITE,
         season_image.SUITE,
         accumulated.SUITE,
+        real_image.SUITE,
     )
 }
 # With the controls, which every board draws in addition to its experiment.

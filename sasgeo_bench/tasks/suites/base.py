@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, LayerBits, observe
+from sasgeo_bench.regions.imagery import Imagery
 from sasgeo_bench.regions.region import MapGraph, Region
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
@@ -24,7 +25,7 @@ from sasgeo_bench.tasks.frames import Frame, FrameLabels
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.perturbations.detectors import DETECTORS
 from sasgeo_bench.tasks.private_seed import Seed
-from sasgeo_bench.tasks.query import PICTURED, PUBLISHED, Detector, PriorGroup, Role, Track
+from sasgeo_bench.tasks.query import PERCEIVED, PUBLISHED, Detector, PriorGroup, Role, Track
 from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.twin import Paste
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
-Need = Literal["older maps", "another region", "rates of ageing"]
+Need = Literal["older maps", "another region", "rates of ageing", "imagery", "degraded map"]
 DRAWN_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 
 
@@ -111,9 +112,9 @@ class Scene:
     """The map to search, the world to see, and everything else that a suite draws from.
 
     `view_reach_m` is the largest distance that a view shows from its centre. `others` are states at other dates, oldest
-    first; `elsewhere` is another place; `scenes` are the tags of the region; `twins` are the places that look like each
-    site; `ageing` has the rates of other places; `looks` are the families of palettes and materials of pictures, by
-    block, and `painted` the last windows that were painted.
+    first, or a degraded one; `elsewhere` is another place; `imagery` is that of the region; `scenes` are its tags;
+    `twins` are the places that look like each site; `ageing` has the rates of other places; `looks` are the families of
+    palettes and materials of pictures, by block, and `painted` the last windows that were painted.
     """
 
     map: State
@@ -123,6 +124,7 @@ class Scene:
     scenes: tuple[str, ...]
     others: tuple[State, ...] = ()
     elsewhere: State | None = None
+    imagery: Imagery | None = None
     twins: Mapping[int, tuple[tuple[float, float], ...]] = field(default_factory=dict)
     ageing: Ageing | None = None
     looks: Mapping[str, Family] = field(default_factory=dict)
@@ -170,7 +172,7 @@ class Choice:
     """A selection of a suite's variants; an empty field selects all.
 
     `kinds` are prefixes of kinds of stress; controls and falsifiers are always selected. Each variant is drawn once for
-    each of `detectors`, at the same site.
+    each of `detectors` that the suite has, at the same site; unless any are chosen, for its first one.
     """
 
     views_cells: tuple[int, ...] = ()
@@ -188,6 +190,9 @@ class Choice:
 
     def lack(self, suite: "Suite") -> str | None:
         """Return why the selection does not fit the suite, or None if it does."""
+        if self.detectors != EVERYTHING.detectors and not suite.drawn_by(self.detectors):
+            named = ", ".join(map(repr, self.detectors))
+            return f"suite {suite.card.name!r} is not drawn by {named}: it has {', '.join(suite.detectors)}"
         if replace(self, detectors=EVERYTHING.detectors) == EVERYTHING:
             return None
         stresses = [variant for variant in suite.variants if variant.role == "stress"]
@@ -338,9 +343,14 @@ class Suite(ABC):
         searched = {self.map_region(scene, variant) for variant in self.usable(scene)}
         return tuple(state for state in scene.others if state.region in searched)
 
-    def detectors(self, chosen: Sequence[Detector]) -> tuple[Detector, ...]:
-        """Return which of the chosen families of errors a suite draws: of perception, or of the look of pictures."""
-        return tuple(name for name in chosen if name not in PICTURED)
+    @property
+    def detectors(self) -> tuple[Detector, ...]:
+        """Return the families of errors that it can be drawn with: of perception, or of the look of pictures."""
+        return PERCEIVED
+
+    def drawn_by(self, chosen: Sequence[Detector]) -> tuple[Detector, ...]:
+        """Return which of the chosen families it is drawn with: its first one if none is chosen."""
+        return self.detectors[:1] if chosen == EVERYTHING.detectors else tuple(filter(self.detectors.count, chosen))
 
     def tracks(self, variant: Variant) -> tuple[Track, ...]:  # noqa: ARG002
         """Return the tracks of a variant."""
@@ -466,12 +476,13 @@ def no_larger(variants: Sequence[Variant], largest_m: float | None) -> tuple[Var
     """
     if largest_m is None:
         return tuple(variants)
-    fitting = {
-        item: max((cells for cells in VIEW_CELLS if cells * item.cell_size_m <= largest_m), default=min(VIEW_CELLS))
-        for item in variants
-    }
-    shrunk = (replace(item, view_cells=min(item.view_cells, cells)) for item, cells in fitting.items())
-    return tuple(dict.fromkeys(shrunk))
+    return tuple(dict.fromkeys(replace(item, view_cells=_fitting_cells(item, largest_m)) for item in variants))
+
+
+def _fitting_cells(variant: Variant, largest_m: float) -> int:
+    if variant.side_m <= largest_m:
+        return variant.view_cells
+    return max((cells for cells in VIEW_CELLS if cells * variant.cell_size_m <= largest_m), default=min(VIEW_CELLS))
 
 
 def pair(control: str, stress: str, falsifier: str) -> tuple[Variant, ...]:

@@ -21,7 +21,7 @@ from sasgeo_bench.sensing.rendering.scene import make_scene
 from sasgeo_bench.sensing.rendering.view import labels, render
 from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
-from sasgeo_bench.tasks.query import PICTURED, RENDERED, Detector
+from sasgeo_bench.tasks.query import PAINTED, Detector
 from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, Variant
 
 if TYPE_CHECKING:
@@ -101,9 +101,10 @@ class PictureSuite(Suite):
         """Return True."""
         return True
 
-    def detectors(self, chosen: Sequence[Detector]) -> tuple[Detector, ...]:
-        """Return the chosen families of looks; the ordinary one if only models of perception are chosen."""
-        return tuple(name for name in chosen if name in PICTURED) or (RENDERED,)
+    @property
+    def detectors(self) -> tuple[Detector, ...]:
+        """Return the families of looks."""
+        return PAINTED
 
     def draw(self, shot: Shot) -> Draft:
         """Take the pictures of a shot; their evidence is unknown until a segmenter has seen them."""

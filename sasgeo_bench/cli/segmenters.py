@@ -27,6 +27,9 @@ class SegmentOptions(Options):
     split: Annotated[
         str | None, typer.Option(help="which places a segmenter learns from for which; default: the split of the tasks")
     ] = None
+    recalibrated: Annotated[
+        bool, typer.Option("--recalibrated", help="shift probabilities to the map's shares of the classes: +shares")
+    ] = False
     most_trained: Annotated[int, typer.Option(min=1, help="pictures to learn from at most, evenly over places")] = 80
     segment_s: Annotated[float, typer.Option(help="seconds for one picture")] = Limits().match_s
     learn_s: Annotated[float, typer.Option(help="seconds to learn")] = Limits().learn_s
@@ -42,6 +45,7 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
     -------
     tuple of Path
         Folders of tasks that every matcher can answer, `out/tasks/<suite>+<segmenter>/<region>`; their truths beside.
+        Recalibrated ones are `out/tasks/<suite>+<segmenter>+shares/<region>`.
 
     Raises
     ------
@@ -58,6 +62,7 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
             tasks=options.tasks,
             split=find_split(options.split or str(read_task(options.tasks[0]).get("split"))),
             out=options.out,
+            is_recalibrated=options.recalibrated,
             most=options.most_trained,
             limits=Limits(match_s=options.segment_s, learn_s=options.learn_s),
             is_shut_in=not options.trusted,

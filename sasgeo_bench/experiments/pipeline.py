@@ -41,7 +41,7 @@ from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
 from sasgeo_bench.scoring.score import score_task
 from sasgeo_bench.tasks.build import carry_out
-from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.tasks.query import RECALIBRATED, base_of
 from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES
 from sasgeo_bench.tasks.task_plan import Request
 
@@ -201,7 +201,14 @@ def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path], *, tell: Tell, pro
         for segmenter in spec.segmenters:
             asked.setdefault(segmenter, []).extend(task for task in pictured if task.parent.name in spec.suites)
     for segmenter, own in asked.items():
-        wanted = SegmentTasks(spec=segmenter, tasks=own, split=plan.split, out=plan.out)
+        wanted = SegmentTasks(
+            spec=segmenter.removesuffix(RECALIBRATED),
+            tasks=own,
+            taught=pictured,
+            split=plan.split,
+            out=plan.out,
+            is_recalibrated=segmenter.endswith(RECALIBRATED),
+        )
         found += segment_tasks(wanted, tell=tell, progress=progress)
     return found
 

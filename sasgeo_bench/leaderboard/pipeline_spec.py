@@ -39,6 +39,7 @@ _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
 }
 
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}$")]  # of a folder, too
+SegmenterName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}(\+shares)?$")]  # +shares: recalibrated
 
 
 class PilotSpec(Document):
@@ -106,7 +107,7 @@ class TaskSpec(Document):
     `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where they are empty: fewer variants
     at more sites say more. Each variant is drawn with each of `detectors`. Suites of pictures name `segmenters` from
     `list-segmenters`: each makes evidence of all pictures, which is asked, learned from and compared as a suite of its
-    own.
+    own. With `+shares` after its name it is recalibrated by the shares of the classes on the map.
 
     >>> TaskSpec(suites=["aerial"], sites=2, segmenters=["pixel_forest"]).asked
     ['aerial+pixel_forest']
@@ -120,7 +121,7 @@ class TaskSpec(Document):
     kinds: list[Short] = []
     tracks: list[Track] = []
     detectors: Annotated[list[Detector], Field(min_length=1)] = ONE_DETECTOR
-    segmenters: list[Name] = []
+    segmenters: list[SegmenterName] = []
 
     @property
     def asked(self) -> list[str]:

@@ -10,11 +10,13 @@ from typing import Any, Final
 
 import numpy as np
 
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.files.folders import fresh_file, sha256_of
 from sasgeo_bench.matching.segmenter import check_text
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.running.recalibration import Said, recalibrated
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits
@@ -24,10 +26,11 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import FrameLabels, read_labels
-from sasgeo_bench.tasks.query import BY, RENDERED, Query, Truth, base_of
+from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of
 from sasgeo_bench.tasks.split import HALVES, Split
 
 FOLDER: Final = "segmenters"  # below the root: what segmenters learned
+_TRAIN: Final = "train"
 _MOST_SHOWN: Final = 3  # failures that are told
 # What `write_task` writes anew.
 _OF_FILES: Final = ("schema_version", "task_version", "counts", "prior_groups", "candidates_sha256", "frames", "files")
@@ -37,15 +40,19 @@ _OF_FILES: Final = ("schema_version", "task_version", "counts", "prior_groups", 
 class SegmentTasks:
     """Tasks of pictures, and the segmenter that is to see them.
 
-    `tasks` are folders of `out/tasks`. A segmenter that learns does so from tasks of the other half of a cross-fit, or
-    from the train places of a hold-out: at most `most` pictures of the ordinary look, evenly over places, suites and
-    sites. `limits.match_s` is for one picture.
+    `tasks` are folders of `out/tasks`. A segmenter that learns does so from `tasks` and `taught` of the other half of a
+    cross-fit, or of the train places of a hold-out, never of a sealed place: at most `most` pictures of the ordinary
+    look, evenly over places, suites and sites. `limits.match_s` is for one picture. With `is_recalibrated`, the
+    probabilities of all pictures of a task are shifted together, so that the mean of each class is its share of the map
+    within the priors.
     """
 
     spec: str
     tasks: Sequence[Path]
     split: Split
     out: Path
+    taught: Sequence[Path] = ()
+    is_recalibrated: bool = False
     most: int = 80
     limits: Limits = field(default_factory=Limits)
     is_shut_in: bool = True
@@ -62,6 +69,7 @@ class _Group:
 
     asked: tuple[Path, ...]
     train: tuple[Path, ...]
+    is_taught_from: bool  # the train places of a hold-out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -71,8 +79,14 @@ class _Sight:
     request: SegmentRequest
     loaded: LoadedSegmenter
     learned: str | None
+    is_recalibrated: bool
     tell: Tell
     progress: Progress | None
+
+    @property
+    def name(self) -> str:
+        """Return what the evidence is named by: the segmenter, and whether it is recalibrated."""
+        return segmenter_name(self.loaded.card.name, is_recalibrated=self.is_recalibrated)
 
     def record(self, about: Mapping[str, Any]) -> dict[str, str]:
         """Return what the evidence of a task follows from, for its `task.json`."""
@@ -82,6 +96,7 @@ class _Sight:
             "code_sha256": self.loaded.code,
             "learned_sha256": "" if self.learned is None else hashlib.sha256(self.learned.encode()).hexdigest(),
             "pictures_sha256": str(about["files"][task_files.QUERIES]["sha256"]),
+            **({"recalibrated_by": "shares of the map"} if self.is_recalibrated else {}),
         }
 
 
@@ -92,6 +107,15 @@ def name_of(suite: str, segmenter: str) -> str:
     'aerial+pixel_forest'
     """
     return f"{suite}{BY}{segmenter}"
+
+
+def segmenter_name(segmenter: str, *, is_recalibrated: bool) -> str:
+    """Return the name of a segmenter as suites are named by it.
+
+    >>> segmenter_name("pixel_forest", is_recalibrated=True)
+    'pixel_forest+shares'
+    """
+    return f"{segmenter}{RECALIBRATED}" if is_recalibrated else segmenter
 
 
 def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None = None) -> tuple[Path, ...]:
@@ -106,14 +130,24 @@ def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None
     StoreError
         If a task, its truths or labels are missing or damaged, or training fails.
     """
-    abouts = {folder: _pictured(folder) for folder in wanted.tasks}
+    abouts = {folder: _pictured(folder) for folder in dict.fromkeys((*wanted.tasks, *wanted.taught))}
     groups = _groups(wanted, abouts)
     request = wanted.request
     loaded = load_card(request)
     made: list[Path] = []
     for group in groups:
-        learned = _learned(wanted, loaded, group, tell) if loaded.learns else None
-        sight = _Sight(request=request, loaded=loaded, learned=learned, tell=tell, progress=progress)
+        if group.is_taught_from and loaded.learns:
+            left = named(sorted(task.name for task in group.asked), "train place")
+            tell(f"left out: {left}, which {loaded.card.name} learns from")
+            continue
+        sight = _Sight(
+            request=request,
+            loaded=loaded,
+            learned=_learned(wanted, loaded, group, tell) if loaded.learns else None,
+            is_recalibrated=wanted.is_recalibrated,
+            tell=tell,
+            progress=progress,
+        )
         made += [_segmented(sight, task, abouts[task]) for task in group.asked]
     return tuple(made)
 
@@ -133,28 +167,32 @@ def _pictured(folder: Path) -> dict[str, Any]:
 def _groups(wanted: SegmentTasks, abouts: Mapping[Path, Mapping[str, Any]]) -> list[_Group]:
     """Return the groups of tasks that learn from the same places."""
     split = wanted.split
-    group = {task: _group_of(str(about["region"]), split) for task, about in abouts.items()}
+    group = {task: _group_of(_region(about), split) for task, about in abouts.items()}
     strange = next((task for task, name in group.items() if name is None), None)
     if strange is not None:
         message = f"{strange}: split {split.spec.id!r} does not hold its region: name one that does with --split"
         raise ConfigError(message)
-    names: tuple[str, ...] = HALVES if split.half_of else ("held out", "train")
+    names: tuple[str, ...] = HALVES if split.half_of else ("held out", _TRAIN)
     found = []
     for name in names:
-        is_taught = name != "train"  # what is learned from in a hold-out is not asked after learning from itself
-        asked = tuple(task for task in group if group[task] == name)
-        train = tuple(task for task in group if group[task] != name) if is_taught else ()
-        found.append(_Group(asked=asked, train=train))
+        asked = tuple(task for task in dict.fromkeys(wanted.tasks) if group[task] == name)
+        others = [task for task in group if group[task] != name and not split.sealed_place(_region(abouts[task]))]
+        train = () if name == _TRAIN else tuple(others)
+        found.append(_Group(asked=asked, train=train, is_taught_from=name == _TRAIN))
     return [one for one in found if one.asked]
 
 
+def _region(about: Mapping[str, Any]) -> str:
+    return base_of(str(about["region"]))
+
+
 def _group_of(region: str, split: Split) -> str | None:
-    place = next(iter(split.places_in(base_of(region))), None)
+    place = next(iter(split.places_in(region)), None)
     if place is None:
         return None
     if split.half_of:
         return split.half_of.get(place)
-    return "train" if split.part_of(place) == "train" else "held out"
+    return _TRAIN if split.part_of(place) == "train" else "held out"
 
 
 def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell: Tell) -> str | None:
@@ -202,7 +240,7 @@ def _image(query: Query, number: int) -> AerialImage:
 
 def _segmented(sight: _Sight, task: Path, about: Mapping[str, Any]) -> Path:
     """Segment one task unless that is done already, and return the folder of the task that results."""
-    suite, record = name_of(str(about["suite"]), sight.loaded.card.name), sight.record(about)
+    suite, record = name_of(str(about["suite"]), sight.name), sight.record(about)
     root = root_of(task)
     folder: Path = root / "tasks" / suite / str(about["region"])
     if _is_made(folder, record):
@@ -236,21 +274,32 @@ def _is_made(folder: Path, record: Mapping[str, str]) -> bool:
 def _pairs(sight: _Sight, task: Path, truth: Path, suite: str, faults: list[str]) -> list[tuple[Query, Truth]]:
     """Return queries with evidence and their truths by id; `faults` gets a line for each picture that failed."""
     truths = {item.query_id: item for item in task_files.read_truths(truth)}
-    rows, found, label = read_labels(truth), [], f"{suite} on {task.name}"
+    label = f"{suite} on {task.name}"
     if sight.progress is not None:
         sight.progress.begin(label, len(truths))
     with SegmenterRun(sight.request, sight.loaded, learned=sight.learned) as run:
-        for query in task_files.read_queries(task):
-            seen: list[Segmentation | None] = []
-            for number in range(len(query.frames)):
-                of_frame = _next_labels(rows, query.query_id, number)
-                reply = run.segment(of_frame.labelled(_image(query, number), task.name))
-                faults += [] if reply.segmentation else [f"{query.query_id}: {reply.message} ({reply.status})"]
-                seen.append(reply.segmentation)
-            found.append(_with_evidence(query, truths[query.query_id], suite, sight.loaded.card.name, seen))
+        said = _said(run, task, truth, faults)
+        if sight.is_recalibrated:
+            said = recalibrated(said, read_region(root_of(task) / "regions" / task.name))
+        found = []
+        for query, seen in said:
+            found.append(_with_evidence(query, truths[query.query_id], suite, sight.name, seen))
             if sight.progress is not None:
                 sight.progress.advance(label, 1)
     return sorted(found, key=lambda pair: pair[0].query_id)
+
+
+def _said(run: SegmenterRun, task: Path, truth: Path, faults: list[str]) -> Iterator[Said]:
+    """Yield queries with what the segmenter says of their pictures; `faults` gets a line for each that failed."""
+    rows = read_labels(truth)
+    for query in task_files.read_queries(task):
+        seen: list[Segmentation | None] = []
+        for number in range(len(query.frames)):
+            of_frame = _next_labels(rows, query.query_id, number)
+            reply = run.segment(of_frame.labelled(_image(query, number), task.name))
+            faults += [] if reply.segmentation else [f"{query.query_id}: {reply.message} ({reply.status})"]
+            seen.append(reply.segmentation)
+        yield query, seen
 
 
 def _next_labels(rows: Iterator[tuple[str, int, FrameLabels]], query_id: str, number: int) -> FrameLabels:

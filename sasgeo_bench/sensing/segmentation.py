@@ -138,16 +138,22 @@ class Segmentation:
         >>> seen.with_shares({"building": 0.1}).probability_bytes.tolist()
         [[[16, 16, 16, 54]]]
         """
+        return self.recoded(tables_of(self.counts(), shares))
+
+    def counts(self) -> dict[str, NDArray[np.int64]]:
+        """Return how many pixels have each byte, shape (255,), by class; those of which nothing is said are left out.
+
+        Counts of several pictures add up: with the sum `tables_of` recalibrates them together, as one flight.
+        """
+        planes = zip(self.classes, self.probability_bytes, strict=True)
+        return {name: np.bincount(plane.ravel(), minlength=SILENT + 1)[:SILENT] for name, plane in planes}
+
+    def recoded(self, tables: Mapping[str, NDArray[np.uint8]]) -> Self:
+        """Return the segmentation with every byte of some classes replaced, by tables of shape (256,)."""
         planes = self.probability_bytes.copy()
-        for name, share in shares.items():
-            if name not in self.classes:
-                message = f"there is no class {name!r}, the segmentation has {', '.join(self.classes)}"
-                raise ImageError(message)
-            if not 0 <= share <= 1:
-                message = f"the share of {name} must lie in 0..1, got {share!r}"
-                raise ImageError(message)
-            plane = planes[self.classes.index(name)]
-            plane[:] = _shifted_bytes(np.bincount(plane.ravel(), minlength=256)[:SILENT], share)[plane]
+        for at, name in enumerate(self.classes):
+            if name in tables:
+                planes[at] = tables[name][planes[at]]
         return type(self)(classes=self.classes, probability_bytes=planes)
 
     def to_bytes(self) -> bytes:
@@ -170,6 +176,26 @@ class Segmentation:
         planes = unpack_body(rest, len(classes) * found[0] * found[1], "a segmentation")
         cells = np.frombuffer(planes, dtype=np.uint8).reshape(len(classes), *found)
         return cls(classes=classes, probability_bytes=cells)
+
+
+def tables_of(counts: Mapping[str, NDArray[np.int64]], shares: Mapping[str, float]) -> dict[str, NDArray[np.uint8]]:
+    """Return the new byte of every byte, shape (256,), by class, so that mean probabilities become the shares.
+
+    `counts` are as of `Segmentation.counts`. Raise `ImageError` as `Segmentation.with_shares` does.
+
+    >>> tables_of({"water": np.bincount([127] * 4, minlength=255)}, {"water": 0.25})["water"][[126, 127, 255]].tolist()
+    [63, 64, 255]
+    """
+    tables = {}
+    for name, share in shares.items():
+        if name not in counts:
+            message = f"there is no class {name!r}, the segmentation has {', '.join(counts)}"
+            raise ImageError(message)
+        if not 0 <= share <= 1:
+            message = f"the share of {name} must lie in 0..1, got {share!r}"
+            raise ImageError(message)
+        tables[name] = _shifted_bytes(counts[name], share)
+    return tables
 
 
 def _shifted_bytes(counts: NDArray[np.int64], share: float) -> NDArray[np.uint8]:

@@ -32,6 +32,7 @@ REAL: Final[Detector] = "real"
 PERCEIVED: Final[tuple[Detector, ...]] = (PUBLISHED, "measured")  # models of perception, the first if none is chosen
 PAINTED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")  # looks of rendered pictures, the first if none is chosen
 BY: Final = "+"  # between a suite of pictures and the segmenter that made its evidence
+RECALIBRATED: Final = "+shares"  # after the segmenter: by the map's shares of the classes
 # Kinds of queries whose right score is known beforehand; the scorer knows them by these names.
 CONTROLS: Final = "controls"  # their suite
 NOISE_FREE: Final = "noise-free"

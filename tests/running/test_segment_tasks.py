@@ -12,9 +12,12 @@ import pytest
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
+from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.recalibration import recalibrated, shares_within
 from sasgeo_bench.running.segment_tasks import FOLDER, SegmentTasks, segment_tasks
 from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.sensing.tiny_images import tiny_images
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks, put_task
@@ -147,3 +150,43 @@ def test_a_matcher_of_evidence_is_not_asked_about_pictures_that_nobody_has_seen(
         plan_run(request)
     plan = plan_run(replace(request, tasks=of_oracle(pictured[:1])))
     assert sum(len(part.left) for part in plan.parts) == 4
+
+
+def test_recalibrated_evidence_has_the_shares_of_the_map_within_the_priors(pictured):
+    (made,) = segment_tasks(wanted(pictured[:1], ORACLE_SEGMENTER, is_recalibrated=True), tell=silent)
+    assert made.parent.name == "aerial+oracle_segmenter+shares"
+    assert task_files.read_task(made)["segmenter"]["recalibrated_by"] == "shares of the map"
+    plain = of_oracle(pictured[:1])[0]
+    ids = [{query.query_id for query in task_files.read_queries(folder)} for folder in (made, plain)]
+    assert not ids[0] & ids[1]
+
+
+def test_pictures_are_recalibrated_together_and_one_that_failed_is_left_out(pictured):
+    region = read_region(Path("out/regions") / pictured[0].name)
+    queries = list(task_files.read_queries(pictured[0]))[:2]
+    planes = np.array([[[200, 100]]], dtype=np.uint8)
+    seen = [Segmentation(classes=("building",), probability_bytes=part) for part in (planes, planes // 2)]
+    shares = shares_within([query.prior for query in queries], region)
+    assert 0 < shares["building"] < 0.5
+    found = list(recalibrated(zip(queries, ([seen[0]], [seen[1]]), strict=True), region))
+    means = [one.shares()["building"] for _, (one,) in found]
+    assert means[0] > means[1]
+    assert np.mean(means) == pytest.approx(shares["building"], abs=0.01)
+    (_, (one, two)) = next(iter(recalibrated([(with_two(queries[0]), [None, seen[0]])], region)))
+    assert one is None
+    assert two.shares()["building"] == pytest.approx(shares["building"], abs=0.01)
+
+
+def with_two(query):
+    return replace(query, frames=query.frames * 2)
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_train_places_of_a_hold_out_are_learned_from_and_not_asked(pictured):
+    split = find_split("holdout")
+    parts = {folder: split.part_of(split.places_in(folder.name)[0]) for folder in pictured}
+    assert set(parts.values()) == {"train", "test"}
+    lines = []
+    made = segment_tasks(wanted(pictured, "segmenters:Learns", split=split), tell=lines.append)
+    assert [folder.name for folder in made] == [folder.name for folder in pictured if parts[folder] == "test"]
+    assert any(line.startswith("left out: 1 train place") for line in lines)

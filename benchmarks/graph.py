@@ -25,7 +25,7 @@ from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.reading import proposals
 from sasgeo_bench.tasks.perturbations.perception import Perception
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 
 SIDE_M = 256

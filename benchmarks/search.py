@@ -55,7 +55,7 @@ from sasgeo_bench.search.find import exhaustive, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan
 from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 
 SIDES_CELLS = (512, 1024, 2048, 4096)  # 1 to 67 km2
 VIEWS_CELLS = (96, 192, 256, 384)

@@ -22,7 +22,7 @@ from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import top_of
 from sasgeo_bench.search.find import rank
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.mining import RINGS, Windows, describe, min_distance_m
 
 VARIED: Final = 0.1  # share of the places that are most varied, among which one is chosen

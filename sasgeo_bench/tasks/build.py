@@ -35,8 +35,9 @@ from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
 from sasgeo_bench.tasks.split import Block, Split
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import find_suite
-from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, State, Suite, no_larger
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, Suite, no_larger
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.suites.synthetic_age import ageing_of
 from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate

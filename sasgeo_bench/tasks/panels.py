@@ -16,7 +16,8 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, Query, Truth
 from sasgeo_bench.tasks.sheet import TWIN, Panel
-from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, State, changed_share
+from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.suites.base import changed_share
 from sasgeo_bench.tasks.suites.mining import describe, mine
 
 SOME_IDS: Final = 3  # that the refusal of an unknown id names

@@ -14,8 +14,8 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, YAW_SIGMA_DEG, PriorGroup, Query, Track, Truth
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
 from sasgeo_bench.tasks.suites.base import (
-    DRAWN_CLASSES,
     EVERYTHING,
     Choice,
     Draft,
@@ -23,7 +23,6 @@ from sasgeo_bench.tasks.suites.base import (
     Seeds,
     Shot,
     Site,
-    State,
     Suite,
     Variant,
     changed_share,

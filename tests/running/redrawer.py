@@ -7,8 +7,9 @@ from dataclasses import replace
 from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import find_suite
-from sasgeo_bench.tasks.suites.base import Scene, Seeds, State
+from sasgeo_bench.tasks.suites.base import Scene, Seeds
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 
 GUESSES = 1000

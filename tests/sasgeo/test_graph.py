@@ -17,7 +17,7 @@ from sasgeo_bench.sasgeo.graph_rules import GraphRules, by_area, by_arms, by_deg
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, warped
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.local_warp import bent
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 from sasgeo_bench.tasks.vectors import as_features, vector_table

@@ -16,7 +16,7 @@ from sasgeo_bench.sasgeo.mapped import JUNCTIONS, SECTORS, JunctionPairs, Mapped
 from sasgeo_bench.sasgeo.nodes import nothing
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.reading import proposals
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 
 EXACT = VectorNoise(missed_share=0.0, gap_share=0.0, shift_m=0.0)

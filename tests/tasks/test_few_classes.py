@@ -15,8 +15,9 @@ from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.sasgeo.variants import Sasgeo
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, make_split, read_split_file
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
-from sasgeo_bench.tasks.suites.base import Scene, State, no_larger
+from sasgeo_bench.tasks.suites.base import Scene, no_larger
 from sasgeo_bench.tasks.task_files import read_queries, read_task, read_truths
 from sasgeo_bench.tasks.task_plan import Request, wrong_place
 from tests.regions.imagery_place import make_hamlet

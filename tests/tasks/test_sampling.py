@@ -22,8 +22,9 @@ from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.tasks.query import RADII_M, SCALE_SIGMAS, YAW_SIGMA_DEG, PriorGroup
 from sasgeo_bench.tasks.sampling import CANDIDATES, LEAST_CANDIDATES, Drawer, Job, away, make_prior
 from sasgeo_bench.tasks.split import SplitFile, make_split
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites import alias, clean
-from sasgeo_bench.tasks.suites.base import Scene, Seeds, State, Variant
+from sasgeo_bench.tasks.suites.base import Scene, Seeds, Variant
 from sasgeo_bench.tasks.suites.mining import STRIDE_M, candidates, min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.twin import Paste, paste

@@ -49,7 +49,8 @@ from sasgeo_bench.tasks.build import check_task, has_truths, put_task
 from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup, Query, Truth
 from sasgeo_bench.tasks.sampling import make_prior
-from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, Seeds, State, changed_share
+from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.suites.base import Seeds, changed_share
 from sasgeo_bench.tasks.suites.mining import Windows as MinedWindows
 from sasgeo_bench.tasks.suites.mining import describe, mine
 from sasgeo_bench.tasks.task_plan import check_roots

@@ -15,7 +15,8 @@ from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, hide
 from sasgeo_bench.tasks.perturbations.occlusion import CentralCrop
-from sasgeo_bench.tasks.suites.base import Seeds, State
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import Seeds
 
 Around = Literal["anchor", "truth"]
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.perturbations.base import share_changed
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import (
     MAIN_VIEW_CELLS,
     Draft,
     Scene,
     Shot,
     Site,
-    State,
     Suite,
     SuiteCard,
     Variant,

@@ -1,24 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base of all suites: the scene they draw from, sites, variants, and stable seeds."""
 
-import datetime as dt
 import hashlib
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, LayerBits, observe
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.imagery import Imagery
-from sasgeo_bench.regions.region import MapGraph, Region
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
@@ -27,6 +21,7 @@ from sasgeo_bench.tasks.perturbations.detectors import DETECTORS
 from sasgeo_bench.tasks.private_seed import Seed
 from sasgeo_bench.tasks.query import PERCEIVED, PUBLISHED, Detector, PriorGroup, Role, Track
 from sasgeo_bench.tasks.split import Block
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.twin import Paste
 
 if TYPE_CHECKING:
@@ -35,76 +30,6 @@ if TYPE_CHECKING:
 MAIN_VIEW_CELLS: Final = 192
 VIEW_CELLS: Final = (96, 192, 384)
 Need = Literal["older maps", "another region", "rates of ageing", "imagery", "degraded map"]
-DRAWN_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
-
-
-@dataclass(frozen=True, kw_only=True)
-class State:
-    """One dated state of a place: its layers in bits, its features and its graph, on one lattice."""
-
-    region: str
-    date: dt.date
-    grid: Grid
-    classes: tuple[str, ...]
-    bits: LayerBits
-    features: "gpd.GeoDataFrame"
-    graph: MapGraph
-    coverage: shapely.Geometry
-
-    @classmethod
-    def of(cls, region: Region, name: str | None = None) -> "State":
-        """Return the state of a region; `name` is its folder if that differs from its id."""
-        return cls(
-            region=name or region.manifest.id,
-            date=region.manifest.extract.date,
-            grid=region.grid,
-            classes=region.classes,
-            bits=LayerBits.of(region.layers),
-            features=region.features,
-            graph=region.graph,
-            coverage=region.coverage,
-        )
-
-    def view(self, pose: Pose, *, size_cells: int, cell_size_m: float) -> Evidence:
-        """Return what a perfect detector would see from a pose."""
-        cells = observe(self.bits, self.grid, pose, size_cells=size_cells, cell_size_m=cell_size_m)
-        return Evidence(classes=self.classes, cells=cells, cell_size_m=cell_size_m)
-
-    @cached_property
-    def known(self) -> NDArray[np.bool_]:
-        """Return the mapped cells, shape (rows, cols)."""
-        return np.asarray(self.bits.bits >> np.uint32(31) == 0)
-
-    def is_mapped(self, en_m: NDArray[np.float64], half_m: float) -> bool:
-        """Return whether a square around a place is wholly mapped."""
-        row, col = self.grid.to_cells(np.asarray(en_m)[None, :])[0].tolist()
-        half = math.ceil(half_m / self.grid.cell_size_m)
-        inside = half <= row < self.grid.rows - half and half <= col < self.grid.cols - half
-        return inside and bool(self.known[row - half : row + half + 1, col - half : col + half + 1].all())
-
-    def of_classes(self, classes: Sequence[str]) -> "State":
-        """Return the state with some of its classes alone, in their order: a view of it shows nothing of the others.
-
-        Raise `ValueError` if it lacks one.
-        """
-        if tuple(classes) == self.classes:
-            return self
-        bits = np.where(self.known, np.uint32(0), self.bits.bits & np.uint32(1 << 31))
-        for at, name in enumerate(classes):
-            bits |= (self.bits.bits >> np.uint32(self.classes.index(name)) & np.uint32(1)) << np.uint32(at)
-        bits[~self.known] = np.uint32(1 << 31)
-        return replace(self, classes=tuple(classes), bits=LayerBits(bits=bits, count=len(classes)))
-
-    def has(self, class_name: str) -> NDArray[np.bool_]:
-        """Return where one class is present, shape (rows, cols)."""
-        bit, unknown = 1 << self.classes.index(class_name), 1 << 31
-        return np.asarray(self.bits.bits & np.uint32(bit | unknown) == np.uint32(bit))
-
-    @cached_property
-    def drawn(self) -> NDArray[np.bool_]:
-        """Return where any of `DRAWN_CLASSES` is present."""
-        mask = np.uint32(sum(1 << self.classes.index(name) for name in DRAWN_CLASSES if name in self.classes))
-        return np.asarray((self.bits.bits & mask).astype(bool) & self.known)
 
 
 @dataclass(frozen=True, kw_only=True)

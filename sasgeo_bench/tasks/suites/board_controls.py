@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence, LayerBits
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup, Track
-from sasgeo_bench.tasks.suites.base import Draft, Shot, State, SuiteCard, Variant, changed_share
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import Draft, Shot, SuiteCard, Variant, changed_share
 from sasgeo_bench.tasks.suites.twins import TwinSuite
 
 VIEW_CELLS: Final = 96

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import footprint
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.vectors import VECTOR_CLASSES, vector_table
 
 if TYPE_CHECKING:

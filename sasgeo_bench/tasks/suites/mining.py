@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -6,7 +6,8 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, State, Suite, SuiteCard, Variant, controls, ladder
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 AGES_YEARS: Final = (2.0, 5.0, 10.0)
 DAYS_PER_YEAR: Final = 365.25

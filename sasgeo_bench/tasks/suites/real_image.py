@@ -15,7 +15,8 @@ from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
 from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import REAL, Detector, Role
-from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, State, Suite, SuiteCard, Variant
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant
 
 CELL_M: Final = 0.5
 SIDES_M: Final = (128.0, 96.0, 64.0)

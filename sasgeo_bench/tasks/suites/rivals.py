@@ -21,7 +21,7 @@ from sasgeo_bench.search.field import FULL, Field, Template, squares
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Mode, place_m
 from sasgeo_bench.tasks.query import UNRIVALLED, Role
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 
 # Of `Truth.measured`: how many rivals a place has, how many of them lie in the disc of the prior and in the list, and
 # whether the place itself is in the list.

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.query import CEILING, RADII_M, PriorGroup
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, State, Suite
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.vectors import site_vectors
 from sasgeo_bench.tasks.twin import Change, Paste

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import footprint
 from sasgeo_bench.tasks.query import PUBLISHED
-from sasgeo_bench.tasks.suites.base import Shot, State
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import Shot
 from sasgeo_bench.tasks.suites.measured_vectors import MeasuredVectorNoise, perceive_coarsely
 from sasgeo_bench.tasks.vectors import VECTOR_CLASSES, vector_table
 

@@ -48,7 +48,8 @@ from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.build import check_task
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup
-from sasgeo_bench.tasks.suites.base import Seeds, State
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import Seeds
 
 FEW = 4
 DRAWS = 3000

@@ -18,8 +18,9 @@ from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
 from sasgeo_bench.tasks.split import blocks_of
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, State, Suite, Variant
+from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, Variant
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
 

@@ -11,8 +11,8 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.tasks.perturbations.objects import thin_classes
 from sasgeo_bench.tasks.perturbations.perception import Perception
+from sasgeo_bench.tasks.state import DRAWN_CLASSES
 from sasgeo_bench.tasks.suites.all_suites import SUITES
-from sasgeo_bench.tasks.suites.base import DRAWN_CLASSES
 from sasgeo_bench.tasks.suites.local_warp import bent
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites

@@ -16,7 +16,7 @@ from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import read_labels
 from sasgeo_bench.tasks.split import SplitFile, make_split
-from sasgeo_bench.tasks.suites.base import State
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.real_image import DEGRADED, SUITE
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
 from sasgeo_bench.tasks.task_plan import Request

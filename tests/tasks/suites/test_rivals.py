@@ -15,8 +15,8 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.sampling import make_prior
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks.suites.base import State
 from sasgeo_bench.tasks.suites.rivals import RivalCheck, field_of, kind_of, plain_modes
 from sasgeo_bench.tasks.suites.twins import RIVAL_M, TWIN_GROUP
 

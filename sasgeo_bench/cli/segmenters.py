@@ -34,6 +34,7 @@ class SegmentOptions(Options):
     segment_s: Annotated[float, typer.Option(help="seconds for one picture")] = Limits().match_s
     learn_s: Annotated[float, typer.Option(help="seconds to learn")] = Limits().learn_s
     trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the segmenter in")] = False
+    jobs: Annotated[int, typer.Option(min=1, help="tasks at once")] = 1
     out: Out = Path("out")
 
 
@@ -66,6 +67,7 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
             most=options.most_trained,
             limits=Limits(match_s=options.segment_s, learn_s=options.learn_s),
             is_shut_in=not options.trusted,
+            jobs=options.jobs,
         ),
         tell=options.tell,
         progress=options.progress,

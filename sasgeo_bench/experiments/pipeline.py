@@ -208,6 +208,7 @@ def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path], *, tell: Tell, pro
             split=plan.split,
             out=plan.out,
             is_recalibrated=segmenter.endswith(RECALIBRATED),
+            jobs=plan.jobs,
         )
         found += segment_tasks(wanted, tell=tell, progress=progress)
     return found

@@ -22,7 +22,7 @@ from sasgeo_bench.config import (
 )
 from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric, attainable, best_value, unreachable
-from sasgeo_bench.tasks.query import BY, CONTROLS, PERCEIVED, PUBLISHED, RENDERED, Detector, PriorGroup, Track
+from sasgeo_bench.tasks.query import BY, CONTROLS, PUBLISHED, RENDERED, Detector, PriorGroup, Track
 
 PAPER_SUITE: Final = "paper-poc"
 Crop = Literal["unknown", "absent", "smaller"]
@@ -132,8 +132,7 @@ class TaskSpec(Document):
     @property
     def looks(self) -> list[Detector]:
         """Return the families of errors that are drawn: of perception, or of the look of pictures."""
-        pictured = [name for name in self.detectors if name not in PERCEIVED]
-        return (pictured or [RENDERED]) if self.segmenters else self.detectors
+        return [RENDERED] if self.segmenters and self.detectors == ONE_DETECTOR else self.detectors
 
 
 class PaperSpec(Document):

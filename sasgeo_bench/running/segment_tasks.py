@@ -5,6 +5,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,9 +14,9 @@ import numpy as np
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.files.folders import fresh_file, sha256_of
 from sasgeo_bench.matching.segmenter import check_text
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.recalibration import Said, recalibrated
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of, truth_of
@@ -44,7 +45,7 @@ class SegmentTasks:
     cross-fit, or of the train places of a hold-out, never of a sealed place: at most `most` pictures of the ordinary
     look, evenly over places, suites and sites. `limits.match_s` is for one picture. With `is_recalibrated`, the
     probabilities of all pictures of a task are shifted together, so that the mean of each class is its share of the map
-    within the priors.
+    within the priors. `jobs` counts the tasks at once.
     """
 
     spec: str
@@ -56,6 +57,7 @@ class SegmentTasks:
     most: int = 80
     limits: Limits = field(default_factory=Limits)
     is_shut_in: bool = True
+    jobs: int = 1
 
     @property
     def request(self) -> SegmentRequest:
@@ -67,9 +69,14 @@ class SegmentTasks:
 class _Group:
     """Tasks of places that one training serves, and the tasks that it learns from."""
 
+    name: str
     asked: tuple[Path, ...]
     train: tuple[Path, ...]
-    is_taught_from: bool  # the train places of a hold-out
+
+    @property
+    def is_taught_from(self) -> bool:
+        """Return whether these are the train places of a hold-out."""
+        return self.name == _TRAIN
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,8 +87,6 @@ class _Sight:
     loaded: LoadedSegmenter
     learned: str | None
     is_recalibrated: bool
-    tell: Tell
-    progress: Progress | None
 
     @property
     def name(self) -> str:
@@ -145,10 +150,16 @@ def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None
             loaded=loaded,
             learned=_learned(wanted, loaded, group, tell) if loaded.learns else None,
             is_recalibrated=wanted.is_recalibrated,
-            tell=tell,
-            progress=progress,
         )
-        made += [_segmented(sight, task, abouts[task]) for task in group.asked]
+        label = f"{sight.name}, {group.name}"
+        if progress is not None:
+            progress.begin(label, len(group.asked))
+        for folder, lines in spread(partial(_segmented, sight), group.asked, jobs=wanted.jobs):
+            made.append(folder)
+            for line in lines:
+                tell(line)
+            if progress is not None:
+                progress.advance(label, 1)
     return tuple(made)
 
 
@@ -178,7 +189,7 @@ def _groups(wanted: SegmentTasks, abouts: Mapping[Path, Mapping[str, Any]]) -> l
         asked = tuple(task for task in dict.fromkeys(wanted.tasks) if group[task] == name)
         others = [task for task in group if group[task] != name and not split.sealed_place(_region(abouts[task]))]
         train = () if name == _TRAIN else tuple(others)
-        found.append(_Group(asked=asked, train=train, is_taught_from=name == _TRAIN))
+        found.append(_Group(name=name, asked=asked, train=train))
     return [one for one in found if one.asked]
 
 
@@ -224,40 +235,43 @@ def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell:
 
 
 def _lessons_of(chosen: TrainingSet) -> Iterator[LabelledImage]:
-    """Yield the newest picture of each chosen query with its labels."""
+    """Yield the newest picture of each chosen query with its labels: of all classes that any of the maps knows of."""
+    classes = tuple(dict.fromkeys(name for item in chosen.taken for name in read_manifest(item.region).classes))
     for item in chosen.taken:
         ids = frozenset(item.ids)
         queries = {query.query_id: query for query in task_files.read_queries(item.task) if query.query_id in ids}
         for query_id, number, found in read_labels(item.truth):
             query = queries.get(query_id)
             if query is not None and number == len(query.frames) - 1:
-                yield found.labelled(_image(query, number), item.region.name)
+                yield found.labelled(_image(query, number), item.region.name, classes)
 
 
 def _image(query: Query, number: int) -> AerialImage:
     return query.frames[number].image(observed_on=query.observed_on, season=query.season)
 
 
-def _segmented(sight: _Sight, task: Path, about: Mapping[str, Any]) -> Path:
-    """Segment one task unless that is done already, and return the folder of the task that results."""
+def _segmented(sight: _Sight, task: Path) -> tuple[Path, list[str]]:
+    """Segment one task unless that is done already; return the folder of the task that results, and what to tell."""
+    about = task_files.read_task(task)
     suite, record = name_of(str(about["suite"]), sight.name), sight.record(about)
     root = root_of(task)
     folder: Path = root / "tasks" / suite / str(about["region"])
     if _is_made(folder, record):
-        return folder
+        return folder, []
     truth = truth_of(task, about)
     task_files.check_queries(task)
     task_files.check_truths(task, truth)
     faults: list[str] = []
+    lines: list[str] = []
     pairs = _pairs(sight, task, truth, suite, faults)
     own = {name: value for name, value in about.items() if name not in _OF_FILES}
     hidden = {name: value for name, value in task_files.read_hidden(truth).items() if name != "queries_sha256"}
-    made = put_task(pairs, own | {"suite": suite, "segmenter": record}, hidden, out=root, tell=sight.tell)
-    sight.tell(f"{suite} on {about['region']}: {counted(made.queries, 'query', 'queries')} in {made.folder}")
+    made = put_task(pairs, own | {"suite": suite, "segmenter": record}, hidden, out=root, tell=lines.append)
+    lines.append(f"{suite} on {about['region']}: {counted(made.queries, 'query', 'queries')} in {made.folder}")
     if faults:
         failed = f"{sight.loaded.card.name} failed at {counted(len(faults), 'picture')}"
-        sight.tell(f"  {failed}, whose evidence is unknown: {'; '.join(faults[:_MOST_SHOWN])}")
-    return made.folder
+        lines.append(f"  {failed}, whose evidence is unknown: {'; '.join(faults[:_MOST_SHOWN])}")
+    return made.folder, lines
 
 
 def _is_made(folder: Path, record: Mapping[str, str]) -> bool:
@@ -274,18 +288,11 @@ def _is_made(folder: Path, record: Mapping[str, str]) -> bool:
 def _pairs(sight: _Sight, task: Path, truth: Path, suite: str, faults: list[str]) -> list[tuple[Query, Truth]]:
     """Return queries with evidence and their truths by id; `faults` gets a line for each picture that failed."""
     truths = {item.query_id: item for item in task_files.read_truths(truth)}
-    label = f"{suite} on {task.name}"
-    if sight.progress is not None:
-        sight.progress.begin(label, len(truths))
     with SegmenterRun(sight.request, sight.loaded, learned=sight.learned) as run:
         said = _said(run, task, truth, faults)
         if sight.is_recalibrated:
             said = recalibrated(said, read_region(root_of(task) / "regions" / task.name))
-        found = []
-        for query, seen in said:
-            found.append(_with_evidence(query, truths[query.query_id], suite, sight.name, seen))
-            if sight.progress is not None:
-                sight.progress.advance(label, 1)
+        found = [_with_evidence(query, truths[query.query_id], suite, sight.name, seen) for query, seen in said]
     return sorted(found, key=lambda pair: pair[0].query_id)
 
 
@@ -314,10 +321,15 @@ def _next_labels(rows: Iterator[tuple[str, int, FrameLabels]], query_id: str, nu
 def _with_evidence(
     query: Query, truth: Truth, suite: str, segmenter: str, seen: Sequence[Segmentation | None]
 ) -> tuple[Query, Truth]:
-    """Return a query with the evidence of its pictures, under an id of its own, and its truth."""
-    empty = query.evidence
-    found = evidence_of(query.frames, seen, size_cells=empty.shape[0], cell_size_m=empty.cell_size_m)
-    evidence = _for_classes(found, empty)
+    """Return a query with the evidence of its pictures, under an id of its own, and its truth.
+
+    A query without pictures keeps the evidence of its model of perception.
+    """
+    evidence = query.evidence
+    if query.frames:
+        size_cells, cell_size_m = evidence.shape[0], evidence.cell_size_m
+        found = evidence_of(query.frames, seen, size_cells=size_cells, cell_size_m=cell_size_m)
+        evidence = _for_classes(found, evidence)
     query_id = hashlib.sha256(f"{query.query_id}/{segmenter}".encode()).hexdigest()[: len(query.query_id)]
     return (
         replace(query, query_id=query_id, suite=suite, evidence=evidence),

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ImageError
 from sasgeo_bench.files.parquet import open_table
-from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, pack, unpack
+from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, UNKNOWN, pack, unpack
 
 # Every process of a matcher reads queries, and few look at pictures: what these need is imported where it is used.
 if TYPE_CHECKING:
@@ -131,11 +131,19 @@ class FrameLabels:
         most = -(-int(np.prod(shape)) // CELLS_PER_BYTE)
         return unpack(zlib.decompressobj().decompress(self.packed, most), shape)
 
-    def labelled(self, image: "AerialImage", place: str) -> "LabelledImage":
-        """Return an image of a place with these labels; raise `ImageError` if they do not fit."""
+    def labelled(self, image: "AerialImage", place: str, classes: tuple[str, ...] | None = None) -> "LabelledImage":
+        """Return an image of a place with these labels; of `classes`, of which those not known here are unknown.
+
+        Raise `ImageError` if they do not fit.
+        """
         from sasgeo_bench.sensing.image import LabelledImage  # noqa: PLC0415 - see above
 
-        return LabelledImage(image=image, classes=self.classes, labels=self.labels, place=place)
+        names, labels = classes or self.classes, self.labels
+        planes = np.full((len(names), self.rows, self.cols), UNKNOWN, dtype=np.uint8)
+        for at, name in enumerate(names):
+            if name in self.classes:
+                planes[at] = labels[self.classes.index(name)]
+        return LabelledImage(image=image, classes=names, labels=planes, place=place)
 
 
 def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES) -> bytes:

@@ -21,7 +21,7 @@ from sasgeo_bench.sensing.rendering.scene import make_scene
 from sasgeo_bench.sensing.rendering.view import labels, render
 from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
-from sasgeo_bench.tasks.query import PAINTED, Detector
+from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, Detector
 from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, Variant
 
 if TYPE_CHECKING:
@@ -103,11 +103,16 @@ class PictureSuite(Suite):
 
     @property
     def detectors(self) -> tuple[Detector, ...]:
-        """Return the families of looks."""
-        return PAINTED
+        """Return the families of looks, and models of perception of the same views, which hold no pictures."""
+        return (*PAINTED, *PERCEIVED)
 
     def draw(self, shot: Shot) -> Draft:
-        """Take the pictures of a shot; their evidence is unknown until a segmenter has seen them."""
+        """Take the pictures of a shot; their evidence is unknown until a segmenter has seen them.
+
+        A model of perception takes none: it is what the same view would be worth without camera and segmenter.
+        """
+        if shot.variant.detector in PERCEIVED:
+            return Draft(evidence=shot.perceived())
         variant, flight = shot.variant, self.flight(shot.variant)
         conditions = flight.conditions(draw_conditions(shot.seeds.rng("conditions"), season="summer"))
         painted = _painted(shot, flight)

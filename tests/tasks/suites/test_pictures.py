@@ -16,7 +16,7 @@ from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES, SUITES, find_su
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Seeds, Shot, Site, Variant
 from sasgeo_bench.tasks.suites.pictures import STOPS_M, Flight, PictureSuite, stands_of
 
-SMALL = Variant(role="control", kind="control", view_cells=48)
+SMALL = Variant(role="control", kind="control", view_cells=48, detector="rendered")
 
 
 def suite_of(**flight):
@@ -147,7 +147,7 @@ def test_what_is_on_a_picture_is_what_the_map_shows_there_and_its_evidence_lies_
 def test_pictures_of_one_site_differ_by_the_stress_alone_and_a_falsifier_is_another_picture_of_the_same(place):
     suite = suite_of()
     control = suite.draw(shot_of(place))
-    again = suite.draw(shot_of(place, Variant(role="falsifier", kind="same height", view_cells=48)))
+    again = suite.draw(shot_of(place, replace(SMALL, role="falsifier", kind="same height")))
     assert control.frames[0].camera == again.frames[0].camera
     np.testing.assert_array_equal(control.labels[0].labels, again.labels[0].labels)
     assert control.frames[0].picture != again.frames[0].picture
@@ -167,7 +167,8 @@ def test_a_suite_of_pictures_draws_looks_and_the_others_draw_detectors():
 @pytest.mark.parametrize(
     ("name", "detectors", "words"),
     [
-        ("aerial", ("measured",), "is not drawn by 'measured': it has rendered, shifted"),
+        ("aerial", ("real",), "is not drawn by 'real': it has rendered, shifted, published, measured"),
+        ("real-image", ("rendered",), "is not drawn by 'rendered': it has real"),
         ("clean", ("rendered", "shifted"), "is not drawn by 'rendered', 'shifted': it has published, measured"),
         ("aerial", ("measured", "shifted"), None),
     ],
@@ -175,3 +176,9 @@ def test_a_suite_of_pictures_draws_looks_and_the_others_draw_detectors():
 def test_detectors_that_a_suite_does_not_have_are_refused(name, detectors, words):
     found = Choice(detectors=detectors).lack(find_suite(name))
     assert (found is None) if words is None else (words in found)
+
+
+def test_a_model_of_perception_sees_the_same_view_without_a_picture(place):
+    draft = suite_of().draw(shot_of(place, replace(SMALL, detector="published")))
+    assert draft.frames == ()
+    assert (draft.evidence.cells == shot_of(place).perceived().cells).all()

@@ -179,6 +179,7 @@ def test_detectors_that_a_suite_does_not_have_are_refused(name, detectors, words
 
 
 def test_a_model_of_perception_sees_the_same_view_without_a_picture(place):
-    draft = suite_of().draw(shot_of(place, replace(SMALL, detector="published")))
+    shot = shot_of(place, replace(SMALL, detector="published"))
+    draft = suite_of().draw(shot)
     assert draft.frames == ()
-    assert (draft.evidence.cells == shot_of(place).perceived().cells).all()
+    assert (draft.evidence.cells == shot.perceived().cells).all()

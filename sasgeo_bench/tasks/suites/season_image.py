@@ -22,7 +22,7 @@ SUITE: Final = PictureSuite(
         version=1,
         title="Seasons in pictures (P5)",
         what="The same place in spring, autumn, winter without leaves, and under snow; the map is that of summer.",
-        separates="Segmenters and weights that know the season from those that do not.",
+        separates="Segmenters by the seasons in which they still see; the query does not say the season.",
         falsifier="Another picture in summer: scores as in the control.",
         strength_unit="share of the season",
     ),

@@ -51,7 +51,7 @@ from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.rendering.conditions import draw_conditions
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import make_scene
-from sasgeo_bench.sensing.rendering.view import labels, render
+from sasgeo_bench.sensing.rendering.view import render_labelled
 
 TRAIN: Final = (
     *("andorra-la-vella", "encamp", "la-massana", "pas-de-la-casa", "sant-julia"),
@@ -120,12 +120,12 @@ def rendered(region: str, family: Family, given: argparse.Namespace) -> Iterator
         look = {"intrinsics": lens, "height_m": height_m, "tilt_deg": min(abs(rng.normal(0, TILT_DEG)), 30.0)}
         camera = Camera.pointed(**look, east_m=at[0], north_m=at[1], yaw_deg=float(rng.uniform(0, 360)))
         weather = draw_conditions(rng)
+        rgb, truth = render_labelled(scene, camera, weather, rng)
         picture = sgb.AerialImage(
-            rgb=render(scene, camera, weather, rng),
+            rgb=rgb,
             camera=Camera.pointed(**look, east_m=0.0, north_m=0.0, yaw_deg=0.0),
             season=weather.season,
         )
-        truth = labels(scene, camera, season=weather.season)
         made += 1
         yield sgb.LabelledImage(image=picture, classes=scene.classes, labels=truth, place=region)
 

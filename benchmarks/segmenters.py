@@ -51,7 +51,7 @@ from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.rendering.conditions import draw_conditions
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import make_scene
-from sasgeo_bench.sensing.rendering.view import labels, render
+from sasgeo_bench.sensing.rendering.view import render_labelled
 
 TRAIN: Final = (
     *("andorra-la-vella", "encamp", "la-massana", "pas-de-la-casa", "sant-julia"),
@@ -120,12 +120,12 @@ def rendered(region: str, family: Family, given: argparse.Namespace) -> Iterator
         look = {"intrinsics": lens, "height_m": height_m, "tilt_deg": min(abs(rng.normal(0, TILT_DEG)), 30.0)}
         camera = Camera.pointed(**look, east_m=at[0], north_m=at[1], yaw_deg=float(rng.uniform(0, 360)))
         weather = draw_conditions(rng)
+        rgb, truth = render_labelled(scene, camera, weather, rng)
         picture = sgb.AerialImage(
-            rgb=render(scene, camera, weather, rng),
+            rgb=rgb,
             camera=Camera.pointed(**look, east_m=0.0, north_m=0.0, yaw_deg=0.0),
             season=weather.season,
         )
-        truth = labels(scene, camera, season=weather.season)
         made += 1
         yield sgb.LabelledImage(image=picture, classes=scene.classes, labels=truth, place=region)
 
@@ -319,23 +319,27 @@ def main() -> None:
 
 def _line(trial: Trial, found: Outcome, scores: dict[str, pd.DataFrame], class_name: str) -> dict[str, str]:
     """Return a row of the printed table."""
-
-    def shown(kind: str, metric: str) -> str:
-        frame = scores[kind]
-        one = frame[(frame["group"] == "all") & (frame["class"] == class_name) & (frame["metric"] == metric)]
-        if one.empty:
-            return "-"
-        row = one.iloc[0]
-        lo, hi = (row["lo"], row["hi"]) if not math.isnan(row["lo"]) else (row["lo_images"], row["hi_images"])
-        return f"{row['value']:.3f} [{lo:.3f}, {hi:.3f}]"
-
     line = {"segmenter": trial.segmenter, "learned from": trial.learned, "tested on": trial.tested}
     line |= {"pictures": str(len(found.counts["plain"]))}
-    line |= {metric.upper(): shown("plain", metric) for metric in ("auc", "iou", "ece", "share_gap")}
+    line |= {
+        metric.upper(): _shown(scores["plain"], class_name, metric) for metric in ("auc", "iou", "ece", "share_gap")
+    }
     for kind in ("picture", "flight"):
-        line |= {f"{metric.upper()}, shares by {kind}": shown(kind, metric) for metric in ("iou", "ece")}
+        line |= {
+            f"{metric.upper()}, shares by {kind}": _shown(scores[kind], class_name, metric) for metric in ("iou", "ece")
+        }
     line |= {"learned, CPU s": f"{found.learn_s:.0f}", "learned, MB": f"{found.learned_mb:.1f}"}
     return line | {"a picture, CPU s": f"{found.segment_s:.2f}"}
+
+
+def _shown(scores: pd.DataFrame, class_name: str, metric: str) -> str:
+    """Return a value over all images with its interval."""
+    one = scores[(scores["group"] == "all") & (scores["class"] == class_name) & (scores["metric"] == metric)]
+    if one.empty:
+        return "-"
+    row = one.iloc[0]
+    lo, hi = (row["lo"], row["hi"]) if not math.isnan(row["lo"]) else (row["lo_images"], row["hi_images"])
+    return f"{row['value']:.3f} [{lo:.3f}, {hi:.3f}]"
 
 
 if __name__ == "__main__":

@@ -78,6 +78,13 @@ from .sensing.image import decode_image as decode_image
 from .sensing.intrinsics import Intrinsics as Intrinsics
 from .sensing.photos import Photo as Photo
 from .sensing.photos import read_photo as read_photo
+from .sensing.rendering.conditions import Conditions as Conditions
+from .sensing.rendering.conditions import Sun as Sun
+from .sensing.rendering.conditions import draw_conditions as draw_conditions
+from .sensing.rendering.scene import make_scene as make_scene
+from .sensing.rendering.view import labels as labels
+from .sensing.rendering.view import render as render
+from .sensing.rendering.view import render_labelled as render_labelled
 from .sensing.segmentation import Segmentation as Segmentation
 from .sensing.tiny_images import tiny_images as tiny_images
 from .sensing.tiny_images import with_picture as with_picture

@@ -135,16 +135,18 @@ class Camera:
         height_m: float,
         yaw_deg: float,
         tilt_deg: float = 0.0,
-        roll_deg: float = 0.0,
     ) -> Self:
-        """Return a camera that looks down, tilted towards its heading by `tilt_deg` (pitch of a gimbal + 90)."""
+        """Return a camera that looks down, tilted towards its heading by `tilt_deg` (pitch of a gimbal + 90).
+
+        One that is rolled as well is `mounted`.
+        """
         return cls.mounted(
             intrinsics=intrinsics,
             east_m=east_m,
             north_m=north_m,
             height_m=height_m,
             body=Attitude(yaw_deg=yaw_deg),
-            mount=Mount(tilt_deg=tilt_deg, roll_deg=roll_deg),
+            mount=Mount(tilt_deg=tilt_deg),
         )
 
     @classmethod
@@ -318,13 +320,9 @@ def _nine(matrix: Points) -> Nine:
 
 def _cut(rays: Points, slope: float) -> Points:
     """Clip a closed ring of rays, shape (N, 3), to those that fall by at least `slope` metres a metre."""
-
-    def excess(ray: Points) -> float:
-        return float(-ray[2] - slope * math.hypot(ray[0], ray[1]))
-
+    excess = -rays[:, 2] - slope * np.hypot(rays[:, 0], rays[:, 1])
     kept = []
-    for ray, after in zip(rays, np.roll(rays, -1, axis=0), strict=True):
-        here, there = excess(ray), excess(after)
+    for ray, after, here, there in zip(rays, np.roll(rays, -1, axis=0), excess, np.roll(excess, -1), strict=True):
         if here >= 0:
             kept.append(ray)
         if (here >= 0) != (there >= 0):

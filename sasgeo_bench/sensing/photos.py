@@ -16,7 +16,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from sasgeo_bench.errors import CameraError, ImageError
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import bearing_deg
-from sasgeo_bench.sensing.camera import Attitude, Camera
+from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
 from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.texts import message_of
 
@@ -122,14 +122,13 @@ class Photo:
             raise CameraError(message)
         crs = epsg or utm_epsg(self.lon_deg, self.lat_deg)
         east_m, north_m, convergence_deg = _to_grid(self.lon_deg, self.lat_deg, crs)
-        sensor = Camera.pointed(
+        sensor = Camera.mounted(
             intrinsics=intrinsics or self.intrinsics(),
             east_m=east_m,
             north_m=north_m,
             height_m=height_m,
-            yaw_deg=self.gimbal.yaw_deg + convergence_deg,
-            tilt_deg=self.gimbal.pitch_deg - _STRAIGHT_DOWN_DEG,
-            roll_deg=self.gimbal.roll_deg,
+            body=Attitude(yaw_deg=self.gimbal.yaw_deg + convergence_deg),
+            mount=Mount(tilt_deg=self.gimbal.pitch_deg - _STRAIGHT_DOWN_DEG, roll_deg=self.gimbal.roll_deg),
         )
         return sensor.upright(_TURNS[self.orientation])
 

@@ -116,6 +116,7 @@ def refine_tilt(
     sigmas = [_sigmas_deg(lines, end_sigma_px, parallel_sigma_deg) for lines in roads]
 
     def residuals(turn_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return by how many standard deviations borders are not parallel after a turn, and the turn itself is off."""
         turned = _turned(camera, turn_deg)
         of_roads = [_angles_deg(turned, lines, sigma) / sigma for lines, sigma in zip(roads, sigmas, strict=True)]
         prior = turn_deg / attitude_sigma_deg

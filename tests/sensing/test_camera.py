@@ -27,15 +27,19 @@ tilts = st.floats(0.0, 60.0)
 
 
 def camera_of(lens=WIDE, *, east_m=0.0, north_m=0.0, height_m=100.0, yaw_deg=0.0, tilt_deg=0.0, roll_deg=0.0):
-    return Camera.pointed(
-        intrinsics=lens, east_m=east_m, north_m=north_m, height_m=height_m, yaw_deg=yaw_deg, tilt_deg=tilt_deg,
-        roll_deg=roll_deg,
-    )  # fmt: skip
+    body, mount = Attitude(yaw_deg=yaw_deg), Mount(tilt_deg=tilt_deg, roll_deg=roll_deg)
+    return Camera.mounted(intrinsics=lens, east_m=east_m, north_m=north_m, height_m=height_m, body=body, mount=mount)
 
 
 def mounted(body, mount=None):
     mount = mount or Mount()
     return Camera.mounted(intrinsics=WIDE, east_m=0.0, north_m=0.0, height_m=100.0, body=body, mount=mount)
+
+
+def test_a_pointed_camera_is_a_mounted_one_without_roll():
+    place = {"intrinsics": WIDE, "east_m": 3.0, "north_m": 4.0, "height_m": 100.0}
+    pointed = Camera.pointed(**place, yaw_deg=33.0, tilt_deg=25.0)
+    assert pointed == Camera.mounted(**place, body=Attitude(yaw_deg=33.0), mount=Mount(tilt_deg=25.0))
 
 
 @given(yaw=angles, tilt=tilts, roll=st.floats(-20, 20), lens=st.sampled_from([WIDE, BENT]), seed=st.integers(0, 99))

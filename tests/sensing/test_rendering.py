@@ -28,7 +28,7 @@ from sasgeo_bench.sensing.rendering.scene import MARGIN_M, Scene, make_scene
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 from sasgeo_bench.sensing.rendering.texture import draw, fractal, grain, noise
 from sasgeo_bench.sensing.rendering.trace import HeightPyramid, trace
-from sasgeo_bench.sensing.rendering.view import labels, render
+from sasgeo_bench.sensing.rendering.view import labels, render, render_labelled
 
 EPSG = 32632
 EAST, NORTH = 500_000.0, 5_200_000.0
@@ -263,6 +263,23 @@ def test_one_generator_state_gives_one_picture_and_another_changes_its_noise_alo
     np.testing.assert_array_equal(first, again)
     difference = np.abs(first.astype(int) - other)
     assert 0 < difference.mean() < 8
+
+
+def test_a_picture_made_with_its_labels_is_the_one_made_without():
+    scene, view, evening = village(), camera(tilt_deg=30.0), replace(CLEAR, season="autumn", noise=0.01)
+    picture, found = render_labelled(scene, view, evening, np.random.default_rng(1))
+    np.testing.assert_array_equal(picture, render(scene, view, evening, np.random.default_rng(1)))
+    np.testing.assert_array_equal(found, labels(scene, view, season="autumn"))
+
+
+def test_beyond_its_window_the_ground_mirrors_the_scene_and_is_unlabelled():
+    scene, rng = village(), np.random.default_rng(0)
+    edge_m = scene.grid.bounds_m[2]
+    inside, beyond = (render(scene, camera(east_m=edge_m + far_m), CLEAR, rng) for far_m in (-30.0, 30.0))
+    alike, turned = (np.corrcoef(picture.ravel(), beyond.ravel())[0, 1] for picture in (inside[:, ::-1], inside))
+    assert alike > 0.8
+    assert turned < 0.6
+    assert (labels(scene, camera(east_m=edge_m + 60)) == UNKNOWN).all()
 
 
 @pytest.mark.parametrize("season", SEASONS)

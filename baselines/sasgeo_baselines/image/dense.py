@@ -2,7 +2,7 @@
 """Exhaustive search: a view, turned and scaled, against every place of a map by normalized cross-correlation."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -12,8 +12,10 @@ from scipy import fft
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.global_descriptor import separate
+from sasgeo_baselines.image.sight import Sight, side_of, sight_of
 
 Planes = NDArray[np.float32]
+Bounds = tuple[int, int, int, int]  # first row and column, last row and column, excluded
 
 SPREAD: Final = 2.5  # standard deviations of heading and scale that are searched
 APART_M: Final = 25.0  # between two places of an answer
@@ -91,8 +93,8 @@ def turns_for(query: sgb.Query, *, reach_m: float, step_m: float) -> tuple[sgb.P
     )
 
 
-def bounds_of(query: sgb.Query, grid: sgb.Grid) -> tuple[int, int, int, int]:
-    """Return first row and column and last row and column, excluded, of the places that a query leaves open."""
+def bounds_of(query: sgb.Query, grid: sgb.Grid) -> Bounds:
+    """Return the places that a query leaves open."""
     if query.track == "retrieval":
         points_m, reach_m = sgb.points_of(query.candidates), AROUND_M
     elif query.prior.center_m is not None:
@@ -102,6 +104,27 @@ def bounds_of(query: sgb.Query, grid: sgb.Grid) -> tuple[int, int, int, int]:
     cells, reach = grid.to_cells(points_m), math.ceil(reach_m / grid.cell_size_m)
     (top, left), (bottom, right) = cells.min(axis=0) - reach, cells.max(axis=0) + reach + 1
     return max(int(top), 0), max(int(left), 0), min(int(bottom), grid.rows), min(int(right), grid.cols)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Question:
+    """What a query asks of a map: where its picture lies, in which of the headings and scales `turns`."""
+
+    sight: Sight
+    bounds: Bounds
+    turns: tuple[sgb.Pose, ...]
+
+    @classmethod
+    def of(cls, query: sgb.Query, grid: sgb.Grid, *, gsd_m: float, step_m: float) -> Self | None:
+        """Return it for a picture with pixels of `gsd_m` whose edge moves by `step_m` from turn to turn.
+
+        None if the picture shows too little, or the query leaves no place of the lattice open.
+        """
+        sight, bounds = sight_of(query, gsd_m=gsd_m), bounds_of(query, grid)
+        if sight is None or bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
+            return None
+        turns = turns_for(query, reach_m=side_of(query) / 2, step_m=step_m)
+        return cls(sight=sight, bounds=bounds, turns=turns)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,7 +140,7 @@ class Search:
     least_energy: float
 
     @classmethod
-    def of(cls, stack: Stack, grid: sgb.Grid, bounds: tuple[int, int, int, int], *, margin: int) -> Self:
+    def of(cls, stack: Stack, grid: sgb.Grid, bounds: Bounds, *, margin: int) -> Self:
         """Cut out the places of `bounds` with `margin` cells around them, half the side of a view."""
         top, left, bottom, right = bounds
         cut = tuple(slice(max(at - margin, 0), to + margin) for at, to in ((top, bottom), (left, right)))
@@ -154,12 +177,12 @@ class Search:
         rows, cols = self.place.shape
         return np.asarray(fft.irfft2(spectrum, self.shape)[:rows, :cols], dtype=np.float32)
 
-    def field(self, turns: Sequence[sgb.Pose], view_of: Callable[[sgb.Pose], Stack]) -> Field:
-        """Return the best of all headings and scales at every place; of equal ones the first."""
+    def field(self, turns: Sequence[sgb.Pose], views: Iterable[Stack]) -> Field:
+        """Return the best of all headings and scales, each with its view, at every place; of equal ones the first."""
         best = np.full(self.place.shape, -np.inf, dtype=np.float32)
         which = np.zeros(self.place.shape, dtype=np.int32)
-        for at, turn in enumerate(turns):
-            scores = self.scores(view_of(turn))
+        for at, (_, view) in enumerate(zip(turns, views, strict=True)):
+            scores = self.scores(view)
             better = scores > best
             best[better], which[better] = scores[better], at
         return Field(grid=self.place, scores=best, which=which, turns=tuple(turns))

@@ -10,16 +10,15 @@ from numpy.typing import NDArray
 import sasgeo_bench as sgb
 from sasgeo_baselines.image.dense import (
     MOST_PLACES,
+    Question,
     Search,
     Stack,
     answer_candidates,
     answer_places,
-    bounds_of,
     disc_of,
     size_for,
-    turns_for,
 )
-from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, side_of, sight_of
+from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, side_of
 
 PIXEL_M: Final = 1.0
 CELL_PX: Final = 4  # pixels a side of a cell of the descriptor
@@ -116,22 +115,17 @@ class HogColour:
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         """Return the most similar tiles, or rank the candidates by the most similar one near each."""
-        sight = sight_of(query, gsd_m=PIXEL_M)
-        if self._stack is None or sight is None:
+        if self._stack is None:
             return sgb.WITHHELD
-        bounds = bounds_of(query, self._grid)
-        if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
+        cell_m = CELL_PX * PIXEL_M
+        question = Question.of(query, self._grid, gsd_m=PIXEL_M, step_m=_STEP * cell_m)
+        if question is None:
             return sgb.WITHHELD
-        cell_m, side_m = CELL_PX * PIXEL_M, side_of(query)
-        turns = turns_for(query, reach_m=side_m / 2, step_m=_STEP * cell_m)
-        size = size_for(turns, side_m / cell_m)
-
-        def view_of(turn: sgb.Pose) -> Stack:
-            turned = sight.turned(turn, size * CELL_PX)
-            return descriptors(turned.rgb, turned.is_seen)
-
-        field = Search.of(self._stack, self._grid, bounds, margin=size // 2).field(turns, view_of)
-        diagnostics = {"peak": field.peak(), "seen_share": float(sight.is_seen.mean())}
+        size = size_for(question.turns, side_of(query) / cell_m)
+        search = Search.of(self._stack, self._grid, question.bounds, margin=size // 2)
+        turned = (question.sight.turned(turn, size * CELL_PX) for turn in question.turns)
+        field = search.field(question.turns, (descriptors(view.rgb, view.is_seen) for view in turned))
+        diagnostics = {"peak": field.peak(), "seen_share": float(question.sight.is_seen.mean())}
         if query.track == "retrieval":
             return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
         most = min(top_k, MOST_PLACES)

@@ -12,14 +12,13 @@ import sasgeo_bench as sgb
 from sasgeo_baselines.image.dense import (
     MOST_PLACES,
     Field,
+    Question,
     Search,
     Stack,
     answer_candidates,
     answer_places,
-    bounds_of,
     disc_of,
     size_for,
-    turns_for,
 )
 from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, grey_of, side_of, sight_of
 
@@ -88,23 +87,20 @@ class NccGradient:
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         """Return the best poses, or rank the candidates by the best pose near each."""
-        sight = sight_of(query, gsd_m=COARSE_M)
-        if self._grey is None or sight is None:
+        if self._grey is None:
             return sgb.WITHHELD
-        bounds = bounds_of(query, self._grid)
-        if bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
+        question = Question.of(query, self._grid, gsd_m=COARSE_M, step_m=_STEP * COARSE_M)
+        if question is None:
             return sgb.WITHHELD
-        side_m = side_of(query)
-        turns = turns_for(query, reach_m=side_m / 2, step_m=_STEP * COARSE_M)
-        field = _search(self._stack, self._grid, bounds, sight, turns)
-        diagnostics = {"peak": field.peak(), "seen_share": float(sight.is_seen.mean())}
+        field = _search(self._stack, self._grid, question)
+        diagnostics = {"peak": field.peak(), "seen_share": float(question.sight.is_seen.mean())}
         if query.track == "retrieval":
             return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
         disc = disc_of(query.prior)
         modes = field.best(disc, most=min(top_k, MOST_PLACES) + 1)
         finer = sight_of(query, gsd_m=FINE_M)
         if finer is not None:
-            step = _STEP * COARSE_M / (side_m / 2)
+            step = _STEP * COARSE_M / (side_of(query) / 2)
             modes = [self._refined(mode, finer, step, disc) for mode in modes]
         return answer_places(modes, top_k=min(top_k, MOST_PLACES), diagnostics=diagnostics)
 
@@ -129,23 +125,14 @@ class NccGradient:
             *(max(at - reach, 0) for at in low),
             *(min(at + reach + 1, end) for at, end in zip(low, high, strict=True)),
         )
-        found = _search(stack, part, (bounds[0], bounds[1], bounds[2], bounds[3]), sight, turns).best(disc, most=1)
+        question = Question(sight=sight, bounds=(bounds[0], bounds[1], bounds[2], bounds[3]), turns=turns)
+        found = _search(stack, part, question).best(disc, most=1)
         return found[0] if found else mode
 
 
-def _search(
-    stack: Stack,
-    grid: sgb.Grid,
-    bounds: tuple[int, int, int, int],
-    sight: Sight,
-    turns: tuple[sgb.Pose, ...],
-) -> Field:
+def _search(stack: Stack, grid: sgb.Grid, question: Question) -> Field:
     """Correlate a picture with a part of a map, in all headings and scales."""
-    size_px = size_for(turns, len(sight.rgb))
-    search = Search.of(stack, grid, bounds, margin=size_px // 2)
-
-    def view_of(turn: sgb.Pose) -> Stack:
-        turned = sight.turned(turn, size_px)
-        return directions(turned.grey, turned.is_seen)
-
-    return search.field(turns, view_of)
+    size_px = size_for(question.turns, len(question.sight.rgb))
+    search = Search.of(stack, grid, question.bounds, margin=size_px // 2)
+    turned = (question.sight.turned(turn, size_px) for turn in question.turns)
+    return search.field(question.turns, (directions(view.grey, view.is_seen) for view in turned))

@@ -49,7 +49,8 @@ def _roughen(canvas: Canvas) -> None:
         fine = 0.075 * grain(grid) + 0.08 * noise(grid, 0.7, seed) + 0.06 * noise(grid, 1.7, seed + 1)
         tufts = -0.2 * np.clip(fractal(grid, 3.0, seed + 5) * (1 + noise(grid, 30.0, seed + 6)) - 0.3, 0, 0.7)
         factor = 1 + rough * (fine + tufts + 0.07 * fractal(grid, 35.0, seed + 2))
-        canvas.colour[strip] = np.clip(canvas.colour[strip] * factor[..., None], 0, 255)
+        for band in range(3):
+            canvas.colour[strip][..., band] = np.clip(canvas.colour[strip][..., band] * factor, 0, 255)
 
 
 def _grass(canvas: Canvas) -> tuple[Numbers, Numbers]:
@@ -67,34 +68,57 @@ def _paint_country(canvas: Canvas) -> Field:
     found = np.empty(canvas.grid.shape, dtype=np.float32)
     for strip, grid in canvas.strips():
         wide, near = fractal(grid, 60.0, seed, octaves=4), fractal(grid, 7.0, seed + 10, octaves=4)
-        dryness = np.clip(0.45 + 0.7 * wide + 0.5 * near, 0, 1)[..., None]
+        dryness = np.clip(0.45 + 0.7 * wide + 0.5 * near, 0, 1)
         soil = near + 0.6 * wide + 1.05 * canvas.built[strip] - 0.62 + 0.22 * palette.unevenness
         found[strip] = np.clip(soil * 2.2, 0, 1)
-        part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)[..., None]
-        ground = fresh + dryness * (dry - fresh)
-        ground += found[strip][..., None] * (dark + part * (light - dark) - ground)
-        _add_plots(canvas, grid, ground, found[strip])
-        canvas.colour[strip] = np.clip(ground, 0, 255)
+        part = np.clip(0.5 + fractal(grid, 18.0, seed + 20), 0, 1)
+        plots = _plots(canvas, grid)
+        for band in range(3):
+            ground = fresh[band] + dryness * (dry[band] - fresh[band])
+            ground += found[strip] * (dark[band] + part * (light[band] - dark[band]) - ground)
+            ground *= plots.tone
+            ground += plots.tilled * (plots.soil[band] - ground)
+            canvas.colour[strip][..., band] = np.clip(ground, 0, 255)
+        np.maximum(found[strip], np.float32(0.5), out=found[strip], where=plots.is_tilled)
     return found
 
 
-def _add_plots(canvas: Canvas, grid: Grid, ground: Field, soil: Field) -> None:
-    """Change open ground plot by plot: what is on no map still belongs to somebody, who mows, sows or lets it lie."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Plots:
+    """What the plots of open ground change: a tone to multiply by, and the share and the colour of tilled soil."""
+
+    tone: Field
+    is_tilled: Mask
+    tilled: Field
+    soil: Field
+
+
+def _plots(canvas: Canvas, grid: Grid) -> _Plots:
+    """Return the plots of open ground: what is on no map still belongs to somebody, who mows, sows or lets it lie."""
     seed, palette = canvas.plan.seed("plots"), canvas.plan.palette
     bend = 22 * noise(grid, 170.0, seed), 22 * noise(grid, 170.0, seed + 1)
     turn = np.pi * draw(seed, np.array([0]))[0]
     east, north = ground_m(grid)
     east, north = east[None, :] + bend[0], north[:, None] + bend[1]
     across, down = east * np.cos(turn) + north * np.sin(turn), north * np.cos(turn) - east * np.sin(turn)
-    plot = np.floor(across / 34).astype(np.int64), np.floor(down / 52).astype(np.int64)
-    luck, use = draw(seed + 2, *plot).astype(np.float32), draw(seed + 3, *plot)
-    tone = (1 + 0.28 * palette.patchwork * (luck - 0.5))[..., None]
-    ground *= tone
+    luck, use = _drawn_by_plot((np.floor(across / 34), np.floor(down / 52)), (seed + 2, seed + 3))
     is_tilled = use < 0.22 * palette.patchwork
     row_m = np.where(luck < 0.5, across, down) * 2 * np.pi / (1.2 + 0.8 * luck)
-    share = np.where(is_tilled, 0.45 + 0.25 * np.sin(row_m), 0)[..., None].astype(np.float32)
-    ground += share * (np.array(palette.soil[int(turn * 10) % 2], dtype=np.float32) - ground)
-    soil[is_tilled] = np.maximum(soil[is_tilled], 0.5)
+    return _Plots(
+        tone=1 + 0.28 * palette.patchwork * (luck - 0.5),
+        is_tilled=is_tilled,
+        tilled=np.where(is_tilled, 0.45 + 0.25 * np.sin(row_m), 0).astype(np.float32),
+        soil=np.array(palette.soil[int(turn * 10) % 2], dtype=np.float32),
+    )
+
+
+def _drawn_by_plot(plot: tuple[Field, Field], seeds: tuple[int, int]) -> tuple[Field, Numbers]:
+    """Return two draws for the plot (column, row) of each cell, which are drawn once for each plot."""
+    first = [int(part.min()) for part in plot]
+    across, down = (np.arange(low, int(part.max()) + 1) for low, part in zip(first, plot, strict=True))
+    cells = (plot[0] - first[0]).astype(np.int32) * np.int32(len(down)) + (plot[1] - first[1]).astype(np.int32)
+    luck, use = (draw(seed, across[:, None], down[None, :]).ravel() for seed in seeds)
+    return luck.astype(np.float32).take(cells), use.take(cells)
 
 
 def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Mask]:

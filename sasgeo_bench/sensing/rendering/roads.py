@@ -47,10 +47,12 @@ def paint_roads(canvas: Canvas) -> None:
 
 def _soft(mask: Mask, canvas: Canvas, ragged: float, purpose: str) -> Field:
     """Return how much of each cell a surface covers; `ragged` breaks its edge up, metres."""
-    grid = canvas.grid
-    soft = blurred(mask.astype(np.float32), max(0.3, 0.4 * ragged), grid)
-    broken = soft + 0.5 * ragged * (soft > 0.02) * (soft < 0.98) * noise(grid, 1.3, canvas.plan.seed(purpose))
-    return np.asarray(np.clip((broken - 0.5) * 3 + 0.5, 0, 1), dtype=np.float32)
+    soft = blurred(mask.astype(np.float32), max(0.3, 0.4 * ragged), canvas.grid)
+    for strip, grid in canvas.strips():
+        is_edge = (soft[strip] > 0.02) & (soft[strip] < 0.98)
+        broken = soft[strip] + 0.5 * ragged * is_edge * noise(grid, 1.3, canvas.plan.seed(purpose))
+        soft[strip] = np.clip((broken - 0.5) * 3 + 0.5, 0, 1)
+    return soft
 
 
 def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:

@@ -83,11 +83,9 @@ def _joined(values: Field, at: NDArray[np.floating]) -> Field:
     low = np.floor(at).astype(np.int64)
     part = (at - low).astype(np.float32)
     part = (part * part * (3 - 2 * part))[:, None]
-    start = values[low]
-    joined = values[low + 1]
-    joined -= start
+    joined = np.diff(values, axis=0).take(low, axis=0)
     joined *= part
-    joined += start
+    joined += values.take(low, axis=0)
     return np.asarray(joined, dtype=np.float32)
 
 
@@ -115,4 +113,4 @@ def grain(grid: Grid, seed: int = 1) -> Field:
     north = -round(grid.north_m / grid.cell_size_m)
     rows = (north + np.arange(grid.rows)) % _TILE_CELLS
     cols = (west + np.arange(grid.cols)) % _TILE_CELLS
-    return np.asarray(_tile(seed)[rows[:, None], cols[None, :]])
+    return np.asarray(_tile(seed).take(cols, axis=1).take(rows, axis=0))

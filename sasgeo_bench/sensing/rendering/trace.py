@@ -23,6 +23,7 @@ _LOW_M: Final = 0.05  # what is lower casts no ray off its way
 _SIDE_M: Final = 0.6  # higher above the point that a ray meets, a cell shows its flank there
 _CHUNK: Final = 32_768  # rays followed at a time, so that they stay in the cache
 _AT_ONCE: Final = 4  # steps
+_AHEAD: Final = np.arange(_AT_ONCE, dtype=np.float32)[:, None]
 _FLATTEST: Final = 0.035  # a ray that falls less than this per metre sees no ground
 
 
@@ -199,28 +200,51 @@ def _follow(hits: Hits, raster: Field, pixel: NDArray[np.int64], top: Field) -> 
     size = np.maximum(_STEP_CELLS, 0.75 * hits.cells_px.ravel()[pixel])
     fall = top / (np.ceil(np.hypot(ahead_col, ahead_row) * top / size) + 1)
     rays = np.stack([ground_col, ground_row, ahead_col, ahead_row, top, fall])
-    ahead = np.arange(_AT_ONCE, dtype=np.float32)[:, None]
+    scratch = _Scratch(len(pixel))
     while len(pixel):
-        z_m = rays[4] - ahead * rays[5]
-        found = _heights_at(raster, rays[0] - rays[2] * z_m, rays[1] - rays[3] * z_m)
+        z_m, found = scratch.look(raster, rays)
         met = found >= z_m
         has_met = np.logical_or.reduce(met, axis=0)
         chosen = np.flatnonzero(has_met)
-        step = met[:, chosen].argmax(axis=0)
+        step, ended = met[:, chosen].argmax(axis=0), rays.take(chosen, axis=1)
         here_m = np.maximum(z_m[step, chosen], 0)  # the ground plane, where the last step went below it
         at = pixel[chosen]
-        hits.col.ravel()[at] = rays[0, chosen] - rays[2, chosen] * here_m
-        hits.row.ravel()[at] = rays[1, chosen] - rays[3, chosen] * here_m
+        hits.col.ravel()[at] = ended[0] - ended[2] * here_m
+        hits.row.ravel()[at] = ended[1] - ended[3] * here_m
         hits.z_m.ravel()[at] = here_m
-        hits.is_side.ravel()[at] = found[step, chosen] - here_m > rays[5, chosen] + np.float32(_SIDE_M)
+        hits.is_side.ravel()[at] = found[step, chosen] - here_m > ended[5] + np.float32(_SIDE_M)
         left = np.flatnonzero(~has_met)
-        pixel, rays = pixel[left], rays[:, left]
+        pixel, rays = pixel[left], rays.take(left, axis=1)
         rays[4] -= _AT_ONCE * rays[5]
 
 
-def _heights_at(raster: Field, col: Field, row: Field) -> Field:
-    """Return the heights of the cells under points; 0 outside, where the border of the raster is level ground."""
-    rows, cols = raster.shape
-    if col.min() < 0 or row.min() < 0 or col.max() >= cols or row.max() >= rows:
-        col, row = np.clip(col, 0, cols - 1), np.clip(row, 0, rows - 1)
-    return np.asarray(raster.ravel().take(row.astype(np.int32) * np.int32(cols) + col.astype(np.int32)))
+class _Scratch:
+    """Memory for the steps of at most `count` rays, used again for each few steps: fresh memory costs as much."""
+
+    def __init__(self, count: int) -> None:
+        self._fields = np.empty((3, _AT_ONCE * count), dtype=np.float32)
+        self._numbers = np.empty((2, _AT_ONCE * count), dtype=np.int32)
+
+    def look(self, raster: Field, rays: Field) -> tuple[Field, Field]:
+        """Return heights of the next steps of rays, shape (steps, N), and the heights of the cells under them.
+
+        Beyond the raster those are 0, as its border is level ground.
+        """
+        (rows, cols), count = raster.shape, rays.shape[1]
+        z_m, col, row = self._fields[:, : _AT_ONCE * count].reshape(3, _AT_ONCE, count)
+        cell, at_col = self._numbers[:, : _AT_ONCE * count].reshape(2, _AT_ONCE, count)
+        ground_col, ground_row, ahead_col, ahead_row, top, fall = rays
+        np.multiply(_AHEAD, fall, out=z_m)
+        np.subtract(top, z_m, out=z_m)
+        np.multiply(ahead_col, z_m, out=col)
+        np.subtract(ground_col, col, out=col)
+        np.multiply(ahead_row, z_m, out=row)
+        np.subtract(ground_row, row, out=row)
+        if col.min() < 0 or row.min() < 0 or col.max() >= cols or row.max() >= rows:
+            np.clip(col, 0, cols - 1, out=col)
+            np.clip(row, 0, rows - 1, out=row)
+        np.copyto(cell, row, casting="unsafe")
+        np.copyto(at_col, col, casting="unsafe")
+        cell *= np.int32(cols)
+        cell += at_col
+        return z_m, raster.ravel().take(cell, out=col, mode="clip")  # "clip" spares numpy a copy: all cells are inside

@@ -2,6 +2,8 @@
 """The picture of a scene that a camera takes, and what each of its pixels shows of the map."""
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -28,34 +30,29 @@ _WAVES: Final = 256  # cells of a tile of rippled water
 def render(scene: Scene, camera: Camera, conditions: Conditions, rng: np.random.Generator) -> Picture:
     """Return the picture that a camera takes of a scene, uint8 of shape (H, W, 3), RGB.
 
-    The camera is in the CRS of the scene, its height above the ground plane. Beyond the scene's window the ground goes
-    on without things; above the horizon is sky. `rng` draws the noise of the sensor alone: all else belongs to the
-    place. Raise `CameraError` for a camera that is not above the scene.
+    The camera is in the CRS of the scene, its height above the ground plane. Beyond the scene's window the ground
+    shows the mirrored paint of the scene, laid flat, with its light and shadows; above the horizon is sky. `rng` draws
+    the noise of the sensor alone: all else belongs to the place. Raise `CameraError` for a camera that is not above
+    the scene.
     """
-    painting = scene.painting(conditions.season)
-    _check(camera, painting)
-    light, exposure = scene.light(conditions.season, conditions.sun), expose(conditions)
-    size = (camera.intrinsics.height_px, camera.intrinsics.width_px, 3)
-    seen = np.empty(size, dtype=np.float32)
-    for rows in strips(camera):
-        hits = trace(camera, scene.grid, painting.heights, rows)
-        seen[rows] = _shaded(scene, painting, light, exposure, hits)
-        _reflect(scene, painting, hits, seen[rows], conditions, exposure)
-        _add_air(seen[rows], camera, hits, conditions, exposure)
-    return expose_sensor(seen, conditions, exposure.dark, rng)
+    exposed = _exposed(scene, conditions)
+    seen = np.empty((*_shape(camera), 3), dtype=np.float32)
+    for rows, hits in _traced(scene, camera, conditions.season):
+        _expose_rows(exposed, camera, hits, seen[rows])
+    return expose_sensor(seen, conditions, exposed.exposure.dark, rng)
 
 
-def _shaded(scene: Scene, painting: Painting, light: Light, exposure: Exposure, hits: Hits) -> Field:
-    """Return the light that comes from each hit, linear, float32 of shape (H, W, 3)."""
-    albedo, shares = _sampled(painting.colours, hits), _light_shares(light, hits)
-    if hits.is_side.any():
-        _paint_sides(scene, painting, light, hits, albedo, shares)
-    seen = np.asarray(cv2.transform(shares, np.stack([exposure.sun, exposure.sky], axis=1)), dtype=np.float32)
-    if exposure.lamp.any():
-        seen += cv2.transform(_linear(painting.lamps, hits), exposure.lamp[:, None] * np.float32(0.9 / 255))
-    cv2.multiply(seen, albedo, dst=seen)
-    cv2.multiply(seen, albedo, dst=seen, scale=1 / 65025)  # colours are stored as the square root of what they reflect
-    return seen
+def render_labelled(
+    scene: Scene, camera: Camera, conditions: Conditions, rng: np.random.Generator
+) -> tuple[Picture, Picture]:
+    """Return `render` and `labels` of one view: its rays are traced once, which is up to half of the work of each."""
+    exposed = _exposed(scene, conditions)
+    seen = np.empty((*_shape(camera), 3), dtype=np.float32)
+    found = np.full((len(scene.classes), *_shape(camera)), UNKNOWN, dtype=np.uint8)
+    for rows, hits in _traced(scene, camera, conditions.season):
+        _expose_rows(exposed, camera, hits, seen[rows])
+        _label(scene, exposed.painting, hits, found[:, rows])
+    return expose_sensor(seen, conditions, exposed.exposure.dark, rng), found
 
 
 def labels(scene: Scene, camera: Camera, *, season: Season = "summer") -> Picture:
@@ -65,13 +62,69 @@ def labels(scene: Scene, camera: Camera, *, season: Season = "summer") -> Pictur
     "building" alone. Under a crown, a class of the ground that the map has there is UNKNOWN, as it is hidden; beyond
     the mapped area, outside the scene and above the horizon all is UNKNOWN.
     """
-    painting = scene.painting(season)
-    _check(camera, painting)
-    size = (camera.intrinsics.height_px, camera.intrinsics.width_px)
-    found = np.full((len(scene.classes), *size), UNKNOWN, dtype=np.uint8)
-    for rows in strips(camera):
-        _label(scene, painting, trace(camera, scene.grid, painting.heights, rows), found[:, rows])
+    found = np.full((len(scene.classes), *_shape(camera)), UNKNOWN, dtype=np.uint8)
+    for rows, hits in _traced(scene, camera, season):
+        _label(scene, scene.painting(season), hits, found[:, rows])
     return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Exposed:
+    """A scene under some conditions."""
+
+    scene: Scene
+    conditions: Conditions
+    painting: Painting
+    light: Light
+    exposure: Exposure
+
+
+def _exposed(scene: Scene, conditions: Conditions) -> _Exposed:
+    return _Exposed(
+        scene=scene,
+        conditions=conditions,
+        painting=scene.painting(conditions.season),
+        light=scene.light(conditions.season, conditions.sun),
+        exposure=expose(conditions),
+    )
+
+
+def _shape(camera: Camera) -> tuple[int, int]:
+    return camera.intrinsics.height_px, camera.intrinsics.width_px
+
+
+def _traced(scene: Scene, camera: Camera, season: Season) -> Iterator[tuple[slice, Hits]]:
+    """Yield strips of a picture's rows with what they see; raise `CameraError` for a camera not above the scene."""
+    heights = scene.painting(season).heights
+    if camera.height_m <= heights.highest_m:
+        message = (
+            f"the highest thing of the scene ends at {heights.highest_m:.1f} m, got height_m {camera.height_m!r}: "
+            "fly higher"
+        )
+        raise CameraError(message)
+    for rows in strips(camera):
+        yield rows, trace(camera, scene.grid, heights, rows)
+
+
+def _expose_rows(exposed: _Exposed, camera: Camera, hits: Hits, seen: Field) -> None:
+    """Fill in the light that some rows of pixels get, linear, shape (H, W, 3)."""
+    seen[...] = _shaded(exposed, hits)
+    _reflect(exposed, hits, seen)
+    _add_air(seen, camera, hits, exposed)
+
+
+def _shaded(exposed: _Exposed, hits: Hits) -> Field:
+    """Return the light that comes from each hit, linear, float32 of shape (H, W, 3)."""
+    painting, light, exposure = exposed.painting, exposed.light, exposed.exposure
+    albedo, shares = _sampled(painting.colours, hits), _light_shares(light, hits)
+    if hits.is_side.any():
+        _paint_sides(exposed, hits, albedo, shares)
+    seen = np.asarray(cv2.transform(shares, np.stack([exposure.sun, exposure.sky], axis=1)), dtype=np.float32)
+    if exposure.lamp.any():
+        seen += cv2.transform(_linear(painting.lamps, hits), exposure.lamp[:, None] * np.float32(0.9 / 255))
+    cv2.multiply(seen, albedo, dst=seen)
+    cv2.multiply(seen, albedo, dst=seen, scale=1 / 65025)  # colours are stored as the square root of what they reflect
+    return seen
 
 
 def _label(scene: Scene, painting: Painting, hits: Hits, found: Picture) -> None:
@@ -81,26 +134,18 @@ def _label(scene: Scene, painting: Painting, hits: Hits, found: Picture) -> None
     bits, kind = scene.class_bits[at], painting.kind[at]
     is_wall, is_crown = hits.is_side & (kind == ROOF), kind == CROWN
     for number, name in enumerate(scene.classes):
-        band = np.where(bits & np.uint32(1 << number), PRESENT, ABSENT).astype(np.uint8)
-        band[is_wall] = PRESENT if name == "building" else ABSENT
+        is_there = (bits & np.uint32(1 << number)) != 0
+        np.copyto(is_there, name == "building", where=is_wall)
+        band = np.where(is_there, np.uint8(PRESENT), np.uint8(ABSENT))
         if name != "green":
-            band[is_crown & (band == PRESENT)] = UNKNOWN
-        found[number][known] = band[known]
+            np.copyto(band, UNKNOWN, where=is_crown & is_there)
+        np.copyto(found[number], band, where=known)
 
 
 def _inside(hits: Hits, shape: tuple[int, ...]) -> Mask:
     """Return which hits lie on the scene, shape (H, W)."""
     rows, cols = shape
     return hits.is_ground & (hits.row >= 0) & (hits.col >= 0) & (hits.row < rows) & (hits.col < cols)
-
-
-def _check(camera: Camera, painting: Painting) -> None:
-    highest_m = painting.heights.highest_m
-    if camera.height_m <= highest_m:
-        message = (
-            f"the highest thing of the scene ends at {highest_m:.1f} m, got height_m {camera.height_m!r}: fly higher"
-        )
-        raise CameraError(message)
 
 
 def _maps(hits: Hits, level: int = 0) -> tuple[Field, Field]:
@@ -140,8 +185,9 @@ def _light_shares(light: Light, hits: Hits) -> Field:
     return _linear(light.shares, hits) * np.float32(1 / 255)
 
 
-def _paint_sides(scene: Scene, painting: Painting, light: Light, hits: Hits, albedo: Field, shares: Field) -> None:
+def _paint_sides(exposed: _Exposed, hits: Hits, albedo: Field, shares: Field) -> None:
     """Give walls their paint, windows and own light, and darken the flanks of crowns towards the ground."""
+    painting, light = exposed.painting, exposed.light
     side = np.nonzero(hits.is_side)
     col, row, z_m = hits.col[side], hits.row[side], hits.z_m[side]
     at = _clipped(row, col, painting.owner.shape)
@@ -157,7 +203,7 @@ def _paint_sides(scene: Scene, painting: Painting, light: Light, hits: Hits, alb
     deep = (0.55 + 0.45 * z_m / np.maximum(high, 0.5)) * (0.72 + 0.5 * leaves).astype(np.float32)
     paint = albedo[side] * deep[:, None]
     walls = np.flatnonzero(is_wall)
-    paint[walls] = _wall_paint(scene, owner[walls] - 1, row[walls], col[walls], z_m[walls])
+    paint[walls] = _wall_paint(exposed.scene, owner[walls] - 1, row[walls], col[walls], z_m[walls])
     albedo[side] = paint
     sun, sky = shares[..., 0], shares[..., 1]
     sun[side] = facing * is_lit * np.where(is_wall, 1.0, 0.7)
@@ -204,14 +250,13 @@ def _waves() -> tuple[Field, Field]:
     return tiles[0], tiles[1]
 
 
-def _reflect(
-    scene: Scene, painting: Painting, hits: Hits, seen: Field, conditions: Conditions, exposure: Exposure
-) -> None:
+def _reflect(exposed: _Exposed, hits: Hits, seen: Field) -> None:
     """Mirror sky and sun in water that ripples."""
-    at = np.flatnonzero((_nearest(painting.kind, hits) == WATER) & hits.is_ground)
+    exposure = exposed.exposure
+    at = np.flatnonzero((_nearest(exposed.painting.kind, hits) == WATER) & hits.is_ground)
     if not len(at):
         return
-    cell = np.float32(scene.grid.cell_size_m)
+    cell = np.float32(exposed.scene.grid.cell_size_m)
     place = [(part.ravel()[at] * cell * 3).astype(np.int32) % _WAVES for part in (hits.row, hits.col)]
     wave_e, wave_n = (tile[place[0], place[1]] for tile in _waves())
     fall = hits.fall.ravel()[at]
@@ -219,7 +264,7 @@ def _reflect(
     ray = (hits.ahead[0].ravel()[at] * scale, -hits.ahead[1].ravel()[at] * scale, -fall)
     cosine = fall - ray[0] * wave_e - ray[1] * wave_n  # of a normal that leans by the waves
     share = 0.02 + 0.98 * np.maximum(1 - cosine, 0) ** 5
-    sun = [np.float32(part) for part in conditions.sun.direction]
+    sun = [np.float32(part) for part in exposed.conditions.sun.direction]
     toward = (
         ray[0] * sun[0] + ray[1] * sun[1] + ray[2] * sun[2] + 2 * cosine * (wave_e * sun[0] + wave_n * sun[1] + sun[2])
     )
@@ -227,15 +272,17 @@ def _reflect(
     for _ in range(8):  # to the power of 256
         glint *= glint
     light = seen.reshape(-1, 3)
-    mirrored = np.multiply.outer(share, 1.1 * exposure.air) + np.multiply.outer(54 * share * glint, exposure.sun)
-    light[at] = light[at] * (1 - share)[:, None] + mirrored
+    mirrored = cv2.transform(
+        np.stack([share, 54 * share * glint], axis=1)[None], np.stack([1.1 * exposure.air, exposure.sun], axis=1)
+    )[0]
+    light[at] = cv2.multiply(light[at], cv2.merge([1 - share] * 3)[:, 0]) + mirrored
 
 
-def _add_air(seen: Field, camera: Camera, hits: Hits, conditions: Conditions, exposure: Exposure) -> None:
+def _add_air(seen: Field, camera: Camera, hits: Hits, exposed: _Exposed) -> None:
     """Mix haze in by distance (Koschmieder's law: contrast falls to 2 % at the visibility), and paint the sky."""
-    extinction = -math.log(0.02) / conditions.visibility_m
+    extinction = -math.log(0.02) / exposed.conditions.visibility_m
     away_m = (np.float32(camera.height_m) - hits.z_m) / np.maximum(hits.fall, 1e-3)
     clear = np.exp(-np.float32(extinction) * away_m)
     clear[~hits.is_ground] = 0
     cv2.multiply(seen, cv2.merge([clear, clear, clear]), dst=seen)
-    seen += cv2.transform(1 - clear, exposure.air[:, None])
+    seen += cv2.transform(1 - clear, exposed.exposure.air[:, None])

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scene: one window of a region, ready to be looked at from any camera in any season and light."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Final
@@ -68,8 +69,8 @@ class Scene:
     """One window of a region: what stands there, in what style, and where each class of the map is.
 
     `grid` is the lattice of the paint; `class_bits`, uint32 of its shape, has bit k set where class k of `classes` is
-    present; `is_mapped` is False beyond the mapped area. Paintings and lights are made when first needed; the last two
-    and the last one are kept.
+    present; `is_mapped` is False beyond the mapped area. Nothing is shown taller than `below_m`: a camera must stand
+    above all there is. Paintings and lights are made when first needed; the last two and the last one are kept.
     """
 
     plan: Plan
@@ -77,6 +78,7 @@ class Scene:
     classes: tuple[str, ...]
     class_bits: NDArray[np.uint32]
     is_mapped: Mask
+    below_m: float = math.inf
     _paintings: dict[Season, Painting] = field(default_factory=dict, init=False, repr=False)
     _lights: dict[tuple[Season, Sun], Light] = field(default_factory=dict, init=False, repr=False)
 
@@ -90,7 +92,7 @@ class Scene:
         if season not in self._paintings:
             while len(self._paintings) > 1:
                 self._paintings.pop(next(iter(self._paintings)))
-            self._paintings[season] = paint(self.plan, self.buildings, season)
+            self._paintings[season] = paint(self.plan, self.buildings, season, self.below_m)
         return self._paintings[season]
 
     def light(self, season: Season, sun: Sun) -> Light:
@@ -169,7 +171,7 @@ def _check(features: "gpd.GeoDataFrame", classes: tuple[str, ...], window: Grid)
         raise ShapeError(message)
 
 
-def paint(plan: Plan, buildings: Buildings, season: Season) -> Painting:
+def paint(plan: Plan, buildings: Buildings, season: Season, below_m: float = math.inf) -> Painting:
     """Paint a plan in a season: ground first, then what lies on it, then what stands on it."""
     shape = plan.grid.shape
     canvas = Canvas(
@@ -189,6 +191,7 @@ def paint(plan: Plan, buildings: Buildings, season: Season) -> Painting:
         _paint_snow(canvas)
     paint_cars(canvas)
     _paint_greenery(canvas, cover)
+    np.minimum(canvas.height_m, np.float32(below_m), out=canvas.height_m)
     colours = [canvas.colour]
     for _ in range(4):
         half = cv2.resize(colours[-1], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)

@@ -3,7 +3,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -38,6 +38,7 @@ _MOST_TILT_DEG: Final = 60.0  # of optical axes: the middle of a view must be se
 _CELL_PX: Final = 1.4  # cells of paint in a pixel, about
 _FINEST_M, _COARSEST_M = 0.25, 1.0
 _KEPT: Final = 2  # painted windows
+_TALLEST: Final = 0.75  # of the flight's height: whoever flies there flies above everything
 _VIEW: Final = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
 # Stops of a flight around the last one, by which a view of twice the picture's width is covered.
 _AROUND: Final = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (0, 0))
@@ -199,7 +200,7 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
     reach_m = _reach_m(flight, variant)
     pixel_m = flight.height_m / LENS.focal_px[0]
     cell_m = min(max(pixel_m * _CELL_PX, _FINEST_M), _COARSEST_M)
-    key = (site.index, family, flight.relief, reach_m, round(cell_m, 3))
+    key = (site.index, family, flight.relief, flight.height_m, reach_m, round(cell_m, 3))
     if key not in scene.painted:
         while len(scene.painted) >= _KEPT:
             scene.painted.pop(next(iter(scene.painted)))
@@ -213,7 +214,7 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
             cols=side,
         )
         state = scene.world
-        scene.painted[key] = make_scene(
+        made = make_scene(
             state.features,
             state.classes,
             state.coverage,
@@ -222,6 +223,7 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
             family=family,
             relief=flight.relief,
         )
+        scene.painted[key] = replace(made, below_m=_TALLEST * flight.height_m)
     return scene.painted[key]
 
 

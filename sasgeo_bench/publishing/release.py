@@ -90,8 +90,8 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
 
     Raise `ConfigError` if a region, suite, split or address is wrong, there are no tasks, or the extra packages are
     missing; `StoreError` if a region is not built, states no licence, has imagery that must not be passed on, or its
-    rasters are no valid COG, if a task is of another map or split or lacks its truths, or if the folder holds something
-    else.
+    rasters are no valid COG, if a task is of another map or split, holds pictures or lacks its truths, or if the folder
+    holds something else.
     """
     check_installed()
     _check_address(request.url)
@@ -219,7 +219,10 @@ def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None
         )
         raise StoreError(message)
     if has_images(task.folder):
-        message = f"{task.folder} holds images, whose licence is not that of the map: leave the suite out"
+        message = (
+            f"{task.folder} holds pictures, and a release holds none so far: name the other suites with --suites, and "
+            "pass this folder on by itself if the licence of its pictures allows it (rendered ones have the map's)"
+        )
         raise StoreError(message)
     if task.released:
         task_files.check_truths(task.folder, task.truth)

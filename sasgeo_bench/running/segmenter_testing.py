@@ -183,7 +183,7 @@ class _Kit:
         again = {name: self._ask(images[name]) for name in reversed(list(images))}
 
         def other(name: str, image: AerialImage) -> str | None:
-            """Return how the answer about an image differs from the first one."""
+            """Return how the later answer about an image differs from the first one."""
             del image
             return _difference(name, self.first[name], again[name], "after others, in a fresh process")
 

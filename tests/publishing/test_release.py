@@ -570,7 +570,7 @@ def test_without_the_extra_one_line_names_it(own, mistake, monkeypatch):
     )
 
 
-def test_images_are_kept_apart_from_what_is_derived_from_the_map(own, mistake):
+def test_queries_with_pictures_are_refused_and_told_what_to_do_instead(own, mistake):
     path = own / "tasks/clean" / RIVERSIDE / "queries.parquet"
     table = pq.read_table(path)
     lens = Intrinsics.from_field_of_view(horizontal_deg=60.0, width_px=8, height_px=8)
@@ -578,6 +578,5 @@ def test_images_are_kept_apart_from_what_is_derived_from_the_map(own, mistake):
     images = pa.array([[frame_row(Frame(picture=b"webp", camera=camera))], *[None] * (len(table) - 1)], pa.list_(FRAME))
     at = table.schema.get_field_index("frames")
     pq.write_table(table.set_column(at, table.schema.field(at), [images]), path)
-    assert "holds images, whose licence is not that of the map" in mistake(
-        "release", "--regions", RIVERSIDE, "--out", own
-    )
+    told = mistake("release", "--regions", RIVERSIDE, "--out", own)
+    assert "holds pictures, and a release holds none so far: name the other suites with --suites" in told

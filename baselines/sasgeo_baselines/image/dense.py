@@ -108,7 +108,7 @@ def bounds_of(query: sgb.Query, grid: sgb.Grid) -> Bounds:
 
 @dataclass(frozen=True, kw_only=True)
 class Question:
-    """What a query asks of a map: where its picture lies, in which of the headings and scales `turns`."""
+    """A query to a dense search: its picture, the places that it leaves open, the headings and scales to try."""
 
     sight: Sight
     bounds: Bounds

@@ -85,7 +85,7 @@ def _paint_country(canvas: Canvas) -> Field:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class _Plots:
-    """What the plots of open ground change: a tone to multiply by, and the share and the colour of tilled soil."""
+    """Changes of open ground by plot: a tone to multiply by, and the share and the colour of tilled soil."""
 
     tone: Field
     is_tilled: Mask

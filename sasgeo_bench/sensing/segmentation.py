@@ -183,8 +183,8 @@ def tables_of(counts: Mapping[str, NDArray[np.int64]], shares: Mapping[str, floa
 
     `counts` are as of `Segmentation.counts`. Raise `ImageError` as `Segmentation.with_shares` does.
 
-    >>> tables_of({"water": np.bincount([127] * 4, minlength=255)}, {"water": 0.25})["water"][[126, 127, 255]].tolist()
-    [63, 64, 255]
+    >>> tables_of({"water": np.bincount([127] * 4, minlength=255)}, {"water": 0.3})["water"][[100, 127, 255]].tolist()
+    [55, 76, 255]
     """
     tables = {}
     for name, share in shares.items():

@@ -44,6 +44,7 @@ ARGUED: Mapping[str, str] = {
     "observed.py:LEAST_M2 = 12": "three cells of the search: smaller patches are noise",
     "observed.py:SPUR_M = 8": "the width of a major road in the taxonomy: shorter branches are its corners",
     "observed.py:MARGIN_M = 8": "the width of a major road in the taxonomy: nearer the border it may be cut",
+    "nodes.py:TOUCH_M = 0.5": "half a cell of a map: outlines of neighbours drawn by hand meet no better",
     "observed.py:BRIDGED_M = 7": "the width of a street with its verges; by hand, and not estimated yet",
     "raster.py:REACH_M = 4": "tau of the paper's Eq. 8, by hand",
     "raster.py:DOUBT_M = 8": "two of REACH_M",

@@ -14,9 +14,11 @@ from sasgeo_bench.cli.console import say, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.progress import Tell, spread
 from sasgeo_bench.tasks import build
-from sasgeo_bench.tasks.query import Detector, PriorGroup
+from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
+from sasgeo_bench.tasks.query import PROFILE, Detector, PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
@@ -48,6 +50,10 @@ class QueryOptions(Options):
             help="family of errors: published or measured, of pictures rendered or shifted; may be repeated, for pairs"
         ),
     ] = None
+    profile: Annotated[
+        Path | None,
+        typer.Option(help="perception profile of a segmenter (*.toml); its errors are the detector 'profile'"),
+    ] = None
     extracts: ExtractFolders = None
     region_files: OwnRegionFolders = None
     out: Out = Path("out")
@@ -69,7 +75,8 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
     Raises
     ------
     ConfigError
-        If a suite, region or split is unknown, or a region cannot carry a suite (unless `skip`).
+        If a suite, region or split is unknown, a profile cannot be read, or a region cannot carry a suite (unless
+        `skip`).
     ExtractError
         If a region cannot be built since its extract is missing.
 
@@ -91,7 +98,7 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
         region_folders=tuple(options.region_files or ()),
         out=root_of(options.out, private),
         may_be_fewer=options.up_to,
-        choice=Choice(detectors=_detectors(options.detector)),
+        choice=_choice(options),
     )
     requests = plan_requests(wanted, tell=options.tell)
     if options.dry_run:
@@ -110,6 +117,17 @@ def make_queries_command(options: QueryOptions) -> None:
 
 def _folder(request: Request) -> Path:
     return request.out / "tasks" / request.suite / request.region.id
+
+
+def _choice(options: QueryOptions) -> Choice:
+    """Return the chosen detectors; a profile is one of them."""
+    if options.profile is None:
+        return Choice(detectors=_detectors(options.detector))
+    profile = read_profile(options.profile)
+    perfect = [name for name in load_taxonomy().names if name not in profile.classes]
+    if perfect:
+        options.tell(f"{options.profile} has no rates of {', '.join(perfect)}: views show that without errors")
+    return Choice(detectors=_detectors([*(options.detector or ()), PROFILE]), profile=profile)
 
 
 def _detectors(names: Sequence[str] | None) -> tuple[Detector, ...]:

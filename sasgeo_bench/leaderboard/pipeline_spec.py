@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from sasgeo_bench.config import (
     Document,
@@ -22,7 +22,7 @@ from sasgeo_bench.config import (
 )
 from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric, attainable, best_value, unreachable
-from sasgeo_bench.tasks.query import BY, CONTROLS, PUBLISHED, RENDERED, Detector, PriorGroup, Track
+from sasgeo_bench.tasks.query import BY, CONTROLS, PROFILE, PUBLISHED, RENDERED, Detector, PriorGroup, Track
 
 PAPER_SUITE: Final = "paper-poc"
 Crop = Literal["unknown", "absent", "smaller"]
@@ -122,6 +122,14 @@ class TaskSpec(Document):
     tracks: list[Track] = []
     detectors: Annotated[list[Detector], Field(min_length=1)] = ONE_DETECTOR
     segmenters: list[SegmenterName] = []
+
+    @field_validator("detectors")
+    @classmethod
+    def _need_no_file(cls, detectors: list[Detector]) -> list[Detector]:
+        if PROFILE in detectors:
+            message = "'profile' needs the file of a perception profile, which make-queries --profile alone takes"
+            raise ValueError(message)
+        return detectors
 
     @property
     def asked(self) -> list[str]:

@@ -147,9 +147,12 @@ def _request_sha256(request: Request) -> str:
         "made_by": version("sasgeo-bench"),
     }
     if request.choice != EVERYTHING:  # tasks that are older than this field stay valid
-        choice = asdict(request.choice)
+        choice = asdict(replace(request.choice, profile=None))
+        del choice["profile"]
         if request.choice.detectors == EVERYTHING.detectors:
             del choice["detectors"]
+        if request.choice.profile is not None:
+            choice["profile"] = request.choice.profile.model_dump(mode="json")
         content["choice"] = choice
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
@@ -221,6 +224,7 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         imagery=base.imagery if "imagery" in needs else None,
         ageing=_ageing(request.region) if "rates of ageing" in needs else None,
         looks={block.id: _look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
+        profile=request.choice.profile,
     )
     return scene, base
 
@@ -334,6 +338,8 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
     # With the seed anyone could draw the truths again, so it stays with them.
     hidden: dict[str, Any] = {**seed_record(request.seed), "count": request.count, "maps": len(by_map)}
     hidden["request_sha256"] = _request_sha256(request)
+    if request.choice.profile is not None:
+        hidden["profile"] = request.choice.profile.model_dump(mode="json", exclude={"classes"})
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
         made = put_task(_drawn(drawer, own), about, hidden, out=request.out, tell=tell)

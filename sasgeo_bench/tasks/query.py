@@ -24,12 +24,13 @@ TASK_VERSIONS: Final = (1, 2, TASK_VERSION)  # readable versions: their files ar
 Track = Literal["retrieval", "localization"]
 Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
-# Families of errors of perception: two models of a detector, and two of the look of pictures, which a segmenter sees.
-Detector = Literal["published", "measured", "rendered", "shifted", "real"]
+# Families of errors of perception: three models of a detector, and looks of pictures, which a segmenter sees.
+Detector = Literal["published", "measured", "profile", "rendered", "shifted", "real"]
 PUBLISHED: Final[Detector] = "published"  # the one that is meant where none is named
 RENDERED: Final[Detector] = "rendered"  # pictures of the ordinary look; from these segmenters learn
 REAL: Final[Detector] = "real"
-PERCEIVED: Final[tuple[Detector, ...]] = (PUBLISHED, "measured")  # models of perception, the first if none is chosen
+PROFILE: Final[Detector] = "profile"  # the measured confusions of a segmenter, from a file
+PERCEIVED: Final[tuple[Detector, ...]] = (PUBLISHED, "measured", PROFILE)  # models, the first if none is chosen
 PAINTED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")  # looks of rendered pictures, the first if none is chosen
 BY: Final = "+"  # between a suite of pictures and the segmenter that made its evidence
 RECALIBRATED: Final = "+shares"  # after the segmenter: by the map's shares of the classes
@@ -186,7 +187,7 @@ class Truth:
         Evaluation block of the centre, the unit of resampling, and scene tags of the region.
     measured : mapping of str to float
         Manipulation check: measures of the applied change.
-    detector : {"published", "measured", "rendered", "shifted"}
+    detector : {"published", "measured", "profile", "rendered", "shifted", "real"}
         Family of the errors of perception, or of the look of pictures; the query does not tell it.
     labels : tuple of FrameLabels
         What is on the pixels of each frame; only in memory, and in a file beside the truths.

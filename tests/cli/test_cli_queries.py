@@ -11,9 +11,10 @@ import pytest
 
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, SUITES
-from sasgeo_bench.tasks.task_files import QUERIES, TASK, TRUTH, TRUTH_OF, read_queries
+from sasgeo_bench.tasks.task_files import QUERIES, TASK, TRUTH, TRUTH_OF, read_queries, read_truths
 
 RIVERSIDE = "town-riverside"
 CLEAN = f"clean/{RIVERSIDE}"
@@ -43,6 +44,25 @@ def split_file(folder: Path, *names: str, kind: str = "holdout") -> Path:
         lines.append(f'part = "{("train", "test")[at % 2]}"' if kind == "holdout" else f'half = "{"ab"[at % 2]}"')
     path = folder / "split.toml"
     path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+PROFILE = """
+segmenter = "mine"
+learned_from = "rendered"
+tested_on = "elsewhere"
+images = 3
+[class.building]
+pixels = 900
+recall = {recall}
+precision = 0.9
+of_ground = 0.0
+"""
+
+
+def profile_file(folder: Path, recall: float) -> Path:
+    path = folder / "mine.toml"
+    path.write_text(PROFILE.format(recall=recall))
     return path
 
 
@@ -86,6 +106,32 @@ def test_what_a_region_cannot_carry_can_be_passed_over(program, own_out):
     assert {path.parent.parent.name for path in (own_out / "tasks").rglob(TASK)} == {"absent"}
 
 
+def buildings_of(out: Path) -> dict[str, int]:
+    """Cells of buildings in all views of `clean` at full strength, by detector."""
+    truths = {truth.query_id: truth for truth in read_truths(out / "truth" / CLEAN)}
+    found: dict[str, int] = {}
+    for query in read_queries(out / "tasks" / CLEAN):
+        truth, view = truths[query.query_id], query.evidence
+        if truth.role == "stress":
+            cells = int((view.cells[view.classes.index("building")] == PRESENT).sum())
+            found[truth.detector] = found.get(truth.detector, 0) + cells
+    return found
+
+
+def test_views_are_drawn_with_a_perception_profile_and_again_when_it_changes(program, own_out, tmp_path):
+    words = ("--suite", "clean", "--regions", RIVERSIDE, "--n", "1", "--detector", "published", "--out", own_out)
+    code, _, err = program("make-queries", *words, "--profile", profile_file(tmp_path, 0.9))
+    assert code == 0, err
+    assert "has no rates of road_major" in err
+    high = buildings_of(own_out)
+    assert high["profile"] > 0
+    assert json.loads((own_out / "truth" / CLEAN / TRUTH_OF).read_text())["profile"]["segmenter"] == "mine"
+    assert program("make-queries", *words, "--profile", profile_file(tmp_path, 0.2))[0] == 0
+    low = buildings_of(own_out)
+    assert low["published"] == high["published"]
+    assert low["profile"] < high["profile"] / 2
+
+
 def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
     words = ("--suite", "growth", "--regions", RIVERSIDE, "--n", "1", "--prior", "r250-known-s10", "--out", own_out)
     assert program("make-queries", *words)[0] == 0
@@ -110,6 +156,8 @@ def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
         (("--prior", "r500-weak"), "'r500-weak' is no prior group: r100, r250, r500, r2000 or rnone"),
         (("--prior", "r300-weak-s3"), "'r300-weak-s3' is no prior group"),
         (("--region-files", "nowhere"), "there is no folder nowhere"),
+        (("--detector", "profile"), "detector 'profile' needs a perception profile: name its file with make-queries"),
+        (("--profile", "none.toml"), "none.toml cannot be read as a perception profile"),
         (("--detector", "published", "--detector", "mine"), "--detector 'mine' is unknown: published or measured"),
     ],
 )

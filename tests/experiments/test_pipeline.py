@@ -295,6 +295,7 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ),
         ({"sites = 1": 'sites = 1\ntracks = ["retrieval"]'}, "is of localization, and no .* draws that track"),
         ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "Input should be 'published', 'measured'"),
+        ({"sites = 1": 'sites = 1\ndetectors = ["profile"]'}, "'profile' needs the file of a perception profile"),
         ({"sites = 1": 'sites = 1\ndetectors = ["measured", "measured"]'}, "detector 'measured' is listed twice"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),
         ({'suites = ["clean"]\nsites': 'suites = ["season"]\nsites'}, "names the suite 'clean', which is not drawn"),

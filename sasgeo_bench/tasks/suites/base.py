@@ -17,9 +17,10 @@ from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
-from sasgeo_bench.tasks.perturbations.detectors import DETECTORS
+from sasgeo_bench.tasks.perturbations.detectors import NO_PROFILE, perception_of
+from sasgeo_bench.tasks.perturbations.perception_profile import PerceptionProfile
 from sasgeo_bench.tasks.private_seed import Seed
-from sasgeo_bench.tasks.query import PERCEIVED, PUBLISHED, Detector, PriorGroup, Role, Track
+from sasgeo_bench.tasks.query import PERCEIVED, PROFILE, PUBLISHED, Detector, PriorGroup, Role, Track
 from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.twin import Paste
@@ -39,7 +40,8 @@ class Scene:
     `view_reach_m` is the largest distance that a view shows from its centre. `others` are states at other dates, oldest
     first, or a degraded one; `elsewhere` is another place; `imagery` is that of the region; `scenes` are its tags;
     `twins` are the places that look like each site; `ageing` has the rates of other places; `looks` are the families of
-    palettes and materials of pictures, by block, and `painted` the last windows that were painted.
+    palettes and materials of pictures, by block, and `painted` the last windows that were painted; `profile` has the
+    errors of the detector "profile".
     """
 
     map: State
@@ -54,6 +56,7 @@ class Scene:
     ageing: Ageing | None = None
     looks: Mapping[str, Family] = field(default_factory=dict)
     painted: dict[tuple[object, ...], Painted] = field(default_factory=dict, repr=False)
+    profile: PerceptionProfile | None = None
 
     def state(self, region: str) -> State:
         """Return the state of a map by its name."""
@@ -97,13 +100,15 @@ class Choice:
     """A selection of a suite's variants; an empty field selects all.
 
     `kinds` are prefixes of kinds of stress; controls and falsifiers are always selected. Each variant is drawn once for
-    each of `detectors` that the suite has, at the same site; unless any are chosen, for its first one.
+    each of `detectors` that the suite has, at the same site; unless any are chosen, for its first one. `profile` has
+    the errors of the detector "profile".
     """
 
     views_cells: tuple[int, ...] = ()
     kinds: tuple[str, ...] = ()
     tracks: tuple[Track, ...] = ()
     detectors: tuple[Detector, ...] = (PUBLISHED,)
+    profile: PerceptionProfile | None = None
 
     def takes(self, variant: Variant, track: Track) -> bool:
         """Return whether a variant on a track is selected."""
@@ -115,10 +120,12 @@ class Choice:
 
     def lack(self, suite: "Suite") -> str | None:
         """Return why the selection does not fit the suite, or None if it does."""
+        if PROFILE in self.detectors and self.profile is None:
+            return NO_PROFILE
         if self.detectors != EVERYTHING.detectors and not suite.drawn_by(self.detectors):
             named = ", ".join(map(repr, self.detectors))
             return f"suite {suite.card.name!r} is not drawn by {named}: it has {', '.join(suite.detectors)}"
-        if replace(self, detectors=EVERYTHING.detectors) == EVERYTHING:
+        if replace(self, detectors=EVERYTHING.detectors, profile=None) == EVERYTHING:
             return None
         stresses = [variant for variant in suite.variants if variant.role == "stress"]
         there: dict[str, tuple[Sequence[object], Sequence[object]]] = {
@@ -354,7 +361,8 @@ class Shot:
         """Return a clean view (of the world unless given) with errors, which are equal in all variants of a site."""
         variant = self.variant
         rng = self.seeds.rng("perception", variant.view_cells, variant.cell_size_m, *variant.others)
-        return DETECTORS[variant.detector](error_factor)(self.clean() if clean is None else clean, rng)
+        see = perception_of(variant.detector, error_factor=error_factor, profile=self.scene.profile)
+        return see(self.clean() if clean is None else clean, rng)
 
 
 def changed_share(first: Evidence, second: Evidence) -> float:

@@ -3,51 +3,53 @@
 
     .venv/bin/python benchmarks/segmenters.py --out out --extracts DIR --zanzibar DIR
     .venv/bin/python benchmarks/segmenters.py --out out --towns          # embedded towns alone: no data at all
+    .venv/bin/python benchmarks/segmenters.py --board docs/results/segmenters   # tables of a stored board, nothing else
 
 Pictures are rendered on regions of the split `holdout`: train places in the family "train", test places in the families
-"test" and "shifted". Regions that are not in `--out` are built first. `--zanzibar` is a folder with the two mosaics and
-the buildings that `data/imagery/manifest.toml` names; its four blocks, two in each of two villages 2.7 km apart, are
-cut into views of 100 m, and for "zanzibar -> zanzibar" each block is segmented by what was learned from the other
-three. Labels there are of buildings alone.
+"test" and "shifted". Regions that are not in `--out` are built first. `--zanzibar` and `--banepa` are folders with the
+pictures and buildings of the regions `zanzibar` and `banepa`. The mapped parts of these regions are cut into views of
+100 m, in blocks: two in each of the two villages of Zanzibar, 2.7 km apart, and the two parts of Banepa. For "zanzibar
+-> zanzibar" and "banepa -> banepa" each block is segmented by what was learned from the other ones. Labels there are of
+buildings alone; what lies outside the mapped parts, or has no picture, is unknown.
+
+`--segmenter NAME`, repeatable, chooses segmenters. One that learns is tested on every set after learning from the
+rendered pictures, and on real ones also after learning from real ones.
 
 Every stage is kept in `--out`/segmenters and not made again: pictures, learned texts, counts of pixels. Remove the
-folder to begin anew. Scores of all classes, places and seasons, with intervals, go to `scores.parquet` there, and
-`reliability.parquet` and `coverage.parquet` beside it. One table is printed, for the class `--class`. Its last columns
-are IoU and calibration error after `Segmentation.with_shares`, given the share of the class in the pictures of the
-place: of each picture alone, and of all pictures of the place together, as of one flight.
+folder to begin anew. Scores of all classes, places and seasons, with intervals, go to `--results`, by default
+`--out`/segmenters/board, with reliability, error over coverage, costs, and a perception profile of each trial. Then the
+tables of the board are printed, or, with `--page FILE`, put into a page below headings of the same names.
 """
 
 import argparse
+import hashlib
 import json
 import math
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-import cv2
-import geopandas as gpd
 import numpy as np
-import pandas as pd
-import rasterio
-from rasterio.features import rasterize
 
 import sasgeo_bench as sgb
-from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.matching.segmenter import LearningSegmenter
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.scoring.draws import seed_of_text
-from sasgeo_bench.scoring.segmentation import error_over_coverage, reliability, segmentation_scores
 from sasgeo_bench.scoring.segmentation_counts import PixelCounts, read_counts, write_counts
+from sasgeo_bench.scoring.segmenter_board import NOTHING, PLAIN, SegmenterBoard, SegmenterTrial, write_board
+from sasgeo_bench.scoring.segmenter_tables import page_tables, with_tables
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.image_bytes import SUFFIX, LabelledFiles, write_labelled
 from sasgeo_bench.sensing.intrinsics import Intrinsics
+from sasgeo_bench.sensing.region_views import part_bounds_m, region_views, split_bounds
 from sasgeo_bench.sensing.rendering.conditions import draw_conditions
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import make_scene
@@ -58,16 +60,21 @@ TRAIN: Final = (
     *("lauf", "porto", "town-grid", "town-suburb"),
 )
 TEST: Final = ("vaduz", "balzers", "badwildbad", "monaco", "town-riverside", "town-agricultural")
+SEGMENTERS: Final = ("colour_thresholds", "pixel_forest")
 SIDE_PX: Final = 448
 VIEW_DEG: Final = 65.0
 HEIGHTS_M: Final = (80.0, 300.0)
 TILT_DEG: Final = 12.0  # standard deviation
 PAINT_M: Final = 0.5  # cells of the paint
 LEAST_SHARE: Final = 0.03  # of a scene that any class covers
-REAL_M: Final = 0.25  # pixels of a view of Zanzibar
-REAL_PX: Final = 400
-FAR_M: Final = 1000.0  # height of the camera of a mosaic, in which nothing leans
+RENDERED: Final = "rendered"
+# Regions with imagery: their parts in the order of the region file, and blocks of each part.
+REAL: Final = {"zanzibar": (("north", "south"), 2), "banepa": (("core", "north"), 1)}
+TESTED: Final = ("test", "shifted", *REAL)
+KINDS: Final = (PLAIN, "picture", "flight")  # uses of shares
 DONE: Final = "done.json"
+
+Files = tuple[Path, ...]
 
 
 @dataclass(frozen=True)
@@ -77,20 +84,37 @@ class Trial:
     segmenter: str
     learned: str
     tested: str
-    folds: tuple[tuple[tuple[Path, ...], tuple[Path, ...]], ...]
+    folds: tuple[tuple[Files, Files], ...]
 
 
-def files_of(folder: Path, make: Callable[[], Iterator[sgb.LabelledImage]]) -> tuple[Path, ...]:
-    """Return the files of a set of pictures, made first unless the folder is complete."""
+def files_of(folder: Path, make: Callable[[], Iterator[sgb.LabelledImage]], *, asked: int = 0) -> Files:
+    """Return the files of a set of pictures, made first unless the folder is complete.
+
+    `asked` is the number of pictures that were asked for; a folder that was made with another one is refused.
+    """
     done = folder / DONE
     if not done.exists():
         folder.mkdir(parents=True, exist_ok=True)
         began = time.perf_counter()
         count = len(write_labelled(folder, make()))
         took = time.perf_counter() - began
-        done.write_text(json.dumps({"pictures": count, "seconds": round(took, 1)}), encoding="utf-8")
+        about = {"asked": asked, "pictures": count, "seconds": round(took, 1)}
+        done.write_text(json.dumps(about), encoding="utf-8")
         print(f"{folder}: {count} pictures in {took:.0f} s", flush=True)
+    made = json.loads(done.read_text(encoding="utf-8"))["asked"]
+    if made != asked:
+        message = f"{folder} was made with --pictures {made}, not {asked}: pass that number, or remove the folder"
+        raise SystemExit(message)
     return tuple(sorted(folder.glob(f"*{SUFFIX}")))
+
+
+def built_region(name: str, given: argparse.Namespace, folders: Sequence[Path]) -> sgb.Region:
+    """Return a region, built first unless it is there; `folders` hold its extracts and pictures."""
+    spec = read_region_file(find_region_file(name))
+    if not (given.out / "regions" / name).exists():
+        plan = plan_build(spec, out=given.out, extract_folders=folders, imagery_folders=folders)
+        build_region(plan, tell=lambda _: None, with_preview=False)
+    return sgb.read_region(given.out / "regions" / name)
 
 
 def rendered(region: str, family: Family, given: argparse.Namespace) -> Iterator[sgb.LabelledImage]:
@@ -98,11 +122,7 @@ def rendered(region: str, family: Family, given: argparse.Namespace) -> Iterator
 
     All families see the same places from the same cameras in the same weather.
     """
-    folder = given.out / "regions" / region
-    if not folder.exists():
-        plan = plan_build(read_region_file(find_region_file(region)), out=given.out, extract_folders=given.extracts)
-        build_region(plan, tell=lambda _: None, with_preview=False)
-    ground = sgb.read_region(folder)
+    ground = built_region(region, given, given.extracts)
     rng = np.random.default_rng(seed_of_text(f"segmenters/{region}"))
     made = 0
     for _ in range(20 * given.pictures):
@@ -130,73 +150,68 @@ def rendered(region: str, family: Family, given: argparse.Namespace) -> Iterator
         yield sgb.LabelledImage(image=picture, classes=scene.classes, labels=truth, place=region)
 
 
-def zanzibar(folder: Path, village: str, half: int) -> Iterator[sgb.LabelledImage]:
-    """Yield the views of one half of a village: west 0, east 1."""
-    with rasterio.open(folder / f"zanzibar_{village}_z21.tif") as source:
-        houses = gpd.read_file(folder / "osm_buildings_labels.geojson").to_crs(source.crs).geometry
-        middle = gpd.GeoSeries.from_xy([source.bounds.left], [source.bounds.top], crs=source.crs).to_crs(4326)
-        shrink = REAL_M / (source.res[0] * math.cos(math.radians(middle.y.iloc[0])))
-        cols, rows = int(source.width / shrink), int(source.height / shrink)
-        rgb = cv2.resize(source.read().transpose(1, 2, 0), (cols, rows), interpolation=cv2.INTER_AREA)
-        where = source.transform * source.transform.scale(source.width / cols, source.height / rows)
-    truth = rasterize([(house, 1) for house in houses], (rows, cols), transform=where, dtype="uint8")
-    focal = FAR_M / REAL_M
-    for row in range(0, rows - REAL_PX // 2, REAL_PX):
-        for col in range(half * (cols // 2), (half + 1) * (cols // 2) - REAL_PX // 2, REAL_PX):
-            part = np.s_[row : row + REAL_PX, col : min(col + REAL_PX, (half + 1) * (cols // 2))]
-            height, width = truth[part].shape
-            lens = Intrinsics(
-                width_px=width, height_px=height, focal_px=(focal, focal), centre_px=(width / 2, height / 2)
-            )
-            camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=FAR_M, yaw_deg=0.0)
-            picture = sgb.AerialImage(rgb=rgb[part].copy(), camera=camera)
-            yield sgb.LabelledImage(
-                image=picture, classes=("building",), labels=truth[part][None].copy(), place=f"zanzibar-{village}"
-            )
+def real_blocks(name: str, given: argparse.Namespace) -> list[Files]:
+    """Return the files of each block of a region with imagery."""
+    root, (parts, count) = given.out / "segmenters" / "pictures" / name, REAL[name]
+    if not all((root / f"{part}-{at}" / DONE).exists() for part in parts for at in range(count)):
+        spec = read_region_file(find_region_file(name))
+        region = built_region(name, given, [getattr(given, name)])
+        for part, whole in zip(parts, part_bounds_m(spec, epsg=region.grid.epsg), strict=True):
+            for at, block in enumerate(split_bounds(whole, count)):
+                files_of(root / f"{part}-{at}", partial(region_views, region, block, place=f"{name}-{part}"))
+    return [files_of(root / f"{part}-{at}", lambda: iter(())) for part in parts for at in range(count)]
 
 
-def sets_of(given: argparse.Namespace) -> dict[str, list[tuple[Path, ...]]]:
+def sets_of(given: argparse.Namespace) -> dict[str, list[Files]]:
     """Return the files of pictures by set and place, or block."""
     root = given.out / "segmenters" / "pictures"
-    found: dict[str, list[tuple[Path, ...]]] = {}
-    for name, family, regions in (("rendered", "train", TRAIN), ("test", "test", TEST), ("shifted", "shifted", TEST)):
+    found: dict[str, list[Files]] = {}
+    for name, family, regions in ((RENDERED, "train", TRAIN), ("test", "test", TEST), ("shifted", "shifted", TEST)):
         usable = [region for region in regions if not given.towns or region.startswith("town-")]
         found[name] = [
-            files_of(root / name / region, lambda region=region, family=family: rendered(region, family, given))
+            files_of(root / name / region, partial(rendered, region, family, given), asked=given.pictures)
             for region in usable
         ]
-    if given.zanzibar:
-        found["zanzibar"] = [
-            files_of(
-                root / "zanzibar" / f"{village}-{half}",
-                lambda village=village, half=half: zanzibar(given.zanzibar, village, half),
-            )
-            for village in ("north", "south")
-            for half in (0, 1)
-        ]
-    return found
+    return found | {name: real_blocks(name, given) for name in REAL if getattr(given, name)}
 
 
-def trials_of(sets: dict[str, list[tuple[Path, ...]]]) -> Iterator[Trial]:
-    """Yield all trials: the floor and the forest on every set, and real to real with one block left out each time."""
-    train = tuple(path for part in sets["rendered"] for path in part)
-    for tested in ("test", "shifted", "zanzibar"):
-        if tested in sets:
-            asked = tuple(path for part in sets[tested] for path in part)
-            yield Trial("colour_thresholds", "-", tested, (((), asked),))
-            yield Trial("pixel_forest", "rendered", tested, ((train, asked),))
-    blocks = sets.get("zanzibar", [])
-    folds = [(tuple(path for other in blocks if other is not block for path in other), block) for block in blocks]
-    if folds:
-        yield Trial("pixel_forest", "zanzibar", "zanzibar", tuple(folds))
+def trials_of(sets: dict[str, list[Files]], segmenters: Sequence[str]) -> Iterator[Trial]:
+    """Yield all trials of some segmenters.
+
+    Those that do not learn are tested on every set; others after learning from rendered pictures, from the other blocks
+    of the same real region, and from the real regions before it.
+    """
+    whole = {name: tuple(path for part in parts for path in part) for name, parts in sets.items()}
+    tested = [name for name in TESTED if name in sets]
+    for name in segmenters:
+        if not isinstance(sgb.load_segmenter(name), LearningSegmenter):
+            yield from (Trial(name, NOTHING, place, (((), whole[place]),)) for place in tested)
+            continue
+        yield from (Trial(name, RENDERED, place, ((whole[RENDERED], whole[place]),)) for place in tested)
+        real = [place for place in tested if place in REAL]
+        for at, place in enumerate(real):
+            yield from (Trial(name, other, place, ((whole[other], whole[place]),)) for other in real[:at])
+            yield Trial(name, place, place, tuple(without_each(sets[place])))
 
 
-def learned_text(trial: Trial, number: int, paths: Sequence[Path], root: Path) -> tuple[str | None, float]:
+def without_each(blocks: Sequence[Files]) -> Iterator[tuple[Files, Files]]:
+    """Yield for each block the files of all others, and its own."""
+    for block in blocks:
+        yield tuple(path for other in blocks if other is not block for path in other), block
+
+
+def digest(*sets: Files) -> str:
+    """Return a short name of some pictures, so that others are not taken for them."""
+    names = "\n".join("/".join(path.parts[-3:]) for files in sets for path in (*files, Path()))
+    return hashlib.sha256(names.encode()).hexdigest()[:8]
+
+
+def learned_text(trial: Trial, paths: Files, root: Path) -> tuple[str | None, float]:
     """Return what the segmenter of a trial learned, and its processor time; from the disk if it is there."""
     segmenter = sgb.load_segmenter(trial.segmenter)
     if not isinstance(segmenter, LearningSegmenter):
         return None, 0.0
-    file = root / "learned" / f"{trial.segmenter}-{trial.learned}-{number}.json"
+    file = root / "learned" / f"{trial.segmenter}-{trial.learned}-{digest(paths)}.json"
     timed = file.with_suffix(".seconds")
     if not timed.exists():
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -206,21 +221,12 @@ def learned_text(trial: Trial, number: int, paths: Sequence[Path], root: Path) -
     return file.read_text(encoding="utf-8"), float(timed.read_text(encoding="utf-8"))
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Counts of a trial: as the segmenter says, with shares by picture, and with shares by flight."""
-
-    counts: dict[str, tuple[PixelCounts, ...]]
-    segment_s: float
-    learn_s: float
-    learned_mb: float
-
-
-def outcome(trial: Trial, root: Path) -> Outcome:
-    """Return the counts of a trial, from the disk where they are."""
-    texts = [learned_text(trial, at, taught, root) for at, (taught, _) in enumerate(trial.folds)]
-    stem = f"{trial.segmenter}-{trial.learned}-{trial.tested}"
-    files = {kind: root / "counts" / f"{stem}-{kind}.parquet" for kind in ("plain", "picture", "flight")}
+def outcome(trial: Trial, root: Path) -> SegmenterTrial:
+    """Return the counts of a trial as the segmenter says and with shares; from the disk where they are."""
+    texts = [learned_text(trial, taught, root) for taught, _ in trial.folds]
+    pictures = digest(*(files for fold in trial.folds for files in fold))
+    stem = f"{trial.segmenter}-{trial.learned}-{trial.tested}-{pictures}"
+    files = {kind: root / "counts" / f"{stem}-{kind}.parquet" for kind in KINDS}
     timed = root / "counts" / f"{stem}.seconds"
     if not timed.exists():
         timed.parent.mkdir(parents=True, exist_ok=True)
@@ -228,32 +234,32 @@ def outcome(trial: Trial, root: Path) -> Outcome:
         for kind, file in files.items():
             write_counts(counts[kind], file)
         timed.write_text(f"{seconds:.4f}", encoding="utf-8")
-    return Outcome(
+        print(f"{stem}: {len(counts[PLAIN])} pictures", flush=True)
+    return SegmenterTrial(
+        segmenter=trial.segmenter,
+        learned_from=trial.learned,
+        tested_on=trial.tested,
         counts={kind: read_counts(file) for kind, file in files.items()},
-        segment_s=float(timed.read_text(encoding="utf-8")),
         learn_s=float(np.mean([took for _, took in texts])),
         learned_mb=float(np.mean([len(text or "") for text, _ in texts])) / 1e6,
+        segment_s=float(timed.read_text(encoding="utf-8")),
     )
 
 
 def _counted(trial: Trial, texts: Sequence[str | None]) -> tuple[dict[str, list[PixelCounts]], float]:
     """Segment every picture and count; the second is the mean processor time of a picture, s."""
-    found: dict[str, list[PixelCounts]] = {"plain": [], "picture": [], "flight": []}
-    took = []
+    found: dict[str, list[PixelCounts]] = {kind: [] for kind in KINDS}
+    took: list[float] = []
     for text, (_, asked) in zip(texts, trial.folds, strict=True):
         segmenter = sgb.load_segmenter(trial.segmenter)
         for place in sorted({path.parent for path in asked}):
             images = list(LabelledFiles([path for path in asked if path.parent == place]))
             began = time.process_time()
             said = [segmenter.segment(one.image, learned=text) for one in images]
-            took.append((time.process_time() - began) / len(images))
+            took += [(time.process_time() - began) / len(images)] * len(images)
             shares = shares_of(images, said[0].classes)
-            ways = {
-                "plain": said,
-                "picture": [one.with_shares(shares) for one in said],
-                "flight": together(said, shares),
-            }
-            for kind, some in ways.items():
+            ways = (said, [one.with_shares(shares) for one in said], together(said, shares))
+            for kind, some in zip(KINDS, ways, strict=True):
                 found[kind] += [
                     PixelCounts.of(one, seen, image=f"{place.name}/{at}")
                     for at, (one, seen) in enumerate(zip(images, some, strict=True))
@@ -288,58 +294,32 @@ def together(said: Sequence[sgb.Segmentation], shares: dict[str, float]) -> list
 
 
 def main() -> None:
-    """Make what is missing, and print the table."""
+    """Make what is missing, write the board, and print its tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out"))
+    parser.add_argument("--results", type=Path, help="folder of the board")
+    parser.add_argument("--board", type=Path, help="measure nothing: take the tables of this stored board")
+    parser.add_argument("--page", type=Path, help="put the tables into this page instead of printing them")
     parser.add_argument("--extracts", type=Path, action="append", default=[])
-    parser.add_argument("--zanzibar", type=Path, help="folder with the mosaics")
+    for name in REAL:
+        parser.add_argument(f"--{name}", type=Path, help=f"folder with the pictures and buildings of {name}")
+    parser.add_argument("--segmenter", action="append", help=f"repeatable; default: {' and '.join(SEGMENTERS)}")
     parser.add_argument("--towns", action="store_true", help="embedded towns alone")
-    parser.add_argument("--pictures", type=int, default=5, help="of each region")
-    parser.add_argument("--class", dest="class_name", default="building", help="class of the printed table")
+    parser.add_argument("--pictures", type=int, default=12, help="of each region")
     given = parser.parse_args()
-    root = given.out / "segmenters"
-    frames: dict[str, list[pd.DataFrame]] = {"scores": [], "reliability": [], "coverage": []}
-    lines = []
-    for trial in trials_of(sets_of(given)):
-        found = outcome(trial, root)
-        about = {"segmenter": trial.segmenter, "learned_from": trial.learned, "tested_on": trial.tested}
-        scores = {}
-        for kind, counts in found.counts.items():
-            scores[kind] = segmentation_scores(counts, **about, shares=kind)
-            frames["scores"].append(scores[kind])
-        frames["reliability"].append(reliability(found.counts["plain"], **about))
-        frames["coverage"].append(error_over_coverage(found.counts["plain"], **about))
-        lines.append(_line(trial, found, scores, given.class_name))
-    for name, some in frames.items():
-        write_frame(pd.concat(some, ignore_index=True), root / f"{name}.parquet", attrs={})
-    print(f"| {' | '.join(lines[0])} |\n|{'---|' * len(lines[0])}")
-    for line in lines:
-        print(f"| {' | '.join(line.values())} |")
-
-
-def _line(trial: Trial, found: Outcome, scores: dict[str, pd.DataFrame], class_name: str) -> dict[str, str]:
-    """Return a row of the printed table."""
-    line = {"segmenter": trial.segmenter, "learned from": trial.learned, "tested on": trial.tested}
-    line |= {"pictures": str(len(found.counts["plain"]))}
-    line |= {
-        metric.upper(): _shown(scores["plain"], class_name, metric) for metric in ("auc", "iou", "ece", "share_gap")
-    }
-    for kind in ("picture", "flight"):
-        line |= {
-            f"{metric.upper()}, shares by {kind}": _shown(scores[kind], class_name, metric) for metric in ("iou", "ece")
-        }
-    line |= {"learned, CPU s": f"{found.learn_s:.0f}", "learned, MB": f"{found.learned_mb:.1f}"}
-    return line | {"a picture, CPU s": f"{found.segment_s:.2f}"}
-
-
-def _shown(scores: pd.DataFrame, class_name: str, metric: str) -> str:
-    """Return a value over all images with its interval."""
-    one = scores[(scores["group"] == "all") & (scores["class"] == class_name) & (scores["metric"] == metric)]
-    if one.empty:
-        return "-"
-    row = one.iloc[0]
-    lo, hi = (row["lo"], row["hi"]) if not math.isnan(row["lo"]) else (row["lo_images"], row["hi_images"])
-    return f"{row['value']:.3f} [{lo:.3f}, {hi:.3f}]"
+    folder = given.board or given.results or given.out / "segmenters" / "board"
+    if not given.board:
+        sets = sets_of(given)
+        done = [outcome(trial, given.out / "segmenters") for trial in trials_of(sets, given.segmenter or SEGMENTERS)]
+        taught = LabelledFiles([path for part in sets[RENDERED] for path in part])
+        shares = {name: round(share, 4) for name, share in shares_of(taught, taught[0].classes).items()}
+        attrs = {"pictures": given.pictures, "package": sgb.__version__, "rendered_shares": shares}
+        write_board(folder, done, attrs=attrs)
+    board = SegmenterBoard.read(folder)
+    if given.page:
+        given.page.write_text(with_tables(given.page.read_text(encoding="utf-8"), board), encoding="utf-8")
+    else:
+        print(page_tables(board))
 
 
 if __name__ == "__main__":

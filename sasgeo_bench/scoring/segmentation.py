@@ -189,7 +189,9 @@ PIXEL_METRICS: Final = (
 )
 
 
-def segmentation_scores(counts: Sequence[PixelCounts], *, draws: int = DRAWS, **about: str) -> pd.DataFrame:
+def segmentation_scores(
+    counts: Sequence[PixelCounts], *, draws: int = DRAWS, groups: Sequence[str] = GROUPS, **about: str
+) -> pd.DataFrame:
     """Return every metric of every class, over all images, by place and by season, with 95 % intervals.
 
     Parameters
@@ -198,6 +200,8 @@ def segmentation_scores(counts: Sequence[PixelCounts], *, draws: int = DRAWS, **
         One for each image of a test, by one segmenter.
     draws : int
         Draws of the bootstrap.
+    groups : sequence of str
+        Which of "all", "place" and "season" to score.
     **about : str
         Columns that come first, as segmenter="pixel_forest", tested_on="shifted".
 
@@ -209,7 +213,7 @@ def segmentation_scores(counts: Sequence[PixelCounts], *, draws: int = DRAWS, **
         NaN for a single one; the number of images and of places; and labelled pixels. A class of which nothing is said
         in any image, since the segmenter cannot tell it, has no row.
     """
-    rows = [row for group, name, part in _groups(counts) for row in _rows(group, name, part, draws)]
+    rows = [row for group, name, part in _groups(counts, groups) for row in _rows(group, name, part, draws)]
     columns = ["group", "name", "class", "metric", "value", "lo", "hi", "lo_images", "hi_images"]
     frame = pd.DataFrame(rows, columns=[*columns, "images", "places", "pixels"])
     for at, (key, value) in enumerate(about.items()):
@@ -217,10 +221,11 @@ def segmentation_scores(counts: Sequence[PixelCounts], *, draws: int = DRAWS, **
     return frame
 
 
-def _groups(counts: Sequence[PixelCounts]) -> Iterator[tuple[str, str, list[PixelCounts]]]:
-    """Yield the images of all, of each place and of each season that is told."""
-    yield "all", "", list(counts)
-    for group in GROUPS[1:]:
+def _groups(counts: Sequence[PixelCounts], groups: Sequence[str]) -> Iterator[tuple[str, str, list[PixelCounts]]]:
+    """Yield the images of all, of each place and of each season that is told, as far as they are wanted."""
+    if GROUPS[0] in groups:
+        yield GROUPS[0], "", list(counts)
+    for group in filter(groups.__contains__, GROUPS[1:]):
         for name in sorted({getattr(one, group) for one in counts} - {""}):
             yield group, name, [one for one in counts if getattr(one, group) == name]
 

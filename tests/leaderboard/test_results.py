@@ -11,12 +11,15 @@ import pytest
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.publishing.archive import stored_settings
 from sasgeo_bench.publishing.archive_file import MOST_BYTES, unpack_tasks
+from sasgeo_bench.scoring.segmenter_board import SegmenterBoard
+from sasgeo_bench.scoring.segmenter_tables import page_tables, with_tables
 from sasgeo_bench.tasks.task_files import read_truths
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"
 FIRST = "leaderboard"
 PAGES = sorted(RESULTS.glob("*.md"))
-BOARDS = sorted(folder.name for folder in RESULTS.glob("*/") if folder.is_dir())
+BOARDS = sorted(path.parent.name for path in RESULTS.glob("*/board.json"))
+SEGMENTERS = RESULTS / "segmenters"
 PROGRAM = re.compile(r"```python\n(.*?)```\n\n```text\n(.*?)```", re.DOTALL)
 ROW = re.compile(r"^\|(?!---).*\|$", re.MULTILINE)
 
@@ -59,6 +62,8 @@ def test_stored_truths_are_of_the_detectors_that_the_pipeline_names(name, tmp_pa
 def test_every_row_of_a_table_on_the_pages_stands_on_a_board():
     boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
     for page in PAGES:
+        if page.stem == SEGMENTERS.name:  # its tables are held as wholes, below
+            continue
         rows = ROW.findall(page.read_text(encoding="utf-8"))
         assert len(rows) > len(BOARDS)
         assert [row for row in rows if row not in boards] == []
@@ -72,6 +77,29 @@ def test_every_program_on_the_pages_prints_what_they_say(page, monkeypatch, caps
     for program, said in found:
         exec(program, {})  # noqa: S102 - of our own page
         assert [line.rstrip() for line in capsys.readouterr().out.splitlines()] == said.splitlines()
+
+
+def test_the_tables_of_segmenters_are_those_of_their_board():
+    text, board = (RESULTS / "segmenters.md").read_text(encoding="utf-8"), SegmenterBoard.read(SEGMENTERS)
+    assert with_tables(text, board) == text
+    assert set(re.findall("^## .*", page_tables(board), re.MULTILINE)) < set(re.findall("^## .*", text, re.MULTILINE))
+
+
+def test_figures_with_intervals_in_the_prose_about_segmenters_stand_in_its_tables():
+    text = (RESULTS / "segmenters.md").read_text(encoding="utf-8")
+    prose = " ".join(" ".join(line for line in text.splitlines() if not line.startswith("|")).split())
+    found = re.findall(r"\d\.\d{3} \[\d\.\d{3}, \d\.\d{3}\]", prose)
+    assert len(found) > 10
+    assert [figure for figure in found if figure not in page_tables(SegmenterBoard.read(SEGMENTERS))] == []
+
+
+def test_the_stored_board_of_segmenters_is_small_and_each_trial_has_a_profile():
+    assert sum(path.stat().st_size for path in SEGMENTERS.rglob("*.*") if path.is_file()) < 1_000_000
+    board = SegmenterBoard.read(SEGMENTERS)
+    assert len(board.profiles) == len(board.runs)
+    for (segmenter, _, _), rows in board.scores.groupby(["segmenter", "learned_from", "tested_on"]):
+        assert {profile.segmenter for profile in board.profiles.values()} >= {segmenter}
+        assert set(rows.loc[rows["group"] == "all", "shares"]) == {"plain", "picture", "flight"}
 
 
 @pytest.mark.parametrize(

@@ -93,6 +93,25 @@ def test_figures_with_intervals_in_the_prose_about_segmenters_stand_in_its_table
     assert [figure for figure in found if figure not in page_tables(SegmenterBoard.read(SEGMENTERS))] == []
 
 
+def test_the_table_about_shares_among_the_concepts_is_of_the_board_of_segmenters():
+    text = (RESULTS.parent / "concepts" / "segmenters.md").read_text(encoding="utf-8")
+    scores = SegmenterBoard.read(SEGMENTERS).scores
+    scores = scores[(scores["group"] == "all") & (scores["tested_on"] == "zanzibar")]
+    found = scores.set_index(["segmenter", "learned_from", "shares", "metric"])["value"]
+    columns = (
+        ("plain", "auc"),
+        ("plain", "iou"),
+        ("plain", "ece"),
+        ("picture", "iou"),
+        ("flight", "iou"),
+        ("flight", "ece"),
+    )
+    trials = {"-": "-", "rendered": "rendered", "zanzibar": "the other three blocks"}
+    for segmenter, learned in (("colour_thresholds", "-"), ("pixel_forest", "rendered"), ("pixel_forest", "zanzibar")):
+        figures = " | ".join(f"{found[segmenter, learned, shares, metric]:.3f}" for shares, metric in columns)
+        assert f"| `{segmenter}` | {trials[learned]} | {figures} |" in text
+
+
 def test_the_stored_board_of_segmenters_is_small_and_each_trial_has_a_profile():
     assert sum(path.stat().st_size for path in SEGMENTERS.rglob("*.*") if path.is_file()) < 1_000_000
     board = SegmenterBoard.read(SEGMENTERS)

@@ -27,8 +27,7 @@ from sasgeo_baselines.segmenters.network import (
 
 _SEED: Final = 1
 _BATCH: Final = 8
-_CROPS_EACH: Final = 60  # of a picture, on average
-_LEAST_CROPS: Final = 720  # of a few pictures
+_CROPS_EACH: Final = 180  # of a picture, on average
 _MOST_CROPS: Final = 4800  # more make it surer of rendered pictures, and worse on real ones
 _RATE: Final = 2e-3  # of learning, at its highest
 _DECAY: Final = 1e-2
@@ -87,7 +86,7 @@ class UNet:
         odds = np.clip(list(shares.values()), _LEAST_SHARE, 1 - _LEAST_SHARE)
         weights["head.shift"] = np.repeat(np.log(odds / (1 - odds)), 4).astype(np.float32)
         crops = Crops(pictures=pictures, classes=tuple(shares))
-        steps = max(min(self.most_crops, max(_CROPS_EACH * len(pictures), _LEAST_CROPS)) // _BATCH, 1)
+        steps = max(min(self.most_crops, _CROPS_EACH * len(pictures)) // _BATCH, 1)
         fitted = _fit(torch, weights, crops, steps=steps, rng=rng)
         return weights_text(tuple(training.classes[at] for at in shares), fitted)
 

@@ -17,7 +17,7 @@ SOURCES := sasgeo_bench baselines benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region queries leaderboard test test-quick check bench ageing figures docs lock clean
+.PHONY: help install demo list-regions build-region queries leaderboard test test-quick test-torch check bench ageing figures docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -60,13 +60,17 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 
 # Three workers for two processors: now and then a test waits for a process that it has started.
 # Hundreds of processes import the same modules: none of them compiles them again.
-test test-quick: export PYTHONDONTWRITEBYTECODE :=
+test test-quick test-torch: export PYTHONDONTWRITEBYTECODE :=
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 3 --dist loadfile -p no:benchmark -rs $(ARGS)
 
 test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built for several of them
 	$(VENV_PYTHON) -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
+
+test-torch: $(STAMP) ## install the extra [torch] of the baselines and run the tests that need it; a PyTorch in .venv is kept
+	$(PIP) install --quiet --no-build-isolation -e 'baselines[torch]'
+	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(addprefix tests/baselines/test_,unet.py deep_retrieval.py image_matchers.py) $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)

@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """A made-up map full of small things, views cut from it, and tasks of an embedded town."""
 
+import builtins
 import datetime as dt
 import shutil
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from sasgeo_baselines.segmenters.network import drawn_weights, encoder_shapes
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
@@ -86,3 +89,32 @@ def town_tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     for request in plan_requests(wanted, tell=lambda _: None):
         make_tasks(request, tell=lambda _: None)
     return out
+
+
+@pytest.fixture(scope="session")
+def torch() -> Any:
+    """PyTorch; the test is skipped without it."""
+    return pytest.importorskip("torch", reason="PyTorch, the extra [torch], is not installed (make test-torch)")
+
+
+@pytest.fixture
+def without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An interpreter that has no PyTorch."""
+    real = builtins.__import__
+
+    def refusing(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name == "torch":
+            message = "No module named 'torch'"
+            raise ModuleNotFoundError(message, name=name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", refusing)
+
+
+@pytest.fixture(scope="session")
+def drawn_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Weights of an encoder that has learned nothing, as an archive of NumPy."""
+    path = tmp_path_factory.mktemp("weights") / "encoder.npz"
+    weights = drawn_weights(1, np.random.default_rng(0))
+    np.savez(path, **{name: weights[name] for name in encoder_shapes()})
+    return path

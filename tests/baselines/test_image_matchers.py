@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import cv2
 import numpy as np
 import pytest
+from sasgeo_baselines.image.deep_retrieval import DeepRetrieval
 
 import sasgeo_bench as sgb
 from sasgeo_bench.matching.matcher import check_match, lacks
@@ -18,7 +19,7 @@ from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.frames import encode_webp
 from tests.regions.imagery_place import SOUTH, WEST, make_hamlet
 
-NAMES = ("hog_colour", "ncc_gradient", "orb_homography", "orb_vlad")
+NAMES = ("deep_retrieval", "hog_colour", "ncc_gradient", "orb_homography", "orb_vlad")
 SIDE_M, PICTURE_PX, HEIGHT_M = 112.0, 400, 80.0
 TRUTH = sgb.Pose(easting_m=WEST + 205.0, northing_m=SOUTH + 172.0, yaw_deg=65.0, scale=1.03)
 PRIOR = sgb.Prior(
@@ -42,10 +43,19 @@ def window(region: sgb.Region) -> sgb.ImageryWindow:
     return region.imagery.read(region.imagery.record.bounds_m)
 
 
+def made_of(name: str, drawn_file: Path) -> sgb.Matcher:
+    """A matcher by its name, with weights where it needs some; skips where it needs what is not installed."""
+    made = sgb.load_matcher(name)
+    if isinstance(made, DeepRetrieval):
+        pytest.importorskip("torch", reason="PyTorch, the extra [torch], is not installed (make test-torch)")
+        made.weights = drawn_file
+    return made
+
+
 @pytest.fixture(scope="module", params=NAMES)
-def matcher(request: pytest.FixtureRequest, region: sgb.Region) -> sgb.Matcher:
+def matcher(request: pytest.FixtureRequest, region: sgb.Region, drawn_file: Path) -> sgb.Matcher:
     """Each matcher, prepared."""
-    made = sgb.load_matcher(request.param)
+    made = made_of(request.param, drawn_file)
     made.prepare(region, None)
     return made
 
@@ -170,8 +180,8 @@ def test_each_needs_a_picture_and_imagery(name, window):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_prepares_a_map_without_imagery_and_withholds(name, window):
-    made = sgb.load_matcher(name)
+def test_each_prepares_a_map_without_imagery_and_withholds(name, window, drawn_file):
+    made = made_of(name, drawn_file)
     made.prepare(SimpleNamespace(imagery=None), None)
     assert made.match(query_of(picture(window, TRUTH)), top_k=5) == sgb.WITHHELD
 

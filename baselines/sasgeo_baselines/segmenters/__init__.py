@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Segmenters: what is on an aerial image, by colour alone, or by trees that learn from labelled images."""
+"""Segmenters: what is on an aerial image, by colour alone, or by trees or a network that learn from labels."""

@@ -2,7 +2,8 @@
 """Features of the pixels of an aerial image: colour, texture and gradients at scales that are metres on the ground."""
 
 from collections.abc import Iterator
-from typing import Final
+from dataclasses import dataclass
+from typing import Final, Self
 
 import cv2
 import numpy as np
@@ -45,6 +46,37 @@ def working_size(image: sgb.AerialImage) -> tuple[int, int, float]:
     return rows, cols, gsd_m * image.shape[0] / rows
 
 
+def working_picture(image: sgb.AerialImage) -> tuple[NDArray[np.uint8], float]:
+    """Return the picture that features are computed from, and the side of its pixels, metres."""
+    rows, cols, pixel_m = working_size(image)
+    if (rows, cols) == image.shape:
+        return image.rgb, pixel_m
+    return np.asarray(cv2.resize(image.rgb, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8), pixel_m
+
+
+def reduced_labels(labels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return labels of a smaller picture: what covers half of a pixel; unknown where any of it is."""
+    if labels.shape == shape:
+        return labels
+    parts = [
+        cv2.resize((labels == state).astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
+        for state in (sgb.PRESENT, sgb.UNKNOWN)
+    ]
+    found = np.asarray(parts[0] >= 0.5, dtype=np.uint8)  # noqa: PLR2004 - half
+    found[parts[1] > 0] = sgb.UNKNOWN
+    return found
+
+
+def enlarged(plane: Plane, shape: tuple[int, int]) -> Plane:
+    """Return a plane of the working picture with the rows and columns of the picture."""
+    return np.asarray(cv2.resize(plane, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def enlarged_mask(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return a mask of the working picture with the rows and columns of the picture."""
+    return np.asarray(cv2.resize(mask.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)).view(np.bool_)
+
+
 def normalized(rgb: NDArray[np.uint8]) -> Plane:
     """Return lightness, green-red and blue-yellow, shape (3, H, W), relative to the picture's own medians and spread.
 
@@ -52,16 +84,33 @@ def normalized(rgb: NDArray[np.uint8]) -> Plane:
     for lightness and one for both colours bring the spread between percentiles to that of a usual picture, so that
     a grey picture stays grey.
     """
-    lab = _lab(rgb)
-    some = lab.reshape(3, -1)[:, :: max(1, lab[0].size // _ENOUGH)]
-    low, middle, high = np.percentile(some, [_CUT[0], 50, _CUT[1]], axis=1)
-    spread = np.maximum(high - low, _LEAST_SPREAD)
-    spread[1:] = spread[1:].max()
-    factor = np.array([4.0, 1.0, 1.0]) * _TARGET_SPREAD / spread
-    return np.ascontiguousarray((lab - middle[:, None, None]) * factor[:, None, None], dtype=np.float32)
+    lab = lab_planes(rgb)
+    return ColourBalance.of(lab).balanced(lab)
 
 
-def _lab(rgb: NDArray[np.uint8]) -> Plane:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColourBalance:
+    """Median of each Lab band of a picture, and the factor that brings its spread to the usual one; shape (3,) each."""
+
+    middle: NDArray[np.float64]
+    factor: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, lab: Plane) -> Self:
+        """Measure the bands of a picture, shape (3, H, W)."""
+        some = lab.reshape(3, -1)[:, :: max(1, lab[0].size // _ENOUGH)]
+        low, middle, high = np.percentile(some, [_CUT[0], 50, _CUT[1]], axis=1)
+        spread = np.maximum(high - low, _LEAST_SPREAD)
+        spread[1:] = spread[1:].max()
+        return cls(middle=middle, factor=np.array([4.0, 1.0, 1.0]) * _TARGET_SPREAD / spread)
+
+    def balanced(self, lab: Plane) -> Plane:
+        """Return the bands of a picture, or of a part of it, relative to its medians and spread."""
+        relative = (lab - self.middle[:, None, None]) * self.factor[:, None, None]
+        return np.ascontiguousarray(relative, dtype=np.float32)
+
+
+def lab_planes(rgb: NDArray[np.uint8]) -> Plane:
     """Return lightness (0..255), green-red and blue-yellow as they are, shape (3, H, W)."""
     lab = cv2.cvtColor(np.asarray(rgb, dtype=np.float32) / 255, cv2.COLOR_RGB2LAB).transpose(2, 0, 1)
     lab[0] *= 2.55
@@ -74,7 +123,7 @@ def features(rgb: NDArray[np.uint8], pixel_m: float) -> tuple[tuple[str, ...], P
     Most are of colours relative to the picture, which travel between cameras; a few are of the colours as they are,
     without which a picture of a lake alone would look like one of a field alone.
     """
-    named = [*_named(normalized(rgb), pixel_m), *_plain(_lab(rgb), pixel_m)]
+    named = [*_named(normalized(rgb), pixel_m), *_plain(lab_planes(rgb), pixel_m)]
     return tuple(name for name, _ in named), np.stack([plane for _, plane in named])
 
 

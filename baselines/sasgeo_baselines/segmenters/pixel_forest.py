@@ -6,12 +6,19 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Final, Self
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.segmenters.features import Plane, features, has_data, working_size
+from sasgeo_baselines.segmenters.features import (
+    Plane,
+    enlarged,
+    enlarged_mask,
+    features,
+    has_data,
+    reduced_labels,
+    working_picture,
+)
 
 FORMAT: Final = "pixel_forest 1"
 _PIXELS: Final = 3000  # drawn from each picture
@@ -76,7 +83,7 @@ class PixelForest:
             message = f"{self.card.name} needs training: learn from labelled pictures first"
             raise ValueError(message)
         forest = _forest(learned)
-        small, pixel_m = _working(image)
+        small, pixel_m = working_picture(image)
         names, planes = features(small, pixel_m)
         if list(names) != forest.features:
             message = f"the learned text has other features than this version of {self.card.name}: learn again"
@@ -86,8 +93,8 @@ class PixelForest:
         found = np.empty((len(forest.models), *image.shape), dtype=np.float32)
         for plane, model in zip(found, forest.models.values(), strict=True):
             chances = np.asarray(model.predict(table, num_threads=1, **_STOPS), dtype=np.float32)
-            plane[:] = _enlarged(chances.reshape(seen.shape), image.shape)
-        found[:, ~_enlarged_mask(seen, image.shape)] = np.nan
+            plane[:] = enlarged(chances.reshape(seen.shape), image.shape)
+        found[:, ~enlarged_mask(seen, image.shape)] = np.nan
         return sgb.Segmentation.of_probabilities(tuple(forest.models), found)
 
 
@@ -106,9 +113,9 @@ class _Drawn:
     @classmethod
     def of(cls, labelled: sgb.LabelledImage, seed: int) -> Self:
         """Draw half of the pixels evenly, and half evenly over the classes in the picture; weights undo the second."""
-        small, pixel_m = _working(labelled.image)
+        small, pixel_m = working_picture(labelled.image)
         names, planes = features(small, pixel_m)
-        labels = np.stack([_reduced(plane, small.shape[:2]) for plane in labelled.labels])
+        labels = np.stack([reduced_labels(plane, small.shape[:2]) for plane in labelled.labels])
         usable = (labels != sgb.UNKNOWN).any(axis=0) & has_data(small, pixel_m)
         at = np.flatnonzero(usable)
         if not len(at):
@@ -163,32 +170,3 @@ def _lightgbm() -> Any:  # noqa: ANN401 - a module
         message = f"LightGBM cannot be loaded ({error}): install libgomp1 (Debian, Ubuntu) or libomp (macOS)"
         raise RuntimeError(message) from error
     return lightgbm
-
-
-def _working(image: sgb.AerialImage) -> tuple[NDArray[np.uint8], float]:
-    """Return the picture that features are computed from, and the side of its pixels, metres."""
-    rows, cols, pixel_m = working_size(image)
-    if (rows, cols) == image.shape:
-        return image.rgb, pixel_m
-    return np.asarray(cv2.resize(image.rgb, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8), pixel_m
-
-
-def _reduced(labels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
-    """Return labels of a smaller picture: what covers half of a pixel; unknown where any of it is."""
-    if labels.shape == shape:
-        return labels
-    parts = [
-        cv2.resize((labels == state).astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
-        for state in (sgb.PRESENT, sgb.UNKNOWN)
-    ]
-    found = np.asarray(parts[0] >= 0.5, dtype=np.uint8)  # noqa: PLR2004 - half
-    found[parts[1] > 0] = sgb.UNKNOWN
-    return found
-
-
-def _enlarged(plane: Plane, shape: tuple[int, int]) -> Plane:
-    return np.asarray(cv2.resize(plane, shape[::-1], interpolation=cv2.INTER_LINEAR), dtype=np.float32)
-
-
-def _enlarged_mask(mask: NDArray[np.bool_], shape: tuple[int, int]) -> NDArray[np.bool_]:
-    return np.asarray(cv2.resize(mask.view(np.uint8), shape[::-1], interpolation=cv2.INTER_NEAREST)).view(np.bool_)

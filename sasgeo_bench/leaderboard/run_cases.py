@@ -36,7 +36,7 @@ from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
 from sasgeo_bench.scoring.score import MISSING, score_task, settle_not_applicable
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import REAL, Query, Truth
 from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.sheet import strength_text
 from sasgeo_bench.tasks.split import Split
@@ -147,7 +147,7 @@ def read_picture(case: Case, root: Path, about: Mapping[str, Any]) -> CasePictur
         at_answer=_seen_at(case.fix, case, bits, grid, manifest),
         disc=_disc(query),
         lines=_lines(case),
-        attribution=manifest.attribution,
+        attribution=_attribution(truth, manifest),
         what=_what(case),
         region=query.region,
         picture=query.frames[-1].image().rgb if query.frames else None,
@@ -155,6 +155,13 @@ def read_picture(case: Case, root: Path, about: Mapping[str, Any]) -> CasePictur
             segmented_file(root, str(about["files"][task_files.QUERIES]["sha256"])), query.query_id
         ),
     )
+
+
+def _attribution(truth: Truth, manifest: Manifest) -> str:
+    """Return whose data a picture shows: the map's, and the imagery's that a real view was cut out of."""
+    if truth.detector != REAL or manifest.imagery is None:
+        return manifest.attribution
+    return f"{manifest.attribution}; {manifest.imagery.attribution}"
 
 
 def _disc(query: Query) -> tuple[float, float, float] | None:

@@ -37,11 +37,12 @@ $(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
 
 install: $(STAMP) ## set up .venv from requirements.lock (the other targets do it too)
 
-demo: $(STAMP) ## build an embedded town and show what is in it; then a small leaderboard and its site, all offline
+demo: $(STAMP) ## build an embedded town and show what is in it; then a small leaderboard, its site and a strip from pictures to poses
 	$(SASGEO) build-region town-riverside --out $(OUT) $(ARGS)
 	$(SASGEO) inspect town-riverside --out $(OUT)
 	$(SASGEO) leaderboard demo --jobs 2 --out $(OUT)
 	$(SASGEO) publish --board $(OUT)/boards/demo
+	$(SASGEO) inspect $(OUT)/boards/demo --strip 6 --out $(OUT)
 
 list-regions: $(STAMP) ## list the regions that come with the package
 	$(SASGEO) list-regions $(ARGS)

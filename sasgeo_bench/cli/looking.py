@@ -12,10 +12,11 @@ from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
 from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.leaderboard.board_files import BOARD, read_board, read_scores
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
 from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
-from sasgeo_bench.leaderboard.strip_plot import strip_of, strip_pixels
+from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest
@@ -24,7 +25,7 @@ from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.build import check_task, has_truths
 from sasgeo_bench.tasks.duplicates import constellations, search_split
 from sasgeo_bench.tasks.panels import panels
-from sasgeo_bench.tasks.query import CONTROLS
+from sasgeo_bench.tasks.query import BY
 from sasgeo_bench.tasks.sheet import write_sheet
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.split_map import write_split_map
@@ -45,7 +46,9 @@ class InspectOptions(Options):
     rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries on the contact sheet")] = 12
     strip: Annotated[
         int | None,
-        typer.Option(min=1, max=20, help="of a run on pictures: draw so many queries, half of them failures"),
+        typer.Option(
+            min=1, max=20, help="of a run on pictures, or of a board's best one: draw so many queries, half failures"
+        ),
     ] = None
     rejector: Annotated[
         list[str] | None, typer.Option(help="of a run: what says which answers are accepted; may be repeated")
@@ -57,7 +60,8 @@ class InspectOptions(Options):
 
 def inspect_command(
     target: Annotated[
-        str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one or of a run")
+        str,
+        typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one, a run or a board"),
     ],
     options: InspectOptions,
 ) -> None:
@@ -67,6 +71,8 @@ def inspect_command(
     if task_folder is not None:
         _inspect_task(task_folder, out, query=query, rows=options.rows)
         return
+    if options.strip is not None and (Path(target) / BOARD).is_file():
+        target = str(_best_run(Path(target), out))
     if Path(target).is_dir() and is_run(Path(target)):
         grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
         chosen = make_split(read_split_file(find_split_file(options.split)), grids)
@@ -114,13 +120,26 @@ def _text_of(value: object) -> str:
     return ", ".join(map(_text_of, value)) if isinstance(value, list) else str(value)
 
 
+def _best_run(board: Path, out: Path) -> Path:
+    """Return the folder of the runs of the matcher of a board that finds most queries with pictures."""
+    about, _ = read_board(board)
+    scores = {str(name): frame for name, frame in read_scores(board).groupby("matcher")}
+    tasks = {(str(item["suite"]), str(item["region"])) for item in about["tasks"]}
+    name = best_on_pictures(scores, {key for key in tasks if BY in key[0]})
+    if name is None:
+        message = f"{board} holds no answers to queries with pictures: name a board of a suite such as aerial+..."
+        raise ConfigError(message)
+    entry = next(item for item in about["entries"] if item["name"] == name)
+    return out / "runs" / str(entry["card"]["name"]) / str(entry["hash"])
+
+
 def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | None) -> None:
     """Count the failures of a run by class, with some to look at; or draw one query and its answer, or a strip."""
     if strip is not None:
         name = cases.entry.name.replace(" ", "-")
-        suites = ", ".join(sorted({suite for suite, _ in cases.tasks if suite != CONTROLS}))
+        suites = ", ".join(sorted({suite for (suite, _), task in cases.tasks.items() if task.about.get("frames")}))
         path = out / "sheets" / f"strip-{name}.png"
-        write_png(path, strip_pixels(strip_of(cases, strip), title=f"{cases.entry.name} on {suites}"))
+        write_png(path, strip_pixels(*strip_of(cases, strip), title=f"{cases.entry.name} on {suites}"))
         say(f"strip: {path}")
         return
     if query is not None:

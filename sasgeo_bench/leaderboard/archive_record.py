@@ -207,9 +207,12 @@ class _Picture(_Record):
     suite: str = ""
 
 
-class _Case(_Picture):
-    query_id: str = ""
+class _Strip(_Picture):
     matcher: str = ""
+
+
+class _Case(_Strip):
+    query_id: str = ""
     failure: str = ""
     kind: str = ""
     said: dict[str, str | float | int | bool | None] | None = None
@@ -224,6 +227,7 @@ class PicturesRecord(_Record):
 
     regions: list[_Picture] = []
     suites: list[_Picture] = []
+    strips: list[_Strip] = []
     cases: list[_Case] = []
 
 

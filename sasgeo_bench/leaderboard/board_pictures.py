@@ -25,6 +25,7 @@ from sasgeo_bench.leaderboard.cases import (
 )
 from sasgeo_bench.leaderboard.plot_tables import shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
+from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
@@ -41,6 +42,9 @@ REGION_BYTES: Final = 15_000
 SUITE_BYTES: Final = 38_000
 CASE_BYTES: Final = 31_000
 MOST_BYTES: Final = 3_000_000  # of all pictures of a board
+STRIP_BYTES: Final = 160_000
+STRIP_ROWS: Final = 4
+KINDS: Final = ("regions", "suites", "strips", "cases")
 _THUMB_CELLS: Final = 1100  # a level of the layers that is not much finer than a thumbnail
 _SHEET_DPI: Final = 72
 _EACH: Final = 4  # cases of one class and matcher
@@ -52,7 +56,7 @@ class _Found:
     """Pictures so far, what `pictures.json` says of them, and why others are not among them."""
 
     files: dict[str, bytes] = field(default_factory=dict)
-    listed: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {"regions": [], "suites": [], "cases": []})
+    listed: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
     lacking: Counter[str] = field(default_factory=Counter)
     failures: Failures
 
@@ -98,10 +102,11 @@ def pictures_extra(
     _add_regions(found, asked, root)
     _add_suites(found, asked, board, root)
     if has_cases:
+        _add_strips(found, board, asked, root)
         _add_cases(found, board, contrasts, asked, root)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
-    listed = ", ".join(f"{len(rows)} of {kind}" for kind, rows in found.listed.items())
+    listed = ", ".join(f"{len(rows)} of {kind}" for kind, rows in found.listed.items() if rows or kind != "strips")
     tell(f"pictures: {listed}, {sum(map(len, found.files.values())) / 1e6:.2f} MB")
     return Extra(pictures=_with_list(found.files, found.listed) if found.files else {})
 
@@ -180,7 +185,44 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
     return sorted(order, key=lambda item: (rank[item.role], -item.strength))[:2]
 
 
-# --- cases ------------------------------------------------------------------------------------------------------------
+# --- strips and cases -------------------------------------------------------------------------------------------------
+
+
+def _add_strips(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
+    """Add for each suite of pictures some queries of the matcher that finds most of them, from picture to pose."""
+    about = {(str(item["suite"]), str(item["region"])): item for item in asked if item.get("frames")}
+    for suite in sorted({suite for suite, _ in about}):
+        own = {key: item for key, item in about.items() if key[0] == suite}
+        name = best_on_pictures(board.scores, own)
+        if name is None:
+            continue
+        strip = Strip.of(board.scores[name], own, STRIP_ROWS)
+        chosen = board.scores[name].set_index("query_id").loc[list(strip.query_ids), ["suite", "region"]]
+        drawn = {
+            (row["query_id"], name): row | {"matcher": name, "failure": ""}
+            for row in chosen.reset_index().to_dict("records")
+        }
+        cases = {case.query.query_id: case for case in _cases(drawn, board, {}, root, found)}
+        alt = f"From the picture to the pose: {name} on {suite}. {strip.facts}"
+        found.add(
+            "strips",
+            suite,
+            partial(_strip, strip, cases, own, root, title=f"{name} on {suite}"),
+            {"suite": suite, "matcher": name, "alt": alt},
+        )
+
+
+def _strip(
+    strip: Strip,
+    cases: Mapping[str, Case],
+    about: Mapping[tuple[str, str], Mapping[str, Any]],
+    root: Path,
+    *,
+    title: str,
+) -> bytes:
+    own = [cases[query_id] for query_id in strip.query_ids if query_id in cases]
+    rows = [read_picture(case, root, about[case.query.suite, case.query.region]) for case in own]
+    return fitted(strip_pixels(strip, rows, title=title), STRIP_BYTES)
 
 
 def _add_cases(
@@ -200,11 +242,10 @@ def _add_cases(
         off = f", {facts['error_m']:.0f} m off" if "error_m" in facts else ""
         alt = f"{case.failure}: view, true place and answer of {case.matcher} on {row['suite']}, {row['region']}{off}"
         task = about[row["suite"], row["region"]]
-        region = root / "regions" / row["region"]
         found.add(
             "cases",
             f"{case.matcher}-{case.query.query_id}",
-            partial(_drawn, case, region, task),
+            partial(_drawn, case, root, task),
             {**{str(name): value for name, value in row.items()}, "alt": alt, "said": facts},
         )
     order = {key: at for at, key in enumerate(drawn)}
@@ -223,8 +264,8 @@ def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
     return pd.concat(frames, ignore_index=True)
 
 
-def _drawn(case: Case, region: Path, about: Mapping[str, Any]) -> bytes:
-    return fitted(case_pixels(read_picture(case, region, about)), CASE_BYTES)
+def _drawn(case: Case, root: Path, about: Mapping[str, Any]) -> bytes:
+    return fitted(case_pixels(read_picture(case, root, about)), CASE_BYTES)
 
 
 def _cases(

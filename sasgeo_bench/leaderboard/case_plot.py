@@ -19,10 +19,13 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.regions.evidence import Evidence, footprint
 from sasgeo_bench.regions.preview import paint_overview, scale_bar
 from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.scoring.pose import SUCCESS_DEG
+from sasgeo_bench.scoring.score import FIX_M
+from sasgeo_bench.tasks.segmented import Segmented
 from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
 WEBP: Final = ".webp"
@@ -144,10 +147,12 @@ class CasePicture:
         Lines on what the answer and the integrity model say.
     attribution : str
         Of the map.
-    what : str
-        Kind and strength of the stress.
+    what, region : str
+        Kind and strength of the stress, and the map that is searched.
     picture : ndarray of uint8, shape (H, W, 3), optional
         The newest picture that the evidence was made of, RGB.
+    segmented : Segmented, optional
+        What a segmenter says of that picture.
     """
 
     title: str
@@ -162,7 +167,9 @@ class CasePicture:
     lines: Sequence[str]
     attribution: str
     what: str = ""
+    region: str = ""
     picture: NDArray[np.uint8] | None = None
+    segmented: Segmented | None = None
 
     @property
     def error_m(self) -> float | None:
@@ -171,6 +178,21 @@ class CasePicture:
             return None
         first = self.modes[0][0]
         return math.hypot(first.easting_m - self.true.easting_m, first.northing_m - self.true.northing_m)
+
+    @property
+    def error_deg(self) -> float | None:
+        """Return the difference of the first heading from the true one, 0 to 180; None without either."""
+        if self.true is None or not self.modes:
+            return None
+        return abs(float(wrap_deg(self.modes[0][0].yaw_deg - self.true.yaw_deg)))
+
+    @property
+    def is_found(self) -> bool:
+        """Return whether the first pose is right: within 25 m and 5 degrees, as `success_25m` counts it."""
+        error_m, error_deg = self.error_m, self.error_deg
+        if error_m is None or error_deg is None or not self.is_present:
+            return False
+        return error_m <= FIX_M and error_deg <= SUCCESS_DEG
 
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:
@@ -233,10 +255,10 @@ def draw_map(chart: Axes, case: CasePicture) -> None:
         if 0 <= at[0] <= side_m and 0 <= at[1] <= side_m:
             chart.text(*at, str(number), fontsize=6.5, color=_OTHER, ha="center", va="center", path_effects=_HALO)
     size_m = case.view.size_m
-    if case.modes:
-        _outline(chart, case.modes[0][0], size_m, part, colour=ANSWERED, dash="--")
     if case.true is not None:
         _outline(chart, case.true, size_m, part, colour=TRUE, dash="-")
+    if case.modes:  # last: its dashes leave the true outline to be seen where both agree
+        _outline(chart, case.modes[0][0], size_m, part, colour=ANSWERED, dash="--")
     if case.true is not None and case.modes:
         _offset(chart, case, part)
     scale_bar(chart, side_m, side_m)
@@ -256,7 +278,9 @@ def _at(pose: Pose, part: MapPart) -> tuple[float, float]:
 def _outline(chart: Axes, pose: Pose, size_m: tuple[float, float], part: MapPart, *, colour: str, dash: str) -> None:
     """Draw the footprint of a view, with a notch at its top."""
     ring = shapely.get_coordinates(footprint(pose, size_m=size_m)) - (part.west_m, part.south_m)
-    chart.plot(ring[:, 0], ring[:, 1], color=colour, ls=dash, lw=1.6, path_effects=_HALO)
+    width = 2.6 if dash == "-" else 1.4
+    halo = _HALO if dash == "-" else ()
+    chart.plot(ring[:, 0], ring[:, 1], color=colour, ls=dash, lw=width, path_effects=halo)
     up = np.array([(0.0, 0.5), (0.0, 0.36)]) * size_m[1]
     top = pose.to_map(up) - (part.west_m, part.south_m)
     chart.plot(top[:, 0], top[:, 1], color=colour, lw=1.6, path_effects=_HALO)

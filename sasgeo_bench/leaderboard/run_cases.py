@@ -36,7 +36,8 @@ from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
 from sasgeo_bench.scoring.score import MISSING, score_task, settle_not_applicable
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import REAL, Query, Truth
+from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.sheet import strength_text
 from sasgeo_bench.tasks.split import Split
 
@@ -120,12 +121,13 @@ def _plain(value: float | str) -> float | str:
     return value if isinstance(value, str) else float(f"{float(value):.6g}")
 
 
-def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePicture:
+def read_picture(case: Case, root: Path, about: Mapping[str, Any]) -> CasePicture:
     """Read the map, evidence and poses that the picture of a case shows.
 
-    `region` is the folder of the searched map, `about` the content of `task.json`: the map must be that very build.
+    `root` holds regions/ and segmenters/, `about` is the content of `task.json`: the map must be that very build.
     Raise StoreError if the map is missing, damaged, or was built anew since the queries were drawn.
     """
+    region = root / "regions" / str(about["region"])
     manifest = region_files.read_manifest(region)
     if not task_files.is_of_map(about, manifest):
         raise StoreError(built_anew(str(about["region"])))
@@ -145,10 +147,21 @@ def read_picture(case: Case, region: Path, about: Mapping[str, Any]) -> CasePict
         at_answer=_seen_at(case.fix, case, bits, grid, manifest),
         disc=_disc(query),
         lines=_lines(case),
-        attribution=manifest.attribution,
+        attribution=_attribution(truth, manifest),
         what=_what(case),
+        region=query.region,
         picture=query.frames[-1].image().rgb if query.frames else None,
+        segmented=read_segmented(
+            segmented_file(root, str(about["files"][task_files.QUERIES]["sha256"])), query.query_id
+        ),
     )
+
+
+def _attribution(truth: Truth, manifest: Manifest) -> str:
+    """Return whose data a picture shows: the map's, and the imagery's that a real view was cut out of."""
+    if truth.detector != REAL or manifest.imagery is None:
+        return manifest.attribution
+    return f"{manifest.attribution}; {manifest.imagery.attribution}"
 
 
 def _disc(query: Query) -> tuple[float, float, float] | None:
@@ -383,7 +396,7 @@ def picture_of(cases: RunCases, query: str) -> tuple[str, CasePicture]:
         prediction=cases.predictions.get(query_id),
         **words_of(words, cases.entry.name, query_id),
     )
-    return query_id, read_picture(case, cases.root / "regions" / row["region"], task.about)
+    return query_id, read_picture(case, cases.root, task.about)
 
 
 def _truth(task: ScoredTask, query_id: str) -> Truth:

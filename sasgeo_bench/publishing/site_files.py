@@ -31,6 +31,7 @@ from sasgeo_bench.leaderboard.board_files import (
     SCORES,
     read_board,
 )
+from sasgeo_bench.leaderboard.board_pictures import KINDS
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -223,7 +224,7 @@ def _read_downloads(folder: Path) -> Iterator[Download]:
 
 
 def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """Read regions, suites and cases of `pictures.json`, and check each file against the folder."""
+    """Read regions, suites, strips and cases of `pictures.json`, and check each file against the folder."""
     path = folder / f"{PICTURES}.json"
     if not path.is_file():
         return {}
@@ -231,7 +232,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
         data = path.read_bytes()
         parse_record(data, PicturesRecord)
         content = parse_json(data)
-        found = {kind: [dict(item) for item in content.get(kind, [])] for kind in ("regions", "suites", "cases")}
+        found = {kind: [dict(item) for item in content.get(kind, [])] for kind in KINDS}
         for item in (one for listed in found.values() for one in listed):
             _check_picture(folder, str(item["file"]))
     except SasgeoError:

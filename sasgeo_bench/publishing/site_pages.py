@@ -96,7 +96,7 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
             table for key in keys for table in (suite_table(book, key, book.matchers[key]), *strata_tables(book, key))
         ),
         figures=tuple(item for item in source.figures if item.file.startswith(starts)),
-        pictures=tuple(item for item in source.pictures.suites if item.of == name),
+        pictures=tuple(item for item in (*source.pictures.suites, *source.pictures.strips) if item.of == name),
         regions=tuple(sorted({base_of(region) for region in tasks})),
     )
 

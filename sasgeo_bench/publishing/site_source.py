@@ -46,7 +46,7 @@ class SiteFigure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
-    """A picture of a region or suite (`of`), made elsewhere."""
+    """A picture of a region or suite (`of`), made elsewhere; a strip is of a suite, too."""
 
     of: str
     file: str
@@ -97,6 +97,7 @@ class Pictures:
 
     regions: tuple[Picture, ...] = ()
     suites: tuple[Picture, ...] = ()
+    strips: tuple[Picture, ...] = ()
     cases: tuple[Case, ...] = ()
 
 

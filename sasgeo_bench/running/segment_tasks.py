@@ -28,6 +28,7 @@ from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import FrameLabels, read_labels
 from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of
+from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
 from sasgeo_bench.tasks.split import HALVES, Split
 
 FOLDER: Final = "segmenters"  # below the root: what segmenters learned
@@ -263,10 +264,12 @@ def _segmented(sight: _Sight, task: Path) -> tuple[Path, list[str]]:
     task_files.check_truths(task, truth)
     faults: list[str] = []
     lines: list[str] = []
-    pairs = _pairs(sight, task, truth, suite, faults)
+    done = _seen_by(sight, task, truth, suite, faults)
     own = {name: value for name, value in about.items() if name not in _OF_FILES}
     hidden = {name: value for name, value in task_files.read_hidden(truth).items() if name != "queries_sha256"}
-    made = put_task(pairs, own | {"suite": suite, "segmenter": record}, hidden, out=root, tell=lines.append)
+    made = put_task(done.pairs, own | {"suite": suite, "segmenter": record}, hidden, out=root, tell=lines.append)
+    queries_sha256 = str(task_files.read_task(made.folder)["files"][task_files.QUERIES]["sha256"])
+    write_segmented(segmented_file(root, queries_sha256), done.pictures)
     lines.append(f"{suite} on {about['region']}: {counted(made.queries, 'query', 'queries')} in {made.folder}")
     if faults:
         failed = f"{sight.loaded.card.name} failed at {counted(len(faults), 'picture')}"
@@ -285,15 +288,28 @@ def _is_made(folder: Path, record: Mapping[str, str]) -> bool:
     return is_whole and about.get("segmenter") == dict(record)
 
 
-def _pairs(sight: _Sight, task: Path, truth: Path, suite: str, faults: list[str]) -> list[tuple[Query, Truth]]:
-    """Return queries with evidence and their truths by id; `faults` gets a line for each picture that failed."""
+@dataclass(frozen=True, kw_only=True)
+class _Seen:
+    """What a segmenter made of a task: queries with evidence and their truths by id, and pictures to look at."""
+
+    pairs: list[tuple[Query, Truth]]
+    pictures: dict[str, Segmented]
+
+
+def _seen_by(sight: _Sight, task: Path, truth: Path, suite: str, faults: list[str]) -> _Seen:
+    """Segment the pictures of a task; `faults` gets a line for each picture that failed."""
     truths = {item.query_id: item for item in task_files.read_truths(truth)}
+    pairs: list[tuple[Query, Truth]] = []
+    pictures: dict[str, Segmented] = {}
     with SegmenterRun(sight.request, sight.loaded, learned=sight.learned) as run:
         said = _said(run, task, truth, faults)
         if sight.is_recalibrated:
             said = recalibrated(said, read_region(root_of(task) / "regions" / task.name))
-        found = [_with_evidence(query, truths[query.query_id], suite, sight.name, seen) for query, seen in said]
-    return sorted(found, key=lambda pair: pair[0].query_id)
+        for query, seen in said:
+            pairs.append(_with_evidence(query, truths[query.query_id], suite, sight.name, seen))
+            if seen and seen[-1] is not None:
+                pictures[pairs[-1][0].query_id] = Segmented.of(seen[-1])
+    return _Seen(pairs=sorted(pairs, key=lambda pair: pair[0].query_id), pictures=pictures)
 
 
 def _said(run: SegmenterRun, task: Path, truth: Path, faults: list[str]) -> Iterator[Said]:

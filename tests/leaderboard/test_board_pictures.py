@@ -151,11 +151,11 @@ def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, as
     changes = {} if prediction == "answer" else {"prediction": prediction}
     said = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}
     case, about = case_at(root, *asked, **said, **changes)
-    first, again = (case_pixels(read_picture(case, root / "regions" / asked[1], about)) for _ in range(2))
+    first, again = (case_pixels(read_picture(case, root, about)) for _ in range(2))
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
     assert fitted(first, CASE_BYTES) == fitted(again, CASE_BYTES)
-    text = "\n".join(read_picture(case, root / "regions" / asked[1], about).lines)
+    text = "\n".join(read_picture(case, root, about).lines)
     assert "P(false) sure: 0.25, accepted" in text
     assert "margin (an order, no probability): 0.5\n" in text
     assert ("margin_nats: 1.25 nat" in text) == (prediction == "answer")
@@ -174,7 +174,7 @@ def test_what_orders_answers_alone_is_told_apart_from_a_probability():
 
 def test_the_map_of_a_case_holds_both_places(root):
     case, about = case_at(root, "absent", "town-riverside")
-    picture = read_picture(case, root / "regions" / "town-riverside", about)
+    picture = read_picture(case, root, about)
     for pose in (case.truth.pose, case.fix):
         if pose is not None:
             assert picture.part.west_m <= pose.easting_m <= picture.part.east_m

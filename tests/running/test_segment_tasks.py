@@ -22,6 +22,7 @@ from sasgeo_bench.sensing.tiny_images import tiny_images
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks, put_task
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
+from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
@@ -73,6 +74,13 @@ def wanted(folders, spec, **changes):
 
 def of_oracle(folders, lines=None):
     return segment_tasks(wanted(folders, ORACLE_SEGMENTER), tell=silent if lines is None else lines.append)
+
+
+def test_pictures_to_look_at_are_stored_by_the_queries_that_they_belong_to(pictured):
+    for folder in of_oracle(pictured):
+        stored = segmented_file(Path("out"), task_files.read_task(folder)["files"][task_files.QUERIES]["sha256"])
+        for query in task_files.read_queries(folder):
+            assert read_segmented(stored, query.query_id).drawn.any()
 
 
 def test_the_oracles_evidence_is_what_the_labels_show_under_new_ids_with_the_truths_of_the_pictures(pictured):

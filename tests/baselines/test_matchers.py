@@ -27,8 +27,8 @@ REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in 
     name: value for name, value in BASELINES.items() if ".image." not in value
 }
 VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
-DENSE = ("fft_vote", "raster_uniform", *VARIANTS)
-STRIDES = dict.fromkeys(VARIANTS, 12) | {"fft_vote": 6, "raster_uniform": 6, "graph_only": 6}
+DENSE = ("fft_vote", "raster_soft", "raster_uniform", *VARIANTS)
+STRIDES = dict.fromkeys(VARIANTS, 12) | {"fft_vote": 6, "raster_soft": 6, "raster_uniform": 6, "graph_only": 6}
 CONTROLS = ("random", "prior_centre", "map_density_prior")
 
 

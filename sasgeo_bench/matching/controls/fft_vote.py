@@ -126,8 +126,12 @@ class DenseMatcher(ABC):
     def _read(self, evidence: Evidence, chart: Chart) -> Evidence:
         """Return the classes that the map has, as this matcher reads them."""
         shared = [index for index, name in enumerate(evidence.classes) if name in chart.classes]
-        names = tuple(evidence.classes[index] for index in shared)
-        return Evidence(classes=names, cells=self.seen(evidence.cells[shared]), cell_size_m=evidence.cell_size_m)
+        return Evidence(
+            classes=tuple(evidence.classes[index] for index in shared),
+            cells=self.seen(evidence.cells[shared]),
+            cell_size_m=evidence.cell_size_m,
+            confidence=None if evidence.confidence is None else evidence.confidence[shared],
+        )
 
     def _view(self, seen: Evidence, chart: Chart) -> View:
         """Make the template; classes that the map holds nowhere only count where they are seen."""

@@ -22,7 +22,7 @@ from sasgeo_bench.scoring.intervals import percentile_interval, wilson_share
 LOOKS = ("published", "rendered", "shifted")
 VIEW = ["matcher", "suite", "pair_id", "role", "kind", "strength", "view_cells"]
 SITE = ["matcher", "suite", "pair_id", "detector"]
-ASKED = ("sasgeo_raster", "sasgeo")
+BLIND = ("oracle_pose", "prior_centre", "random")  # controls, which look at no evidence
 HEAD = "| Matcher | Evidence | Views | n | Places | Found, % | 95 % |\n|---|---|---|---:|---:|---:|---|"
 
 
@@ -52,6 +52,11 @@ def read_scores(board: Path, metres: float, degrees: float) -> pd.DataFrame:
     return scores.assign(hit=hit.astype(float), suite=parts[0], segmenter=parts[1], **text)
 
 
+def asked(scores: pd.DataFrame) -> list[str]:
+    """Return the matchers that look at evidence, by name."""
+    return sorted(set(scores["matcher"]) - set(BLIND))
+
+
 def line(*cells: object) -> str:
     """Return a row of a table."""
     return f"| {' | '.join(map(str, cells))} |"
@@ -68,7 +73,7 @@ def by_evidence(scores: pd.DataFrame) -> Iterator[str]:
     yield HEAD
     aerial = scores[(scores["suite"] == "aerial") & (scores["role"] != "falsifier")]
     real = scores[(scores["suite"] == "real-image") & (scores["role"] != "falsifier")]
-    for matcher in ASKED:
+    for matcher in asked(aerial):
         for cells, name in ((192, "192 m from 160 m"), (96, "96 m from 80 m")):
             own = aerial[(aerial["matcher"] == matcher) & (aerial["view_cells"] == cells)]
             for look in LOOKS:
@@ -85,7 +90,7 @@ def by_difference(scores: pd.DataFrame) -> Iterator[str]:
     """Yield the differences of two looks on the same views of suite aerial."""
     yield "| Matcher | Difference | Views | n | Places | Points | 95 % |\n|---|---|---|---:|---:|---:|---|"
     aerial = scores[(scores["suite"] == "aerial") & (scores["role"] != "falsifier")]
-    for matcher in ASKED:
+    for matcher in asked(aerial):
         for first, second in (("rendered", "published"), ("shifted", "rendered")):
             for cells in (192, 96):
                 own = aerial[(aerial["matcher"] == matcher) & (aerial["view_cells"] == cells)]
@@ -97,13 +102,13 @@ def by_difference(scores: pd.DataFrame) -> Iterator[str]:
                 yield line(*labels, f"{value:+.0f}", f"{lo:+.0f} to {hi:+.0f}")
 
 
-def by_suite(scores: pd.DataFrame, suites: Sequence[str]) -> Iterator[str]:
-    """Yield by suite and step what is found, and the difference from the control of the same site."""
+def by_suite(scores: pd.DataFrame, suites: Sequence[str], matcher: str) -> Iterator[str]:
+    """Yield by suite and step what a matcher finds, and the difference from the control of the same site."""
     yield (
         "| Suite | Segmenter | Step | n | Places | Found, % | Less control, points | 95 % |\n"
         "|---|---|---|---:|---:|---:|---:|---|"
     )
-    own = scores[(scores["matcher"] == "sasgeo") & (scores["detector"] == "rendered")]
+    own = scores[(scores["matcher"] == matcher) & (scores["detector"] == "rendered")]
     for suite in suites:
         for segmenter in sorted(set(own.loc[own["suite"] == suite, "segmenter"])):
             rows = own[(own["suite"] == suite) & (own["segmenter"] == segmenter)]
@@ -131,10 +136,15 @@ def main() -> None:
     parser.add_argument("board", type=Path)
     parser.add_argument("--metres", type=float, default=25.0)
     parser.add_argument("--degrees", type=float, default=5.0)
+    parser.add_argument("--matcher", default="sasgeo", help="of the table suite by suite")
     given = parser.parse_args()
     scores = read_scores(given.board, given.metres, given.degrees)
     suites = [name for name in dict.fromkeys(scores["suite"]) if name not in ("aerial", "real-image")]
-    for table in (by_evidence(scores), by_difference(scores), by_suite(scores, ["aerial", *sorted(suites)])):
+    for table in (
+        by_evidence(scores),
+        by_difference(scores),
+        by_suite(scores, ["aerial", *sorted(suites)], given.matcher),
+    ):
         print("\n".join(table), end="\n\n")
 
 

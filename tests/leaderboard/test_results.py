@@ -3,6 +3,7 @@
 
 import json
 import re
+import runpy
 from pathlib import Path
 
 import pandas as pd
@@ -59,8 +60,23 @@ def test_stored_truths_are_of_the_detectors_that_the_pipeline_names(name, tmp_pa
     assert {truth.detector for some in truths for truth in some} == named
 
 
-def test_every_row_of_a_table_on_the_pages_stands_on_a_board():
+@pytest.fixture(scope="module")
+def tables_of_pictures():
+    """The lines that the program of the page on pictures prints of its board."""
+    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "sim_to_real.py"))
+    scores = program["read_scores"](RESULTS / "aerial", 25.0, 5.0)
+    suites = sorted(set(scores["suite"]) - {"real-image"})
+    tables = (
+        program["by_evidence"](scores),
+        program["by_difference"](scores),
+        program["by_suite"](scores, suites, "sasgeo"),
+    )
+    return {row.rstrip() for table in tables for line in table for row in line.splitlines()}
+
+
+def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures):
     boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
+    boards |= tables_of_pictures
     for page in PAGES:
         if page.stem == SEGMENTERS.name:  # its tables are held as wholes, below
             continue

@@ -46,7 +46,7 @@ def _roughen(canvas: Canvas) -> None:
     """Make the ground uneven: grain, tufts and wide patches."""
     seed, rough = canvas.plan.seed("ground"), canvas.plan.palette.unevenness
     for strip, grid in canvas.strips():
-        fine = 0.075 * grain(grid) + 0.08 * noise(grid, 0.7, seed) + 0.06 * noise(grid, 1.7, seed + 1)
+        fine = 0.075 * grain(grid, 1 + canvas.plan.salt) + 0.08 * noise(grid, 0.7, seed) + 0.06 * noise(grid, 1.7, seed + 1)
         tufts = -0.2 * np.clip(fractal(grid, 3.0, seed + 5) * (1 + noise(grid, 30.0, seed + 6)) - 0.3, 0, 0.7)
         factor = 1 + rough * (fine + tufts + 0.07 * fractal(grid, 35.0, seed + 2))
         for band in range(3):
@@ -237,7 +237,9 @@ def _paint_green(canvas: Canvas) -> NDArray[np.int8]:
         cells = found == kind
         mixed = np.clip(dryness + 0.5 * (patches[cells] - 0.5) + 0.12 * tone[numbers[cells]], 0, 1)[:, None]
         canvas.tint(cells, (fresh * (1 - mixed) + dry * mixed) * (1 + 0.05 * tone[numbers[cells]])[:, None], share)
-    mown = (found == PARK) & (draw(3, np.arange(len(kinds))) < 0.4)[numbers]
+    # By its place in the window, as pictures of published tasks are; another look is painted window by window.
+    which = np.concatenate([[0], shapes.key]) if canvas.plan.salt else np.arange(len(kinds))
+    mown = (found == PARK) & (draw(3, which) < 0.4)[numbers]
     stripes = np.sign(np.sin(np.pi * _stripe_m(canvas, numbers) / 2.4)) * 0.035
     canvas.shade(mown, np.asarray(1 + stripes, dtype=np.float32))
     floor = np.array(canvas.plan.palette.soil[0]) * 0.55 + fresh * 0.2
@@ -261,7 +263,7 @@ def _paint_fields(canvas: Canvas) -> Mask:
     colour = colour * (1 + 0.07 * bell(plan.seed("field"), shapes.key))[:, None]
     colour = np.vstack([np.zeros((1, 3)), colour])
     cells = numbers > 0
-    canvas.tint(cells, colour[numbers[cells]], np.asarray(0.82 + 0.12 * noise(canvas.grid, 12.0, 5), dtype=np.float32))
+    canvas.tint(cells, colour[numbers[cells]], np.asarray(0.82 + 0.12 * noise(canvas.grid, 12.0, 5 + plan.salt), dtype=np.float32))
     across = _field_rows_m(canvas, shapes, numbers)
     pitch = np.concatenate([[1.0], 0.75 + 1.6 * luck])[numbers]
     wander = 0.5 * noise(canvas.grid, 25.0, plan.seed("wander"))
@@ -297,6 +299,6 @@ def _paint_water(canvas: Canvas) -> None:
         part.tint(bank, np.array(palette.soil[0]) * 0.8, 0.6)
         share = np.exp(-depth_m[strip] / 4.0) + 0.25 * fractal(strip_grid, 25.0, seed + 3)
         share = np.clip(share, 0, 1)[here][:, None]
-        ripples = (1 + 0.04 * noise(strip_grid, 1.6, seed + 7) + 0.03 * grain(strip_grid, 5))[here][:, None]
+        ripples = (1 + 0.04 * noise(strip_grid, 1.6, seed + 7) + 0.03 * grain(strip_grid, 5 + canvas.plan.salt))[here][:, None]
         part.tint(here, (deep * (1 - share) + shallow * share) * ripples)
         part.kind[here] = WATER

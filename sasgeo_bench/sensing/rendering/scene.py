@@ -37,7 +37,7 @@ from sasgeo_bench.sensing.rendering.plan import (
 from sasgeo_bench.sensing.rendering.roads import paint_barriers, paint_roads
 from sasgeo_bench.sensing.rendering.roofs import paint_buildings
 from sasgeo_bench.sensing.rendering.seasons import GROWTH, Season
-from sasgeo_bench.sensing.rendering.texture import Numbers, draw, fractal, noise
+from sasgeo_bench.sensing.rendering.texture import Numbers, draw, fractal, noise, seed_of
 from sasgeo_bench.sensing.rendering.trace import HeightPyramid
 from sasgeo_bench.sensing.rendering.trees import hedge_trees, make_trees, paint_trees, scatter
 
@@ -48,6 +48,7 @@ MARGIN_M: Final = 24.0  # painted around the window asked for, so that its edge 
 _SNOW: Final = (232, 236, 242)
 _MOST_CELLS: Final = 40_000_000
 _MOST_CLASSES: Final = 31
+_MOST_SALT: Final = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -114,6 +115,7 @@ def make_scene(
     window: Grid,
     family: Family = "train",
     relief: float = 1.0,
+    look: str = "",
 ) -> Scene:
     """Return the scene of one window of a region: `make_scene(region.features, region.classes, region.coverage, ...)`.
 
@@ -129,6 +131,9 @@ def make_scene(
         Palette and materials.
     relief : float
         Multiplies the heights of buildings: 0 for flat ones, 2 for tall ones.
+    look : str
+        Names another look of the place, which shares no draw with the one without a name: other roofs, crops, heights,
+        trees, cars and grain.
 
     Raises
     ------
@@ -140,8 +145,14 @@ def make_scene(
     grid = window.window(-more, -more, window.rows + 2 * more, window.cols + 2 * more)
     west, south, east, north = grid.bounds_m
     box = shapely.box(west - 80, south - 80, east + 80, north + 80)
-    shapes = shapes_of(features, box)
-    plan = Plan(grid=grid, place=place, palette=PALETTES[family], shapes=shapes)
+    salt = seed_of(place, look) % _MOST_SALT + 1 if look else 0
+    plan = Plan(
+        grid=grid,
+        place=f"{place}/{look}" if look else place,
+        palette=PALETTES[family],
+        shapes=shapes_of(features, box, salt=salt),
+        salt=salt,
+    )
     paint_areas = make_paint(features[shapely.intersects(features.geometry.to_numpy(), box)], classes, coverage)
     bits = np.zeros(grid.shape, dtype=np.uint32)
     for number, areas in enumerate(paint_areas.areas):

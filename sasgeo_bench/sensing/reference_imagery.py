@@ -165,7 +165,7 @@ def place_of(region: str) -> str:
     >>> place_of("vaduz@2013-08-03")
     'vaduz'
     """
-    return region.split("@")[0]
+    return region.split("@", maxsplit=1)[0]
 
 
 def _picture(manifest: Manifest, shown: Manifest, look: Look) -> PictureRecord:
@@ -283,10 +283,9 @@ def _scene(rendering: _Rendering, part: Grid) -> Scene:
         rendering.features,
         rendering.shown.classes,
         shapely.from_wkt(rendering.shown.coverage.wkt),
-        place=rendering.place,
+        place=f"{rendering.place}/{rendering.look.name}",
         window=window,
         family=rendering.look.family,
-        look=rendering.look.name,
     )
 
 

@@ -66,6 +66,7 @@ class Plan:
     """One window of a region, a palette, and the seed of the place.
 
     `salt` is 0, or that of another look of the place: it changes every draw that no `seed` decides.
+    `corner_m` is where plots and stripes of another look are counted from, None for squares of 5 km.
     """
 
     grid: Grid
@@ -73,6 +74,7 @@ class Plan:
     palette: Palette
     shapes: dict[str, Shapes]
     salt: int = 0
+    corner_m: tuple[float, float] | None = None
 
     def of(self, class_name: str) -> Shapes:
         """Return the features of a class; none if the region has no such class."""

@@ -115,7 +115,6 @@ def make_scene(
     window: Grid,
     family: Family = "train",
     relief: float = 1.0,
-    look: str = "",
 ) -> Scene:
     """Return the scene of one window of a region: `make_scene(region.features, region.classes, region.coverage, ...)`.
 
@@ -125,15 +124,14 @@ def make_scene(
         Those of a `Region` of any state of the map.
     place : str
         Seeds all styles together with the identity of each feature: the same place looks the same at every date.
+        With a slash, as in "vaduz/survey", it is another look of a place, which shares no draw with that of the place
+        alone: other roofs, crops, heights, trees, cars and grain.
     window : Grid
         Ground and cell size (0.25 to 0.5 m) of the paint; a margin of 24 m is added on every side.
     family : {"train", "calibration", "test", "shifted"}
         Palette and materials.
     relief : float
         Multiplies the heights of buildings: 0 for flat ones, 2 for tall ones.
-    look : str
-        Names another look of the place, which shares no draw with the one without a name: other roofs, crops, heights,
-        trees, cars and grain.
 
     Raises
     ------
@@ -145,13 +143,14 @@ def make_scene(
     grid = window.window(-more, -more, window.rows + 2 * more, window.cols + 2 * more)
     west, south, east, north = grid.bounds_m
     box = shapely.box(west - 80, south - 80, east + 80, north + 80)
-    salt = seed_of(place, look) % _MOST_SALT + 1 if look else 0
+    salt = seed_of(place) % _MOST_SALT + 1 if "/" in place else 0
     plan = Plan(
         grid=grid,
-        place=f"{place}/{look}" if look else place,
+        place=place,
         palette=PALETTES[family],
         shapes=shapes_of(features, box, salt=salt),
         salt=salt,
+        corner_m=(float(features.total_bounds[0]), float(features.total_bounds[3])) if salt and len(features) else None,
     )
     paint_areas = make_paint(features[shapely.intersects(features.geometry.to_numpy(), box)], classes, coverage)
     bits = np.zeros(grid.shape, dtype=np.uint32)

@@ -103,7 +103,8 @@ def strips(camera: Camera) -> Iterator[slice]:
 
 def trace_down(pixels: Grid, grid: Grid) -> Hits:
     """Return what vertical rays through the pixels of one lattice see of a raster on another; heights are left at 0."""
-    uv = grid.to_uv(pixels.to_en_m(np.stack(np.meshgrid(*map(_middles, pixels.shape[::-1])), axis=-1).reshape(-1, 2)))
+    rows, cols = np.indices(pixels.shape).reshape(2, -1)
+    uv = grid.to_uv(pixels.to_centres_m(np.column_stack([rows, cols])))
     col, row = uv.astype(np.float32).T.reshape(2, *pixels.shape)
     flat = np.zeros_like(col)
     return Hits(
@@ -116,10 +117,6 @@ def trace_down(pixels: Grid, grid: Grid) -> Hits:
         is_side=np.zeros(col.shape, dtype=bool),
         is_ground=np.ones(col.shape, dtype=bool),
     )
-
-
-def _middles(count: int) -> NDArray[np.float64]:
-    return np.arange(count) + 0.5
 
 
 def trace(camera: Camera, grid: Grid, heights: HeightPyramid, rows: slice) -> Hits:

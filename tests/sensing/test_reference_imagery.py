@@ -188,7 +188,7 @@ def test_a_region_that_is_not_built_is_refused_and_no_file_is_made(tmp_path):
     with pytest.raises(StoreError, match="is not built, or not by this region file: run sasgeo-bench build-region"):
         render(tmp_path)
     assert list(tmp_path.iterdir()) == []
-    with pytest.raises(StoreError, match="holds no region.json"):
+    with pytest.raises(StoreError, match=r"holds no region\.json"):
         render_imagery(tmp_path / "regions" / "nowhere", tmp_path, COARSE, tell=silent)
     assert list(tmp_path.iterdir()) == []
 
@@ -237,7 +237,8 @@ def test_a_full_disk_while_tiles_are_written_is_one_line(rendered, tmp_path, mon
     before = state_of(out / "regions" / TOWN)
 
     def full(*_, **__):
-        raise rasterio.errors.RasterioIOError("No space left on device")
+        message = "No space left on device"
+        raise rasterio.errors.RasterioIOError(message)
 
     monkeypatch.setattr(rasterio.shutil, "copy", full)
     with pytest.raises(ImageryError, match=r"ortho.tif cannot be written \(No space left on device\)"):

@@ -4,10 +4,15 @@
     .venv/bin/python benchmarks/image_matchers.py out/regions/zanzibar                    # a built region with imagery
     .venv/bin/python benchmarks/image_matchers.py out/regions/zanzibar --views 20 --radius 250
 
+    .venv/bin/python benchmarks/image_matchers.py out/regions/vaduz --suite aerial        # rendered views of its task
+
 Views of 128 m are cut from the region's own imagery at drawn places, headings and scales (3 %), made darker, flatter
 and noisier, and searched within a disc of `--radius` metres that holds the place, with the heading known to 5 degrees.
 View and map are one picture: the figures bound from above what a flight on another day would give. Latency is processor
 time of `match`; bytes are those of the matcher's arrays after `prepare`.
+
+With `--suite` the queries are those of a task of the region, drawn before, and right is within 25 m: first of all, then
+by kind and strength of the stress. Intervals are Wilson's over queries; sites are fewer, and are printed too.
 """
 
 import argparse
@@ -24,41 +29,85 @@ import cv2
 import numpy as np
 
 import sasgeo_bench as sgb
+from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.tasks.frames import encode_webp
 
 MATCHERS = ("ncc_gradient", "hog_colour", "orb_vlad", "orb_homography")
 SIDE_M, PICTURE_PX, HEIGHT_M, GSD_M = 128.0, 512, 100.0, 0.3
-NEAR_M = 10.0
+NEAR_M, NEAR_TASK_M = 10.0, 25.0
+
+Asked = list[tuple[sgb.Query, sgb.Pose, str, str]]  # with what the truth says: kind with strength, and site
 
 
 def main() -> None:
-    """Print a row for each matcher."""
+    """Print what each matcher finds."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("region", type=Path)
     parser.add_argument("--views", type=int, default=20)
     parser.add_argument("--radius", type=float, default=250.0)
+    parser.add_argument("--suite", default="")
     parser.add_argument("--matchers", nargs="+", default=MATCHERS)
     said = parser.parse_args()
     cv2.setNumThreads(1)
     region = sgb.read_region(said.region)
-    asked = [drawn(region, said.radius, np.random.default_rng((22, number))) for number in range(said.views)]
+    if region.imagery is None:
+        message = f"{said.region} has no imagery: sasgeo-bench render-imagery makes some"
+        raise SystemExit(message)
+    print(f"{said.region.name}: {region.imagery.record.to_text()}", flush=True)
+    near_m = NEAR_TASK_M if said.suite else NEAR_M
+    asked = of_task(said.region, said.suite) if said.suite else of_imagery(region, said.radius, said.views)
     for name in said.matchers:
-        matcher = sgb.load_matcher(name)
+        measure(name, region, asked, near_m=near_m)
+
+
+def of_imagery(region: sgb.Region, radius_m: float, count: int) -> Asked:
+    """Return views cut from the imagery itself."""
+    found = [drawn(region, radius_m, np.random.default_rng((22, number))) for number in range(count)]
+    return [(query, pose, "", str(number)) for number, (query, pose) in enumerate(found)]
+
+
+def of_task(region: Path, suite: str) -> Asked:
+    """Return the localization queries of a task that have a right answer."""
+    root = region.resolve().parents[1]
+    truths = {item.query_id: item for item in sgb.read_truths(root / "truth" / suite / region.name)}
+    queries = sgb.read_queries(root / "tasks" / suite / region.name)
+    known = [(query, truths[query.query_id]) for query in queries if query.track == "localization"]
+    return [
+        (query, truth.pose, f"{truth.kind} {truth.strength:g}", truth.pair_id)
+        for query, truth in known
+        if truth.is_present and truth.pose is not None
+    ]
+
+
+def measure(name: str, region: sgb.Region, asked: Asked, *, near_m: float) -> None:
+    """Print what a matcher finds, what it costs, and for a task its successes by kind."""
+    matcher = sgb.load_matcher(name)
+    start = time.process_time()
+    matcher.prepare(region, None)
+    ready_s = time.process_time() - start
+    seconds, errors_m = [], []
+    for query, truth, *_ in asked:
         start = time.process_time()
-        matcher.prepare(region, None)
-        ready_s = time.process_time() - start
-        seconds, errors_m = [], []
-        for query, truth in asked:
-            start = time.process_time()
-            poses = matcher.match(query, top_k=5).poses
-            seconds.append(time.process_time() - start)
-            errors_m.append(away_m(poses[0], truth) if poses else math.inf)
-        right = sum(error < NEAR_M for error in errors_m)
-        print(
-            f"{name}: {right} of {len(asked)} within {NEAR_M:g} m (median error {np.median(errors_m):.1f} m), "
-            f"{np.median(seconds):.2f} CPU s a view, map {held_bytes(vars(matcher)) / 1e6:.1f} MB in {ready_s:.1f} s",
-            flush=True,
-        )
+        poses = matcher.match(query, top_k=5).poses
+        seconds.append(time.process_time() - start)
+        errors_m.append(away_m(poses[0], truth) if poses else math.inf)
+    sites, held_mb = len({item[3] for item in asked}), held_bytes(vars(matcher)) / 1e6
+    print(
+        f"{name}: {shown(errors_m, near_m)} within {near_m:g} m, {sites} sites (median error "
+        f"{np.median(errors_m):.1f} m), {np.median(seconds):.2f} CPU s a view, map {held_mb:.1f} MB in {ready_s:.1f} s",
+        flush=True,
+    )
+    kinds = sorted({item[2] for item in asked})
+    for kind in kinds if len(kinds) > 1 else ():
+        own = [error for error, item in zip(errors_m, asked, strict=True) if item[2] == kind]
+        print(f"    {kind}: {shown(own, near_m)}", flush=True)
+
+
+def shown(errors_m: list[float], near_m: float) -> str:
+    """Return successes of trials with their interval."""
+    right = sum(error <= near_m for error in errors_m)
+    found = wilson(right, len(errors_m))
+    return f"{right} of {len(errors_m)} [{found.lo:.2f}, {found.hi:.2f}]"
 
 
 def drawn(region: sgb.Region, radius_m: float, rng: np.random.Generator) -> tuple[sgb.Query, sgb.Pose]:

@@ -59,6 +59,7 @@ def test_a_new_plugin_begins_with_public_names_alone():
 
 STEPS = {
     "build-region": "build_region",
+    "render-imagery": "render_imagery",
     "make-queries": "make_tasks",
     "run": "run",
     "score": "score",

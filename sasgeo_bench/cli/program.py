@@ -31,6 +31,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Regions": {
         "list-regions": "listing",
         "build-region": "regions",
+        "render-imagery": "regions",
         "measure-ageing": "ageing",
         "compare-ageing": "ageing",
     },

@@ -4,7 +4,7 @@
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
@@ -13,6 +13,12 @@ from sasgeo_bench.cli.options import ExtractFolders, ImageryFolders, Options, Ou
 from sasgeo_bench.progress import spread
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.sensing.rendering.palettes import PALETTES
+from sasgeo_bench.sensing.rendering.seasons import SEASONS
+
+if TYPE_CHECKING:
+    from sasgeo_bench.sensing.rendering.palettes import Family
+    from sasgeo_bench.sensing.rendering.seasons import Season
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,6 +73,78 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
         for _ in spread(partial(build.build_region, tell=options.tell), plans, jobs=options.jobs):
             pass
     return tuple(plan.folder for plan in plans)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderOptions(Options):
+    """Flags of render-imagery."""
+
+    region: Annotated[list[str], typer.Argument(help="ids from list-regions, or files of your own; built before")] = (
+        field(kw_only=False)
+    )
+    date: Annotated[str | None, typer.Option(help="YYYY-MM-DD of the map that is shown; default: newest")] = None
+    family: Annotated[str, typer.Option(help=f"palette: {', '.join(PALETTES)}")] = "calibration"
+    season: Annotated[str, typer.Option(help=", ".join(SEASONS))] = "autumn"
+    gsd_m: Annotated[float, typer.Option(help="side of a pixel on the ground, metres, 0.25 to 2")] = 0.5
+    seed: Annotated[int, typer.Option(min=0, help="another number draws another look")] = 0
+    extracts: ExtractFolders = None
+    region_files: RegionFolders = None
+    out: Out = Path("out")
+    jobs: Annotated[int, typer.Option(min=1, help="regions rendered at once")] = 1
+
+
+@takes(RenderOptions)
+def render_imagery(options: RenderOptions) -> tuple[Path, ...]:
+    """Render reference imagery of built regions: `ortho.tif`, of any of their dates, in a look that no query has.
+
+    The map's hash stays: tasks stay valid, and so do answers of methods that look at no imagery.
+
+    Returns
+    -------
+    tuple of Path
+        The image of each region.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such region, date, family, season or resolution.
+    StoreError
+        If a region is not built, or cannot be written.
+    ImageryError
+        If a region has real imagery, or nothing to draw.
+
+    Examples
+    --------
+    >>> import sasgeo_bench as sgb
+    >>> sgb.render_imagery(["town-grid"], season="monsoon")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: season is one of spring, summer, autumn, winter, snow, got 'monsoon'
+    """
+    from sasgeo_bench.sensing.reference_imagery import Look, render_place  # noqa: PLC0415 - build-region needs none
+
+    look = Look(
+        family=cast("Family", options.family),
+        season=cast("Season", options.season),
+        gsd_m=options.gsd_m,
+        seed=options.seed,
+    )
+    specs = [read_region_file(find_region_file(name, folders=options.region_files or ())) for name in options.region]
+    render = partial(
+        render_place,
+        look=look,
+        date=read_date(options.date),
+        out=options.out,
+        extract_folders=options.extracts or (),
+        tell=options.tell,
+    )
+    return tuple(spread(render, specs, jobs=options.jobs))
+
+
+def render_imagery_command(options: RenderOptions) -> None:
+    """Render reference imagery of built regions: OUT/regions/<id>/ortho.tif, of any date, in a look no query has."""
+    for path in render_imagery(**vars(options) | {"say": say, "tell": tell}):
+        say(path)
 
 
 def build_region_command(options: BuildOptions) -> None:

@@ -40,6 +40,7 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
 from sasgeo_bench.scoring.score import score_task
+from sasgeo_bench.sensing.reference_imagery import render_place
 from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import RECALIBRATED, base_of
 from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES
@@ -71,6 +72,7 @@ def run_pipeline(
         check_results(stored, board_folder(plan))
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored, tell=tell)
     drawn = _draw(plan.requests, tell, jobs=plan.jobs)
+    _render(plan, tell)
     tasks = [*_with_evidence(plan, drawn, tell=tell, progress=progress), *_draw_paper(plan, tell)]
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
     if not asked:
@@ -188,6 +190,23 @@ def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
     if len(lacking) > MOST_LINES:
         tell(f"left out: {len(lacking) - MOST_LINES} more")
     return tasks
+
+
+def _render(plan: PipelinePlan, tell: Tell) -> None:
+    """Render the reference imagery of the file, unless it is up to date."""
+    said = plan.spec.reference_imagery
+    if said is None:
+        return
+    for request in plan.imaged:
+        date = said.date_of({item.date for item in request.region.extract})
+        render_place(
+            request.region,
+            look=said.look,
+            date=date,
+            out=plan.out,
+            extract_folders=request.extract_folders,
+            tell=tell,
+        )
 
 
 def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path], *, tell: Tell, progress: Progress | None) -> list[Path]:

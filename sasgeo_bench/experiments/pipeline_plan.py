@@ -24,7 +24,8 @@ from sasgeo_bench.running.training_tasks import Lessons
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.rows import is_unranked
-from sasgeo_bench.tasks.build import is_of_region, made_tasks, why_to_draw
+from sasgeo_bench.sensing.rendering.palettes import PALETTES
+from sasgeo_bench.tasks.build import is_of_region, look_of, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import BY, CONTROLS, PriorGroup, base_of
 from sasgeo_bench.tasks.split import Split
@@ -86,10 +87,27 @@ class PipelinePlan:
         lines += [line for stage in stages for line in stage.lines()]
         lines += [] if self.training_groups is None else self.training_groups.lines(self.requests)
         lines += [] if self.seal is None else self.seal.lines()
+        lines += self._imagery_lines()
         lines += _run_lines(self, stages, controls)
         lines.append(f"  score: {len(self.spec.rejectors)} rejectors, {len(self.spec.contrast)} contrasts")
         lines.append(f"  board: {board_folder(self)}")
         return "\n".join(lines)
+
+    @property
+    def imaged(self) -> tuple[Request, ...]:
+        """Return one request of each region that gets rendered imagery: those asked that have no real imagery."""
+        if self.spec.reference_imagery is None:
+            return ()
+        asked = {item.region.id: item for item in self.requests if not is_train(self, item.region.id)}
+        return tuple(item for item in asked.values() if not item.region.imagery)
+
+    def _imagery_lines(self) -> list[str]:
+        """Report what imagery is rendered."""
+        said = self.spec.reference_imagery
+        if said is None:
+            return []
+        look = f"{said.season}, family {said.family}, seed {said.seed}, {said.age_years:g} years older"
+        return [f"  reference imagery: {counted(len(self.imaged), 'region')}, rendered ({look})"]
 
     @property
     def matchers(self) -> tuple[str, ...]:
@@ -259,6 +277,7 @@ def plan_pipeline(
         raise ConfigError(message)
     _check_kinds(spec)
     _check_pictures(spec)
+    _check_look(spec, requests)
     kept = needed(requests, spec.learning) if requests else ()
     left = {item.region.id for item in requests} - {item.region.id for item in kept}
     if left:
@@ -284,6 +303,30 @@ def _check_pictures(spec: PipelineFile) -> None:
             mend = "name segmenters" if not task.segmenters else "leave segmenters out, or name it in another [[task]]"
             message = f"pipeline {spec.id!r}: suite {name!r} {what}: {mend}"
             raise ConfigError(message)
+
+
+def _check_look(spec: PipelineFile, requests: Sequence[Request]) -> None:
+    """Refuse reference imagery in a family of looks that a query has, too, and imagery that no suite looks at."""
+    if spec.reference_imagery is None:
+        return
+    pictured = [item for item in requests if item.suite in PICTURE_SUITES]
+    if not pictured:
+        message = f"pipeline {spec.id!r} has reference_imagery, and draws no suite of pictures: leave it out"
+        raise ConfigError(message)
+    family = spec.reference_imagery.family
+    alike = next((item.region.id for item in pictured if family in _families(item)), None)
+    if alike is not None:
+        message = (
+            f"pipeline {spec.id!r}: reference_imagery is of family {family!r}, and so are pictures of queries on "
+            f"{alike}: take another of {', '.join(PALETTES)}"
+        )
+        raise ConfigError(message)
+
+
+def _families(request: Request) -> set[str]:
+    """Return the families of looks that the pictures of a request are drawn in."""
+    found: set[str] = {look_of(request.split, block) for block in request.split.blocks_in(request.region.id)}
+    return found | ({"shifted"} & set(request.choice.detectors))
 
 
 def _check_kinds(spec: PipelineFile) -> None:

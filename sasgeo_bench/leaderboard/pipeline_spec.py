@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a file in `pipelines/` says: an experiment as data, read before anything is run."""
 
+import datetime as dt
 import difflib
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Annotated, Final, Literal, Self
 
@@ -22,7 +23,11 @@ from sasgeo_bench.config import (
 )
 from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric, attainable, best_value, unreachable
+from sasgeo_bench.sensing.reference_imagery import COARSEST_M, FINEST_M, Look
+from sasgeo_bench.sensing.rendering.palettes import Family
+from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.tasks.query import BY, CONTROLS, PROFILE, PUBLISHED, RENDERED, Detector, PriorGroup, Track
+from sasgeo_bench.tasks.suites.real_age import DAYS_PER_YEAR
 
 PAPER_SUITE: Final = "paper-poc"
 Crop = Literal["unknown", "absent", "smaller"]
@@ -193,6 +198,33 @@ class LearningSpec(Document):
     kinds: list[Short] = []
 
 
+class ReferenceImagerySpec(Document):
+    """Rendered imagery that the asked regions get, for matchers that hold pictures against pictures.
+
+    It shows the dated map of each place that is nearest to `age_years` older than the newest one, in a look that no
+    query has; `sensing.reference_imagery.Look` tells the other keys. Regions with real imagery keep that.
+
+    >>> ReferenceImagerySpec(season="snow").date_of({dt.date(2025, 1, 1), dt.date(2014, 1, 1)})
+    datetime.date(2025, 1, 1)
+    """
+
+    age_years: Annotated[float, Field(ge=0, le=100)] = 0.0
+    family: Family = "calibration"
+    season: Season = "autumn"
+    gsd_m: Annotated[float, Field(ge=FINEST_M, le=COARSEST_M)] = 0.5
+    seed: Annotated[int, Field(ge=0)] = 0
+
+    @property
+    def look(self) -> Look:
+        """Return the look of the images."""
+        return Look(family=self.family, season=self.season, gsd_m=self.gsd_m, seed=self.seed)
+
+    def date_of(self, dates: Collection[dt.date]) -> dt.date:
+        """Return the date of the map that is shown, out of those that a place has."""
+        newest = max(dates)
+        return min(sorted(dates), key=lambda date: abs((newest - date).days / DAYS_PER_YEAR - self.age_years))
+
+
 class PipelineFile(NamedDocument):
     """A pipeline file: suites on regions of a split, the paper's experiment, or both.
 
@@ -209,6 +241,7 @@ class PipelineFile(NamedDocument):
     task: list[TaskSpec] = []
     paper: PaperSpec | None = None
     learning: LearningSpec | None = None
+    reference_imagery: ReferenceImagerySpec | None = None
     matchers: Annotated[list[str], Field(min_length=1)]
     rejectors: list[str] = []
     contrast: list[ContrastSpec] = []
@@ -219,13 +252,14 @@ class PipelineFile(NamedDocument):
     @property
     def sha256(self) -> str:
         """Hash of all that it says, defaults among it, as `board.json` names it."""
-        fields = self.model_dump(mode="json", exclude={"learning"} if self.learning is None else None)
+        unsaid = {name for name in ("learning", "reference_imagery") if getattr(self, name) is None}
+        fields = self.model_dump(mode="json", exclude=unsaid)
         pilots = [item["pilot"] for item in fields["contrast"] if item["pilot"] is not None]
         named = {**fields, "pilot": pilots}
         for name, newer in _NEWER.items():
             tables = named.get(name) or []
             for table in tables if isinstance(tables, list) else [tables]:
-                for key in [key for key, unsaid in newer.items() if table[key] == unsaid]:
+                for key in [key for key, meant in newer.items() if table[key] == meant]:
                     del table[key]
         return hashlib.sha256(json.dumps(fields, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 

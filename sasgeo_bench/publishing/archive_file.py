@@ -401,7 +401,7 @@ def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into:
             (run / learned_file.FOLDER).mkdir(exist_ok=True)
             (run / learned_file.FOLDER / _learned_name(training)).write_text(row[LEARNED], encoding="utf-8")
         part = answers.slice(start, count)
-        key = None if training is None else training.key
+        key = prediction_files.key_of(about)
         ties = [asked_under(asked[name], key) for name in part["query_id"].to_pylist()]
         write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
         start += count

@@ -86,10 +86,12 @@ Everything is made from dated OpenStreetMap extracts by {release.made_by}; publi
 
 def _imagery_line(release: Release) -> str:
     """Say where imagery is, which is under other licences."""
-    shown = [item.name for item in release.maps if item.manifest.imagery is not None]
+    shown = {item.name: item.manifest.imagery for item in release.maps if item.manifest.imagery is not None}
     if not shown:
         return "imagery, apart from what is derived from OpenStreetMap: none in this release"
-    return f"licences and authors of the imagery, `ortho.tif` of {', '.join(shown)}, which is not under the ODbL"
+    text = f"licences and authors of the imagery, `ortho.tif` of {', '.join(shown)}, which is not under the ODbL"
+    rendered = [name for name, record in shown.items() if record.is_rendered]
+    return f"{text}, but for what is rendered from the map ({', '.join(rendered)})" if rendered else text
 
 
 def _truth_line(release: Release) -> str:

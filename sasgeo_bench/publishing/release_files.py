@@ -56,8 +56,9 @@ licence.
 _IMAGERY: Final = """\
 # Imagery
 
-These files are not derived from OpenStreetMap, and not under the ODbL. Each has the licence of the pictures that it was
-cut out of; whoever passes it on names their authors where a reader sees it. All other files are as the notice says.
+Each file has the licence of the pictures that it was cut out of; whoever passes it on names their authors where readers
+see it. Photographs are not derived from OpenStreetMap, and not under the ODbL. What is rendered from a map is, and its
+source says so. All other files are as the notice says.
 
 | file | picture | date | licence | attribution | source |
 |---|---|---|---|---|---|

@@ -248,13 +248,13 @@ def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading, tell: Tell)
     offset = measure_offset(
         imagery, houses.geometry.to_numpy(), reading.coverage, rng=np.random.default_rng(_OFFSET_SEED)
     )
-    share = _share_shown(imagery, reading.coverage, plan.grid.cell_size_m)
+    share = share_shown(imagery, reading.coverage, plan.grid.cell_size_m)
     shown = f"{name}: imagery shows {share:.1%} of the mapped ground"
     tell(f"{shown}, off the map by {offset.to_text()}" if offset else f"{shown}; its offset could not be measured")
     return record.model_copy(update={"offset": offset, "share": share})
 
 
-def _share_shown(imagery: Imagery, mapped: shapely.Geometry, cell_size_m: float) -> float:
+def share_shown(imagery: Imagery, mapped: shapely.Geometry, cell_size_m: float) -> float:
     """Return the fraction of the mapped ground that the imagery shows, by cells of the map or larger ones."""
     shown = total = 0
     areas = shapely.orient_polygons(shapely.get_parts(mapped), exterior_cw=False)

@@ -4,11 +4,11 @@
 import datetime as dt
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field
+from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from sasgeo_bench.config import Document
 from sasgeo_bench.errors import ImageryError, StoreError
@@ -30,8 +30,26 @@ class _Record(Document):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=False)
 
 
+class RenderedRecord(_Record):
+    """How a picture was rendered of a map: no photograph is in it.
+
+    `map_sha256` is the hash of the inputs of the dated map that it shows, `made_by` the program.
+    """
+
+    family: str
+    season: str
+    seed: int
+    sun_elevation_deg: float
+    sun_azimuth_deg: float
+    map_sha256: str
+    made_by: str
+
+
 class PictureRecord(_Record):
-    """One picture that the imagery was made of; `gsd_m` is its own ground resolution."""
+    """One picture that the imagery was made of; `gsd_m` is its own ground resolution.
+
+    A picture that was rendered has `rendered`: its file, hash and date are those of the extract that it shows.
+    """
 
     file: str
     sha256: str
@@ -42,6 +60,20 @@ class PictureRecord(_Record):
     publish: bool
     source: str | None
     gsd_m: Metres
+    rendered: RenderedRecord | None = None
+
+    @model_serializer(mode="wrap")
+    def _without_newer_keys(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Leave out `rendered` where there is none, as regions of older versions do."""
+        fields: dict[str, Any] = write(self)
+        return fields if self.rendered else {name: value for name, value in fields.items() if name != "rendered"}
+
+    def to_text(self) -> str:
+        """Describe in a few words what it is."""
+        if self.rendered is None:
+            return f"{self.file} of {self.date}"
+        look = f"{self.rendered.season}, family {self.rendered.family}, seed {self.rendered.seed}"
+        return f"rendered from {self.file} of {self.date} ({look})"
 
 
 class OffsetRecord(_Record):
@@ -88,14 +120,20 @@ class OrthoRecord(_Record):
         return all(picture.publish for picture in self.pictures)
 
     @property
+    def is_rendered(self) -> bool:
+        """Return whether it was rendered of a map, so that nothing in it is a photograph."""
+        return any(picture.rendered is not None for picture in self.pictures)
+
+    @property
     def attribution(self) -> str:
         """Return the attributions of all pictures with their licences, each once."""
         return "; ".join(dict.fromkeys(f"{item.attribution} ({item.licence})" for item in self.pictures))
 
     def to_text(self) -> str:
         """Describe in one line what there is, how far it is off the map, and whether it may be passed on."""
-        files = ", ".join(f"{item.file} of {item.date}" for item in self.pictures)
-        off = f"off the map by {self.offset.to_text()}" if self.offset else "its offset is not known"
+        files = ", ".join(item.to_text() for item in self.pictures)
+        unknown = "on the map that it shows" if self.is_rendered else "its offset is not known"
+        off = f"off the map by {self.offset.to_text()}" if self.offset else unknown
         rights = "may be passed on" if self.is_publishable else "must not be passed on"
         shown = f"pixels of {self.gsd_m:.3f} m show {self.share:.1%} of the mapped ground"
         return f"{files}; {shown}, {off}; {self.attribution}, {rights}"

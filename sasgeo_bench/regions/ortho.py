@@ -2,7 +2,7 @@
 """Pictures from outside -> `ortho.tif`: checked, cut to the region, reprojected, as a cloud-optimized GeoTIFF."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -159,12 +159,17 @@ def ortho_grid(pictures: Sequence[Picture], region: Grid) -> Grid:
     >>> found.bounds_m, found.cell_size_m, found.shape
     ((10.0, 0.0, 100.0, 50.0), 0.25, (200, 360))
     """
-    finest_m, cell_m = min(picture.gsd_m for picture in pictures), region.cell_size_m
+    bounds = np.array([picture.bounds_m for picture in pictures])
+    return lattice_within(bounds, region, finest_m=min(picture.gsd_m for picture in pictures))
+
+
+def lattice_within(bounds: NDArray[np.float64], region: Grid, *, finest_m: float) -> Grid:
+    """Return the lattice of the part of a region that some boxes cover, shape (N, 4); see `ortho_grid`."""
+    cell_m = region.cell_size_m
     if finest_m <= cell_m:
         gsd_m = cell_m / math.ceil(cell_m / finest_m - _SNAP)
     else:
         gsd_m = cell_m * math.floor(finest_m / cell_m + _SNAP)
-    bounds = np.array([picture.bounds_m for picture in pictures])
     edges_m = np.array(region.bounds_m)
     low, high = np.maximum(bounds[:, :2].min(axis=0), edges_m[:2]), np.minimum(bounds[:, 2:].max(axis=0), edges_m[2:])
     cells = Grid.from_bounds(*low.tolist(), *high.tolist(), cell_size_m=max(cell_m, gsd_m), epsg=region.epsg)
@@ -173,7 +178,7 @@ def ortho_grid(pictures: Sequence[Picture], region: Grid) -> Grid:
     if rows * cols > MOST_ORTHO_PIXELS:
         message = (
             f"the imagery of the region has {cols:,} x {rows:,} pixels of {gsd_m:.3g} m, the most is "
-            f"{MOST_ORTHO_PIXELS:,}: make the region smaller, or give its [[imagery]] a coarser gsd_m"
+            f"{MOST_ORTHO_PIXELS:,}: make the region smaller, or its gsd_m coarser"
         )
         raise ImageryError(message)
     return Grid(epsg=region.epsg, west_m=west, north_m=north, cell_size_m=gsd_m, rows=rows, cols=cols)
@@ -182,14 +187,35 @@ def ortho_grid(pictures: Sequence[Picture], region: Grid) -> Grid:
 def write_ortho(path: Path, pictures: Sequence[Picture], grid: Grid) -> None:
     """Write the pictures on one lattice, later ones over earlier ones, with a mask of what none of them shows.
 
-    The file is a cloud-optimized GeoTIFF with JPEG tiles; parts without a picture take no space. Raise `ImageryError`
-    if a picture is damaged, none shows any ground of the region, or the file cannot be written.
+    Raise `ImageryError` if a picture is damaged, none shows any ground of the region, or the file cannot be written.
+    """
+    who = "; ".join(dict.fromkeys(item.entry.attribution for item in pictures))
+    licence = "; ".join(dict.fromkeys(item.entry.licence for item in pictures))
+    if not write_tiles(path, grid, _warped_tiles(pictures, grid), attribution=who, licence=licence):
+        message = f"{', '.join(item.entry.file for item in pictures)}: no pixel lies in the region: leave it out"
+        raise ImageryError(message)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OrthoTile:
+    """One window of an ortho image from (row, col) on: `rgb` (3, rows, cols), and where it is known (rows, cols)."""
+
+    row: int
+    col: int
+    rgb: NDArray[np.uint8]
+    is_known: NDArray[np.bool_]
+
+
+def write_tiles(path: Path, grid: Grid, tiles: Iterable[OrthoTile], *, attribution: str, licence: str) -> bool:
+    """Write an ortho image tile by tile; return False, and write no file, if no pixel of it is known.
+
+    The file is a cloud-optimized GeoTIFF with JPEG tiles, a mask and overviews; parts without a picture take no space.
+    Raise `ImageryError` if it cannot be written.
     """
     draft = path.with_name(f".{path.name}.draft")
     try:
-        if not _write_draft(draft, pictures, grid):
-            message = f"{', '.join(item.entry.file for item in pictures)}: no pixel lies in the region: leave it out"
-            raise ImageryError(message)
+        if not _write_draft(draft, grid, tiles, attribution=attribution, licence=licence):
+            return False
         with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES):
             rasterio.shutil.copy(
                 draft,
@@ -201,6 +227,7 @@ def write_ortho(path: Path, pictures: Sequence[Picture], grid: Grid) -> None:
                 overview_resampling="AVERAGE",
                 sparse_ok=True,
             )
+        return True  # noqa: TRY300 - the errors below are those of both steps
     except (RasterioError, OSError, GridError) as error:
         if isinstance(error, ImageryError):
             raise
@@ -210,27 +237,35 @@ def write_ortho(path: Path, pictures: Sequence[Picture], grid: Grid) -> None:
         draft.unlink(missing_ok=True)
 
 
-def _write_draft(path: Path, pictures: Sequence[Picture], grid: Grid) -> bool:
-    """Write colours and mask window by window; return whether any pixel is known."""
+def _write_draft(path: Path, grid: Grid, tiles: Iterable[OrthoTile], *, attribution: str, licence: str) -> bool:
+    """Write colours and mask tile by tile; return whether any pixel is known."""
     is_any = False
-    notices = {name: "; ".join(dict.fromkeys(getattr(item.entry, name) for item in pictures)) for name in ("licence",)}
+    with (
+        rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK=True),
+        rasterio.open(path, "w", **_draft_profile(grid)) as target,
+    ):
+        target.update_tags(TIFFTAG_COPYRIGHT=attribution, attribution=attribution, licence=licence)
+        for tile in tiles:
+            if tile.is_known.any():
+                is_any = True
+                rows, cols = tile.is_known.shape
+                window = Window(tile.col, tile.row, cols, rows)
+                target.write(tile.rgb * tile.is_known, window=window)
+                target.write_mask(tile.is_known, window=window)
+    return is_any
+
+
+def _warped_tiles(pictures: Sequence[Picture], grid: Grid) -> Iterator[OrthoTile]:
+    """Yield the pictures on the lattice window by window."""
     with ExitStack() as stack:
-        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK=True))
         views = [_Warped(item, stack, grid) for item in pictures]
-        target = stack.enter_context(rasterio.open(path, "w", **_draft_profile(grid)))
-        who = "; ".join(dict.fromkeys(item.entry.attribution for item in pictures))
-        target.update_tags(TIFFTAG_COPYRIGHT=who, attribution=who, **notices)
         for row, col, part in grid.windows(_WINDOW_PIXELS):
             window = Window(col, row, part.cols, part.rows)
             rgb = np.zeros((3, *part.shape), dtype=np.uint8)
             is_known = np.zeros(part.shape, dtype=bool)
             for view in views:
                 view.lay(window, part, rgb, is_known)
-            if is_known.any():
-                is_any = True
-                target.write(rgb * is_known, window=window)
-                target.write_mask(is_known, window=window)
-    return is_any
+            yield OrthoTile(row=row, col=col, rgb=rgb, is_known=is_known)
 
 
 def _draft_profile(grid: Grid) -> dict[str, object]:

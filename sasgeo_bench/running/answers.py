@@ -254,7 +254,7 @@ class _Map:
         for writer in self._writers:
             writer.begin()
             for query, blob, asked in task_files.read_some(writer.part.task, frozenset(writer.part.left)):
-                if writer.part.asked[query.query_id] != asked_under(asked, self._plan.key):
+                if writer.part.asked[query.query_id] != asked_under(asked, writer.part.key):
                     message = f"{writer.part.task} was made anew while it was asked: run again, answers are kept"
                     raise StoreError(message)
                 yield writer, query, blob

@@ -13,13 +13,15 @@ from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, rea
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.matching.results import STATUSES, Status, matcher_hash
+from sasgeo_bench.regions.imagery import ORTHO
+from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import CARD
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, map_of, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.task_rows import asked_under
+from sasgeo_bench.tasks.task_rows import asked_under, tie_key
 
 MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
@@ -71,7 +73,8 @@ class RunPart:
     """One task of a run: its folder of rows, its map, its truths, and its pending queries.
 
     `about` is the content of `task.json`; `asked` gives the hash that the row of each pending query carries
-    (`task_rows.asked_under`); `aside` counts rows of earlier queries or of other training.
+    (`task_rows.asked_under`); `aside` counts rows of earlier queries, of other training, or of other imagery. `imagery`
+    is the hash of rendered imagery that the matcher looks at, and `key` what its rows are tied to.
     """
 
     task: Path
@@ -83,6 +86,8 @@ class RunPart:
     asked: Mapping[str, str]
     done: int
     aside: int
+    imagery: str | None = None
+    key: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -341,6 +346,8 @@ def _part(
         message = f"{task} is of a private seed, whose answers stay with it: say --out {task.parent.parent.parent}"
         raise ConfigError(message)
     region = map_of(task, about)
+    imagery = _rendered_imagery(card, region)
+    key = tie_key(key, imagery)
     asked = {name: asked_under(one, key) for name, one in task_files.read_asked(task).items()}
     ties = prediction_files.read_ties(folder) if folder.is_dir() else []
     is_same_task = (before or {}).get("queries_sha256") == about["files"][task_files.QUERIES]["sha256"]
@@ -364,7 +371,18 @@ def _part(
         asked={name: asked[name] for name in left},
         done=len(own) - len(left),
         aside=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
+        imagery=imagery,
+        key=key,
     )
+
+
+def _rendered_imagery(card: MatcherCard, region: Path) -> str | None:
+    """Return the hash of a map's rendered imagery, which is no part of the map's own, if a matcher looks at it."""
+    if "imagery" not in card.needs:
+        return None
+    manifest = read_manifest(region)
+    is_rendered = manifest.imagery is not None and manifest.imagery.is_rendered
+    return manifest.files[ORTHO].sha256 if is_rendered else None
 
 
 def _shard_of(query_id: str, count: int) -> int:

@@ -25,7 +25,7 @@ from sasgeo_bench.running.prediction_rows import (
     predictions_of,
     row_faults,
 )
-from sasgeo_bench.tasks.task_rows import ASKED, asked_under
+from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
 from sasgeo_bench.texts import json_text, one_line
 
 RUN: Final = "run.json"
@@ -96,9 +96,9 @@ class Answers:
 def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Answers:
     """Read answers to some queries from a run's folder; of two for one query, the one that was written last.
 
-    `asked` gives the hash of each query, by id (`task_files.read_asked`); a row must carry it, tied to the training in
-    `run.json`. `is_tied` states whether rows without a hash are known to answer these queries. A run that was killed
-    before its first row has no answers. Raise `StoreError` if a part cannot be read.
+    `asked` gives the hash of each query, by id (`task_files.read_asked`); a row must carry it, tied to what `run.json`
+    says (`key_of`). `is_tied` states whether rows without a hash are known to answer these queries. A run that was
+    killed before its first row has no answers. Raise `StoreError` if a part cannot be read.
     """
     found: dict[str, Prediction] = {}
     aside: set[Tie] = set()
@@ -116,7 +116,7 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
 
 
 def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the hash that each row must carry: of its query, and of the training that `run.json` records.
+    """Return the hash that each row must carry: of its query, and of what `run.json` records (`key_of`).
 
     Raise `StoreError` if `run.json` is damaged.
 
@@ -128,13 +128,27 @@ def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def read_key(folder: Path) -> str | None:
-    """Read the hash of the training result from `run.json`; None without training. Raise as `read_run` does."""
+    """Read what rows are tied to besides their queries from `run.json` (`key_of`). Raise as `read_run` does."""
     try:
-        record = TrainingRecord.of(read_run(folder) or {})
+        return key_of(read_run(folder) or {})
     except MatchError as error:
         message = f"{folder / RUN} is damaged ({error}): {_MEND_RUN}"
         raise StoreError(message) from error
-    return None if record is None else record.key
+
+
+def key_of(about: Mapping[str, Any]) -> str | None:
+    """Return what the rows of a `run.json` are tied to: the training result, and the hash of rendered imagery.
+
+    Raise `MatchError` if either is damaged.
+
+    >>> key_of({}), len(key_of({"rendered_imagery": "ab"}))
+    (None, 64)
+    """
+    record, imagery = TrainingRecord.of(about), about.get("rendered_imagery")
+    if imagery is not None and not isinstance(imagery, str):
+        message = f"rendered_imagery is {imagery!r}, expected a hash"
+        raise MatchError(message)
+    return tie_key(None if record is None else record.key, imagery)
 
 
 def read_predictions(path: str | Path) -> Iterator[Prediction]:

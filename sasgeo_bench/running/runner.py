@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any, Final
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.progress import Lines, Progress, Tell
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running import prediction_files, prediction_rows
 from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Watch, answer, pool_costs
@@ -133,7 +135,7 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
     plan = trained(plan, tell=tell)
     _tell_state(plan, tell)
     for part in plan.parts:
-        if not part.left and part.done and prediction_files.read_key(part.folder) != plan.key:
+        if not part.left and part.done and prediction_files.read_key(part.folder) != part.key:
             with locked(part.folder, tell=tell):
                 _begin(plan, part)  # answers under an earlier training count again: `run.json` says which
     parts = [part for part in plan.parts if part.left]
@@ -264,6 +266,14 @@ def _begin(plan: RunPlan, part: RunPart) -> Cost:
     return before
 
 
+def _map_bytes(part: RunPart) -> int:
+    """Return the bytes of a map; rendered imagery counts for those that look at it."""
+    manifest = region_files.read_manifest(part.region)
+    is_idle = manifest.imagery is not None and manifest.imagery.is_rendered and part.imagery is None
+    files = (path for path in part.region.iterdir() if path.is_file() and not (is_idle and path.name == ORTHO))
+    return sum(path.stat().st_size for path in files)
+
+
 def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: the run, and its cost together with that of earlier runs."""
     about = part.about
@@ -285,7 +295,8 @@ def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
             "limits": asdict(plan.request.limits),
             "warm_up": "one query of each process is asked twice and timed the second time",
             "learned": None if plan.training_record is None else asdict(plan.training_record),
-            "map_bytes": sum(path.stat().st_size for path in part.region.iterdir() if path.is_file()),
+            **({} if part.imagery is None else {"rendered_imagery": part.imagery}),
+            "map_bytes": _map_bytes(part),
             **cost_fields,
             "licence": LICENCE,
             "attribution": ATTRIBUTION,

@@ -203,7 +203,8 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
     needs = suite.card.needs
     others: tuple[State, ...] = ()
     elsewhere: State | None = None
-    if "degraded map" in needs and base.imagery is not None:
+    imagery = base.imagery if base.imagery is not None and not base.imagery.record.is_rendered else None
+    if "degraded map" in needs and imagery is not None:
         others = (_degraded(request, suite, base),)
     if "older maps" in needs:
         others = tuple(
@@ -221,9 +222,9 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         scenes=base.manifest.scenes,
         others=others,
         elsewhere=elsewhere,
-        imagery=base.imagery if "imagery" in needs else None,
+        imagery=imagery if "imagery" in needs else None,
         ageing=_ageing(request.region) if "rates of ageing" in needs else None,
-        looks={block.id: _look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
+        looks={block.id: look_of(request.split, block) for block in blocks} if suite.is_pictured else {},
         profile=request.choice.profile,
     )
     return scene, base
@@ -239,7 +240,7 @@ def _degraded(request: Request, suite: Suite, base: Region) -> State:
     return State.of(region_files.read_region(folder), name=folder.name)
 
 
-def _look_of(split: Split, block: Block) -> Family:
+def look_of(split: Split, block: Block) -> Family:
     """Return the family of palettes of a block: that of its part; the halves of a cross-fit look different, too."""
     place = split.place_of[block.id]
     if split.half_of:

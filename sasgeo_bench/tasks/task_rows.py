@@ -256,8 +256,17 @@ def truth_sha256(truth: Truth) -> str:
     return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
+def tie_key(learned: str | None, imagery: str | None) -> str | None:
+    """Return the key of what decides an answer besides the question: what was learned, and rendered imagery looked at.
+
+    >>> tie_key("ab", None), len(tie_key(None, "cd"))
+    ('ab', 64)
+    """
+    return learned if imagery is None else hashlib.sha256(f"{learned} {imagery}".encode()).hexdigest()
+
+
 def asked_under(asked: str, key: str | None) -> str:
-    """Return the hash that an answer carries: that of the question and, if the matcher has learned, of what it learned.
+    """Return the hash that an answer carries: that of the question and of what else decides it (`tie_key`).
 
     Examples
     --------

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A pipeline draws, runs and scores; a second time it does only what is not up to date."""
 
+import datetime as dt
 import hashlib
 import json
 from dataclasses import replace
@@ -478,6 +479,7 @@ def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
     assert "learning" in spec.model_dump()
     newer = {
         "learning": True,
+        "reference_imagery": True,
         "contrast": {"__all__": {"pilot", "detectors"}},
         "task": {"__all__": {"views_cells", "kinds", "tracks", "detectors", "segmenters"}},
     }
@@ -641,3 +643,54 @@ def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch
     assert set(beside.scores) == set(board.scores) - {"random"}
     assert [item.verdict for item in beside.findings] == ["not decided: random failed"]
     assert "in broken" in (plan.out / "boards" / "small.failures.log").read_text(encoding="utf-8")
+
+
+PICTURED = {
+    '[[task]]\nsuites = ["clean"]': '[reference_imagery]\nage_years = 10\nseason = "snow"\ngsd_m = 1.0\n\n[[task]]\n'
+    'suites = ["aerial"]\nsegmenters = ["oracle_segmenter"]',
+    'suites = ["clean"]\n': 'suites = ["aerial+oracle_segmenter"]\n',
+}
+
+
+def test_reference_imagery_shows_the_map_nearest_in_age_of_each_place(tmp_path, monkeypatch):
+    plan = plan_pipeline(small(**PICTURED), out=tmp_path, tell=lambda _: None)
+    assert "  reference imagery: 1 region, rendered (snow, family calibration, seed 0, 10 years older)" in (
+        plan.to_text().splitlines()
+    )
+    asked = []
+    monkeypatch.setattr(pipeline, "render_place", lambda spec, **said: asked.append((spec.id, said)))
+    pipeline._render(plan, lambda _: None)
+    ((region, said),) = asked
+    assert (region, said["date"], said["out"]) == ("town-suburb", dt.date(2014, 1, 1), tmp_path)
+    assert (said["look"].season, said["look"].gsd_m) == ("snow", 1.0)
+
+
+def test_reference_imagery_is_part_of_what_a_file_says():
+    with_it = small(**PICTURED)
+    other = with_it.model_copy(update={"reference_imagery": None})
+    assert with_it.sha256 != other.sha256
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ('season = "snow"', 'family = "train"', "of family 'train', and so are pictures of queries on town-suburb"),
+        ('season = "snow"', 'season = "monsoon"', "season"),
+        ('season = "snow"', "gsd_m = 0.01", "gsd_m"),
+        (
+            'suites = ["aerial"]\nsegmenters = ["oracle_segmenter"]',
+            'suites = ["clean"]',
+            "has reference_imagery, and draws no suite of pictures: leave it out",
+        ),
+    ],
+)
+def test_reference_imagery_that_tells_nothing_or_too_much_is_refused(tmp_path, old, new, words):
+    text = TEXT
+    for before, after in PICTURED.items():
+        text = text.replace(before, after)
+    text = text.replace("gsd_m = 1.0\n", "").replace(old, new)
+    if "clean" in new:
+        text = text.replace("aerial+oracle_segmenter", "clean")
+    with pytest.raises(ConfigError, match=words) as error:
+        plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+    assert "\n" not in str(error.value)

@@ -28,7 +28,7 @@ from sasgeo_bench.sensing.rendering.scene import MARGIN_M, Scene, make_scene
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 from sasgeo_bench.sensing.rendering.texture import draw, fractal, grain, noise
 from sasgeo_bench.sensing.rendering.trace import HeightPyramid, trace
-from sasgeo_bench.sensing.rendering.view import labels, render, render_labelled
+from sasgeo_bench.sensing.rendering.view import labels, render, render_labelled, render_ortho
 
 EPSG = 32632
 EAST, NORTH = 500_000.0, 5_200_000.0
@@ -386,3 +386,29 @@ def test_a_scene_covers_its_window_and_a_margin():
 def test_empty_ground_is_a_picture_too():
     scene = scene_of((VILLAGE[3],), size_m=48.0)
     assert render(scene, camera(height_m=60.0), CLEAR, np.random.default_rng(0)).std() > 3
+
+
+def test_another_look_of_a_place_shares_no_draw_with_it():
+    """Grain, tufts and stains of open ground correlate wholly within one look, and not at all between two."""
+    rows = [(name, shapely.affinity.translate(shape, 300, 0), width) for name, shape, width in VILLAGE]
+    one, again, other = (scene_of(rows, place=name) for name in ("village", "village", "village/survey"))
+    colours = [scene.painting("summer").colours[0].mean(axis=2).ravel() for scene in (one, again, other)]
+    assert np.corrcoef(colours[0], colours[1])[0, 1] == pytest.approx(1)
+    assert abs(np.corrcoef(colours[0], colours[2])[0, 1]) < 0.1
+    keys = [set(scene_of(place=name).plan.of("building").key.tolist()) for name in ("village", "village/survey")]
+    assert not keys[0] & keys[1]
+
+
+def test_from_straight_above_no_house_leans_over_the_road_whatever_its_height():
+    """Roof and ground keep their colours where they are: the light of the sun aside, only shadows move."""
+    window = Grid.around(EAST, NORTH, size_m=(80.0, 80.0), cell_size_m=0.5, epsg=EPSG)
+    dull = replace(CLEAR, cloud=1.0)
+    flat, high = (
+        render_ortho(scene_of(relief=relief), window, dull, np.random.default_rng(1)) for relief in (0.0, 3.0)
+    )
+    off = np.abs(flat.astype(float) - high).mean(axis=2)
+    rows, cols = np.indices(window.shape).reshape(2, -1)
+    at_m = window.to_centres_m(np.column_stack([rows, cols]))
+    away_m = shapely.distance(shapely.points(at_m), HOUSE).reshape(window.shape)
+    assert flat.shape == (160, 160, 3)
+    assert off[away_m > 12].max() <= 2  # leaning by 3 storeys would reach farther

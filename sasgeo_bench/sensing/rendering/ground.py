@@ -46,7 +46,11 @@ def _roughen(canvas: Canvas) -> None:
     """Make the ground uneven: grain, tufts and wide patches."""
     seed, rough = canvas.plan.seed("ground"), canvas.plan.palette.unevenness
     for strip, grid in canvas.strips():
-        fine = 0.075 * grain(grid) + 0.08 * noise(grid, 0.7, seed) + 0.06 * noise(grid, 1.7, seed + 1)
+        fine = (
+            0.075 * grain(grid, 1 + canvas.plan.salt)
+            + 0.08 * noise(grid, 0.7, seed)
+            + 0.06 * noise(grid, 1.7, seed + 1)
+        )
         tufts = -0.2 * np.clip(fractal(grid, 3.0, seed + 5) * (1 + noise(grid, 30.0, seed + 6)) - 0.3, 0, 0.7)
         factor = 1 + rough * (fine + tufts + 0.07 * fractal(grid, 35.0, seed + 2))
         for band in range(3):
@@ -98,7 +102,7 @@ def _plots(canvas: Canvas, grid: Grid) -> _Plots:
     seed, palette = canvas.plan.seed("plots"), canvas.plan.palette
     bend = 22 * noise(grid, 170.0, seed), 22 * noise(grid, 170.0, seed + 1)
     turn = np.pi * draw(seed, np.array([0]))[0]
-    east, north = ground_m(grid)
+    east, north = ground_m(grid, canvas.plan.corner_m)
     east, north = east[None, :] + bend[0], north[:, None] + bend[1]
     across, down = east * np.cos(turn) + north * np.sin(turn), north * np.cos(turn) - east * np.sin(turn)
     luck, use = _drawn_by_plot((np.floor(across / 34), np.floor(down / 52)), (seed + 2, seed + 3))
@@ -190,17 +194,21 @@ def _stripe_m(canvas: Canvas, numbers: Cells) -> Field:
     grid = canvas.grid
     turn = np.pi * draw(canvas.plan.seed("rows"), np.arange(int(numbers.max(initial=0)) + 1))
     cos, sin = (part.astype(np.float32)[numbers] for part in (np.cos(turn), np.sin(turn)))
-    east, north = ground_m(grid)
+    east, north = ground_m(grid, canvas.plan.corner_m)
     return np.asarray(cos * east[None, :] - sin * north[:, None], dtype=np.float32)
 
 
-def ground_m(grid: Grid) -> tuple[Field, Field]:
+def ground_m(grid: Grid, corner_m: tuple[float, float] | None = None) -> tuple[Field, Field]:
     """Return eastings (cols,) and northings (rows,) of cell centres, metres.
 
-    They count from a corner that is fixed to the ground, so that windows agree, and near enough for float32.
+    They count from a corner that is fixed to the ground, so that windows agree, and near enough for float32: the one
+    given, or that of the squares of 5 km, at whose edges windows do not agree.
     """
-    east = (np.arange(grid.cols) + 0.5) * grid.cell_size_m + grid.west_m % 5000
-    north = grid.north_m % 5000 - (np.arange(grid.rows) + 0.5) * grid.cell_size_m
+    west_m, north_m = grid.west_m % 5000, grid.north_m % 5000
+    if corner_m is not None:
+        west_m, north_m = grid.west_m - corner_m[0], grid.north_m - corner_m[1]
+    east = (np.arange(grid.cols) + 0.5) * grid.cell_size_m + west_m
+    north = north_m - (np.arange(grid.rows) + 0.5) * grid.cell_size_m
     return east.astype(np.float32), north.astype(np.float32)
 
 
@@ -237,7 +245,9 @@ def _paint_green(canvas: Canvas) -> NDArray[np.int8]:
         cells = found == kind
         mixed = np.clip(dryness + 0.5 * (patches[cells] - 0.5) + 0.12 * tone[numbers[cells]], 0, 1)[:, None]
         canvas.tint(cells, (fresh * (1 - mixed) + dry * mixed) * (1 + 0.05 * tone[numbers[cells]])[:, None], share)
-    mown = (found == PARK) & (draw(3, np.arange(len(kinds))) < 0.4)[numbers]
+    # By its place in the window, as pictures of published tasks are; another look is painted window by window.
+    which = np.concatenate([[0], shapes.key]) if canvas.plan.salt else np.arange(len(kinds))
+    mown = (found == PARK) & (draw(3, which) < 0.4)[numbers]
     stripes = np.sign(np.sin(np.pi * _stripe_m(canvas, numbers) / 2.4)) * 0.035
     canvas.shade(mown, np.asarray(1 + stripes, dtype=np.float32))
     floor = np.array(canvas.plan.palette.soil[0]) * 0.55 + fresh * 0.2
@@ -261,7 +271,11 @@ def _paint_fields(canvas: Canvas) -> Mask:
     colour = colour * (1 + 0.07 * bell(plan.seed("field"), shapes.key))[:, None]
     colour = np.vstack([np.zeros((1, 3)), colour])
     cells = numbers > 0
-    canvas.tint(cells, colour[numbers[cells]], np.asarray(0.82 + 0.12 * noise(canvas.grid, 12.0, 5), dtype=np.float32))
+    canvas.tint(
+        cells,
+        colour[numbers[cells]],
+        np.asarray(0.82 + 0.12 * noise(canvas.grid, 12.0, 5 + plan.salt), dtype=np.float32),
+    )
     across = _field_rows_m(canvas, shapes, numbers)
     pitch = np.concatenate([[1.0], 0.75 + 1.6 * luck])[numbers]
     wander = 0.5 * noise(canvas.grid, 25.0, plan.seed("wander"))
@@ -276,7 +290,7 @@ def _paint_fields(canvas: Canvas) -> Mask:
 def _field_rows_m(canvas: Canvas, shapes: Shapes, numbers: Cells) -> Field:
     """Return the distance across the rows of each field, which run along its longer side, metres."""
     axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[numbers]
-    east, north = ground_m(canvas.grid)
+    east, north = ground_m(canvas.grid, canvas.plan.corner_m)
     return np.asarray(axis[..., 0] * north[:, None] - axis[..., 1] * east[None, :], dtype=np.float32)
 
 
@@ -297,6 +311,8 @@ def _paint_water(canvas: Canvas) -> None:
         part.tint(bank, np.array(palette.soil[0]) * 0.8, 0.6)
         share = np.exp(-depth_m[strip] / 4.0) + 0.25 * fractal(strip_grid, 25.0, seed + 3)
         share = np.clip(share, 0, 1)[here][:, None]
-        ripples = (1 + 0.04 * noise(strip_grid, 1.6, seed + 7) + 0.03 * grain(strip_grid, 5))[here][:, None]
+        ripples = (1 + 0.04 * noise(strip_grid, 1.6, seed + 7) + 0.03 * grain(strip_grid, 5 + canvas.plan.salt))[here][
+            :, None
+        ]
         part.tint(here, (deep * (1 - share) + shallow * share) * ripples)
         part.kind[here] = WATER

@@ -63,12 +63,18 @@ class Shapes:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plan:
-    """One window of a region, a palette, and the seed of the place."""
+    """One window of a region, a palette, and the seed of the place.
+
+    `salt` is 0, or that of another look of the place: it changes every draw that no `seed` decides.
+    `corner_m` is where plots and stripes of another look are counted from, None for squares of 5 km.
+    """
 
     grid: Grid
     place: str
     palette: Palette
     shapes: dict[str, Shapes]
+    salt: int = 0
+    corner_m: tuple[float, float] | None = None
 
     def of(self, class_name: str) -> Shapes:
         """Return the features of a class; none if the region has no such class."""
@@ -161,8 +167,11 @@ def no_shapes() -> Shapes:
     )
 
 
-def shapes_of(features: "gpd.GeoDataFrame", box: shapely.Geometry) -> dict[str, Shapes]:
-    """Return the visible features that reach into a box, by class, ordered by level and identity."""
+def shapes_of(features: "gpd.GeoDataFrame", box: shapely.Geometry, *, salt: int = 0) -> dict[str, Shapes]:
+    """Return the visible features that reach into a box, by class, ordered by level and identity.
+
+    `salt` changes the keys, and with them all that is drawn for a feature; the order stays.
+    """
     near = features[features["is_visible"].to_numpy() & shapely.intersects(features.geometry.to_numpy(), box)]
     kind = near["osm_type"].map(_KINDS).fillna(3).to_numpy(dtype=np.int64)
     key = near["osm_id"].to_numpy(dtype=np.int64) * 4 + kind
@@ -174,7 +183,7 @@ def shapes_of(features: "gpd.GeoDataFrame", box: shapely.Geometry) -> dict[str, 
         found[str(name)] = Shapes(
             geometry=near.geometry.to_numpy()[chosen],
             width_m=near["width_m"].to_numpy(dtype=np.float64)[chosen],
-            key=key[chosen],
+            key=key[chosen] ^ salt,
             level=level[chosen],
             is_bridge=near["is_bridge"].to_numpy()[chosen],
             is_sea=kind[chosen] == _KINDS[SEA],

@@ -106,7 +106,9 @@ def _wear(canvas: Canvas, mask: Mask, is_paved: Mask) -> None:
 
 def _wear_part(canvas: Canvas, mask: Mask, is_paved: Mask, edge_m: Field) -> None:
     grid, seed, rough = canvas.grid, canvas.plan.seed("wear"), canvas.plan.palette.unevenness
-    stains = 0.06 * fractal(grid, 9.0, seed) + 0.045 * grain(grid) + 0.045 * noise(grid, 1.0, seed + 4)
+    stains = (
+        0.06 * fractal(grid, 9.0, seed) + 0.045 * grain(grid, 1 + canvas.plan.salt) + 0.045 * noise(grid, 1.0, seed + 4)
+    )
     patches = np.where(noise(grid, 5.0, seed + 5) > 0.72, -0.09, 0.0)
     cracks = np.where(np.abs(noise(grid, 6.0, seed + 6)) < 0.018, -0.12, 0.0)
     wheels = 0.035 * np.cos(2 * np.pi * edge_m / 1.75)
@@ -160,7 +162,9 @@ def _paint_rails(canvas: Canvas) -> None:
     if not len(shapes):
         return
     bed = burn_numbers(shapes.areas(), canvas.grid) > 0
-    stones = 0.06 * grain(canvas.grid) + 0.08 * noise(canvas.grid, 3.0, canvas.plan.seed("ballast"))
+    stones = 0.06 * grain(canvas.grid, 1 + canvas.plan.salt) + 0.08 * noise(
+        canvas.grid, 3.0, canvas.plan.seed("ballast")
+    )
     canvas.tint(bed, _BALLAST, _soft(bed, canvas, 0.5, "ballast"))
     canvas.shade(bed, np.asarray(1 + stones, dtype=np.float32))
     canvas.kind[bed] = ROAD

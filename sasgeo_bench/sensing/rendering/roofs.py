@@ -106,7 +106,11 @@ def _weather(canvas: Canvas, buildings: Buildings, cells: _Cells) -> Numbers:
     is_sheet = cover == COVERS.index("sheets")
     is_tile = (cover == COVERS.index("tiles")) | (cover == COVERS.index("slates"))
     pattern = np.where(is_sheet, 0.045 * strip, np.where(is_tile, 0.03 * course + 0.03 * lumps, 0.025 * lumps))
-    stained = (0.08 + 0.1 * draw(29, cells.key)) * patches + 0.05 * fine + 0.045 * grain(canvas.grid)[at]
+    stained = (
+        (0.08 + 0.1 * draw(29, cells.key)) * patches
+        + 0.05 * fine
+        + 0.045 * grain(canvas.grid, 1 + canvas.plan.salt)[at]
+    )
     edge = np.where(cells.edge_m < 0.4, np.where(buildings.form[cells.owner] == FLAT, 0.1, -0.12), 0.0)
     return np.asarray(1 + rough * (pattern + stained) + edge)
 

@@ -37,7 +37,7 @@ from sasgeo_bench.sensing.rendering.plan import (
 from sasgeo_bench.sensing.rendering.roads import paint_barriers, paint_roads
 from sasgeo_bench.sensing.rendering.roofs import paint_buildings
 from sasgeo_bench.sensing.rendering.seasons import GROWTH, Season
-from sasgeo_bench.sensing.rendering.texture import Numbers, draw, fractal, noise
+from sasgeo_bench.sensing.rendering.texture import Numbers, draw, fractal, noise, seed_of
 from sasgeo_bench.sensing.rendering.trace import HeightPyramid
 from sasgeo_bench.sensing.rendering.trees import hedge_trees, make_trees, paint_trees, scatter
 
@@ -48,6 +48,7 @@ MARGIN_M: Final = 24.0  # painted around the window asked for, so that its edge 
 _SNOW: Final = (232, 236, 242)
 _MOST_CELLS: Final = 40_000_000
 _MOST_CLASSES: Final = 31
+_MOST_SALT: Final = 2**31 - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -123,6 +124,8 @@ def make_scene(
         Those of a `Region` of any state of the map.
     place : str
         Seeds all styles together with the identity of each feature: the same place looks the same at every date.
+        With a slash, as in "vaduz/survey", it is another look of a place, which shares no draw with that of the place
+        alone: other roofs, crops, heights, trees, cars and grain.
     window : Grid
         Ground and cell size (0.25 to 0.5 m) of the paint; a margin of 24 m is added on every side.
     family : {"train", "calibration", "test", "shifted"}
@@ -140,8 +143,15 @@ def make_scene(
     grid = window.window(-more, -more, window.rows + 2 * more, window.cols + 2 * more)
     west, south, east, north = grid.bounds_m
     box = shapely.box(west - 80, south - 80, east + 80, north + 80)
-    shapes = shapes_of(features, box)
-    plan = Plan(grid=grid, place=place, palette=PALETTES[family], shapes=shapes)
+    salt = seed_of(place) % _MOST_SALT + 1 if "/" in place else 0
+    plan = Plan(
+        grid=grid,
+        place=place,
+        palette=PALETTES[family],
+        shapes=shapes_of(features, box, salt=salt),
+        salt=salt,
+        corner_m=(float(features.total_bounds[0]), float(features.total_bounds[3])) if salt and len(features) else None,
+    )
     paint_areas = make_paint(features[shapely.intersects(features.geometry.to_numpy(), box)], classes, coverage)
     bits = np.zeros(grid.shape, dtype=np.uint32)
     for number, areas in enumerate(paint_areas.areas):

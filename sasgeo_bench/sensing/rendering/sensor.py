@@ -15,10 +15,13 @@ _BANK: Final = 1024
 _VIGNETTE: Final = 0.14  # of the light is lost in the corners
 
 
-def expose_sensor(light: Field, conditions: Conditions, dark: float, rng: np.random.Generator) -> Picture:
+def expose_sensor(
+    light: Field, conditions: Conditions, dark: float, rng: np.random.Generator, *, is_flat: bool = False
+) -> Picture:
     """Return a picture, uint8 of shape (H, W, 3), of linear light, float32 of the same shape, which is used up.
 
     `dark` (0 to 1) says how far the sensor had to amplify: noise is up to five times as strong.
+    With `is_flat` the lens darkens no corner.
 
     Notes
     -----
@@ -26,7 +29,8 @@ def expose_sensor(light: Field, conditions: Conditions, dark: float, rng: np.ran
     photons has one standard deviation at every brightness.
     """
     blurred = _blurred(light, conditions)
-    blurred *= _vignette(*light.shape[:2])
+    if not is_flat:
+        blurred *= _vignette(*light.shape[:2])
     tone = _curve(np.sqrt(np.maximum(blurred, 0, out=blurred)))
     sigma = conditions.noise * (1 + 4 * dark)
     if sigma > 0:

@@ -101,6 +101,24 @@ def strips(camera: Camera) -> Iterator[slice]:
         yield slice(row, min(row + _STRIP_PX, camera.intrinsics.height_px))
 
 
+def trace_down(pixels: Grid, grid: Grid) -> Hits:
+    """Return what vertical rays through the pixels of one lattice see of a raster on another; heights are left at 0."""
+    rows, cols = np.indices(pixels.shape).reshape(2, -1)
+    uv = grid.to_uv(pixels.to_centres_m(np.column_stack([rows, cols])))
+    col, row = uv.astype(np.float32).T.reshape(2, *pixels.shape)
+    flat = np.zeros_like(col)
+    return Hits(
+        col=col,
+        row=row,
+        z_m=flat,
+        cells_px=np.full_like(col, pixels.cell_size_m / grid.cell_size_m),
+        fall=np.ones_like(col),
+        ahead=np.zeros((2, *col.shape), dtype=np.float32),
+        is_side=np.zeros(col.shape, dtype=bool),
+        is_ground=np.ones(col.shape, dtype=bool),
+    )
+
+
 def trace(camera: Camera, grid: Grid, heights: HeightPyramid, rows: slice) -> Hits:
     """Return what some rows of pixels see of a height raster on a grid; the ground plane is at 0.
 

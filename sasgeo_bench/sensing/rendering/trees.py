@@ -129,7 +129,7 @@ def paint_trees(canvas: Canvas, trees: Trees) -> None:
     sleeps = ~is_evergreen & (
         np.mod(trees.luck * 7.31, 1) < growth.bare_share * (0.85 if growth.bare_share == 1 else 1)
     )
-    twigs = np.abs(grain(canvas.grid, 3)) > 1.3
+    twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3
     order = np.argsort(trees.height_m, kind="stable")
     for tree in order.tolist():
         shape = int(trees.luck[tree] * 1e6) % _SHAPES

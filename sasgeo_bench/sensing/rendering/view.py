@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import CameraError
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.rendering.conditions import Conditions
@@ -21,10 +22,12 @@ from sasgeo_bench.sensing.rendering.scene import Painting, Scene
 from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.sensing.rendering.sensor import expose_sensor
 from sasgeo_bench.sensing.rendering.texture import Field, draw
-from sasgeo_bench.sensing.rendering.trace import Hits, strips, trace
+from sasgeo_bench.sensing.rendering.trace import Hits, strips, trace, trace_down
 
 _GLASS: Final = np.array([54, 62, 70], dtype=np.float32)
 _WAVES: Final = 256  # cells of a tile of rippled water
+_STRIP_ROWS: Final = 128
+_RIM_PX: Final = 8  # rendered around a lattice, for the blur
 
 
 def render(scene: Scene, camera: Camera, conditions: Conditions, rng: np.random.Generator) -> Picture:
@@ -66,6 +69,24 @@ def labels(scene: Scene, camera: Camera, *, season: Season = "summer") -> Pictur
     for rows, hits in _traced(scene, camera, season):
         _label(scene, scene.painting(season), hits, found[:, rows])
     return found
+
+
+def render_ortho(scene: Scene, grid: Grid, conditions: Conditions, rng: np.random.Generator) -> Picture:
+    """Return a scene seen straight down everywhere, on a lattice in its CRS, uint8 of shape (rows, cols, 3).
+
+    An ideal orthophoto: nothing leans, no wall is seen, no haze or vignette darkens it, so that tiles fit together.
+    The lattice should lie within the scene.
+    """
+    wide = grid.window(-_RIM_PX, -_RIM_PX, grid.rows + 2 * _RIM_PX, grid.cols + 2 * _RIM_PX)
+    exposed = _exposed(scene, conditions)
+    seen = np.empty((*wide.shape, 3), dtype=np.float32)
+    for row in range(0, wide.rows, _STRIP_ROWS):
+        part = wide.window(row, 0, min(_STRIP_ROWS, wide.rows - row), wide.cols)
+        hits = trace_down(part, scene.grid)
+        seen[row : row + part.rows] = _shaded(exposed, hits)
+        _reflect(exposed, hits, seen[row : row + part.rows])
+    picture = expose_sensor(seen, conditions, exposed.exposure.dark, rng, is_flat=True)
+    return picture[_RIM_PX:-_RIM_PX, _RIM_PX:-_RIM_PX]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

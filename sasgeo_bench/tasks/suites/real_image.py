@@ -46,7 +46,7 @@ class RealImageSuite(Suite):
     def lack(self, scene: Scene) -> str | None:
         """Return that there is no imagery, or what any suite lacks."""
         if scene.imagery is None:
-            return "no imagery ([[imagery]] in its region file)"
+            return "no real imagery ([[imagery]] in its region file)"
         return super().lack(scene)
 
     def spacing_m(self, scene: Scene) -> float:  # noqa: ARG002

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendered reference imagery: the whole of a region from above, as it was at one date, in a look of its own."""
+
+import datetime as dt
+import os
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import ConfigError, ImageryError, SasgeoError, StoreError
+from sasgeo_bench.files.folders import file_record, fresh_folder, locked
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.progress import Tell
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.build import build_region, package_version, plan_build, share_shown
+from sasgeo_bench.regions.imagery import ORTHO, Imagery, OrthoRecord, PictureRecord, RenderedRecord
+from sasgeo_bench.regions.ortho import OrthoTile, lattice_within, write_tiles
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
+from sasgeo_bench.regions.region_spec import RegionFile
+from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun
+from sasgeo_bench.sensing.rendering.palettes import PALETTES, Family
+from sasgeo_bench.sensing.rendering.scene import Scene, make_scene
+from sasgeo_bench.sensing.rendering.seasons import SEASONS, Season
+from sasgeo_bench.sensing.rendering.texture import seed_of
+from sasgeo_bench.sensing.rendering.view import render_ortho
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+
+FINEST_M: Final = 0.25
+COARSEST_M: Final = 2.0
+_LOOK: Final = "reference imagery"  # no query is drawn in a look of a name that begins so
+_TILE_PX: Final = 1024
+_REACH_M: Final = 40.0  # painted around a tile: shadows fall into it, yards and crowns reach into it
+_COARSEST_CELL_M: Final = 1.0
+_SOURCE: Final = "rendered from the map: no photograph, and not the look of any query"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """How reference imagery looks; raise `ConfigError` for a family, season or resolution that there is not.
+
+    >>> Look(season="monsoon")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: season is one of spring, summer, autumn, winter, snow, got 'monsoon'
+    """
+
+    family: Family = "calibration"
+    season: Season = "autumn"
+    gsd_m: float = 0.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Check every value."""
+        for name, known in (("family", tuple(PALETTES)), ("season", SEASONS)):
+            if getattr(self, name) not in known:
+                message = f"{name} is one of {', '.join(known)}, got {getattr(self, name)!r}"
+                raise ConfigError(message)
+        if not FINEST_M <= self.gsd_m <= COARSEST_M:
+            message = f"gsd_m lies between {FINEST_M:g} and {COARSEST_M:g} m, got {self.gsd_m!r}"
+            raise ConfigError(message)
+
+    def conditions(self, place: str) -> Conditions:
+        """Return one light for the whole image, drawn for place and seed: a survey flies around noon, in the clear."""
+        rng = np.random.default_rng(seed_of(place, _LOOK, self.seed))
+        sun = Sun(
+            elevation_deg=round(float(rng.uniform(30, 55)), 1), azimuth_deg=round(float(rng.uniform(110, 250)), 1)
+        )
+        return Conditions(season=self.season, sun=sun, cloud=0.15, noise=0.006, jpeg_quality=0)
+
+    @property
+    def name(self) -> str:
+        """Return what seeds its styles: it differs from that of all queries, and from seed to seed."""
+        return f"{_LOOK} {self.seed}"
+
+
+def render_imagery(folder: Path, world: Path, look: Look, *, tell: Tell) -> OrthoRecord:
+    """Render the map in `world`, a dated state of the place of the region in `folder`, as that region's imagery.
+
+    The region's map stays as it is, and so does its hash: tasks and answers of methods that look at no imagery stay
+    valid. Nothing is done if the region has this very imagery. A failed rendering leaves the region as it was.
+
+    Raises
+    ------
+    StoreError
+        If either is not built, or the folder cannot be written.
+    ImageryError
+        If the region has real imagery, or the map shows nothing to draw.
+    """
+    region_files.read_manifest(folder)  # before a lock is made: what is no region gets no file beside it
+    try:
+        with locked(folder, tell=tell):
+            manifest, shown = region_files.read_manifest(folder), region_files.read_manifest(world)
+            picture = _picture(manifest, shown, look)
+            if _is_current(folder, manifest, picture) and manifest.imagery is not None:
+                tell(f"{folder.name}: rendered imagery is up to date, nothing to do")
+                return manifest.imagery
+            features = region_files.read_features(world)  # without the layers, which take more memory than a tile
+            rendering = _Rendering(folder, manifest, shown, features, look, picture)
+            _check_drawable(rendering)
+            with fresh_folder(folder) as scratch:
+                return _render_into(scratch, rendering, tell)
+    except SasgeoError:
+        raise
+    except OSError as error:
+        message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        raise StoreError(message) from error
+
+
+def render_place(
+    spec: RegionFile,
+    *,
+    look: Look,
+    out: Path,
+    date: dt.date | None = None,
+    extract_folders: Sequence[Path] = (),
+    tell: Tell,
+) -> Path:
+    """Render the imagery of a region that is built in `out`; an older state of its place is built if it is missing.
+
+    Return the image. Raise as `render_imagery` and `plan_build` do.
+    """
+    plan = plan_build(spec, out=out, extract_folders=extract_folders)
+    if not plan.is_current:
+        message = f"{plan.folder} is not built, or not by this region file: run sasgeo-bench build-region {spec.id}"
+        raise StoreError(message)
+    world = plan if date is None else plan_build(spec, out=out, date=date, extract_folders=extract_folders)
+    if not world.is_current:
+        build_region(world, tell=tell)
+    render_imagery(plan.folder, world.folder, look, tell=tell)
+    return plan.folder / ORTHO
+
+
+@dataclass(frozen=True, slots=True)
+class _Rendering:
+    """What is rendered: the region that gets the imagery, the map that it shows, its look and its record.
+
+    `features` are those of the map that is shown.
+    """
+
+    folder: Path
+    manifest: Manifest
+    shown: Manifest
+    features: "gpd.GeoDataFrame"
+    look: Look
+    picture: PictureRecord
+
+    @property
+    def place(self) -> str:
+        """Return the place that seeds the styles."""
+        return place_of(self.manifest.id)
+
+
+def place_of(region: str) -> str:
+    """Return the place of a map, by which its styles are drawn.
+
+    >>> place_of("vaduz@2013-08-03")
+    'vaduz'
+    """
+    return region.split("@", maxsplit=1)[0]
+
+
+def _picture(manifest: Manifest, shown: Manifest, look: Look) -> PictureRecord:
+    """Return the record of the image; refuse a region whose imagery is real."""
+    if manifest.imagery is not None and not manifest.imagery.is_rendered:
+        message = f"{manifest.id} has imagery of its own ([[imagery]] in its region file): a rendered one adds nothing"
+        raise ImageryError(message)
+    extract, sun = shown.extract, look.conditions(place_of(manifest.id)).sun
+    return PictureRecord(
+        file=extract.file,
+        sha256=extract.sha256,
+        bytes=extract.bytes,
+        date=extract.date,
+        licence=LICENCE,
+        attribution=ATTRIBUTION,
+        publish=True,
+        source=_SOURCE,
+        gsd_m=look.gsd_m,
+        rendered=RenderedRecord(
+            family=look.family,
+            season=look.season,
+            seed=look.seed,
+            sun_elevation_deg=sun.elevation_deg,
+            sun_azimuth_deg=sun.azimuth_deg,
+            map_sha256=shown.inputs_sha256,
+            made_by=f"sasgeo-bench {package_version()}",
+        ),
+    )
+
+
+def _is_current(folder: Path, manifest: Manifest, picture: PictureRecord) -> bool:
+    path, record = folder / ORTHO, manifest.imagery
+    if record is None or record.pictures != (picture,) or not path.is_file():
+        return False
+    return ORTHO in manifest.files and manifest.files[ORTHO] == file_record(path)
+
+
+def _check_drawable(rendering: _Rendering) -> None:
+    """Refuse a map without a visible feature in the bounds."""
+    geometry = rendering.features.geometry.to_numpy()[rendering.features["is_visible"].to_numpy()]
+    if not shapely.intersects(geometry, shapely.box(*rendering.manifest.bounds_m)).any():
+        message = f"{rendering.folder.name} of {rendering.picture.date} shows nothing to draw: take another date"
+        raise ImageryError(message)
+
+
+def _render_into(scratch: Path, rendering: _Rendering, tell: Tell) -> OrthoRecord:
+    """Fill the folder that replaces a region's: its other files, the image, and a manifest that says so."""
+    folder, manifest = rendering.folder, rendering.manifest
+    tell(f"{folder.name}: rendering {rendering.picture.to_text().removeprefix('rendered from ')}")
+    for name in manifest.files:
+        if name != ORTHO:
+            _link(folder / name, scratch / name)
+    bounds = np.array([manifest.bounds_m])
+    grid = lattice_within(bounds, manifest.grid, finest_m=rendering.look.gsd_m)
+    tiles = _tiles(rendering, grid)
+    if not write_tiles(scratch / ORTHO, grid, tiles, attribution=ATTRIBUTION, licence=LICENCE):
+        message = f"{folder.name} of {rendering.picture.date} has no mapped ground: take another date"
+        raise ImageryError(message)
+    record = _measured(scratch, rendering, grid)
+    files = manifest.files | {ORTHO: file_record(scratch / ORTHO)}
+    changed = manifest.model_copy(update={"files": dict(sorted(files.items())), "imagery": record})
+    region_files.write_manifest(scratch, changed)
+    tell(f"{folder.name}: {record.to_text()}")
+    return record
+
+
+def _link(source: Path, target: Path) -> None:
+    """Give a file a second name; copy it where the file system has no such names."""
+    with suppress(OSError):
+        os.link(source, target)
+        return
+    shutil.copy2(source, target)
+
+
+def _measured(scratch: Path, rendering: _Rendering, grid: Grid) -> OrthoRecord:
+    """Return the record with the share of the region's mapped ground that is shown.
+
+    There is no offset to measure: the image lies on the map that it shows.
+    """
+    record = OrthoRecord(
+        pictures=(rendering.picture,),
+        gsd_m=grid.cell_size_m,
+        bounds_m=grid.bounds_m,
+        rows=grid.rows,
+        cols=grid.cols,
+        share=0.0,
+        offset=None,
+    )
+    imagery = Imagery(path=scratch / ORTHO, file=file_record(scratch / ORTHO), record=record, epsg=grid.epsg)
+    mapped = shapely.from_wkt(rendering.manifest.coverage.wkt)
+    return record.model_copy(update={"share": share_shown(imagery, mapped, rendering.manifest.cell_size_m)})
+
+
+def _tiles(rendering: _Rendering, grid: Grid) -> Iterator[OrthoTile]:
+    """Yield the image tile by tile: one painted window is in memory at a time."""
+    conditions = rendering.look.conditions(rendering.place)
+    for row, col, part in grid.windows(_TILE_PX):
+        scene = _scene(rendering, part)
+        is_known = _is_mapped(scene, part)
+        if not is_known.any():
+            continue
+        rng = np.random.default_rng((seed_of(rendering.place, rendering.look.name), row, col))
+        picture = render_ortho(scene, part, conditions, rng)
+        yield OrthoTile(row=row, col=col, rgb=np.ascontiguousarray(np.moveaxis(picture, -1, 0)), is_known=is_known)
+
+
+def _scene(rendering: _Rendering, part: Grid) -> Scene:
+    """Return the painted surroundings of a tile."""
+    cell_m = min(part.cell_size_m, _COARSEST_CELL_M)
+    west, south, east, north = part.bounds_m
+    window = Grid.from_bounds(
+        west - _REACH_M, south - _REACH_M, east + _REACH_M, north + _REACH_M, cell_size_m=cell_m, epsg=part.epsg
+    )
+    return make_scene(
+        rendering.features,
+        rendering.shown.classes,
+        shapely.from_wkt(rendering.shown.coverage.wkt),
+        place=f"{rendering.place}/{rendering.look.name}",
+        window=window,
+        family=rendering.look.family,
+    )
+
+
+def _is_mapped(scene: Scene, part: Grid) -> NDArray[np.bool_]:
+    """Return which pixels show mapped ground, shape (rows, cols)."""
+    length = max(part.shape)
+    diagonal = scene.grid.to_cells(part.to_centres_m(np.column_stack([np.arange(length)] * 2).astype(np.int64)))
+    rows, cols = diagonal[: part.rows, 0], diagonal[: part.cols, 1]
+    return np.asarray(scene.is_mapped[np.ix_(rows, cols)])

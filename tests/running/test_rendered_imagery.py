@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Answers of matchers that look at rendered imagery are tied to it; those of all others are not."""
+
+from dataclasses import replace
+
+import pytest
+
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.runner import run
+from sasgeo_bench.scoring.validate import validate
+from sasgeo_bench.sensing.reference_imagery import Look, render_imagery
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.suites.base import Choice
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+TOWN = "town-riverside"
+LOOK = Look(gsd_m=2.0)
+SETTINGS = {"regions": (TOWN,), "split": "crossfit", "count": 1, "seed": 0}
+
+
+def quiet(_):
+    pass
+
+
+@pytest.fixture
+def draw(own_out):
+    """Draw a site's queries of a suite, and return the task."""
+
+    def drawn(suite, *kinds):
+        wanted = Wanted(suites=(suite,), choice=Choice(kinds=kinds), out=own_out, **SETTINGS)
+        (request,) = plan_requests(wanted, tell=quiet)
+        (made,) = make_tasks(request, tell=quiet)
+        return made.folder
+
+    return drawn
+
+
+def plan_of(task, spec):
+    return plan_run(RunRequest(spec=spec, tasks=(task,), out=task.parents[2]))
+
+
+def ask(task, spec):
+    """Ask what is left; the statuses of what was asked."""
+    return run(plan_of(task, spec), tell=quiet).counts
+
+
+def about(task, spec):
+    plan = plan_of(task, spec)
+    return prediction_files.read_run(plan.parts[0].folder)
+
+
+def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(draw):
+    plain, seen = draw("clean"), draw("aerial", "P1 height")
+    folder = plain.parents[2] / "regions" / TOWN
+    ask(plain, "oracle_pose")
+    bare = about(plain, "oracle_pose")["map_bytes"]
+    (count,) = ask(seen, "hog_colour").values()
+    assert set(about(seen, "hog_colour")) == set(about(plain, "oracle_pose"))
+
+    render_imagery(folder, folder, LOOK, tell=quiet)
+    assert not ask(plain, "oracle_pose")
+    assert ask(plain.parents[1] / "clean" / TOWN, "prior_centre")
+    assert about(plain, "prior_centre")["map_bytes"] < bare + 5_000  # region.json says a little more
+    assert ask(seen, "hog_colour") == {"ok": count}
+    assert not ask(seen, "hog_colour")
+    first = about(seen, "hog_colour")
+    assert first["map_bytes"] > bare + 50_000
+    assert first["rendered_imagery"] == plan_of(seen, "hog_colour").parts[0].imagery
+    assert not list(validate(plan_of(seen, "hog_colour").parts[0].folder, [seen]))
+
+    render_imagery(folder, folder, replace(LOOK, seed=1), tell=quiet)
+    assert plan_of(seen, "hog_colour").parts[0].aside == 2 * count
+    assert ask(seen, "hog_colour") == {"ok": count}
+    assert not ask(plain, "oracle_pose")
+    render_imagery(folder, folder, LOOK, tell=quiet)
+    assert not ask(seen, "hog_colour")  # the same imagery again: its answers count again
+
+
+def test_a_damaged_hash_of_imagery_is_refused():
+    with pytest.raises(MatchError, match="rendered_imagery is 7, expected a hash"):
+        prediction_files.key_of({"rendered_imagery": 7})

@@ -69,6 +69,7 @@ OTHERS = {
     r"^pip install -e my-(matcher|segmenter)$": "done by hand: an installation needs the package registry",
     r"^sha256sum ": "a program of the system",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",
+    r"^python benchmarks/image_matchers\.py ": "minutes of matching, on a region with imagery and a task of pictures",
     r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
     r"^pip install 'sasgeo-bench\[publish\]'$": "an installation needs the package registry",
 }

@@ -103,5 +103,5 @@ def test_the_degraded_map_lacks_houses_and_views_of_two_sites_share_no_ground(dr
 
 def test_a_region_without_imagery_is_refused_in_one_line(tmp_path):
     town = read_region_file(list_region_files()["town-old-town"])
-    with pytest.raises(ConfigError, match=r"town-old-town cannot carry suite 'real-image': no imagery"):
+    with pytest.raises(ConfigError, match=r"town-old-town cannot carry suite 'real-image': no real imagery"):
         make_tasks(request_of(town, tmp_path), tell=lambda _: None)

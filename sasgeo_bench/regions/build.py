@@ -234,15 +234,7 @@ def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading, tell: Tell)
     tell(f"{name}: cutting {counted(len(plan.pictures), 'picture')} to the region")
     grid = ortho_grid(plan.pictures, plan.grid)
     write_ortho(path, plan.pictures, grid)
-    record = OrthoRecord(
-        pictures=tuple(item.record() for item in plan.pictures),
-        gsd_m=grid.cell_size_m,
-        bounds_m=grid.bounds_m,
-        rows=grid.rows,
-        cols=grid.cols,
-        share=0.0,
-        offset=None,
-    )
+    record = OrthoRecord.unmeasured(tuple(item.record() for item in plan.pictures), grid)
     imagery = Imagery(path=path, file=file_record(path), record=record, epsg=grid.epsg)
     houses = reading.features[((reading.features["class"] == "building") & reading.features["is_visible"]).to_numpy()]
     offset = measure_offset(

@@ -4,7 +4,7 @@
 import datetime as dt
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +137,19 @@ class OrthoRecord(_Record):
         rights = "may be passed on" if self.is_publishable else "must not be passed on"
         shown = f"pixels of {self.gsd_m:.3f} m show {self.share:.1%} of the mapped ground"
         return f"{files}; {shown}, {off}; {self.attribution}, {rights}"
+
+    @classmethod
+    def unmeasured(cls, pictures: tuple[PictureRecord, ...], grid: Grid) -> Self:
+        """Return the record of an image on a lattice before its share and offset are measured."""
+        return cls(
+            pictures=pictures,
+            gsd_m=grid.cell_size_m,
+            bounds_m=grid.bounds_m,
+            rows=grid.rows,
+            cols=grid.cols,
+            share=0.0,
+            offset=None,
+        )
 
     def grid(self, *, epsg: int) -> Grid:
         """Return the lattice of the pixels."""

@@ -245,15 +245,7 @@ def _measured(scratch: Path, rendering: _Rendering, grid: Grid) -> OrthoRecord:
 
     There is no offset to measure: the image lies on the map that it shows.
     """
-    record = OrthoRecord(
-        pictures=(rendering.picture,),
-        gsd_m=grid.cell_size_m,
-        bounds_m=grid.bounds_m,
-        rows=grid.rows,
-        cols=grid.cols,
-        share=0.0,
-        offset=None,
-    )
+    record = OrthoRecord.unmeasured((rendering.picture,), grid)
     imagery = Imagery(path=scratch / ORTHO, file=file_record(scratch / ORTHO), record=record, epsg=grid.epsg)
     mapped = shapely.from_wkt(rendering.manifest.coverage.wkt)
     return record.model_copy(update={"share": share_shown(imagery, mapped, rendering.manifest.cell_size_m)})

@@ -62,16 +62,15 @@ def test_stored_truths_are_of_the_detectors_that_the_pipeline_names(name, tmp_pa
 
 @pytest.fixture(scope="module")
 def tables_of_pictures():
-    """The lines that the program of the page on pictures prints of its board."""
+    """The lines that the program of the page on pictures prints of its boards."""
     program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "sim_to_real.py"))
-    scores = program["read_scores"](RESULTS / "aerial", 25.0, 5.0)
-    suites = sorted(set(scores["suite"]) - {"real-image"})
-    tables = (
-        program["by_evidence"](scores),
-        program["by_difference"](scores),
-        program["by_suite"](scores, suites, "sasgeo"),
-    )
-    return {row.rstrip() for table in tables for line in table for row in line.splitlines()}
+    lines = []
+    for board, matcher in (("aerial", "sasgeo"), ("aerial-soft", "raster_soft")):
+        scores = program["read_scores"](RESULTS / board, 25.0, 5.0)
+        suites = sorted(set(scores["suite"]) - {"real-image"})
+        lines += [*program["by_evidence"](scores), *program["by_difference"](scores)]
+        lines += program["by_suite"](scores, suites, matcher)
+    return {row.rstrip() for line in lines for row in line.splitlines()}
 
 
 def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures):
@@ -139,7 +138,11 @@ def test_the_stored_board_of_segmenters_is_small_and_each_trial_has_a_profile():
 
 @pytest.mark.parametrize(
     ("page", "board", "unsaid"),
-    [("README", "claims", set()), ("first", FIRST, {"age", "rejection-alias", "rejection-absent"})],
+    [
+        ("README", "claims", set()),
+        ("first", FIRST, {"age", "rejection-alias", "rejection-absent"}),
+        ("pictures", "aerial-soft", set()),
+    ],
 )
 def test_the_claims_on_a_page_are_the_differences_and_intervals_of_its_board(page, board, unsaid):
     text = " ".join((RESULTS / f"{page}.md").read_text(encoding="utf-8").split())

@@ -16,7 +16,7 @@ from sasgeo_bench.leaderboard.board_files import BOARD, read_board, read_scores
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
 from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
-from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, strip_of, strip_pixels
+from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest
@@ -137,7 +137,7 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | Non
     """Count the failures of a run by class, with some to look at; or draw one query and its answer, or a strip."""
     if strip is not None:
         name = cases.entry.name.replace(" ", "-")
-        suites = ", ".join(sorted({suite for (suite, _), task in cases.tasks.items() if task.about.get("frames")}))
+        suites = ", ".join(sorted({suite for suite, _ in pictured_tasks(cases)}))
         path = out / "sheets" / f"strip-{name}.png"
         write_png(path, strip_pixels(*strip_of(cases, strip), title=f"{cases.entry.name} on {suites}"))
         say(f"strip: {path}")

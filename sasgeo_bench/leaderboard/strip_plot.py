@@ -29,6 +29,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.rows import is_unranked
+from sasgeo_bench.tasks.query import BY, PERCEIVED
 from sasgeo_bench.tasks.sheet import HIDDEN
 
 _SIDE_INCHES: Final = 2.3
@@ -56,10 +57,11 @@ class Strip:
         Parameters
         ----------
         scores : DataFrame
-            One matcher's rows: `query_id`, `suite`, `region`, `role`, `is_present`, `is_right`, `yaw_error_deg`.
+            One matcher's rows: `query_id`, `suite`, `region`, `role`, `detector`, `is_present`, `is_right`,
+            `yaw_error_deg`.
         pictured : collection of (suite, region)
-            Tasks whose queries hold pictures. Queries of others count nowhere, nor do falsifiers and places that are
-            not on the map.
+            Tasks that hold pictures. Queries of others count nowhere, nor do those of a model of perception, falsifiers
+            and places that are not on the map.
         count : int
             How many to look at.
 
@@ -67,12 +69,13 @@ class Strip:
         --------
         >>> rows = {"query_id": list("abcd"), "suite": "aerial", "region": ["x", "x", "y", "y"], "role": "control"}
         >>> answers = {"is_right": [False, False, False, True], "yaw_error_deg": 1.0}
-        >>> scores = pd.DataFrame({**rows, **answers, "is_present": True})
+        >>> scores = pd.DataFrame({**rows, **answers, "is_present": True, "detector": "rendered"})
         >>> Strip.of(scores, {("aerial", "x"), ("aerial", "y")}, 3)
         Strip(found=1, total=4, query_ids=('d', 'a', 'c'))
         """
         keys = pd.MultiIndex.from_frame(scores[["suite", "region"]])
         is_usable = scores["is_present"].astype(bool) & (scores["role"] != "falsifier") & keys.isin(list(pictured))
+        is_usable &= ~scores["detector"].isin(PERCEIVED)
         own = scores[is_usable].sort_values(["suite", "region", "query_id"])
         own = own.assign(is_found=own["is_right"].astype(bool) & (own["yaw_error_deg"] <= SUCCESS_DEG))
         own["turn"] = own.groupby(["is_found", "suite", "region"]).cumcount()
@@ -94,8 +97,9 @@ class Strip:
 def best_on_pictures(scores: Mapping[str, pd.DataFrame], pictured: Collection[tuple[str, str]]) -> str | None:
     """Return the matcher, controls apart, that finds most queries with pictures; None if nobody was asked any.
 
-    >>> rows = {"query_id": ["q"], "suite": "aerial", "region": "x", "role": "control", "is_present": True}
-    >>> good, bad = (pd.DataFrame(rows | {"is_right": found, "yaw_error_deg": 0.0}) for found in (True, False))
+    >>> rows = {"query_id": ["q"], "suite": "aerial", "region": "x", "role": "control", "detector": "rendered"}
+    >>> rows |= {"is_present": True, "yaw_error_deg": 0.0}
+    >>> good, bad = (pd.DataFrame(rows | {"is_right": found}) for found in (True, False))
     >>> best_on_pictures({"a": bad, "b": good, "oracle_pose": good}, {("aerial", "x")})
     'b'
     """
@@ -104,13 +108,21 @@ def best_on_pictures(scores: Mapping[str, pd.DataFrame], pictured: Collection[tu
     return min(asked, key=lambda name: (-asked[name].found, name), default=None)
 
 
+def pictured_tasks(cases: RunCases) -> tuple[tuple[str, str], ...]:
+    """Return suite and region of the tasks of a run that hold pictures: those of segmenters that are told nothing.
+
+    Tasks of a control such as `oracle_segmenter` are returned if there are no others.
+    """
+    found = tuple(name for name, task in cases.tasks.items() if task.about.get("frames"))
+    return tuple(name for name in found if not is_unranked(name[0].partition(BY)[2])) or found
+
+
 def strip_of(cases: RunCases, count: int) -> tuple[Strip, list[CasePicture]]:
     """Return a strip of queries of a run, and the content of its rows.
 
     Raise `ConfigError` if no query of the run holds pictures.
     """
-    pictured = [name for name, task in cases.tasks.items() if task.about.get("frames")]
-    strip = Strip.of(cases.scores, pictured, count)
+    strip = Strip.of(cases.scores, pictured_tasks(cases), count)
     if not strip.query_ids:
         message = f"{cases.run} holds no answers to queries with pictures: name a run on a suite such as aerial+..."
         raise ConfigError(message)

@@ -32,7 +32,7 @@ def put_pictures(out, tasks):
     frame = Frame(picture=encode_webp(DRAWN.image.rgb), camera=DRAWN.image.camera)
     asked = [query for query in task_files.read_queries(folder) if truths[query.query_id].is_present]
     pairs = [
-        (replace(query, suite=SUITE, frames=(frame,), candidates=(), track="localization"), truths[query.query_id])
+        (replace(query, suite=SUITE, frames=(frame,)), replace(truths[query.query_id], detector="rendered"))
         for query in asked
         if query.track == "localization"
     ]

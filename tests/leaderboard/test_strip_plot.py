@@ -11,7 +11,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard import strip_plot
 from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart
-from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_of, strip_pixels
+from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.segmented import NOTHING, Segmented
 
@@ -45,7 +45,7 @@ def cases(rights, suites=None):
     rows = pd.DataFrame({"is_right": rights})
     names = suites or ["aerial+good"] * len(rights)
     rows = rows.assign(query_id=[f"q{at:02}" for at in range(len(rows))], region="town", suite=names, role="stress")
-    rows = rows.assign(yaw_error_deg=0.0)
+    rows = rows.assign(yaw_error_deg=0.0, detector="rendered")
     tasks = {(name, "town"): SimpleNamespace(about={"frames": 3} if "+" in name else {}) for name in set(names)}
     return SimpleNamespace(scores=rows.assign(is_present=True), tasks=tasks, run="out/runs/good")
 
@@ -110,3 +110,16 @@ def test_a_strip_is_drawn_alike_twice_and_tells_the_distance():
     np.testing.assert_array_equal(first, again)
     assert first.shape[0] > 3 * 190
     assert (strip_pixels(strip, rows[:1], title="raster on aerial").shape[0]) < first.shape[0] / 2
+
+
+def test_views_of_a_model_of_perception_have_no_picture_and_count_nowhere():
+    scores = cases([True, True, False]).scores.assign(detector=["rendered", "published", "measured"])
+    strip = Strip.of(scores, {("aerial+good", "town")}, 3)
+    assert (strip.found, strip.total, strip.query_ids) == (1, 1, ("q00",))
+
+
+def test_a_control_that_is_told_the_answer_is_shown_only_where_there_is_nothing_else():
+    both = cases([True, False], ["aerial+good", "aerial+oracle_segmenter"])
+    alone = cases([True], ["aerial+oracle_segmenter"])
+    assert pictured_tasks(both) == (("aerial+good", "town"),)
+    assert pictured_tasks(alone) == (("aerial+oracle_segmenter", "town"),)

@@ -28,7 +28,7 @@ REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in 
 }
 VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
 DENSE = ("fft_vote", "raster_soft", "raster_uniform", *VARIANTS)
-STRIDES = dict.fromkeys(VARIANTS, 12) | {"fft_vote": 6, "raster_soft": 6, "raster_uniform": 6, "graph_only": 6}
+STRIDES = dict.fromkeys((*VARIANTS, "raster_soft"), 12) | {"fft_vote": 6, "raster_uniform": 6, "graph_only": 6}
 CONTROLS = ("random", "prior_centre", "map_density_prior")
 
 

@@ -105,7 +105,8 @@ def test_figures_with_intervals_in_the_prose_about_segmenters_stand_in_its_table
     prose = " ".join(" ".join(line for line in text.splitlines() if not line.startswith("|")).split())
     found = re.findall(r"\d\.\d{3} \[\d\.\d{3}, \d\.\d{3}\]", prose)
     assert len(found) > 10
-    assert [figure for figure in found if figure not in page_tables(SegmenterBoard.read(SEGMENTERS))] == []
+    tables = page_tables(SegmenterBoard.read(SEGMENTERS))
+    assert [figure for figure in found if figure not in tables] == []
 
 
 def test_the_table_about_shares_among_the_concepts_is_of_the_board_of_segmenters():

@@ -21,7 +21,7 @@ from sasgeo_bench.leaderboard.board_tables import Book, summary
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
 from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import control_lines, warnings_of
+from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_folder import is_pack
@@ -273,12 +273,15 @@ def _check_controls(board: Board) -> None:
     """End with a status that a script sees where a control or a contestant failed; the board is written though."""
     for name, why in board.failures.found.items():
         tell(f"failed, and so not on the board: {name}: {why}")
+    unseen = segmenter_lines({"tasks": board.tasks})
+    for line in unseen:
+        tell(line)
     if board.failures.found and board.failures.log.is_file():
         tell(f"where it failed stands in {board.failures.log}")
     failed = [item for item in board.verdicts if not item.holds]
     if any(item.is_of_board for item in failed):
         raise typer.Exit(CONTROL_FAILED)
-    if board.failures.found or failed:
+    if board.failures.found or failed or unseen:
         raise typer.Exit(CONTESTANT_FAILED)
 
 

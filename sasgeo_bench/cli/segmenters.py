@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, say, shown_progress, tell
 from sasgeo_bench.cli.matchers import end_with_checks, lay_package
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
@@ -15,7 +15,7 @@ from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.running.segmenter_testing import check_segmenter
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks.split import find_split
-from sasgeo_bench.tasks.task_files import read_task
+from sasgeo_bench.tasks.task_files import FAILED_PICTURES, read_task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,6 +80,9 @@ def segment_command(options: SegmentOptions) -> None:
         folders = segment(**vars(options) | {"tell": tell, "progress": progress})
     for folder in folders:
         say(folder)
+    if any(FAILED_PICTURES in read_task(folder) for folder in folders):
+        tell(f"pictures failed, so the command ends with status {CONTESTANT_FAILED}; it tries them again when repeated")
+        raise typer.Exit(CONTESTANT_FAILED)
 
 
 def new_segmenter_command(

@@ -219,6 +219,7 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
                 "map_date": item.get("map_date"),
                 "queries_sha256": item["files"][task_files.QUERIES]["sha256"],
                 "map_fingerprint": item["map_fingerprint"],
+                **{name: item[name] for name in (task_files.FAILED_PICTURES,) if name in item},
             }
             for item in board.tasks
         ],

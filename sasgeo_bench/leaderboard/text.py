@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A leaderboard as Markdown, and as lines for a terminal; the parquet tables hold everything."""
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Final
@@ -19,6 +20,7 @@ from sasgeo_bench.scoring.controls import Falsifier, Verdict, verdict_frame
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT
 from sasgeo_bench.scoring.strata import ALL
 from sasgeo_bench.scoring.verdicts import Finding
+from sasgeo_bench.tasks.task_files import FAILED_PICTURES
 from sasgeo_bench.texts import markdown, markdown_item, tex
 
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
@@ -84,6 +86,26 @@ def training_lines(about: Mapping[str, Any]) -> list[str]:
     ]
 
 
+def segmenter_lines(about: Mapping[str, Any]) -> list[str]:
+    """Return at how many pictures segmenters failed, suite by suite.
+
+    >>> tasks = [{"suite": "aerial+mine", "region": name, "failed_pictures": 2} for name in ("monaco", "vaduz")]
+    >>> segmenter_lines({"tasks": tasks})
+    ['aerial+mine: the segmenter failed at 4 pictures of 2 tasks (monaco, vaduz), whose evidence is unknown.']
+    """
+    regions: dict[str, list[str]] = {}
+    counts: Counter[str] = Counter()
+    for task in about.get("tasks", ()):
+        if failed := task.get(FAILED_PICTURES):
+            regions.setdefault(task["suite"], []).append(task["region"])
+            counts[task["suite"]] += failed
+    return [
+        f"{suite}: the segmenter failed at {counted(counts[suite], 'picture')} of {named(names, 'task')}, whose "
+        "evidence is unknown."
+        for suite, names in regions.items()
+    ]
+
+
 def tables_of(
     board: pd.DataFrame,
     about: Mapping[str, Any],
@@ -124,6 +146,7 @@ def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], **more: Any) -
         *sealed_lines(about),
         *warnings_of(board),
         *training_lines(about),
+        *segmenter_lines(about),
         *(f"Failed, and not on this board: {name}: {why}" for name, why in about.get("failed", {}).items()),
     ]
     columns = {column.term: column.meaning for table in tables for column in table.columns}

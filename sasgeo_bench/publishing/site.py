@@ -17,7 +17,7 @@ from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
 from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text, p_text
-from sasgeo_bench.leaderboard.text import control_lines, training_lines, warnings_of
+from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.publishing.site_pages import (
     figures_by_kind,
@@ -214,7 +214,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "ageing.html": {"table": rate_table(source.rates), "kinds": kinds},
         "method.html": {
             "controls": control_table(source.controls),
-            "learned": training_lines(source.about),
+            "learned": [*training_lines(source.about), *segmenter_lines(source.about)],
             "meanings": MEANINGS | MARKS,
         },
     }

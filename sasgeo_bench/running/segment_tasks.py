@@ -12,7 +12,8 @@ from typing import Any, Final
 import numpy as np
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
-from sasgeo_bench.files.folders import fresh_file, sha256_of
+from sasgeo_bench.files.folders import sha256_of
+from sasgeo_bench.matching.learned_file import write_learned
 from sasgeo_bench.matching.segmenter import check_text
 from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
@@ -36,6 +37,7 @@ _TRAIN: Final = "train"
 _MOST_SHOWN: Final = 3  # failures that are told
 # What `write_task` writes anew.
 _OF_FILES: Final = ("schema_version", "task_version", "counts", "prior_groups", "candidates_sha256", "frames", "files")
+_DIGEST: Final = 16  # hexadecimal digits of the text in the name of its file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,9 +134,10 @@ def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None
     ConfigError
         If a task has no pictures, the split does not speak of it, or there is nothing to learn from.
     MatchError
-        If the segmenter cannot be loaded. A picture that it fails at has no evidence, and is told.
+        If the segmenter cannot be loaded. A picture that it fails at has no evidence; it is told, counted in the
+        `task.json` that results, and tried again by the next call.
     StoreError
-        If a task, its truths or labels are missing or damaged, or training fails.
+        If a task, its truths or labels, or what was learned, are missing or damaged, or training fails.
     """
     abouts = {folder: _pictured(folder) for folder in dict.fromkeys((*wanted.tasks, *wanted.taught))}
     groups = _groups(wanted, abouts)
@@ -222,17 +225,34 @@ def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell:
     )
     code = json.dumps([wanted.spec, loaded.card.version, loaded.code])
     own = f"{loaded.card.name}-{hashlib.sha256(code.encode()).hexdigest()[:12]}"
-    path = wanted.out / FOLDER / own / f"{chosen.sha256}.txt"
-    if path.is_file():
-        return check_text(path.read_text(encoding="utf-8"))
+    folder = wanted.out / FOLDER / own
+    kept = next(iter(sorted(folder.glob(f"{chosen.sha256}-*.txt"))), None)
+    if kept is not None:
+        return _kept_text(kept)
     result = train_segmenter(wanted.request, _lessons_of(chosen))
     if result.text is None:
         message = f"{loaded.card.name} could not learn from {chosen.to_text()}: {result.message} ({result.status})"
         raise StoreError(message)
-    with fresh_file(path, mend="free some space and run again") as scratch:
-        scratch.write_text(result.text, encoding="utf-8")
+    path = folder / f"{chosen.sha256}-{_digest(result.text)}.txt"
+    write_learned(path, result.text)
     tell(f"{loaded.card.name}: trained on the pictures of {chosen.to_text()}, {path}")
     return result.text
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:_DIGEST]
+
+
+def _kept_text(path: Path) -> str:
+    """Read what a segmenter learned; raise `StoreError` if it is not what its name says: evidence would be lost."""
+    try:
+        text = path.read_bytes().decode()
+    except (OSError, UnicodeDecodeError):
+        text = ""
+    if path.stem.rpartition("-")[2] != _digest(text):
+        message = f"{path} is damaged: remove this file and segment again, which learns anew"
+        raise StoreError(message)
+    return check_text(text)
 
 
 def _lessons_of(chosen: TrainingSet) -> Iterator[LabelledImage]:
@@ -257,7 +277,7 @@ def _segmented(sight: _Sight, task: Path) -> tuple[Path, list[str]]:
     suite, record = name_of(str(about["suite"]), sight.name), sight.record(about)
     root = root_of(task)
     folder: Path = root / "tasks" / suite / str(about["region"])
-    if _is_made(folder, record):
+    if _is_made(folder, record, root):
         return folder, []
     truth = truth_of(task, about)
     task_files.check_queries(task)
@@ -267,25 +287,31 @@ def _segmented(sight: _Sight, task: Path) -> tuple[Path, list[str]]:
     done = _seen_by(sight, task, truth, suite, faults)
     own = {name: value for name, value in about.items() if name not in _OF_FILES}
     hidden = {name: value for name, value in task_files.read_hidden(truth).items() if name != "queries_sha256"}
-    made = put_task(done.pairs, own | {"suite": suite, "segmenter": record}, hidden, out=root, tell=lines.append)
+    own |= {"suite": suite, "segmenter": record, **({task_files.FAILED_PICTURES: len(faults)} if faults else {})}
+    made = put_task(done.pairs, own, hidden, out=root, tell=lines.append)
     queries_sha256 = str(task_files.read_task(made.folder)["files"][task_files.QUERIES]["sha256"])
     write_segmented(segmented_file(root, queries_sha256), done.pictures)
     lines.append(f"{suite} on {about['region']}: {counted(made.queries, 'query', 'queries')} in {made.folder}")
     if faults:
-        failed = f"{sight.loaded.card.name} failed at {counted(len(faults), 'picture')}"
+        total = counted(sum(len(query.frames) for query, _ in done.pairs), "picture")
+        failed = f"{sight.loaded.card.name} failed at {len(faults)} of {total}"
         lines.append(f"  {failed}, whose evidence is unknown: {'; '.join(faults[:_MOST_SHOWN])}")
     return made.folder, lines
 
 
-def _is_made(folder: Path, record: Mapping[str, str]) -> bool:
-    """Return whether a task was made of these pictures by this segmenter with what it has learned."""
+def _is_made(folder: Path, record: Mapping[str, str], root: Path) -> bool:
+    """Return whether a task was made of these pictures by this segmenter with what it has learned.
+
+    Pictures that it failed at are tried again: it may have been late on a busy machine.
+    """
     try:
         about = task_files.read_task(folder)
     except StoreError:
         return False
     path = folder / task_files.QUERIES
-    is_whole = path.is_file() and sha256_of(path) == about["files"][task_files.QUERIES]["sha256"]
-    return is_whole and about.get("segmenter") == dict(record)
+    sha256 = str(about["files"][task_files.QUERIES]["sha256"])
+    is_whole = path.is_file() and sha256_of(path) == sha256 and segmented_file(root, sha256).is_file()
+    return is_whole and about.get("segmenter") == dict(record) and task_files.FAILED_PICTURES not in about
 
 
 @dataclass(frozen=True, kw_only=True)

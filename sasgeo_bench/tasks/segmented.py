@@ -25,7 +25,7 @@ NOTHING: Final = 0  # no class is likely
 _HALF: Final = CERTAIN / 2
 _VEIL: Final = 0.6  # of a class's colour over the picture
 _LIGHT: Final = 0.5  # of the grey picture below is at least this
-_MEND: Final = "segment the pictures again"
+_MEND: Final = "remove this file and segment the pictures again"
 _SCHEMA: Final = pa.schema(
     [("query_id", pa.string()), ("rows", pa.int32()), ("cols", pa.int32()), ("drawn", pa.binary())]
 )

@@ -53,6 +53,7 @@ Folder = Annotated[str, Field(pattern=FOLDER)]  # never a path that leaves its r
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
+FAILED_PICTURES: Final = "failed_pictures"  # of `task.json`: how many a segmenter failed at; absent if none
 TRUTH: Final = "truth.parquet"
 TRUTH_OF: Final = "truth.json"
 PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
@@ -107,6 +108,7 @@ class TaskManifest(Document):
     sealed_seed: dict[str, str | int] | None = None  # the same
     frames: Count | None = None  # pictures of all queries
     segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
+    failed_pictures: Count | None = None  # that the segmenter failed at
     files: TaskFiles
     licence: str | None = None
     attribution: str | None = None

@@ -131,10 +131,40 @@ def test_each_half_is_seen_after_learning_from_the_other_and_nothing_is_learned_
 def test_a_picture_that_a_segmenter_fails_at_has_no_evidence_and_is_told(pictured):
     lines = []
     made = segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"), tell=lines.append)
-    assert "failed at 4 pictures, whose evidence is unknown" in lines[-1]
+    assert "failed at 4 of 4 pictures, whose evidence is unknown" in lines[-1]
+    assert task_files.read_task(made[0])[task_files.FAILED_PICTURES] == 4
     for query in task_files.read_queries(made[0]):
         assert (query.evidence.cells == UNKNOWN).all()
         assert query.evidence.confidence is not None
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_pictures_that_failed_are_tried_again_and_told_again(pictured):
+    for _ in range(2):
+        lines = []
+        segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"), tell=lines.append)
+        assert "failed at 4 of 4 pictures" in lines[-1]
+
+
+@pytest.mark.usefixtures("in_threads")
+@pytest.mark.parametrize("damage", [b"garbage", b"", bytes([255, 254, 0])])
+def test_a_damaged_learned_text_is_refused_and_loses_no_evidence(pictured, damage):
+    made = segment_tasks(wanted(pictured, "segmenters:Learns"), tell=silent)
+    before = (made[1] / "queries.parquet").read_bytes()
+    for path in Path("out", FOLDER).rglob("*.txt"):
+        path.write_bytes(damage)
+    (made[0] / "queries.parquet").unlink()
+    with pytest.raises(StoreError, match=r"\.txt is damaged: remove this file and segment again, which learns anew$"):
+        segment_tasks(wanted(pictured, "segmenters:Learns"), tell=silent)
+    assert (made[1] / "queries.parquet").read_bytes() == before
+
+
+def test_pictures_to_look_at_that_are_gone_are_made_again(pictured):
+    (made,) = of_oracle(pictured[:1])
+    stored = segmented_file(Path("out"), task_files.read_task(made)["files"][task_files.QUERIES]["sha256"])
+    stored.unlink()
+    of_oracle(pictured[:1])
+    assert stored.is_file()
 
 
 def test_wrong_tasks_are_refused_in_a_line(pictured):

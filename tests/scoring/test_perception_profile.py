@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Confusions of a segmenter: measured, written, read, and met again in the views that are drawn with them."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -124,3 +126,22 @@ def test_a_file_that_is_no_profile_is_refused_in_one_line(tmp_path):
 def test_a_profile_needs_images_that_label_the_same_classes():
     with pytest.raises(MetricError, match="one at least"):
         measure_profile([], segmenter="mine", learned_from="elsewhere")
+
+
+@pytest.mark.parametrize("place", ["[class.castle]", "called", "also"])
+def test_a_profile_of_a_class_that_is_none_is_refused(tmp_path, place):
+    wrong = tmp_path / "wrong.toml"
+    head = 'version = 1\nsegmenter = "a"\nlearned_from = "b"\ntested_on = "c"\nimages = 1\n'
+    rates = "pixels = 9\nrecall = 0.9\nprecision = 0.9\nof_ground = 0.1\n"
+    more = "" if place.startswith("[") else f"{place} = {{ castle = 0.05 }}\n"
+    wrong.write_text(f"{head}{place if not more else '[class.water]'}\n{rates}{more}", encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"has rates of castle, which is no class: choose of .*water"):
+        read_profile(wrong)
+
+
+def test_what_is_no_file_or_far_too_large_is_not_read_as_a_profile(tmp_path):
+    large = tmp_path / "large.toml"
+    large.write_bytes(b"#" * 2_000_000)
+    for path in (tmp_path, large, Path("/dev/zero")):
+        with pytest.raises(ConfigError, match="is no perception profile: expected a file of at most 1000000 bytes"):
+            read_profile(path)

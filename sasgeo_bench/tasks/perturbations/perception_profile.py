@@ -17,11 +17,13 @@ from pydantic import Field, field_validator, model_validator
 from sasgeo_bench.config import Document, Line, Short, parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredErrors
 
 VERSION: Final = 1
 _MEND: Final = "name a .toml file that perception_profile.write_profile has written"
 _DIGITS: Final = 5
+_MOST_BYTES: Final = 1_000_000
 _PLAIN: Final = MeasuredErrors(recall=1.0, precision=1.0)
 
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -94,11 +96,20 @@ def _errors(name: str, found: ClassConfusions) -> MeasuredErrors:
 def read_profile(path: Path) -> PerceptionProfile:
     """Read a profile; raise `ConfigError`, in one line, if it is missing or wrong."""
     try:
+        if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
+            message = f"{path} is no perception profile: expected a file of at most {_MOST_BYTES} bytes"
+            raise ConfigError(message)
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         message = f"{path} cannot be read as a perception profile ({error}): {_MEND}"
         raise ConfigError(message) from error
-    return parse_toml(text, PerceptionProfile, source=str(path))
+    profile = parse_toml(text, PerceptionProfile, source=str(path))
+    known = {item.name for item in load_taxonomy().classes}
+    named = {name for at, found in profile.classes.items() for name in (at, *found.called, *found.also)}
+    if strange := sorted(named - known):
+        message = f"{path} has rates of {', '.join(strange)}, which is no class: choose of {', '.join(sorted(known))}"
+        raise ConfigError(message)
+    return profile
 
 
 def write_profile(profile: PerceptionProfile, path: Path) -> None:

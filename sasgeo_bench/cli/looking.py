@@ -69,6 +69,7 @@ def inspect_command(
     out, query, folders = options.out, options.query, options.region_folders or []
     task_folder, region_folder = find_task(target, out), find_built(target, out)
     if task_folder is not None:
+        _refuse_strip(target, options.strip)
         _inspect_task(task_folder, out, query=query, rows=options.rows)
         return
     if options.strip is not None and (Path(target) / BOARD).is_file():
@@ -81,6 +82,7 @@ def inspect_command(
         return
     if region_folder is None and not is_split(target):
         raise no_target(target, out, folders)
+    _refuse_strip(target, options.strip)
     if query is not None:
         message = (
             f"--query draws a query of a task or a run, and {target} is neither: leave it out, or name one of these"
@@ -96,6 +98,13 @@ def inspect_command(
         print_table(reasons)
     for line in differing_files(region_folder):
         tell(f"warning: {line}")
+
+
+def _refuse_strip(target: str, strip: int | None) -> None:
+    """Refuse to draw a strip of something that holds no answers."""
+    if strip is not None:
+        message = f"--strip draws queries with their answers, and {target} holds none: name a run or a board"
+        raise ConfigError(message)
 
 
 def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:

@@ -98,3 +98,10 @@ def test_the_strip_of_a_board_is_drawn_as_a_png_of_its_best_run(board, program):
     code, told, _ = program("inspect", str(board), "--strip", "3", "--out", str(out))
     assert (code, told) == (0, f"strip: {out / 'sheets' / 'strip-better.png'}\n")
     assert cv2.imread(str(out / "sheets" / "strip-better.png")).shape[1] > 800
+
+
+def test_a_strip_of_what_holds_no_answers_is_refused(program, board):
+    out = board.parents[1]
+    for target in ("crossfit", str(out / "regions" / REGION), str(out / "tasks" / SUITE / REGION)):
+        code, _, err = program("inspect", target, "--strip", "3", "--out", str(out))
+        assert (code, "--strip draws queries with their answers" in err) == (2, True)

@@ -57,6 +57,10 @@ class CameraError(SasgeoError, ValueError):
     """A camera, a ground or a photo whose values cannot be, or from which no view can be computed."""
 
 
+class FlightError(SasgeoError, ValueError):
+    """A trajectory, a flight plan or a drift profile whose values cannot be."""
+
+
 class ConfigError(SasgeoError, ValueError):
     """A TOML file with an unknown key, a wrong type or a value out of range."""
 

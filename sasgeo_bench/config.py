@@ -7,7 +7,7 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Any, Final, Literal, TypeVar, get_origin
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
@@ -16,7 +16,7 @@ from sasgeo_bench.errors import ConfigError
 Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
-_FEW: Final = 8  # known names that an error lists in full
+_FEW: Final = 8  # known names, or faults, that an error lists in full
 _LONGEST: Final = 300
 
 
@@ -58,7 +58,7 @@ class NamedDocument(Document):
 def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
     """Parse and validate one TOML document; `source` names it in an error.
 
-    Raise `ConfigError`, with all faults on one line, if the text is no TOML, a key is unknown, a type is wrong or a
+    Raise `ConfigError`, with the faults on one line, if the text is no TOML, a key is unknown, a type is wrong or a
     value out of range.
 
     >>> class Town(Document):
@@ -82,7 +82,9 @@ def check_document(content: object, model: type[Model], *, source: str) -> Model
         return model.model_validate(content)
     except ValidationError as error:
         faults = sorted((_fault(item, model) for item in error.errors()), key=lambda fault: "is missing" in fault)
-        message = f"{source}: " + "; ".join(dict.fromkeys(faults))
+        found = list(dict.fromkeys(faults))
+        more = [f"and {len(found) - _FEW} more"] if len(found) > _FEW else []
+        message = f"{source}: " + "; ".join([*found[:_FEW], *more])
         raise ConfigError(message) from error
 
 
@@ -126,8 +128,10 @@ def _short(value: object) -> str:
 def _known_keys(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:
     """Return the keys that a model knows at the level of an unknown key."""
     current: Any = model
+    is_name = False  # of an entry of a mapping, which is no field
     for part in location[:-1]:
-        if isinstance(part, int):
+        if isinstance(part, int) or is_name:
+            is_name = False
             continue
         field = current.model_fields.get(part) or next(
             (known for known in current.model_fields.values() if known.alias == part), None
@@ -137,6 +141,7 @@ def _known_keys(location: tuple[int | str, ...], model: type[BaseModel]) -> list
         current = _model_inside(field.annotation)
         if current is None:
             return []
+        is_name = get_origin(field.annotation) in (dict, Mapping)
     return [field.alias or name for name, field in current.model_fields.items()]
 
 

@@ -15,6 +15,7 @@ class Outer(Document):
     name: str
     inner: list[Inner] = []
     near: Inner | None = None
+    by_name: dict[str, Inner] = {}
 
 
 def fault(text: str) -> str:
@@ -39,8 +40,20 @@ def test_an_unknown_key_far_inside_suggests_the_nearest_there():
     assert "did you mean 'depth_m'?" in fault('name = "x"\n[near]\ndepth_n = 2.0\ndepth_m = 1.0')
 
 
+def test_an_unknown_key_in_a_table_of_names_suggests_the_nearest():
+    assert "did you mean 'depth_m'?" in fault('name = "x"\n[by_name.any]\ndepth = 2.0\ndepth_m = 1.0')
+
+
+def test_a_file_full_of_faults_names_the_first_few():
+    many = "".join(f"[by_name.n{at}]\ndepth_m = 'deep'\n" for at in range(12))
+    found = fault(f'name = "x"\n{many}')
+    assert "n7.depth_m" in found
+    assert "n8.depth_m" not in found
+    assert found.endswith("; and 4 more")
+
+
 def test_an_unknown_key_like_no_other_lists_the_known_ones():
-    assert "known keys: name, inner, near" in fault('name = "x"\nzzz = 1')
+    assert "known keys: name, inner, near, by_name" in fault('name = "x"\nzzz = 1')
 
 
 def test_a_wrong_type_says_what_was_found():

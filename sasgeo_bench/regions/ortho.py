@@ -2,8 +2,8 @@
 """Pictures from outside -> `ortho.tif`: checked, cut to the region, reprojected, as a cloud-optimized GeoTIFF."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -206,7 +206,7 @@ class OrthoTile:
     is_known: NDArray[np.bool_]
 
 
-def write_tiles(path: Path, grid: Grid, tiles: Iterable[OrthoTile], *, attribution: str, licence: str) -> bool:
+def write_tiles(path: Path, grid: Grid, tiles: Generator[OrthoTile], *, attribution: str, licence: str) -> bool:
     """Write an ortho image tile by tile; return False, and write no file, if no pixel of it is known.
 
     The file is a cloud-optimized GeoTIFF with JPEG tiles, a mask and overviews; parts without a picture take no space.
@@ -237,11 +237,12 @@ def write_tiles(path: Path, grid: Grid, tiles: Iterable[OrthoTile], *, attributi
         draft.unlink(missing_ok=True)
 
 
-def _write_draft(path: Path, grid: Grid, tiles: Iterable[OrthoTile], *, attribution: str, licence: str) -> bool:
+def _write_draft(path: Path, grid: Grid, tiles: Generator[OrthoTile], *, attribution: str, licence: str) -> bool:
     """Write colours and mask tile by tile; return whether any pixel is known."""
     is_any = False
     with (
         rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES, GDAL_TIFF_INTERNAL_MASK=True),
+        closing(tiles),  # here, for it holds pictures open that need GDAL
         rasterio.open(path, "w", **_draft_profile(grid)) as target,
     ):
         target.update_tags(TIFFTAG_COPYRIGHT=attribution, attribution=attribution, licence=licence)
@@ -255,7 +256,7 @@ def _write_draft(path: Path, grid: Grid, tiles: Iterable[OrthoTile], *, attribut
     return is_any
 
 
-def _warped_tiles(pictures: Sequence[Picture], grid: Grid) -> Iterator[OrthoTile]:
+def _warped_tiles(pictures: Sequence[Picture], grid: Grid) -> Generator[OrthoTile]:
     """Yield the pictures on the lattice window by window."""
     with ExitStack() as stack:
         views = [_Warped(item, stack, grid) for item in pictures]

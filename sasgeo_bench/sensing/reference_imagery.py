@@ -4,7 +4,7 @@
 import datetime as dt
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -251,7 +251,7 @@ def _measured(scratch: Path, rendering: _Rendering, grid: Grid) -> OrthoRecord:
     return record.model_copy(update={"share": share_shown(imagery, mapped, rendering.manifest.cell_size_m)})
 
 
-def _tiles(rendering: _Rendering, grid: Grid) -> Iterator[OrthoTile]:
+def _tiles(rendering: _Rendering, grid: Grid) -> Generator[OrthoTile]:
     """Yield the image tile by tile: one painted window is in memory at a time."""
     conditions = rendering.look.conditions(rendering.place)
     for row, col, part in grid.windows(_TILE_PX):

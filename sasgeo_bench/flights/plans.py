@@ -1,0 +1,335 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Paths for flights over a region: survey, corridor, transit, loiter and waypoints, all over mapped ground."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Final, Literal, get_args
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from sasgeo_bench.errors import FlightError
+from sasgeo_bench.flights.corridors import Corridors, Ways
+from sasgeo_bench.flights.kinematics import DEFAULT_LIMITS, Limits, length_m, round_corners
+from sasgeo_bench.regions.region import Region
+
+Floats = NDArray[np.float64]
+PlanKind = Literal["survey", "corridor", "transit", "loiter", "waypoints"]
+
+KINDS: Final[tuple[PlanKind, ...]] = get_args(PlanKind)
+SHORTEST_M, LONGEST_M = 1_000.0, 10_000.0
+MARGIN_M: Final = 100.0  # from the edge of what is mapped: about what a camera sees to its side from 120 m
+
+_ASKED_M: Final = 100.0  # to which lengths are rounded down where an error names one
+_DRAWS: Final = 40  # of a path, before there is none
+_PLACES: Final = 24  # tried for the shape of each draw
+_SPACING_M: Final = (40.0, 80.0)  # between legs of a survey: pictures from 120 m overlap by half or more
+_LEAST_LEGS: Final = 3
+_RADIUS_M: Final = (50.0, 200.0)  # of a loiter
+_LONG_SIDE: Final = (1.5, 3.0)  # length over width of an oval
+_OFFSET: Final = (0.04, 0.15)  # of a transit's waypoints from the straight line, in its lengths
+_LEG_M: Final = (150.0, 800.0)  # between waypoints
+_SHARPEST_DEG: Final = 130.0  # at a waypoint
+_NEXT: Final = 24  # places drawn for the next waypoint
+_CURVE_M: Final = 2.0  # between points of a curve
+_SQUARE: Final = 1.05  # sides as like as these have no longer one
+_ROUNDING_M: Final = 1e-6  # by which a place may lie outside
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Wish:
+    """What a plan shall be, and where it may lie."""
+
+    area: shapely.Geometry  # prepared
+    length_m: float
+    limits: Limits
+    corridors: Corridors | None
+
+
+def flight_area(region: Region, margin_m: float = MARGIN_M) -> shapely.Geometry:
+    """Return where flights may go: mapped ground within the grid, less a margin; empty where there is none.
+
+    Ground that the map does not know is outside, and the margin holds around it too.
+    """
+    if not (math.isfinite(margin_m) and margin_m >= 0):
+        message = f"margin_m is a distance in metres, got {margin_m!r}"
+        raise FlightError(message)
+    area = region.coverage.intersection(shapely.box(*region.grid.bounds_m)).buffer(-margin_m)
+    shapely.prepare(area)
+    return area
+
+
+def plan_flight(
+    region: Region,
+    kind: PlanKind,
+    *,
+    length_m: float,
+    rng: np.random.Generator,
+    margin_m: float = MARGIN_M,
+    along: Ways = "road",
+    limits: Limits = DEFAULT_LIMITS,
+) -> Floats:
+    """Draw the path of a flight over a region.
+
+    Parameters
+    ----------
+    region : Region
+        Its mapped ground is flown over, its roads or waterways are followed.
+    kind : {"survey", "corridor", "transit", "loiter", "waypoints"}
+        Parallel legs; a way along roads or a waterway without U-turns; a gentle path between two places far apart;
+        laps of a circle, an oval or an eight; straight legs between random places.
+    length_m : float
+        Length of the path, 1,000 to 10,000 m.
+    rng : numpy Generator
+        Source of all choices: equal seeds give equal paths.
+    margin_m : float
+        Least distance from ground that is not mapped, and from the edge of the region, metres.
+    along : {"road", "water"}
+        What a corridor follows.
+    limits : Limits
+        Their `turn_radius_m` rounds the corners.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Easting and northing, metres, of a path that `fly` takes. Its length is the one asked for.
+
+    Raises
+    ------
+    FlightError
+        If no such path fits; the message names the longest that was found.
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> from sasgeo_bench.regions.build import build_region, plan_build
+    >>> from sasgeo_bench.regions.region_files import read_region
+    >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+    >>> with tempfile.TemporaryDirectory() as out:
+    ...     spec = read_region_file(find_region_file("town-suburb"))
+    ...     _ = build_region(plan_build(spec, out=Path(out)), tell=lambda _: None, with_preview=False)
+    ...     region = read_region(Path(out) / "regions" / "town-suburb")
+    >>> path = plan_flight(region, "loiter", length_m=2000.0, rng=np.random.default_rng(3))
+    >>> round(length_m(path)), bool(flight_area(region).covers(shapely.LineString(path)))
+    (2000, True)
+    """
+    if kind not in KINDS:
+        message = f"a flight is one of {', '.join(KINDS)}, got {kind!r}"
+        raise FlightError(message)
+    if not SHORTEST_M <= length_m <= LONGEST_M:
+        message = f"length_m lies in {SHORTEST_M:g}..{LONGEST_M:g}, got {length_m!r}"
+        raise FlightError(message)
+    area = flight_area(region, margin_m)
+    corridors = Corridors.of(region.features, area, along) if kind == "corridor" else None
+    wish = _Wish(area=area, length_m=float(length_m), limits=limits, corridors=corridors)
+    path_m = None if area.is_empty else _MAKERS[kind](wish, rng)
+    if path_m is None:
+        name = f"{kind} along {along}" if kind == "corridor" else kind
+        raise FlightError(_what_fits(wish, kind, name, region.manifest.id, margin_m))
+    return path_m
+
+
+def _what_fits(wish: _Wish, kind: PlanKind, name: str, region: str, margin_m: float) -> str:
+    """Return the message that a path does not fit, with the longest one that does."""
+    low, high = SHORTEST_M, wish.length_m
+    longest = None
+    # Draws of their own, so that the message does not depend on the caller's.
+    while not wish.area.is_empty and (longest is None or high - low > _ASKED_M):
+        middle = low if longest is None else (low + high) / 2
+        if _MAKERS[kind](replace(wish, length_m=middle), np.random.default_rng(0)) is not None:
+            longest = low = middle
+        elif longest is None:
+            break
+        else:
+            high = middle
+    head = f"found no {name} of {wish.length_m:g} m in {region} with a margin of {margin_m:g} m"
+    mend = "take a smaller margin, another kind or a larger region"
+    if longest is None:
+        return f"{head}, nor one of {SHORTEST_M:g} m: {mend}"
+    return f"{head}: one of {longest // _ASKED_M * _ASKED_M:.0f} m fits; for more, {mend}"
+
+
+def _survey(wish: _Wish, rng: np.random.Generator) -> Floats | None:
+    """Draw parallel legs, along the longer side of their rectangle; long surveys lie along the area's longer side."""
+    longer_deg = _longer_side_deg(wish.area, rng)
+    radius_m = wish.limits.turn_radius_m
+    saved_m = (4 - math.pi) * radius_m  # by the two rounded corners of each turn
+    for draw in range(_DRAWS):
+        spacing_m = max(rng.uniform(*_SPACING_M), 2 * radius_m)
+        most = int(math.sqrt(wish.length_m / spacing_m)) + 1
+        for legs in rng.permutation(np.arange(_LEAST_LEGS, most + 1)).tolist():
+            leg_m = (wish.length_m - (legs - 1) * (spacing_m - saved_m)) / legs
+            if leg_m < max((legs - 1) * spacing_m, 2 * radius_m):
+                continue
+            across = np.repeat(np.arange(legs) * spacing_m, 2) * rng.choice([-1, 1])
+            along = np.resize([0.0, leg_m, leg_m, 0.0], 2 * legs)
+            shape_m = round_corners(np.column_stack([across, along]), radius_m)
+            headings = longer_deg + np.array([0.0, 180.0]) if draw % 2 else rng.uniform(0.0, 360.0, 2)
+            placed = _placed(shape_m, wish.area, headings, rng)
+            if placed is not None:
+                return placed
+    return None
+
+
+def _corridor(wish: _Wish, rng: np.random.Generator) -> Floats | None:
+    """Draw a way along roads or waterways."""
+    if wish.corridors is None or not len(wish.corridors):
+        return None
+    for _ in range(_DRAWS):
+        line_m = wish.corridors.walk(wish.length_m, rng)
+        if line_m is not None:
+            path_m = _cut(line_m, wish.length_m)
+            if path_m is not None and _fits(path_m, wish.area):
+                return path_m
+    return None
+
+
+def _transit(wish: _Wish, rng: np.random.Generator) -> Floats | None:
+    """Draw a curve between two places, past one waypoint or two."""
+    for _ in range(_DRAWS):
+        count = int(rng.integers(1, 3))
+        at = np.array([0.0, *(np.arange(1, count + 1) + rng.uniform(-0.2, 0.2, count)) / (count + 1), 1.0])
+        off = np.array([0.0, *(rng.uniform(*_OFFSET, count) * rng.choice([-1, 1], count)), 0.0])
+        curve = CubicSpline(at, np.column_stack([off, at]), bc_type="natural")
+        shape_m = curve(np.linspace(0.0, 1.0, math.ceil(wish.length_m / _CURVE_M) + 1))
+        shape_m *= wish.length_m / length_m(shape_m)
+        placed = _placed(shape_m, wish.area, rng.uniform(0.0, 360.0, _PLACES), rng)
+        if placed is not None:
+            return placed
+    return None
+
+
+def _loiter(wish: _Wish, rng: np.random.Generator) -> Floats | None:
+    """Draw laps of a circle, an oval or an eight around a place, to the right or to the left."""
+    for _ in range(_DRAWS):
+        least_m = max(_RADIUS_M[0], 2 * wish.limits.turn_radius_m)  # ovals and eights have half of it
+        radius_m = rng.uniform(least_m, max(_RADIUS_M[1], least_m))
+        lap_m = (_circle, _oval, _eight)[rng.integers(3)](radius_m, rng)
+        lap_m = lap_m * np.array([rng.choice([-1.0, 1.0]), 1.0])
+        laps = math.ceil(wish.length_m / length_m(lap_m)) + 1
+        start = int(rng.integers(len(lap_m) - 1))
+        shape_m = np.tile(lap_m[:-1], (laps + 1, 1))[start:]
+        cut_m = _cut(shape_m, wish.length_m)
+        placed = None if cut_m is None else _placed(cut_m, wish.area, rng.uniform(0.0, 360.0, 4), rng)
+        if placed is not None:
+            return placed
+    return None
+
+
+def _waypoints(wish: _Wish, rng: np.random.Generator) -> Floats | None:
+    """Draw places one after the other; legs have a least length and no hairpins between them."""
+    for _ in range(_DRAWS):
+        places_m = _points(wish.area, 1, rng)
+        flown_m = 0.0
+        while len(places_m) and flown_m < wish.length_m:
+            found = _next_place(places_m, wish.area, rng)
+            if found is None:
+                break
+            places_m = np.vstack([places_m, found])
+            # Rounding shortens the path a little, so it is measured as it is flown.
+            flown_m = length_m(round_corners(places_m, wish.limits.turn_radius_m))
+        if flown_m < wish.length_m:
+            continue
+        path_m = _cut(round_corners(places_m, wish.limits.turn_radius_m), wish.length_m)
+        if path_m is not None and _fits(path_m, wish.area):
+            return path_m
+    return None
+
+
+_MAKERS: Final[MappingProxyType[str, Callable[[_Wish, np.random.Generator], Floats | None]]] = MappingProxyType(
+    {"survey": _survey, "corridor": _corridor, "transit": _transit, "loiter": _loiter, "waypoints": _waypoints}
+)
+
+
+def _next_place(places_m: Floats, area: shapely.Geometry, rng: np.random.Generator) -> Floats | None:
+    here_m = places_m[-1]
+    low_m, high_m = _LEG_M
+    reach_m, turn = rng.uniform(low_m, high_m, _NEXT), rng.uniform(0.0, 2 * np.pi, _NEXT)
+    legs_m = reach_m[:, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)
+    is_open = shapely.contains_xy(area, here_m + legs_m)
+    if len(places_m) > 1:
+        before_m = here_m - places_m[-2]
+        ahead = legs_m @ before_m / reach_m / np.hypot(*before_m)
+        is_open &= ahead >= math.cos(math.radians(_SHARPEST_DEG))
+    for leg_m in legs_m[is_open]:
+        if _fits(np.stack([here_m, here_m + leg_m]), area):
+            return np.asarray(here_m + leg_m)
+    return None
+
+
+def _placed(shape_m: Floats, area: shapely.Geometry, headings_deg: Floats, rng: np.random.Generator) -> Floats | None:
+    """Turn a shape to headings in turn and move it to where it fits; None where no place was found."""
+    west, south, east, north = shapely.bounds(area).tolist()
+    for heading_deg in headings_deg.tolist():
+        turn = math.radians(heading_deg)
+        turned = shape_m @ np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        room = np.array([east - west, north - south]) - np.ptp(turned, axis=0)
+        if room.min() < 0:
+            continue
+        turned += (west, south) - turned.min(axis=0)
+        for share in rng.random((max(1, _PLACES // len(headings_deg)), 2)):
+            if _fits(turned + share * room, area):
+                return np.asarray(turned + share * room)
+    return None
+
+
+def _fits(path_m: Floats, area: shapely.Geometry) -> bool:
+    return bool(area.covers(shapely.LineString(path_m)))
+
+
+def _points(area: shapely.Geometry, count: int, rng: np.random.Generator) -> Floats:
+    """Draw places in an area, evenly; fewer than asked for, or none, in one that hardly fills its box."""
+    west, south, east, north = shapely.bounds(area).tolist()
+    drawn_m = rng.uniform((west, south), (east, north), (64 * count, 2))
+    return np.asarray(drawn_m[shapely.contains_xy(area, drawn_m)][:count])
+
+
+def _cut(line_m: Floats, most_m: float) -> Floats | None:
+    """Return the first part of a line, of a length; None if it is shorter."""
+    along_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
+    if along_m[-1] < most_m:
+        return None
+    end_m = [np.interp(most_m, along_m, axis) for axis in line_m.T]
+    return np.vstack([line_m[along_m < most_m - _ROUNDING_M], end_m])
+
+
+def _longer_side_deg(area: shapely.Geometry, rng: np.random.Generator) -> float:
+    """Return the bearing of the longer side of an area; of a square one, either."""
+    corners_m = shapely.get_coordinates(shapely.oriented_envelope(area))[:3]
+    sides = np.diff(corners_m, axis=0)
+    lengths = np.hypot(*sides.T)
+    is_square = lengths.max() < _SQUARE * lengths.min()
+    at = int(rng.integers(2)) if is_square else int(np.argmax(lengths))
+    return math.degrees(math.atan2(sides[at, 0], sides[at, 1]))
+
+
+def _circle(radius_m: float, _: np.random.Generator) -> Floats:
+    return _arc(radius_m, 0.0, 2 * math.pi)
+
+
+def _oval(radius_m: float, rng: np.random.Generator) -> Floats:
+    """Return a racetrack: two straights, and two halves of a circle."""
+    radius_m /= 2
+    half_m = radius_m * (rng.uniform(*_LONG_SIDE) - 1)
+    up_m = np.array([0.0, half_m])
+    top, bottom = _arc(radius_m, 0.0, math.pi) + up_m, _arc(radius_m, math.pi, 2 * math.pi) - up_m
+    return np.vstack([top, bottom, top[:1]])
+
+
+def _eight(radius_m: float, _: np.random.Generator) -> Floats:
+    """Return two circles that touch, flown in opposite senses."""
+    radius_m /= 2
+    off_m = np.array([radius_m, 0.0])
+    right, left = _arc(radius_m, math.pi, 3 * math.pi) + off_m, _arc(radius_m, 0.0, -2 * math.pi) - off_m
+    return np.vstack([right, left[1:]])
+
+
+def _arc(radius_m: float, first: float, last: float) -> Floats:
+    """Return an arc from an angle to another, radians, counter-clockwise from east."""
+    angles = np.linspace(first, last, math.ceil(radius_m * abs(last - first) / _CURVE_M) + 1)
+    return radius_m * np.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -154,11 +154,14 @@ def _words(figure: Figure, manifest: Manifest, total: tuple[float, float]) -> No
     title = wrap(f"{manifest.title} ({manifest.id})", int(per_inch * 0.9 * (total[0] - 0.6)))
     figure.text(0.3 / total[0], 1 - 0.16 / total[1], title[0], ha="left", va="top", fontsize=14, fontweight="bold")
     facts = (
-        f"map of {manifest.extract.date}  |  {', '.join(manifest.scenes)}  |  "
-        f"cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}  |  "
-        f"mapped: {manifest.coverage.share:.1%} ({manifest.coverage.source})"
+        f"map of {manifest.extract.date}",
+        ", ".join(manifest.scenes),
+        f"cells of {manifest.cell_size_m:g} m, EPSG:{manifest.epsg}",
+        f"mapped: {manifest.coverage.share:.1%} ({manifest.coverage.source})",
     )
-    figure.text(0.3 / total[0], 1 - 0.52 / total[1], facts, ha="left", va="top", fontsize=9, color="#444444")
+    whole = "  |  ".join(fact.replace(" ", "\N{NO-BREAK SPACE}") for fact in facts)  # a line ends between two facts
+    lines = "\n".join(wrap(whole, int(1.35 * per_inch * (total[0] - 0.6))))
+    figure.text(0.3 / total[0], 1 - 0.48 / total[1], lines, ha="left", va="top", fontsize=9, color="#444444")
     figure.text(0.3 / total[0], 0.14 / total[1], manifest.attribution, ha="left", va="bottom", fontsize=9)
 
 

@@ -1,0 +1,291 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Odometry of a flight, with drift that lasts: increments between poses, and what the odometer believes of them.
+
+Errors are drawn as processes over the distance flown, and a pose moves by their integrals. So errors of neighbouring
+increments are alike, and those of a sum do not average out, as with truth plus white noise they would.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from sasgeo_bench.errors import FlightError
+from sasgeo_bench.flights.drift_profile import DriftProfile
+from sasgeo_bench.flights.processes import draw_gauss_markov, draw_walk, heading_law, mean_variance
+from sasgeo_bench.flights.trajectory import Trajectory
+from sasgeo_bench.geometry.pose import wrap_deg
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Belief = Literal["honest", "optimistic"]
+
+OPTIMISM: Final = 3.0  # an optimistic odometer believes a third of its standard deviations
+LOST_M: Final = 1e4  # standard deviations of a lost increment
+LOST_DEG: Final = 180.0
+_FLOOR_M: Final = 1e-3  # believed of any increment, drifting or not, so that a covariance can be inverted
+_FLOOR_DEG: Final = 1e-3
+_SCALE_M: Final = 100.0  # distance at which a profile gives its drift of heading
+_M_PER_KM: Final = 1000.0
+_PERCENT: Final = 100.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Odometry:
+    """N - 1 increments between N poses.
+
+    Parameters
+    ----------
+    right_m, up_m : ndarray, shape (N - 1,)
+        Displacement in the axes of the pose before, metres; up is where the body heads. 0 where lost.
+    yaw_deg : ndarray, shape (N - 1,)
+        Turn, clockwise, [-180, 180) degrees. 0 where lost.
+    covariance : ndarray, shape (N - 1, 3, 3)
+        Of one increment, in the order right, up, yaw; m2, m deg and deg2. Errors of neighbouring increments are
+        correlated, so a sum is worse than its covariances say, as with any odometer.
+    is_lost : ndarray of bool, shape (N - 1,)
+        True where the odometer says nothing; the covariance is that of 10 km and 180 degrees.
+
+    Raises
+    ------
+    FlightError
+        If shapes do not fit.
+    """
+
+    right_m: Floats
+    up_m: Floats
+    yaw_deg: Floats
+    covariance: Floats
+    is_lost: Bools
+
+    def __post_init__(self) -> None:
+        """Check the shapes; make the arrays read-only."""
+        count = len(self.right_m)
+        shapes = {"right_m": (), "up_m": (), "yaw_deg": (), "covariance": (3, 3), "is_lost": ()}
+        for name, rest in shapes.items():
+            values = getattr(self, name)
+            if values.shape != (count, *rest):
+                message = f"{name} of {count} increments has shape {values.shape}"
+                raise FlightError(message)
+            values.flags.writeable = False
+
+    def __len__(self) -> int:
+        """Return the number of increments."""
+        return len(self.right_m)
+
+
+def true_odometry(flown: Trajectory) -> Odometry:
+    """Return the increments of a trajectory, without any error.
+
+    A body that heads east and flies 10 m east goes up in its own axes:
+
+    >>> flown = Trajectory.of_angles(time_s=[0.0, 1.0], position_m=[[0, 0, 80], [10, 0, 80]], yaw_deg=[90.0, 90.0])
+    >>> steps = true_odometry(flown)
+    >>> steps.right_m.round(6).tolist(), steps.up_m.round(6).tolist()
+    ([0.0], [10.0])
+    """
+    step = _true_steps(flown)
+    count = len(step)
+    return Odometry(
+        right_m=step.real.copy(),
+        up_m=step.imag.copy(),
+        yaw_deg=_turns_deg(flown),
+        covariance=np.tile(np.diag([_FLOOR_M**2, _FLOOR_M**2, _FLOOR_DEG**2]), (count, 1, 1)),
+        is_lost=np.zeros(count, dtype=bool),
+    )
+
+
+def draw_odometry(
+    flown: Trajectory, profile: DriftProfile, *, belief: Belief = "honest", rng: np.random.Generator
+) -> Odometry:
+    """Draw what an odometer says of a flight.
+
+    Parameters
+    ----------
+    flown : Trajectory
+        N poses, two at least; increments lie between them.
+    profile : DriftProfile
+        Drift over the path flown, in which climbs count.
+    belief : {"honest", "optimistic"}
+        Covariances that fit the errors of single increments over many runs, or standard deviations a third of these.
+    rng : numpy.random.Generator
+        Source of all errors; the same state gives the same odometry.
+
+    Returns
+    -------
+    Odometry
+        N - 1 increments.
+
+    Raises
+    ------
+    FlightError
+        If there is one pose alone, or the belief is unknown.
+
+    Notes
+    -----
+    A step z = right + i up becomes z exp(a - i (h + c)): a is the mean error of the logarithm of length over the step,
+    c that of the course, h the mean error of heading that has come up since the step began. Heading errors before the
+    step need not be told: the increment is in the axes that the odometer believes in. All are integrals of processes
+    over distance (`sasgeo_bench.flights.processes`), so twice as many poses have the same drift after the same
+    distance. Nothing drifts while hovering.
+
+    An odometer knows of its own resets: their increment has the covariance of the jump.
+
+    Examples
+    --------
+    One kilometre north in steps of 10 m. The error is no noise of single steps: a run that is 1.5 % long stays so, and
+    heading walks away.
+
+    >>> from sasgeo_bench.flights.drift_profile import load_profile
+    >>> places = [[0.0, 10.0 * step, 80.0] for step in range(101)]
+    >>> flown = Trajectory.of_angles(time_s=np.arange(101.0), position_m=places, yaw_deg=np.zeros(101))
+    >>> steps = draw_odometry(flown, load_profile("wheel-poor"), rng=np.random.default_rng(7))
+    >>> steps.up_m[[0, 50, 99]].round(2).tolist()
+    [10.15, 10.15, 10.15]
+    >>> dead_reckon(flown, steps).yaw_deg[[25, 50, 100]].round(1).tolist()
+    [0.9, 359.3, 354.2]
+    """
+    if len(flown) == 1 or belief not in ("honest", "optimistic"):
+        message = f"odometry needs two poses and the belief 'honest' or 'optimistic', got {len(flown)} and {belief!r}"
+        raise FlightError(message)
+    steps_m = path_steps_m(flown)
+    step, law = _true_steps(flown), _Law(profile=profile, steps_m=steps_m)
+    drift = law.draw(rng)
+    is_lost = _draw_lost(steps_m, profile, rng)
+    moved = step * np.exp(drift.log_length - 1j * drift.course_rad) + drift.jump_m
+    covariance = law.covariance(step, drift.resets) / (OPTIMISM**2 if belief == "optimistic" else 1.0)
+    covariance[is_lost] = np.diag([LOST_M**2, LOST_M**2, LOST_DEG**2])
+    yaw_deg = wrap_deg(_turns_deg(flown) + np.degrees(drift.turn_rad) + drift.jump_deg)
+    return Odometry(
+        right_m=np.where(is_lost, 0.0, moved.real),
+        up_m=np.where(is_lost, 0.0, moved.imag),
+        yaw_deg=np.where(is_lost, 0.0, yaw_deg),
+        covariance=covariance,
+        is_lost=is_lost,
+    )
+
+
+def dead_reckon(flown: Trajectory, steps: Odometry) -> Trajectory:
+    """Return the trajectory that an odometer believes in, from the true first pose.
+
+    Positions and headings follow from the increments, heights and tilt are those of the flight. Poses within a lost
+    stretch are left out, and after it the odometer goes on from where it was: nobody tells it how far it went.
+    """
+    yaw_deg = flown.yaw_deg[0] + np.concatenate([[0.0], np.cumsum(steps.yaw_deg)])
+    # (right, up) of a body that heads `yaw_deg` clockwise from north, as east + i north.
+    moved = (steps.right_m + 1j * steps.up_m) * np.exp(-1j * np.radians(yaw_deg[:-1]))
+    place = complex(*flown.position_m[0, :2]) + np.concatenate([[0.0], np.cumsum(moved)])
+    position_m = np.stack([place.real, place.imag, flown.position_m[:, 2]], axis=1)
+    turn = Rotation.from_euler("z", -wrap_deg(yaw_deg - flown.yaw_deg)[:, None], degrees=True)
+    is_kept = ~np.concatenate([[False], steps.is_lost[:-1] & steps.is_lost[1:], [False]])
+    return Trajectory(
+        time_s=flown.time_s[is_kept],
+        position_m=position_m[is_kept],
+        quaternion_xyzw=(turn * flown.rotation).as_quat()[is_kept],
+    )
+
+
+def path_steps_m(flown: Trajectory) -> Floats:
+    """Return the distances between successive poses, shape (N - 1,), metres; climbs count."""
+    return np.asarray(np.linalg.norm(np.diff(flown.position_m, axis=0), axis=1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Drift:
+    """Errors of each step; `resets` counts those until the step, its own included."""
+
+    log_length: Floats
+    course_rad: Floats
+    turn_rad: Floats
+    jump_m: NDArray[np.complex128]
+    jump_deg: Floats
+    resets: NDArray[np.int64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Law:
+    """A profile over the steps of one flight."""
+
+    profile: DriftProfile
+    steps_m: Floats
+
+    def draw(self, rng: np.random.Generator) -> _Drift:
+        """Draw the errors of one run."""
+        profile, steps_m = self.profile, self.steps_m
+        # Mean square 1: what a profile gives are standard deviations over all runs.
+        factor = math.exp(rng.normal(-(profile.run_spread**2), profile.run_spread))
+        is_reset = rng.random(len(steps_m)) < -np.expm1(-profile.resets.per_km * steps_m / _M_PER_KM)
+        resets = np.cumsum(is_reset, dtype=np.int64)
+        wander = draw_gauss_markov(steps_m, length_m=profile.scale.length_m, rng=rng).means
+        along, across = (draw_gauss_markov(steps_m, length_m=profile.slip.length_m, rng=rng).means for _ in range(2))
+        heading, rate = profile.heading, rng.standard_normal()
+        # Saturating or not, the walk has the same variance per metre at first.
+        scale = math.radians(heading.walk_deg_at_100m) / math.sqrt(_SCALE_M)
+        if heading.length_m is None:
+            walk = draw_walk(steps_m, rng=rng)
+        else:
+            walk = draw_gauss_markov(steps_m, length_m=heading.length_m, rng=rng)
+            scale *= math.sqrt(heading.length_m / 2)
+        bend = math.radians(heading.rate_deg_at_100m) / _SCALE_M * rate
+        biases = np.concatenate(
+            [[factor * profile.scale.bias_pct], np.full(int(resets[-1]), profile.resets.scale_pct)]
+        ) * rng.standard_normal(int(resets[-1]) + 1)
+        slip = profile.slip.sigma_pct / _PERCENT
+        # A reset ends its step: the new scale begins with the next one.
+        bias = biases[resets - is_reset] / _PERCENT
+        jumps = rng.standard_normal((3, len(steps_m))) * is_reset
+        return _Drift(
+            log_length=bias + factor * (profile.scale.wander_pct / _PERCENT * wander + slip * along),
+            course_rad=factor * (slip * across + scale * (walk.means - walk.values[:-1]) + bend * steps_m / 2),
+            turn_rad=factor * (scale * np.diff(walk.values) + bend * steps_m),
+            jump_m=profile.resets.position_m * (jumps[0] + 1j * jumps[1]),
+            jump_deg=profile.resets.yaw_deg * jumps[2],
+            resets=resets,
+        )
+
+    def covariance(self, step: NDArray[np.complex128], resets: NDArray[np.int64]) -> Floats:
+        """Return the covariances of the increments over many runs, shape (N - 1, 3, 3); resets are known."""
+        profile, steps_m = self.profile, self.steps_m
+        is_reset = np.diff(resets, prepend=0) > 0
+        bias = np.where(resets - is_reset > 0, profile.resets.scale_pct, profile.scale.bias_pct) / _PERCENT
+        slip = (profile.slip.sigma_pct / _PERCENT) ** 2 * mean_variance(steps_m, length_m=profile.slip.length_m)
+        wander = mean_variance(steps_m, length_m=profile.scale.length_m) * (profile.scale.wander_pct / _PERCENT) ** 2
+        law = heading_law(steps_m, length_m=profile.heading.length_m)
+        walk = math.radians(profile.heading.walk_deg_at_100m) ** 2 / _SCALE_M
+        bend = (math.radians(profile.heading.rate_deg_at_100m) / _SCALE_M) ** 2 * steps_m**2
+        # Errors of the logarithm of length, of the course and of the turn; the first is independent of the others.
+        inner = np.zeros((len(steps_m), 3, 3))
+        inner[:, 0, 0] = bias**2 + wander + slip
+        inner[:, 1, 1] = slip + walk * law.mean + bend / 4
+        inner[:, 1, 2] = inner[:, 2, 1] = walk * law.both + bend / 2
+        inner[:, 2, 2] = walk * law.change + bend
+        into = np.zeros((len(steps_m), 3, 3))
+        into[:, 0, 0], into[:, 1, 0] = step.real, step.imag
+        into[:, 0, 1], into[:, 1, 1] = step.imag, -step.real  # a clockwise turn of (right, up)
+        into[:, 2, 2] = math.degrees(1.0)
+        floor = np.diag([_FLOOR_M**2, _FLOOR_M**2, _FLOOR_DEG**2])
+        jump = np.diag([profile.resets.position_m**2, profile.resets.position_m**2, profile.resets.yaw_deg**2])
+        return np.asarray(into @ inner @ into.transpose(0, 2, 1) + floor + is_reset[:, None, None] * jump)
+
+
+def _true_steps(flown: Trajectory) -> NDArray[np.complex128]:
+    """Return right + i up of each step in the axes of the pose before, metres."""
+    moved = np.diff(flown.position_m[:, :2], axis=0)
+    return np.asarray((moved[:, 0] + 1j * moved[:, 1]) * np.exp(1j * np.radians(flown.yaw_deg[:-1])))
+
+
+def _turns_deg(flown: Trajectory) -> Floats:
+    return wrap_deg(np.diff(flown.yaw_deg))
+
+
+def _draw_lost(steps_m: Floats, profile: DriftProfile, rng: np.random.Generator) -> Bools:
+    """Draw which steps are lost: any that touches a dropout."""
+    ends = np.cumsum(steps_m)
+    begins = np.sort(rng.uniform(0, ends[-1], size=rng.poisson(profile.dropouts.per_km * ends[-1] / _M_PER_KM)))
+    is_lost = np.zeros(len(steps_m), dtype=bool)
+    for begin, length in zip(begins, rng.exponential(profile.dropouts.length_m, size=len(begins)), strict=True):
+        is_lost |= (ends > begin) & (ends - steps_m < begin + length)
+    return is_lost

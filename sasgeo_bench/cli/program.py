@@ -67,6 +67,9 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "publish": "publishing",
         "release": "releasing",
     },
+    "Flights": {
+        "measure-drift": "flights",
+    },
     "Datasets of others": {
         "import-dataset": "importing",
         "locate-dataset": "importing",

@@ -1,0 +1,84 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands about flights and their odometry."""
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import pandas as pd
+import typer
+from rich.table import Table
+
+from sasgeo_bench.cli.console import print_table, tell
+from sasgeo_bench.errors import FlightError, counted
+from sasgeo_bench.files.parquet import write_frame
+from sasgeo_bench.flights.drift import LOST_S, PairedRun, measure_drift, pair_run
+from sasgeo_bench.flights.drift_fit import fit_profile
+from sasgeo_bench.flights.drift_profile import write_drift_profile
+from sasgeo_bench.flights.tum import read_tum
+
+
+def measure_drift_command(
+    truth: Annotated[list[Path], typer.Option(help="true trajectory, TUM format, plain or gzipped; may be repeated")],
+    estimate: Annotated[list[Path], typer.Option(help="estimate of it; one for each --truth, in the same order")],
+    lengths_m: Annotated[str, typer.Option(metavar="M,M,...", help="lengths of segments, metres of path")] = "10,50",
+    lost_s: Annotated[float, typer.Option(min=0, help="seconds without a pose that are a lost stretch")] = LOST_S,
+    results: Annotated[Path | None, typer.Option(help="also write the figures into this Parquet file")] = None,
+    profile: Annotated[Path | None, typer.Option(help="also write a profile that was fitted, a TOML file")] = None,
+) -> None:
+    """Measure drift of odometry against truth by segment length; runs of one truth file are one cluster."""
+    lengths = _read_lengths(lengths_m)
+    runs = _read_runs(truth, estimate, lost_s)
+    flights = counted(len({run.sequence for run in runs}), "sequence")
+    tell(f"{counted(len(runs), 'run')} of {flights}, {sum(run.path_m for run in runs):.0f} m tracked")
+    figures = measure_drift(runs, lengths_m=lengths)
+    print_table(_table_of(figures))
+    if results is not None:
+        write_frame(figures, results, attrs={"runs": len(runs), "lost_s": lost_s})
+        tell(f"wrote {results}")
+    if profile is not None:
+        fitted = fit_profile(runs, name=profile.stem, lengths_m=lengths)
+        write_drift_profile(fitted.profile, profile)
+        for row in fitted.parameters.to_dict("records"):
+            tell(f"{row['name']} = {row['value']:.3f} [{row['lo']:.3f}, {row['hi']:.3f}]")
+        tell(f"wrote {profile}: add where the data come from and where the profile must not be believed")
+
+
+def _read_lengths(text: str) -> list[float]:
+    """Read lengths in metres, separated by commas; each must be positive."""
+    try:
+        lengths = [float(part) for part in text.split(",")]
+    except ValueError:
+        lengths = []
+    if not lengths or not all(0 < length < math.inf for length in lengths):
+        message = f"--lengths-m must be positive metres as in 10,50, got {text!r}"
+        raise FlightError(message)
+    return lengths
+
+
+def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float) -> list[PairedRun]:
+    """Read pairs of files; each truth is read once."""
+    if len(truth) != len(estimate):
+        message = f"give one --estimate for each --truth, got {len(truth)} truths and {len(estimate)} estimates"
+        raise FlightError(message)
+    truths = {path.resolve(): read_tum(path) for path in dict.fromkeys(truth)}
+    runs = []
+    for true_path, path in zip(truth, estimate, strict=True):
+        try:
+            run = pair_run(
+                truths[true_path.resolve()], read_tum(path), sequence=str(true_path.resolve()), lost_s=lost_s
+            )
+        except FlightError as error:
+            message = f"{path} against {true_path}: {error}" if str(path) not in str(error) else str(error)
+            raise FlightError(message) from error
+        runs.append(run)
+    return runs
+
+
+def _table_of(figures: pd.DataFrame) -> Table:
+    table = Table("figure", "length, m", "value", "95 %", "sequences", "segments", box=None, pad_edge=False)
+    for row in figures.to_dict("records"):
+        length = "" if math.isnan(row["length_m"]) else f"{row['length_m']:g}"
+        value, lo, hi = ("-" if math.isnan(row[key]) else f"{row[key]:.2f}" for key in ("value", "lo", "hi"))
+        table.add_row(row["figure"], length, value, f"[{lo}, {hi}]", str(row["sequences"]), str(row["segments"]))
+    return table

@@ -62,15 +62,16 @@ class Odometry:
     is_lost: Bools
 
     def __post_init__(self) -> None:
-        """Check the shapes; make the arrays read-only."""
+        """Check the shapes; keep own arrays, read-only."""
         count = len(self.right_m)
         shapes = {"right_m": (), "up_m": (), "yaw_deg": (), "covariance": (3, 3), "is_lost": ()}
         for name, rest in shapes.items():
-            values = getattr(self, name)
+            values = np.array(getattr(self, name))
             if values.shape != (count, *rest):
                 message = f"{name} of {count} increments has shape {values.shape}"
                 raise FlightError(message)
             values.flags.writeable = False
+            object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
         """Return the number of increments."""
@@ -90,8 +91,8 @@ def true_odometry(flown: Trajectory) -> Odometry:
     step = _true_steps(flown)
     count = len(step)
     return Odometry(
-        right_m=step.real.copy(),
-        up_m=step.imag.copy(),
+        right_m=step.real,
+        up_m=step.imag,
         yaw_deg=_turns_deg(flown),
         covariance=np.tile(np.diag([_FLOOR_M**2, _FLOOR_M**2, _FLOOR_DEG**2]), (count, 1, 1)),
         is_lost=np.zeros(count, dtype=bool),

@@ -2,6 +2,7 @@
 """Trajectories as text in the TUM format: one pose a line, `time x y z qx qy qz qw`, plain or gzipped."""
 
 import gzip
+import io
 import math
 import zlib
 from pathlib import Path
@@ -11,7 +12,7 @@ from sasgeo_bench.errors import FlightError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.flights.trajectory import Trajectory
 
-MOST_BYTES: Final = 500_000_000  # of text, unpacked
+MOST_BYTES: Final = 300_000_000  # of text, unpacked
 MOST_POSES: Final = 2_000_000
 _COLUMNS: Final = 8
 _GZIP: Final = b"\x1f\x8b"
@@ -53,10 +54,10 @@ def read_tum(path: Path, *, most_bytes: int = MOST_BYTES, most_poses: int = MOST
     ...     read_tum(path).distance_m.tolist()
     [0.0, 5.0]
     """
-    lines = _text_of(path, most_bytes).splitlines()
     times: list[float] = []
     rows: list[list[float]] = []
-    for number, line in enumerate(lines, start=1):
+    for number, content in enumerate(io.BytesIO(_content_of(path, most_bytes)), start=1):
+        line = _decoded(content, f"{path}, line {number}")
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         values = _pose(line, f"{path}, line {number}")
@@ -83,7 +84,7 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
             out.write(" ".join([f"{time:.6f}", *(f"{x:.4f}" for x in place), *(f"{x:.9f}" for x in turn)]) + "\n")
 
 
-def _text_of(path: Path, most_bytes: int) -> str:
+def _content_of(path: Path, most_bytes: int) -> bytes:
     try:
         with path.open("rb") as file:
             is_packed = file.read(2) == _GZIP
@@ -96,23 +97,27 @@ def _text_of(path: Path, most_bytes: int) -> str:
     if len(content) > most_bytes:
         message = f"{path} holds more than {most_bytes} bytes of text: cut the file, or leave out poses"
         raise FlightError(message)
+    return content
+
+
+def _decoded(line: bytes, where: str) -> str:
     try:
-        return content.decode("utf-8-sig")
+        return line.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
-        line = content[: error.start].count(b"\n") + 1
-        message = f"{path}, line {line}: no text: {_FORM}"
+        message = f"{where}: no text: {_FORM}"
         raise FlightError(message) from error
 
 
 def _pose(line: str, where: str) -> list[float]:
     """Return the eight numbers of a line; raise `FlightError` if they are no pose."""
-    words = line.split()
+    words = line.split(maxsplit=_COLUMNS)  # a line may be as long as the file
     try:
         values = [float(word) for word in words]
     except ValueError:
         values = []
     if len(values) != _COLUMNS or "_" in line or not all(map(math.isfinite, values)):
-        found = f"{len(words)} words" if len(words) != _COLUMNS else "words that are no finite numbers"
+        count = f"{len(words)} words" if len(words) < _COLUMNS else "more than 8 words"
+        found = count if len(words) != _COLUMNS else "words that are no finite numbers"
         message = f"{where}: {found}: {_FORM}"
         raise FlightError(message)
     length = math.hypot(*values[4:])

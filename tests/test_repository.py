@@ -46,7 +46,7 @@ IMPORTED_AS = {
 }
 
 # Declared, though no file of ours imports them: another library needs them for what we ask of it.
-INDIRECT = {"defusedxml": "the XMP of photos, which Pillow reads with it", "tqdm": "the progress bar of pooch"}
+INDIRECT = {"tqdm": "the progress bar of pooch"}
 
 
 def repository_files() -> list[Path]:

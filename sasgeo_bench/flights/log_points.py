@@ -1,0 +1,188 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Points of a flight log as its file gives them, and what is refused of them; the readers of all formats use it."""
+
+import datetime as dt
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Self
+
+import numpy as np
+import pyproj
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import FlightError
+from sasgeo_bench.texts import plain
+
+Floats = NDArray[np.float64]
+
+MOST_BYTES: Final = 64 * 2**20  # of a log
+MOST_POINTS: Final = 1_000_000
+FASTEST_MPS: Final = 100.0  # between two points: no drone of this benchmark is faster
+
+_MOST_SHOWN: Final = 40  # characters of a text out of a file
+_ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
+_HIGHEST_M: Final = 10_000.0
+_WGS84: Final = pyproj.Geod(ellps="WGS84")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogSource:
+    """A log's file, and what its points are counted by: lines of a table, or points of a track."""
+
+    path: Path
+    unit: str = "point"
+
+    def fault(self, text: str, number: int | None = None) -> FlightError:
+        """Return the error of a line or point, or of the file."""
+        where = self.path.name if number is None else f"{self.path.name}, {self.unit} {number}"
+        return FlightError(f"{where}: {text}")
+
+    def number(self, text: str | None, name: str, number: int) -> float:
+        """Return a finite number out of the file; raise `FlightError` for anything else."""
+        if text is None or not text.strip():
+            message = f"{name} is missing: complete the point, or delete it"
+            raise self.fault(message, number)
+        try:
+            value = math.nan if "_" in text else float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            message = f"{name} is no number, {shown(text)}: mend the value, or delete the point"
+            raise self.fault(message, number)
+        return value
+
+    def moment(self, text: str | None, number: int) -> dt.datetime:
+        """Return a time as ISO 8601 has it; one without a zone is UTC."""
+        try:
+            moment = dt.datetime.fromisoformat((text or "").strip())
+        except ValueError as error:
+            message = f"time is no date and time like 2025-05-01T10:00:00Z, {shown(text or '')}: mend it"
+            raise self.fault(message, number) from error
+        return moment if moment.tzinfo else moment.replace(tzinfo=dt.UTC)
+
+    def check_size(self) -> None:
+        """Raise `FlightError` if there is no such file, or if it is too large."""
+        if not self.path.is_file():
+            message = f"there is no flight log {self.path}: check the path"
+            raise FlightError(message)
+        size = self.path.stat().st_size
+        if size > MOST_BYTES:
+            message = f"{size} bytes, at most {MOST_BYTES} are read: cut the log first"
+            raise self.fault(message)
+
+    def check_count(self, count: int) -> None:
+        """Raise `FlightError` for more points than are read."""
+        if count > MOST_POINTS:
+            message = f"more than {MOST_POINTS} points: cut the log, or thin it out, first"
+            raise self.fault(message)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FlightLog:
+    """N points of a flight, two at least, in order; None for what the file does not have.
+
+    Parameters
+    ----------
+    lon_deg, lat_deg : ndarray, shape (N,)
+        WGS 84, degrees.
+    time_s : ndarray, shape (N,), optional
+        Seconds since the first point, strictly increasing.
+    height_m : ndarray, shape (N,), optional
+        Height above the ground or the place of take-off, metres; never one above the sea.
+    yaw_deg, pitch_deg, roll_deg : ndarray, shape (N,), optional
+        Attitude of the body, degrees, yaw from true north; in the order of angles of `sensing.camera.Attitude`.
+    """
+
+    lon_deg: Floats
+    lat_deg: Floats
+    time_s: Floats | None = None
+    height_m: Floats | None = None
+    yaw_deg: Floats | None = None
+    pitch_deg: Floats | None = None
+    roll_deg: Floats | None = None
+
+    @classmethod
+    def of(cls, source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats]) -> Self:
+        """Return a log of checked columns; `numbers` are the lines or points in the file, for messages.
+
+        Raises
+        ------
+        FlightError
+            If there are fewer than two points, a place is none on Earth or 0, 0 (no fix), time does not increase, the
+            flight is faster than 100 m/s, or a height or an angle is out of range.
+        """
+        if len(numbers) < 2:  # noqa: PLR2004 - a way
+            message = f"a flight has two points at least, the log has {len(numbers)}: export more of it"
+            raise source.fault(message)
+        _check_places(source, numbers, columns)
+        _check_times(source, numbers, columns)
+        for name, most in {**_ANGLES, "height_m": _HIGHEST_M}.items():
+            if name in columns:
+                text = f"{name} lies beyond {most:g}: mend the value, or name the column by its unit"
+                _check(source, numbers, np.abs(columns[name]) <= most, text)
+        return cls(**columns)
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.lon_deg)
+
+
+def steps_m(lon_deg: Floats, lat_deg: Floats) -> Floats:
+    """Return the distances between successive points on the ellipsoid, shape (N - 1,), metres."""
+    return np.asarray(_WGS84.inv(lon_deg[:-1], lat_deg[:-1], lon_deg[1:], lat_deg[1:])[2])
+
+
+def shown(text: str) -> str:
+    r"""Return a text out of a file as messages quote it: short, and without controls.
+
+    >>> shown("12,5\x1b[31m")
+    "'12,5?[31m'"
+    """
+    line = plain(text.strip())
+    return repr(line if len(line) <= _MOST_SHOWN else line[: _MOST_SHOWN - 3] + "...")
+
+
+def _check(
+    source: LogSource,
+    numbers: Sequence[int],
+    is_right: NDArray[np.bool_],
+    text: str | Callable[[int], str],
+    *,
+    later: int = 0,
+) -> None:
+    """Raise the error of the first point that is not right; `later` is 1 where rows are steps from point to point."""
+    wrong = np.flatnonzero(~is_right)
+    if len(wrong):
+        at = int(wrong[0])
+        raise source.fault(text if isinstance(text, str) else text(at), numbers[at + later])
+
+
+def _check_places(source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats]) -> None:
+    lon, lat = columns["lon_deg"], columns["lat_deg"]
+    _check(
+        source,
+        numbers,
+        (np.abs(lon) <= 180) & (np.abs(lat) <= 90),  # noqa: PLR2004 - the globe
+        lambda at: (
+            f"latitude {lat[at]:g}, longitude {lon[at]:g} are no degrees on Earth: mend them, or delete the point"
+        ),
+    )
+    text = "latitude and longitude are 0, which is no fix: delete the points without a fix"
+    _check(source, numbers, (lon != 0) | (lat != 0), text)
+
+
+def _check_times(source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats]) -> None:
+    moved_m = steps_m(columns["lon_deg"], columns["lat_deg"])
+    if "time_s" not in columns:
+        text = "repeats the point before, and has no time: delete it"
+        _check(source, numbers, moved_m > 0, text, later=1)
+        return
+    gained_s = np.diff(columns["time_s"])
+    back = "time goes back by {:g} s: sort the points, or keep one flight"
+    same = "the same time as the point before: keep one point of each time"
+    _check(source, numbers, gained_s > 0, lambda at: back.format(-gained_s[at]) if gained_s[at] else same, later=1)
+    speed_mps = moved_m / gained_s
+    text = "moves at {:.0f} m/s since the point before, {:g} at most: delete points that jump, check the unit of time"
+    _check(source, numbers, speed_mps <= FASTEST_MPS, lambda at: text.format(speed_mps[at], FASTEST_MPS), later=1)

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""GPX and KML: one track of a file, without document types or entities, point by point."""
+
+import datetime as dt
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+from xml.etree.ElementTree import Element, ParseError
+
+import numpy as np
+from defusedxml import DefusedXmlException  # type: ignore[import-untyped]
+from defusedxml.ElementTree import iterparse  # type: ignore[import-untyped]
+
+from sasgeo_bench.errors import FlightError
+from sasgeo_bench.flights.log_points import FlightLog, LogSource, shown
+from sasgeo_bench.texts import message_of
+
+_ABOVE_GROUND: Final = "relativeToGround"  # of KML's altitudes; the others count from the sea, or are none
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Track:
+    """What was read of a file so far."""
+
+    source: LogSource
+    places: list[tuple[float, float]] = field(default_factory=list)
+    moments: list[dt.datetime] = field(default_factory=list)
+    heights_m: list[float] = field(default_factory=list)
+
+    def log(self) -> FlightLog:
+        """Return the log; times are of all points or of none."""
+        count = len(self.places)
+        numbers = range(1, count + 1)
+        if self.moments and len(self.moments) != count:
+            message = f"{len(self.moments)} of {count} points have a time: give each one, or none"
+            raise self.source.fault(message)
+        lon_deg, lat_deg = np.array(self.places, dtype=np.float64).reshape(-1, 2).T
+        columns = {"lon_deg": lon_deg, "lat_deg": lat_deg}
+        if self.moments:
+            columns["time_s"] = np.array([(moment - self.moments[0]).total_seconds() for moment in self.moments])
+        if self.heights_m:
+            columns["height_m"] = np.array(self.heights_m)
+        return FlightLog.of(self.source, numbers, columns)
+
+
+def read_gpx(path: Path) -> FlightLog:
+    """Read the track of a GPX file, or its route where it has no track; raise `FlightError` if it is not sound.
+
+    Segments of the track follow each other. Elevations are above the sea, and are not read.
+    """
+    track, route = _Track(source=LogSource(path=path)), _Track(source=LogSource(path=path))
+    tracks = 0
+    for event, element in _elements(track.source):
+        name = _name(element)
+        tracks += event == "start" and name == "trk"
+        if tracks > 1:
+            message = "more than one track: keep the one that is meant"
+            raise track.source.fault(message)
+        if event == "end" and name in ("trkpt", "rtept"):
+            _add_point(track if name == "trkpt" else route, element)
+            element.clear()
+    return (track if track.places else route).log()
+
+
+def _add_point(track: _Track, element: Element) -> None:
+    number = len(track.places) + 1
+    track.source.check_count(number)
+    lon_deg = track.source.number(element.get("lon"), "longitude", number)
+    track.places.append((lon_deg, track.source.number(element.get("lat"), "latitude", number)))
+    for child in element:
+        if _name(child) == "time":
+            track.moments.append(track.source.moment(child.text, number))
+
+
+def read_kml(path: Path) -> FlightLog:
+    """Read the one line or track of a KML file; raise `FlightError` if it is not sound.
+
+    A `LineString` has no times, a `gx:Track` has. Altitudes are heights where they are relative to the ground; others
+    are not read, nor are angles.
+    """
+    source = LogSource(path=path)
+    lines: list[_Track] = []
+    opened = ""  # times and places of other elements are not of the line
+    texts: dict[str, str] = {}
+    for event, element in _elements(source):
+        name, text = _name(element), element.text or ""
+        if event == "start":
+            if name in ("LineString", "Track"):
+                lines.append(_Track(source=source))
+                opened, texts = name, {}
+        elif not opened:
+            continue
+        elif name in ("altitudeMode", "coordinates"):
+            texts[name] = text
+        elif name in ("when", "coord"):
+            _add(lines[-1], name, text)
+            element.clear()
+        elif name == opened:
+            _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
+            opened = ""
+    if len(lines) != 1:
+        message = f"{len(lines)} lines or tracks, one is read: keep the one that is meant"
+        raise source.fault(message)
+    return lines[0].log()
+
+
+def _add(line: _Track, name: str, text: str) -> None:
+    """Add a time or a place of a gx:Track, which lists all of the one kind before the other."""
+    if name == "when":
+        line.moments.append(line.source.moment(text, len(line.moments) + 1))
+    else:
+        _add_place(line, text.split())
+
+
+def _close(line: _Track, coordinates: str, mode: str) -> None:
+    """Read the points of a LineString; keep heights if all points have one, above the ground."""
+    for place in coordinates.split():
+        _add_place(line, place.split(","))
+    if mode != _ABOVE_GROUND or len(line.heights_m) != len(line.places):
+        line.heights_m.clear()
+
+
+def _add_place(line: _Track, parts: list[str]) -> None:
+    number = len(line.places) + 1
+    line.source.check_count(number)
+    if len(parts) not in (2, 3):
+        message = f"{shown(' '.join(parts))} is no longitude, latitude and altitude: mend the coordinates"
+        raise line.source.fault(message, number)
+    lon_deg, lat_deg, *height_m = (
+        line.source.number(text, name, number)
+        for text, name in zip(parts, ("longitude", "latitude", "altitude"), strict=False)
+    )
+    line.places.append((lon_deg, lat_deg))
+    line.heights_m.extend(height_m)
+
+
+def _elements(source: LogSource) -> Iterator[tuple[str, Element]]:
+    """Yield elements as they begin and end; refuse document types and entities, and what is no XML."""
+    source.check_size()
+    try:
+        with source.path.open("rb") as file:
+            yield from iterparse(file, events=("start", "end"), forbid_dtd=True)
+    except FlightError:
+        raise
+    except DefusedXmlException as error:
+        message = "has a document type or entities, which are not read: export it anew without them"
+        raise source.fault(message) from error
+    except (ParseError, ValueError, LookupError) as error:
+        message = f"no sound XML ({message_of(error)}): export it anew"
+        raise source.fault(message) from error
+    except OSError as error:
+        message = f"cannot be read ({message_of(error)}): check its rights"
+        raise source.fault(message) from error
+
+
+def _name(element: Element) -> str:
+    """Return the name of an element without its namespace."""
+    return str(element.tag).rpartition("}")[2]

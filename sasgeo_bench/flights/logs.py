@@ -1,0 +1,231 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flights out of files: GPX, KML, CSV with latitude and longitude, TUM; brought onto a region and cut to it."""
+
+import math
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyproj
+import shapely
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import FlightError
+from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, steps_m
+from sasgeo_bench.flights.log_table import read_csv
+from sasgeo_bench.flights.log_xml import read_gpx, read_kml
+from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
+from sasgeo_bench.flights.trajectory import Trajectory
+from sasgeo_bench.flights.tum import read_tum
+from sasgeo_bench.geometry.pose import bearing_deg
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.texts import plain
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+SUFFIXES: Final = (".gpx", ".kml", ".csv", ".tum", ".txt", ".tum.gz", ".txt.gz")
+MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones nobody knows where the drone was
+
+_TUM: Final = SUFFIXES[3:]
+_LOWEST_M: Final = 5.0  # lower poses are of a drone that stands, takes off or lands
+_SPEED_MPS: Final = 10.0  # of a log without times
+_COURSE_S: Final = 1.0  # before and after a pose, over which its course is measured
+_HOVER_M: Final = 1.0  # a shorter way has no course
+_FAR_M: Final = 1e9  # where a projection ends: outside of every region
+
+
+def read_log(path: Path) -> FlightLog:
+    """Read a GPX, KML or CSV log by its suffix; raise `FlightError` if it is not sound, or of another kind.
+
+    A line drawn in KML has no times: `read_flight` flies it at an even speed.
+
+    >>> import tempfile
+    >>> line = "<coordinates>9.52,47.14,80 9.53,47.15,80</coordinates><altitudeMode>relativeToGround</altitudeMode>"
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder, "line.kml")
+    ...     _ = path.write_text(f"<kml><LineString>{line}</LineString></kml>")
+    ...     log = read_log(path)
+    >>> log.lat_deg.tolist(), log.height_m.tolist(), log.time_s
+    ([47.14, 47.15], [80.0, 80.0], None)
+    """
+    readers = {".gpx": read_gpx, ".kml": read_kml, ".csv": read_csv}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        message = f"{path.name} is no flight log that is read: {', '.join(SUFFIXES)} are (unzip a .kmz, export a .ulg)"
+        raise FlightError(message)
+    return reader(path)
+
+
+def read_flight(
+    path: Path,
+    region: Region,
+    *,
+    margin_m: float = MARGIN_M,
+    least_m: float = SHORTEST_M,
+    height_m: float | None = None,
+    speed_mps: float = _SPEED_MPS,
+    step_s: float = 0.2,
+) -> Trajectory:
+    r"""Read a flight log and return its longest stretch inside a region.
+
+    Parameters
+    ----------
+    path : Path
+        GPX, KML, CSV, or TUM (.tum, .txt), whose positions are easting, northing and height of the region's CRS.
+    region : Region
+        The stretch lies over its mapped ground.
+    margin_m : float
+        Least distance from ground that is not mapped, metres.
+    least_m : float
+        Shortest stretch that is taken, metres.
+    height_m : float, optional
+        Height above the ground that is kept throughout, metres; it replaces the heights in the log.
+    speed_mps : float
+        Even speed of a log without times, metres a second.
+    step_s : float
+        Seconds between poses.
+
+    Returns
+    -------
+    Trajectory
+        In the region's CRS, heights above the ground or the place of take-off; time counts from the first point. Yaw is
+        from grid north. A log without a heading points along its course, and is level.
+
+    Raises
+    ------
+    FlightError
+        If the file is not sound, has no heights and none is given, or leaves the region.
+
+    Notes
+    -----
+    Places are linear between the points of the log, attitudes take the shortest turn. A gap of more than 10 s between
+    points ends a stretch, and so does a height of less than 5 m: take-off and landing are left out.
+
+    Examples
+    --------
+    A flight due east across an embedded town, from edge to edge; true east is 88 degrees from grid north there:
+
+    >>> import tempfile
+    >>> from sasgeo_bench.regions.build import build_region, plan_build
+    >>> from sasgeo_bench.regions.region_files import read_region
+    >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+    >>> with tempfile.TemporaryDirectory() as out:
+    ...     spec = read_region_file(find_region_file("town-suburb"))
+    ...     _ = build_region(plan_build(spec, out=Path(out)), tell=lambda _: None, with_preview=False)
+    ...     region = read_region(Path(out) / "regions" / "town-suburb")
+    ...     west, south, east, north = region.manifest.bounds_lonlat
+    ...     path = Path(out) / "flight.csv"
+    ...     _ = path.write_text(f"lat,lon\n{(south + north) / 2},{west}\n{(south + north) / 2},{east}\n")
+    ...     flown = read_flight(path, region, height_m=100.0, least_m=500.0)
+    >>> round(flown.distance_m[-1] / 100), round(np.mean(flown.yaw_deg))
+    (8, 88)
+    """
+    for name, value in (("step_s", step_s), ("speed_mps", speed_mps), ("height_m", height_m)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            message = f"{name} must be positive, got {value!r}"
+            raise FlightError(message)
+    log = None if path.name.lower().endswith(_TUM) else read_log(path)
+    if log is None:
+        logged = read_tum(path)
+        logged = logged if height_m is None else _at_height(logged, height_m)
+    else:
+        logged = _on_grid(log, path, region.manifest.epsg, height_m, speed_mps)
+    flown = _resampled(logged, path, step_s)
+    is_known = np.ones(len(flown) - 1, dtype=bool)
+    if log is None or log.time_s is not None:
+        is_known = ~_in_gaps(flown.time_s, logged.time_s)
+    if log is not None and log.yaw_deg is None:
+        flown = _along_course(flown, step_s)
+    return _longest_inside(flown, is_known, path, region, margin_m, least_m)
+
+
+def _on_grid(log: FlightLog, path: Path, epsg: int, height_m: float | None, speed_mps: float) -> Trajectory:
+    """Return the points of a log in a projected CRS; without a heading yaw is 0."""
+    up_m = log.height_m if height_m is None else np.full(len(log), height_m)
+    if up_m is None:
+        message = f"{path.name} has no height above the ground, and altitudes above the sea are not read: give height_m"
+        raise FlightError(message)
+    to_grid = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
+    en_m = np.stack(to_grid.transform(log.lon_deg, log.lat_deg), axis=1)
+    en_m = np.nan_to_num(en_m, nan=_FAR_M, posinf=_FAR_M, neginf=-_FAR_M)
+    time_s = log.time_s
+    if time_s is None:
+        time_s = np.append(0.0, np.cumsum(steps_m(log.lon_deg, log.lat_deg))) / speed_mps
+    if log.yaw_deg is None:
+        return Trajectory.of_angles(time_s=time_s, position_m=np.column_stack([en_m, up_m]), yaw_deg=np.zeros(len(log)))
+    # A bearing in the grid is one from true north less the meridian convergence.
+    convergence = pyproj.Proj(f"EPSG:{epsg}").get_factors(log.lon_deg, log.lat_deg).meridian_convergence
+    return Trajectory.of_angles(
+        time_s=time_s,
+        position_m=np.column_stack([en_m, up_m]),
+        yaw_deg=log.yaw_deg - np.nan_to_num(convergence, nan=0.0, posinf=0.0, neginf=0.0),
+        pitch_deg=0.0 if log.pitch_deg is None else log.pitch_deg,
+        roll_deg=0.0 if log.roll_deg is None else log.roll_deg,
+    )
+
+
+def _at_height(flown: Trajectory, height_m: float) -> Trajectory:
+    position_m = np.column_stack([flown.position_m[:, :2], np.full(len(flown), height_m)])
+    return Trajectory(time_s=flown.time_s, position_m=position_m, quaternion_xyzw=flown.quaternion_xyzw)
+
+
+def _resampled(flown: Trajectory, path: Path, step_s: float) -> Trajectory:
+    if len(flown) < 2:  # noqa: PLR2004 - a way
+        message = f"{path.name}: a flight has two poses at least, got {len(flown)}"
+        raise FlightError(message)
+    first_s, last_s = float(flown.time_s[0]), float(flown.time_s[-1])
+    count = math.floor((last_s - first_s) / step_s) + 1
+    if count > MOST_POINTS:
+        message = f"{path.name} lasts {last_s - first_s:.0f} s, {MOST_POINTS * step_s:.0f} s are read at most: cut it"
+        raise FlightError(message)
+    return flown.at(np.minimum(first_s + step_s * np.arange(count), last_s))
+
+
+def _along_course(flown: Trajectory, step_s: float) -> Trajectory:
+    """Return a trajectory that is level and points where it flies; while it hovers, where it flew before."""
+    reach = max(1, round(_COURSE_S / step_s))
+    at = np.arange(len(flown))
+    before, after = np.maximum(at - reach, 0), np.minimum(at + reach, len(flown) - 1)
+    way_m = flown.position_m[after, :2] - flown.position_m[before, :2]
+    moves = np.flatnonzero(np.hypot(*way_m.T) >= _HOVER_M)
+    yaw_deg = np.zeros(len(flown))
+    if len(moves):
+        held = moves[np.maximum(np.searchsorted(moves, at, side="right") - 1, 0)]
+        yaw_deg = bearing_deg(*way_m[held].T)
+    return Trajectory.of_angles(time_s=flown.time_s, position_m=flown.position_m, yaw_deg=yaw_deg)
+
+
+def _longest_inside(
+    flown: Trajectory, is_known: Bools, path: Path, region: Region, margin_m: float, least_m: float
+) -> Trajectory:
+    """Return the longest run of known poses inside a region; raise `FlightError` if it is too short."""
+    area = flight_area(region, margin_m)
+    places_m = flown.position_m[:, :2]
+    sides = shapely.linestrings(np.stack([places_m[:-1], places_m[1:]], axis=1))
+    is_up = flown.position_m[:, 2] >= _LOWEST_M
+    is_inside = np.asarray(shapely.covers(area, sides), dtype=bool) & is_known & is_up[:-1] & is_up[1:]
+    edges = np.diff(np.concatenate([[0], is_inside, [0]]))
+    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    along_m = flown.distance_m
+    lengths_m = along_m[ends] - along_m[starts]
+    best = int(np.argmax(lengths_m)) if len(lengths_m) else -1
+    longest_m = float(lengths_m[best]) if best >= 0 else 0.0
+    if best < 0 or longest_m < least_m:
+        message = (
+            f"{path.name} leaves {region.manifest.id}: of {along_m[-1]:.0f} m the longest stretch over mapped ground, "
+            f"{margin_m:g} m from its edge and in the air, has {longest_m:.0f} m, {least_m:g} m are needed: take "
+            "another region, or a smaller margin_m or least_m"
+        )
+        raise FlightError(plain(message))
+    run = slice(starts[best], ends[best] + 1)
+    return Trajectory(
+        time_s=flown.time_s[run], position_m=flown.position_m[run], quaternion_xyzw=flown.quaternion_xyzw[run]
+    )
+
+
+def _in_gaps(time_s: Floats, logged_s: Floats) -> Bools:
+    """Return which steps between poses lie in a gap of the log, shape (N - 1,)."""
+    is_gap = np.append(np.diff(logged_s) > MOST_GAP_S, [False])  # nothing follows its end
+    middle_s = (time_s[:-1] + time_s[1:]) / 2
+    return np.asarray(is_gap[np.searchsorted(logged_s, middle_s, side="right") - 1])

@@ -1,0 +1,447 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flight logs: formats and units, cut to a region, and one line for each fault of a file."""
+
+import datetime as dt
+import gzip
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyproj
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from sasgeo_bench.errors import FlightError
+from sasgeo_bench.flights import log_points, log_table
+from sasgeo_bench.flights.logs import read_flight, read_log
+from sasgeo_bench.flights.plans import flight_area
+from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.sensing.camera import Attitude
+
+LON, LAT = 9.52, 47.14
+START = dt.datetime(2025, 5, 1, 10, tzinfo=dt.UTC)
+BOMB = """<?xml version="1.0"?><!DOCTYPE lolz [<!ENTITY lol "lol"><!ENTITY lol2 "&lol;&lol;&lol;&lol;&lol;&lol;&lol;">
+<!ENTITY lol3 "&lol2;&lol2;&lol2;&lol2;&lol2;&lol2;">]>{}"""
+EXTERNAL = '<?xml version="1.0"?><!DOCTYPE x [<!ENTITY e SYSTEM "file:///etc/hostname">]>{}'
+POINT = '<trkpt lat="{}" lon="{}">{}</trkpt>'
+SUM = "<trkpt lat='47.14' lon='9.52'><time>&lol3;</time></trkpt>"
+LINE = "<kml><Document><Placemark><LineString><coordinates>{}</coordinates></LineString></Placemark></Document></kml>"
+
+
+def _points(count: int = 5, *, step_deg: float = 1e-4) -> list[tuple[float, float, int]]:
+    """Longitude, latitude and seconds of a flight to the north at 11 m/s."""
+    return [(LON, round(LAT + at * step_deg, 7), at) for at in range(count)]
+
+
+def _gpx(points: list[tuple[float, float, int]], *, tag: str = "trk", times: bool = True) -> str:
+    stamps = [(START + dt.timedelta(seconds=at)).isoformat().replace("+00:00", "Z") for _, _, at in points]
+    time = "<time>{}</time>" if times else ""
+    body = "".join(POINT.format(lat, lon, time.format(at)) for (lon, lat, _), at in zip(points, stamps, strict=True))
+    head = '<?xml version="1.0"?><gpx xmlns="http://www.topografix.com/GPX/1/1">'
+    inner = f"<trk><trkseg>{body}</trkseg></trk>" if tag == "trk" else f"<rte>{body.replace('trkpt', 'rtept')}</rte>"
+    return f"{head}{inner}</gpx>"
+
+
+def _csv(head: str, *rows: str) -> str:
+    return "\n".join([head, *rows, ""])
+
+
+@pytest.fixture
+def written(tmp_path: Path) -> Callable[[str, str], Path]:
+    def write(name: str, text: str) -> Path:
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture(scope="module")
+def region(lay_towns: Callable[..., Path], tmp_path_factory: pytest.TempPathFactory) -> Region:
+    out = lay_towns(tmp_path_factory.mktemp("logged") / "out", "town-grid")
+    return read_region(out / "regions" / "town-grid")
+
+
+def _refused(path: Path) -> str:
+    with pytest.raises(FlightError) as fault:
+        read_log(path)
+    line = str(fault.value)
+    assert line.isprintable()
+    assert len(line) < 500
+    assert path.name in line
+    return line
+
+
+# Formats
+
+
+@pytest.mark.parametrize("tag", ["trk", "rte"])
+def test_a_gpx_track_or_route_has_places_and_times(written: Callable, tag: str) -> None:
+    log = read_log(written("a.gpx", _gpx(_points(), tag=tag)))
+    assert log.lat_deg.tolist() == [lat for _, lat, _ in _points()]
+    assert log.lon_deg.tolist() == [LON] * 5
+    assert log.time_s is not None
+    assert log.time_s.tolist() == [0, 1, 2, 3, 4]
+    assert (log.height_m, log.yaw_deg) == (None, None)
+
+
+def test_segments_of_a_gpx_track_follow_each_other(written: Callable) -> None:
+    text = _gpx(_points(4)).replace("</trkpt><trkpt", "</trkpt></trkseg><trkseg><trkpt", 1)
+    assert len(read_log(written("a.gpx", text))) == 4
+
+
+@pytest.mark.parametrize(("mode", "heights"), [("relativeToGround", [80, 90]), ("absolute", None), ("", None)])
+def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(
+    written: Callable, mode: str, heights: list | None
+) -> None:
+    line = LINE.format("\n 9.52,47.14,80 \t 9.52,47.15,90\n")
+    text = line.replace("<coordinates>", f"<altitudeMode>{mode}</altitudeMode><coordinates>")
+    log = read_log(written("a.KML", text))
+    assert log.time_s is None
+    assert (None if log.height_m is None else log.height_m.tolist()) == heights
+
+
+def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(written: Callable) -> None:
+    whens = "".join(f"<when>2025-05-01T10:00:0{at}Z</when>" for at in range(3))
+    coords = "".join(f"<gx:coord>9.52 {47.14 + at / 1e4} 60</gx:coord>" for at in range(3))
+    other = "<Placemark><TimeStamp><when>2020-01-01T00:00:00Z</when></TimeStamp></Placemark>"
+    text = (
+        f'<kml xmlns:gx="http://www.google.com/kml/ext/2.2">{other}<gx:Track><altitudeMode>relativeToGround'
+        f"</altitudeMode>{whens}{coords}</gx:Track>{other}</kml>"
+    )
+    log = read_log(written("a.kml", text))
+    assert log.time_s is not None
+    assert log.height_m is not None
+    assert (log.time_s.tolist(), log.height_m.tolist()) == ([0, 1, 2], [60, 60, 60])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        _csv("lat,lon,time_s", "47.14,9.52,5", "47.1401,9.52,6"),
+        _csv("Latitude;Longitude;Timestamp", "47.14;9.52;2025-05-01 10:00:00", "47.1401;9.52;2025-05-01 10:00:01.0"),
+        _csv("# made by hand", "", "lat_deg\tlon_deg\ttime_ms", "47.14\t9.52\t5000", "47.1401\t9.52\t6000", "\t\t"),
+        _csv("\ufefftimestamp,lat,lon,alt", "1000000,471400000,95200000,480000", "2000000,471401000,95200000,480000"),
+        _csv("TimeUS,GPS.Lat,GPS.Lng,GPS.Alt", "7,47.14,9.52,480.5", "1000007,47.1401,9.52,480.5"),
+        _csv("time(millisecond),datetime(utc),latitude,longitude", "0,x,47.14,9.52", "1000,x,47.1401,9.52"),
+        _csv("timestamp,lat,lon", "4,47.14,9.52", "5,47.1401,9.52"),
+        _csv("timestamp,lat,lon", "4e9,47.14,9.52", "5e9,47.1401,9.52"),
+        _csv("utc,lat,lon", '"2025-05-01T10:00:00+02:00",47.14,9.52', "2025-05-01T08:00:01Z,47.1401,9.52"),
+    ],
+)
+def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Callable, text: str) -> None:
+    log = read_log(written("a.csv", text))
+    assert log.lat_deg.tolist() == [47.14, 47.1401]
+    assert log.lon_deg.tolist() == [9.52, 9.52]
+    assert log.time_s is not None
+    assert log.time_s == pytest.approx([0, 1])
+
+
+@given(speed_mps=st.floats(0.2, 90.0), power=st.integers(0, 3), count=st.integers(2, 20))
+def test_the_unit_of_a_bare_time_follows_from_the_speed(
+    tmp_path_factory: pytest.TempPathFactory, speed_mps: float, power: int, count: int
+) -> None:
+    path = tmp_path_factory.mktemp("units") / "a.csv"
+    step_s = 11.12 / speed_mps
+    rows = [f"{at * step_s * 1000**power!r},{LAT + at * 1e-4},{LON}" for at in range(count)]
+    path.write_text(_csv("time,lat,lon", *rows), encoding="utf-8")
+    log = read_log(path)
+    assert log.time_s is not None
+    assert log.time_s[-1] == pytest.approx(step_s * (count - 1), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "height_m"),
+    [
+        ("relative_alt", "80.5", 80.5),
+        ("relative_alt", "80500", 80.5),
+        ("altitudeRelative", "80.5", 80.5),
+        ("height_above_takeoff(feet)", "100", 30.48),
+        ("relative_alt_mm", "900", 0.9),
+    ],
+)
+def test_heights_are_metres_unless_name_or_size_says_otherwise(
+    written: Callable, head: str, row: str, height_m: float
+) -> None:
+    log = read_log(written("a.csv", _csv(f"lat,lon,{head},alt", f"47.14,9.52,{row},500", f"47.1401,9.52,{row},500")))
+    assert log.height_m is not None
+    assert log.height_m == pytest.approx(height_m)
+
+
+@pytest.mark.parametrize(
+    ("head", "row", "angles"),
+    [
+        ("yaw,pitch,roll", "90.0,-5,2.5", (90.0, -5.0, 2.5)),
+        ("heading,pitch_deg,roll_deg", "90,-5,2.5", (90.0, -5.0, 2.5)),
+        ("yaw_rad,pitch_rad,roll_rad", "1.5707963,-0.0872665,0.0436332", (90.0, -5.0, 2.5)),
+        ("hdg", "9000", (90.0, None, None)),
+        ("yaw_deg", "0.5", (0.5, None, None)),
+        ("pitch,roll", "0.1,0.2", (None, None, None)),  # no attitude without a heading
+    ],
+)
+def test_angles_are_degrees_radians_or_hundredths(written: Callable, head: str, row: str, angles: tuple) -> None:
+    log = read_log(written("a.csv", _csv(f"lat,lon,{head}", f"47.14,9.52,{row}", f"47.1401,9.52,{row}")))
+    for found, expected in zip((log.yaw_deg, log.pitch_deg, log.roll_deg), angles, strict=True):
+        assert (found is None) if expected is None else (found == pytest.approx(expected, abs=1e-4))
+
+
+# Faults
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        (_csv("lat,lon", "47.14,9.52"), "two points at least, the log has 1"),
+        (_csv("lat,lon"), "two points at least, the log has 0"),
+        ("", "no column of latitude and longitude, found none: name them lat and lon"),
+        (_csv("x,y\x1b[31m,lat", "1,2,3"), r"no column of longitude, found 'x', 'y\?\[31m', 'lat'"),
+        (_csv("lat,lon,GPS.lat", "1,2,3"), "latitude is ambiguous, columns 'lat', 'GPS.lat': keep one"),
+        (_csv("lat,lon,yaw_deg,heading_rad", "1,2,3,4"), "yaw is ambiguous, columns 'yaw_deg', 'heading_rad'"),
+        (_csv("lat,lon", "47.14,9.52", "nan,9.52"), "line 3: latitude is no number, 'nan'"),
+        (_csv("lat,lon", "47.14,9.52", "inf,9.52"), "line 3: latitude is no number"),
+        (_csv("lat,lon", "47.14,9.52", "4_7,9.52"), "line 3: latitude is no number"),
+        (_csv("lat,lon", "47.14,9.52", ",9.52"), "line 3: latitude is missing"),
+        (_csv("lat,lon", "47.14,9.52", "47.1,\x1b]0;x\x07"), r"line 3: longitude is no number, '\?\]0;x\?'"),
+        (_csv("lat,lon", "47.14,9.52", "97.14,9.52"), "line 3: latitude 97.14, longitude 9.52 are no degrees on Earth"),
+        (_csv("lat,lon", "47.14,9.52", "47.14,189.5"), "line 3: latitude 47.14, longitude 189.5 are no degrees"),
+        (_csv("lat,lon", "471400000,95200000", "1900000000,95200000"), "line 3: latitude 190, longitude 9.52"),
+        (_csv("lat,lon", "0,0", "47.14,9.52"), "line 2: latitude and longitude are 0, which is no fix"),
+        (_csv("lat,lon", "47.14,9.52", "47.14,9.52"), "line 3: repeats the point before, and has no time"),
+        (_csv("lat,lon", "47.14,9.52", "47.14"), "line 3: 1 cells, the head has 2"),
+        (_csv("lat,lon", "47.14,9.52", '47.1,"9.5'), "line 4: no sound CSV|line 3: no sound CSV"),
+        (_csv("lat,lon,time_s", "47.14,9.52,3", "47.1401,9.52,2"), "line 3: time goes back by 1 s: sort"),
+        (_csv("lat,lon,time", "47.14,9.52,3", "47.1401,9.52,3"), "line 3: the same time as the point before"),
+        (_csv("lat,lon,time", "47.14,9.52,3", "47.1401,9.52,"), "line 3: time is missing"),
+        (_csv("lat,lon,time", "47.14,9.52,2025-05-01T10:00:00", "47.2,9.52,6"), "line 3: time is no date and time"),
+        (_csv("lat,lon,time_s", "47.14,9.52,3", "48.14,9.52,4"), "line 3: moves at 111183 m/s since the point before"),
+        (_csv("lat,lon,time", "47.14,9.52,0", "48.14,9.52,1e-9"), "column 'time' fits no unit of time"),
+        (_csv("lat,lon,yaw", "47.14,9.52,1.5", "47.15,9.52,1.6"), "radians or degrees, columns 'yaw': name them like"),
+        (_csv("lat,lon,hdg", "47.14,9.52,65535", "47.15,9.52,9000"), "line 2: yaw_deg lies beyond 360"),
+        (_csv("lat,lon,height_m", "47.14,9.52,2e4", "47.15,9.52,80"), "line 2: height_m lies beyond 10000"),
+    ],
+)
+def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
+    written: Callable, text: str, match: str
+) -> None:
+    with pytest.raises(FlightError, match=match):
+        raise FlightError(_refused(written("a.csv", text)))
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "match"),
+    [
+        ("a.gpx", BOMB.format(f"<gpx>{SUM}</gpx>"), "has a document type or entities"),
+        ("a.kml", BOMB.format(LINE.format("&lol3;")), "has a document type or entities"),
+        ("a.gpx", EXTERNAL.format(f"<gpx>{POINT.format(1, 2, '<time>&e;</time>')}</gpx>"), "has a document type or"),
+        ("a.kml", EXTERNAL.format(LINE.format("&e;")), "has a document type or entities"),
+        ("a.gpx", "<gpx><trk>", "no sound XML"),
+        ("a.gpx", '<?xml version="1.0" encoding="martian"?><gpx/>', "no sound XML"),
+        ("a.gpx", "lat,lon", "no sound XML"),
+        ("a.gpx", "<gpx/>", "two points at least, the log has 0"),
+        ("a.gpx", _gpx(_points(1)), "two points at least, the log has 1"),
+        ("a.gpx", _gpx(_points()).replace("</trk>", "</trk><trk></trk>"), "more than one track"),
+        ("a.gpx", _gpx(_points()).replace("<time>2025-05-01T10:00:02Z</time>", ""), "4 of 5 points have a time"),
+        ("a.gpx", _gpx(_points()).replace("10:00:02Z", "10:00:00Z"), "point 3: time goes back by 1 s"),
+        ("a.gpx", _gpx(_points()).replace("10:00:02Z", "10:00:01Z"), "point 3: the same time as the point before"),
+        ("a.gpx", _gpx(_points()).replace("2025-05-01T10:00:02Z", "&#9;noon"), "point 3: time is no date and time"),
+        ("a.gpx", _gpx(_points()).replace('lat="47.1402"', 'lat="NaN"'), "point 3: latitude is no number, 'NaN'"),
+        ("a.gpx", _gpx(_points()).replace('lat="47.1402"', ""), "point 3: latitude is missing"),
+        (
+            "a.gpx",
+            _gpx(_points()).replace('lat="47.1402"', 'lat="-91"'),
+            "point 3: latitude -91, longitude 9.52 are no",
+        ),
+        ("a.kml", "<kml/>", "0 lines or tracks, one is read"),
+        ("a.kml", LINE.format("9,47 9,48").replace("</Document>", "<LineString/></Document>"), "2 lines or tracks"),
+        ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
+        ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
+        ("a.kmz", "PK", r"no flight log that is read: .gpx, .kml, .csv, .tum, .*\(unzip a .kmz, export a .ulg\)"),
+    ],
+)
+def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(
+    written: Callable, name: str, text: str, match: str
+) -> None:
+    with pytest.raises(FlightError, match=match):
+        raise FlightError(_refused(written(name, text)))
+
+
+def test_files_that_are_missing_too_large_or_no_text_are_refused(
+    written: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "there is no flight log" in _refused(tmp_path / "none.csv")
+    binary = tmp_path / "a.csv"
+    binary.write_bytes(b"lat,lon\n\xff\xfe,9\n")
+    assert "no text in UTF-8" in _refused(binary)
+    binary.write_bytes(b"\x00" * 100)
+    _refused(binary)
+    tracks = [written("b.gpx", _gpx(_points(9))), written("b.kml", LINE.format("9,47 " * 9))]
+    tables = [written("b.csv", _csv("lat,lon", *(f"{lat},{lon}" for lon, lat, _ in _points(9))))]
+    for path in (*tracks, *tables):
+        with monkeypatch.context() as patch:
+            patch.setattr(log_points, "MOST_POINTS", 8)
+            assert "more than 8 points" in _refused(path)
+        with monkeypatch.context() as patch:
+            patch.setattr(log_points, "MOST_BYTES", 8)
+            assert "at most 8 are read" in _refused(path)
+
+
+@given(st.binary(max_size=300), st.sampled_from([".gpx", ".kml", ".csv"]))
+def test_any_bytes_are_read_or_refused_in_one_line(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes, suffix: str
+) -> None:
+    path = tmp_path_factory.mktemp("any") / f"a{suffix}"
+    path.write_bytes(content)
+    assert _refused(path)
+
+
+def test_no_name_of_a_column_stands_for_two_fields() -> None:
+    names = [name for columns in log_table.COLUMNS.values() for name in columns]
+    assert len(names) == len(set(names))
+
+
+# Onto a region
+
+
+def _lonlat(region: Region, en_m: np.ndarray) -> np.ndarray:
+    to_degrees = pyproj.Transformer.from_crs(f"EPSG:{region.manifest.epsg}", "EPSG:4326", always_xy=True)
+    return np.stack(to_degrees.transform(*en_m.T), axis=1)
+
+
+def _table(region: Region, en_m: np.ndarray, *, speed_mps: float = 10.0, more: str = "", cells: str = "") -> str:
+    """A log of points in the region's CRS at an even speed."""
+    time_s = np.append(0.0, np.cumsum(np.hypot(*np.diff(en_m, axis=0).T))) / speed_mps
+    rows = [
+        f"{at!r},{lat!r},{lon!r}{cells}"
+        for at, (lon, lat) in zip(time_s.tolist(), _lonlat(region, en_m).tolist(), strict=True)
+    ]
+    return _csv(f"time_s,lat,lon{more}", *rows)
+
+
+def _across(region: Region, *, beyond_m: float = 0.0, points: int = 400) -> np.ndarray:
+    """A straight way to grid east through the middle of a region, and beyond its edges."""
+    west, south, east, north = region.grid.bounds_m
+    east_m = np.linspace(west - beyond_m, east + beyond_m, points)
+    return np.column_stack([east_m, np.full(points, (south + north) / 2)])
+
+
+def test_a_log_is_cut_to_its_longest_stretch_inside(written: Callable, region: Region) -> None:
+    flown = read_flight(written("a.csv", _table(region, _across(region, beyond_m=500.0))), region, height_m=100.0)
+    west, south, east, north = region.grid.bounds_m
+    assert flown.position_m[0] == pytest.approx([west + 100, (south + north) / 2, 100], abs=2.1)
+    assert flown.position_m[-1] == pytest.approx([east - 100, (south + north) / 2, 100], abs=2.1)
+    assert flight_area(region, 100.0).covers(shapely.LineString(flown.position_m[:, :2]))
+    assert np.diff(flown.time_s) == pytest.approx(0.2)
+    assert flown.time_s[0] == pytest.approx(60, abs=0.3)
+    assert np.diff(flown.distance_m) == pytest.approx(2.0, abs=0.01)
+    assert wrap_deg(flown.yaw_deg - 90) == pytest.approx(0, abs=0.05)
+
+
+def test_a_log_is_cut_at_ground_that_is_not_mapped(written: Callable, region: Region) -> None:
+    west, south, east, north = region.grid.bounds_m
+    hole = shapely.box(west + 700, south, west + 800, north)
+    holed = replace(region, coverage=region.coverage.difference(hole))
+    path = written("a.csv", _table(region, _across(region)))
+    flown = read_flight(path, holed, height_m=100.0, margin_m=50.0)
+    assert flown.position_m[0, 0] == pytest.approx(west + 850, abs=2.1)
+    assert flown.position_m[-1, 0] == pytest.approx(east - 50, abs=2.1)
+
+
+def test_a_log_is_cut_at_a_gap_unless_it_has_no_times(written: Callable, region: Region) -> None:
+    places = _across(region, points=200)
+    gapped = np.delete(places, range(60, 80), axis=0)
+    west = region.grid.bounds_m[0]
+    flown = read_flight(written("a.csv", _table(region, gapped)), region, height_m=100.0)
+    assert flown.position_m[0, 0] == pytest.approx(places[80, 0], abs=2.1)
+    lines = " ".join(f"{lon},{lat}" for lon, lat in _lonlat(region, gapped).tolist())
+    whole = read_flight(written("a.kml", LINE.format(lines)), region, height_m=100.0, speed_mps=8.0)
+    assert whole.position_m[0, 0] == pytest.approx(west + 100, abs=2.1)
+    # Even on the ellipsoid; the grid of a UTM zone is 0.04 % smaller in the zone's middle.
+    assert np.diff(whole.distance_m) / 0.2 == pytest.approx(8.0, rel=2e-3)
+
+
+def test_a_log_that_leaves_is_refused_in_one_line_with_the_longest_stretch(written: Callable, region: Region) -> None:
+    away = written("a.csv", _csv("lat,lon,time_s", "47.14,9.52,0", "47.15,9.52,100"))
+    near = written("b.csv", _table(region, _across(region)[:100]))
+    far = written("c.csv", _csv("lat,lon,time_s", "-47.14,-170.52,0", "-47.15,-170.52,100"))
+    for path, metres in ((away, r"0 m"), (near, r"40\d m"), (far, "0 m")):
+        with pytest.raises(
+            FlightError, match=rf"{path.name} leaves town-grid: of \d+ m .* has {metres}, 1000 m are needed"
+        ):
+            read_flight(path, region, height_m=100.0)
+    assert read_flight(near, region, height_m=100.0, least_m=400.0).distance_m[-1] > 400
+
+
+def test_heights_come_from_the_log_or_are_given(written: Callable, region: Region) -> None:
+    with_heights = written("a.csv", _table(region, _across(region), more=",height", cells=",70"))
+    assert np.unique(read_flight(with_heights, region).position_m[:, 2]).tolist() == [70]
+    assert np.unique(read_flight(with_heights, region, height_m=90.0).position_m[:, 2]).tolist() == [90]
+    without = written("b.csv", _table(region, _across(region), more=",alt", cells=",470"))
+    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground, .*: give height_m"):
+        read_flight(without, region)
+
+
+def test_what_is_on_the_ground_is_left_out(written: Callable, region: Region) -> None:
+    places = _across(region)
+    lines = _table(region, places, more=",height").splitlines()
+    rows = [f"{line},{min(100.0, max(0.0, at - 100.0))}" for at, line in enumerate(lines[1:])]
+    flown = read_flight(written("a.csv", _csv(lines[0], *rows)), region)
+    assert flown.position_m[0, 2] == pytest.approx(5, abs=0.4)
+    assert flown.position_m[0, 0] == pytest.approx(places[105, 0], abs=2.1)
+
+
+def test_yaw_of_a_log_is_turned_from_true_north_to_the_grid(written: Callable, region: Region) -> None:
+    places = _across(region)
+    path = written("a.csv", _table(region, places, more=",yaw,pitch,roll", cells=",30,-8,4"))
+    flown = read_flight(path, region, height_m=100.0)
+    (lon, lat) = _lonlat(region, flown.position_m[:1, :2])[0]
+    to_grid = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{region.manifest.epsg}", always_xy=True)
+    east, north = to_grid.transform([lon, lon], [lat, lat + 1e-5])
+    true_north = float(bearing_deg(east[1] - east[0], north[1] - north[0]))
+    assert abs(wrap_deg(true_north)) > 1  # else the test would show nothing
+    assert wrap_deg(flown.yaw_deg[0] - 30 - true_north) == pytest.approx(0, abs=0.01)
+    level = Attitude(yaw_deg=float(flown.yaw_deg[0]), pitch_deg=-8, roll_deg=4).matrix
+    assert flown.rotation.apply([0.0, 0.0, 1.0])[0, 2] == pytest.approx(-level[2, 2])
+
+
+def test_while_a_drone_hovers_it_points_where_it_flew(written: Callable, region: Region) -> None:
+    west, south, *_ = region.grid.bounds_m
+    start = np.array([west + 200, south + 200])
+    offsets_m = [(at * 10.0, 0.0) for at in range(121)] + [(1200.0, at * 0.01) for at in range(1, 6)]
+    places = start + np.array(offsets_m)
+    rows = [f"{at},{lat!r},{lon!r}" for at, (lon, lat) in enumerate(_lonlat(region, places).tolist())]
+    flown = read_flight(written("a.csv", _csv("time_s,lat,lon", *rows)), region, height_m=50.0)
+    assert wrap_deg(flown.yaw_deg - 90) == pytest.approx(0, abs=1.0)
+
+
+def test_a_tum_file_in_the_regions_frame_is_cut_alike(tmp_path: Path, region: Region) -> None:
+    places = _across(region)
+    rows = [f"{at} {east!r} {north!r} 75 0 0 0 1" for at, (east, north) in enumerate(places.tolist())]
+    path = tmp_path / "run.txt.gz"
+    path.write_bytes(gzip.compress("\n".join(rows).encode()))
+    flown = read_flight(path, region)
+    assert flown.position_m[0] == pytest.approx([places[0, 0] + 100, places[0, 1], 75], abs=1.1)
+    assert np.unique(flown.quaternion_xyzw.round(9), axis=0).tolist() == [[0, 0, 0, 1]]
+    path.write_bytes(gzip.compress(b"0 1 2 75 0 0 0 1\n"))
+    with pytest.raises(FlightError, match="two poses at least, got 1"):
+        read_flight(path, region)
+    path.write_bytes(gzip.compress(b"0 1 2 75 0 0 0 1\n9 90 2 75 0 0 0 1\n"))
+    with pytest.raises(FlightError, match=r"run\.txt\.gz leaves town-grid: of 89 m .* has 0 m"):
+        read_flight(path, region)
+
+
+@pytest.mark.parametrize("wish", [{"step_s": 0.0}, {"speed_mps": float("nan")}, {"height_m": -1.0}, {"margin_m": -1.0}])
+def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wish: dict) -> None:
+    path = written("a.csv", _table(region, _across(region)))
+    with pytest.raises(FlightError, match=next(iter(wish))):
+        read_flight(path, region, **({"height_m": 100.0} | wish))
+
+
+def test_a_log_of_days_is_refused_before_it_is_resampled(written: Callable, region: Region) -> None:
+    path = written("a.csv", _csv("time_s,lat,lon", "0,49.2,12.2", "300000,49.3,12.2"))
+    with pytest.raises(FlightError, match="lasts 300000 s, 200000 s are read at most"):
+        read_flight(path, region, height_m=80.0)

@@ -304,12 +304,13 @@ def _errors_of(part: Stretch, count: int, spacing_m: float) -> Segments:
 
 def _window_products(first: Plane, second: Plane, count: int) -> Plane:
     """Return the sums of conj(first) second about the means, over each window of count + 1 points."""
+    sums = [_window_sums(values, count) for values in (np.conj(first) * second, np.conj(first), second)]
+    return np.asarray(sums[0] - sums[1] * sums[2] / (count + 1))
 
-    def sums(values: Plane) -> Plane:
-        total = np.concatenate([[0.0], np.cumsum(values)])
-        return np.asarray(total[count + 1 :] - total[: -count - 1])
 
-    return np.asarray(sums(np.conj(first) * second) - np.conj(sums(first)) * sums(second) / (count + 1))
+def _window_sums(values: Plane, count: int) -> Plane:
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    return np.asarray(total[count + 1 :] - total[: -count - 1])
 
 
 def _between(path_m: Floats, at_m: Floats, values: Plane) -> Plane:

@@ -272,16 +272,19 @@ def _solved(design: Floats, target: Floats, columns: NDArray[np.int64] | NDArray
 
 def _best_lengths(designs: Mapping[_Choice, Floats], target: Floats) -> tuple[_Choice, Floats]:
     """Return the lengths of slip and heading that fit best, and their designs."""
-    is_known = np.isfinite(target) & (target > 0)
-
-    def misfit(choice: _Choice) -> float:
-        design = _mean(designs[choice])
-        modelled = design @ _solved(design, target, np.arange(len(PARTS)))
-        found = float(np.mean((modelled[is_known] / target[is_known] - 1) ** 2)) if is_known.any() else 0.0
-        return found * (_GAIN if choice[1] is None else 1.0)
-
-    best = min(designs, key=misfit)
+    misfits = {
+        choice: _misfit(_mean(design), target) * (_GAIN if choice[1] is None else 1.0)
+        for choice, design in designs.items()
+    }
+    best = min(misfits, key=lambda choice: misfits[choice])
     return best, designs[best]
+
+
+def _misfit(design: Floats, target: Floats) -> float:
+    """Return the mean square of the relative differences that are left."""
+    is_known = np.isfinite(target) & (target > 0)
+    modelled = design @ _solved(design, target, np.arange(len(PARTS)))
+    return float(np.mean((modelled[is_known] / target[is_known] - 1) ** 2)) if is_known.any() else 0.0
 
 
 def _profile(

@@ -11,7 +11,7 @@ angle and height are slow Gauss-Markov processes of second order, whose rates ar
 
 import math
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -186,6 +186,9 @@ def fly(
     if not (math.isfinite(step_s) and step_s > 0):
         message = f"step_s must be positive, got {step_s!r}"
         raise FlightError(message)
+    if carriage not in get_args(Carriage):
+        message = f"carriage is one of {', '.join(get_args(Carriage))}, got {carriage!r}"
+        raise FlightError(message)
     path_m = _smooth(round_corners(polyline, limits.turn_radius_m))
     cruise_mps = rng.uniform(*limits.speed_mps)
     motion = _move(path_m, cruise_mps, limits, step_s)
@@ -194,8 +197,8 @@ def fly(
     crab_deg = mean_deg + sd_deg * _wander(rng, count, step_s, RIDE.crab_tau_s)
     yaw_deg = gaussian_filter1d(motion.course_deg, _EASING_S / step_s, mode="nearest") - crab_deg
     up_m = _heights(height_m, motion.time_s, limits, rng)
-    lean = _lean(motion, yaw_deg, limits, rng) if carriage == "body" else _gimbal(count, step_s, rng)
-    pitch_deg, roll_deg = lean
+    is_fixed = carriage == "body"
+    pitch_deg, roll_deg = _lean(motion, yaw_deg, limits, rng) if is_fixed else _gimbal(count, step_s, rng)
     position_m = np.column_stack([motion.en_m, up_m])
     return Trajectory.of_angles(
         time_s=motion.time_s, position_m=position_m, yaw_deg=yaw_deg, pitch_deg=pitch_deg, roll_deg=roll_deg

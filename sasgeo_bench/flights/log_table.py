@@ -12,7 +12,6 @@ as "_". Names decide units; where they do not, these rules do, and what they lea
 """
 
 import csv
-import io
 import math
 import re
 from collections.abc import Iterator, Sequence
@@ -110,20 +109,22 @@ def read_csv(path: Path) -> FlightLog:
 def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
     """Yield number and cells of each line that has any."""
     source.check_size()
+    line = 0
     try:
-        text = source.path.read_text(encoding="utf-8-sig")
+        with source.path.open(encoding="utf-8-sig", newline="") as file:
+            head = next((text for text in file if text.strip() and not text.startswith("#")), "")
+            file.seek(0)
+            reader = csv.reader(file, delimiter=max(",;\t", key=head.count), strict=True)
+            for row in reader:
+                line = reader.line_num
+                if any(cell.strip() for cell in row) and not row[0].startswith("#"):
+                    yield line, row
     except (OSError, UnicodeDecodeError) as error:
         message = f"no text in UTF-8 ({message_of(error)}): export it anew"
         raise source.fault(message) from error
-    head = next((line for line in text.splitlines() if line.strip() and not line.startswith("#")), "")
-    reader = csv.reader(io.StringIO(text), delimiter=max(",;\t", key=head.count), strict=True)
-    try:
-        for row in reader:
-            if any(cell.strip() for cell in row) and not row[0].startswith("#"):
-                yield reader.line_num, row
     except csv.Error as error:
         message = f"no sound CSV ({message_of(error)}): mend the line"
-        raise source.fault(message, reader.line_num) from error
+        raise source.fault(message, line + 1) from error
 
 
 def _find(source: LogSource, header: Sequence[str]) -> dict[str, _Column]:

@@ -2,7 +2,7 @@
 """GPX and KML: one track of a file, without document types or entities, point by point."""
 
 import datetime as dt
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -16,6 +16,8 @@ from sasgeo_bench.errors import FlightError
 from sasgeo_bench.flights.log_points import FlightLog, LogSource, shown
 from sasgeo_bench.texts import message_of
 
+_POINTS: Final = ("trkpt", "rtept")  # of a track and of a route
+_DEEPEST: Final = 64  # elements in each other
 _ABOVE_GROUND: Final = "relativeToGround"  # of KML's altitudes; the others count from the sea, or are none
 
 
@@ -51,26 +53,17 @@ def read_gpx(path: Path) -> FlightLog:
     """
     track, route = _Track(source=LogSource(path=path)), _Track(source=LogSource(path=path))
     tracks = 0
-    for event, element in _elements(track.source):
+    for event, element, parent in _elements(track.source):
         name = _name(element)
         tracks += event == "start" and name == "trk"
         if tracks > 1:
             message = "more than one track: keep the one that is meant"
             raise track.source.fault(message)
-        if event == "end" and name in ("trkpt", "rtept"):
-            _add_point(track if name == "trkpt" else route, element)
-            element.clear()
+        if event == "start" and name in _POINTS:
+            _add_place(track if name == _POINTS[0] else route, [element.get("lon"), element.get("lat")])
+        elif event == "end" and name == "time" and parent in _POINTS:
+            _add_time(track if parent == _POINTS[0] else route, element.text)
     return (track if track.places else route).log()
-
-
-def _add_point(track: _Track, element: Element) -> None:
-    number = len(track.places) + 1
-    track.source.check_count(number)
-    lon_deg = track.source.number(element.get("lon"), "longitude", number)
-    track.places.append((lon_deg, track.source.number(element.get("lat"), "latitude", number)))
-    for child in element:
-        if _name(child) == "time":
-            track.moments.append(track.source.moment(child.text, number))
 
 
 def read_kml(path: Path) -> FlightLog:
@@ -83,7 +76,7 @@ def read_kml(path: Path) -> FlightLog:
     lines: list[_Track] = []
     opened = ""  # times and places of other elements are not of the line
     texts: dict[str, str] = {}
-    for event, element in _elements(source):
+    for event, element, _ in _elements(source):
         name, text = _name(element), element.text or ""
         if event == "start":
             if name in ("LineString", "Track"):
@@ -95,7 +88,6 @@ def read_kml(path: Path) -> FlightLog:
             texts[name] = text
         elif name in ("when", "coord"):
             _add(lines[-1], name, text)
-            element.clear()
         elif name == opened:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
             opened = ""
@@ -108,7 +100,7 @@ def read_kml(path: Path) -> FlightLog:
 def _add(line: _Track, name: str, text: str) -> None:
     """Add a time or a place of a gx:Track, which lists all of the one kind before the other."""
     if name == "when":
-        line.moments.append(line.source.moment(text, len(line.moments) + 1))
+        _add_time(line, text)
     else:
         _add_place(line, text.split())
 
@@ -121,11 +113,17 @@ def _close(line: _Track, coordinates: str, mode: str) -> None:
         line.heights_m.clear()
 
 
-def _add_place(line: _Track, parts: list[str]) -> None:
+def _add_time(line: _Track, text: str | None) -> None:
+    number = len(line.moments) + 1
+    line.source.check_count(number)
+    line.moments.append(line.source.moment(text, number))
+
+
+def _add_place(line: _Track, parts: Sequence[str | None]) -> None:
     number = len(line.places) + 1
     line.source.check_count(number)
     if len(parts) not in (2, 3):
-        message = f"{shown(' '.join(parts))} is no longitude, latitude and altitude: mend the coordinates"
+        message = f"{shown(' '.join(map(str, parts)))} is no longitude, latitude and altitude: mend the coordinates"
         raise line.source.fault(message, number)
     lon_deg, lat_deg, *height_m = (
         line.source.number(text, name, number)
@@ -135,12 +133,26 @@ def _add_place(line: _Track, parts: list[str]) -> None:
     line.heights_m.extend(height_m)
 
 
-def _elements(source: LogSource) -> Iterator[tuple[str, Element]]:
-    """Yield elements as they begin and end; refuse document types and entities, and what is no XML."""
+def _elements(source: LogSource) -> Iterator[tuple[str, Element, str]]:
+    """Yield elements, with the name of what they stand in, as they begin and end; keep none of them in memory.
+
+    Refuse document types and entities, what nests deeper than any track, and what is no XML.
+    """
     source.check_size()
+    open_ones: list[Element] = []
     try:
         with source.path.open("rb") as file:
-            yield from iterparse(file, events=("start", "end"), forbid_dtd=True)
+            for event, element in iterparse(file, events=("start", "end"), forbid_dtd=True):
+                if event == "end":
+                    open_ones.pop()
+                yield event, element, _name(open_ones[-1]) if open_ones else ""
+                if event == "start":
+                    open_ones.append(element)
+                elif open_ones:
+                    open_ones[-1].remove(element)
+                if len(open_ones) > _DEEPEST:
+                    message = f"elements nest more than {_DEEPEST} deep: export it anew"
+                    raise source.fault(message)
     except FlightError:
         raise
     except DefusedXmlException as error:

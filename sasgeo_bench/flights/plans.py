@@ -121,6 +121,9 @@ def plan_flight(
     if kind not in KINDS:
         message = f"a flight is one of {', '.join(KINDS)}, got {kind!r}"
         raise FlightError(message)
+    if along not in get_args(Ways):
+        message = f"a corridor lies along one of {', '.join(get_args(Ways))}, got {along!r}"
+        raise FlightError(message)
     if not SHORTEST_M <= length_m <= LONGEST_M:
         message = f"length_m lies in {SHORTEST_M:g}..{LONGEST_M:g}, got {length_m!r}"
         raise FlightError(message)

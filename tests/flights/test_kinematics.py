@@ -227,7 +227,7 @@ def test_limits_that_cannot_be_are_refused(values: dict, match: str) -> None:
         Limits(**values)
 
 
-@pytest.mark.parametrize("wish", [{"height_m": 0.0}, {"height_m": float("nan")}, {"step_s": 0.0}])
+@pytest.mark.parametrize("wish", [{"height_m": 0.0}, {"height_m": float("nan")}, {"step_s": 0.0}, {"carriage": "kite"}])
 def test_heights_and_steps_that_cannot_be_are_refused(wish: dict) -> None:
     with pytest.raises(FlightError, match=next(iter(wish))):
         fly(CORNER, rng=_rng(), **({"height_m": 80.0} | wish))

@@ -182,6 +182,7 @@ def test_what_does_not_fit_is_refused_with_what_does(regions: Callable[[str], Re
         ({"length_m": 500.0}, "length_m lies in 1000..10000, got 500"),
         ({"length_m": float("nan")}, "length_m lies in"),
         ({"margin_m": -1.0}, "margin_m is a distance"),
+        ({"kind": "corridor", "along": "rail"}, "along one of road, water, got 'rail'"),
         ({"kind": "joyride"}, "one of survey, corridor, transit, loiter, waypoints, got 'joyride'"),
     ],
 )

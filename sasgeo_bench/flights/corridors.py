@@ -11,6 +11,7 @@ import shapely
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
+from sasgeo_bench.geometry.pose import wrap_deg
 from sasgeo_bench.regions.network import ROAD, WATER, make_chains, make_network
 
 Floats = NDArray[np.float64]
@@ -22,9 +23,14 @@ _CLASSES: Final = {"road": (("road_major", "road_minor"), ROAD), "water": (("wat
 _LINE_DIMENSION: Final = 1
 _PASSING_DEGREE: Final = 2
 _STEP_M: Final = 2.0  # between points of a corridor
+_TURN_STEP_M: Final = 10.0  # by which turns along a way are measured
 _SMOOTHING_M: Final = 15.0  # standard deviation: a drone follows a road's course, not its every vertex
 _AHEAD_M: Final = 30.0  # over which the direction at a junction is measured
 _SHARPEST_DEG: Final = 120.0  # at a junction; sharper ones are U-turns
+_LINK_M: Final = (
+    60.0  # two turns nearer to each other count as one: over a link between carriageways there is no way back
+)
+_BACK_DEG: Final = 150.0  # within that length, on one way: turning loops and hairpins are not followed
 _STRAIGHT_DEG: Final = 40.0  # by which a turn is e times less likely
 _AGAIN: Final = 0.2  # of the chance of a way that was flown before
 _SPARE: Final = 1.3  # of the length, before it is smoothed, which shortens it
@@ -69,7 +75,8 @@ class Corridors:
         parts = np.split(chains.en_m, chains.first[1:-1])
         # A ring without a junction leads nowhere.
         is_ring = (chains.tips[:, 0] == chains.tips[:, 1]) & (degree[chains.tips[:, 0]] == _PASSING_DEGREE)
-        return cls._joined([part for part, is_out in zip(parts, is_ring, strict=True) if not is_out])
+        kept = [part for part, is_out in zip(parts, is_ring, strict=True) if not is_out and not _turns_back(part)]
+        return cls._joined(kept)
 
     @classmethod
     def _joined(cls, parts: list[Floats]) -> Self:
@@ -121,12 +128,20 @@ class Corridors:
         ways = [way for way in leaving.get(int(self.end[here]), []) if way != here ^ 1]
         if not ways:
             return []
-        turns = np.degrees(self.heading[ways, 0] - self.heading[here, 1])
-        turns = np.abs((turns + 180.0) % 360.0 - 180.0)
+        turns = np.abs(wrap_deg(np.degrees(self.heading[ways, 0] - self.heading[here, 1])))
+        both = np.abs(wrap_deg(np.degrees(self.heading[ways, 0] - self._course_before(walk))))
         times = np.array([sum(way in (past, past ^ 1) for past in walk) for way in ways])
         # The largest of these is each way in proportion to its weight (exponential clocks).
         clocks = np.log(rng.random(len(ways))) * np.exp(turns / _STRAIGHT_DEG) * _AGAIN ** -times.astype(np.float64)
-        return [ways[at] for at in np.argsort(clocks, kind="stable") if turns[at] <= _SHARPEST_DEG]
+        return [ways[at] for at in np.argsort(clocks, kind="stable") if max(turns[at], both[at]) <= _SHARPEST_DEG]
+
+    def _course_before(self, walk: list[int]) -> float:
+        """Return the direction at the end of a walk before its last links, radians."""
+        at, links_m = len(walk) - 1, float(self.length_m[walk[-1]])
+        while at > 0 and links_m < _LINK_M:
+            at -= 1
+            links_m += float(self.length_m[walk[at]])
+        return float(self.heading[walk[at], 1])
 
     def _smoothed(self, walk: list[int], length_m: float) -> Floats | None:
         """Return the smoothed line of a walk if it is long enough."""
@@ -141,6 +156,17 @@ class Corridors:
 def _forward(line_m: Floats) -> Floats:
     """Return a line from the lesser of its ends; of two equal ones, in the lesser order of its points."""
     return min((line_m, line_m[::-1]), key=lambda part: part.ravel().tolist())
+
+
+def _turns_back(line_m: Floats) -> bool:
+    """Return whether a line turns back on itself within the length of a link."""
+    along_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
+    even_m = np.arange(0.0, along_m[-1], _TURN_STEP_M)
+    sides = np.diff(np.stack([np.interp(even_m, along_m, axis) for axis in line_m.T], axis=1), axis=0)
+    course_deg = np.degrees(np.unwrap(np.arctan2(*sides.T)))
+    reach = round(_LINK_M / _TURN_STEP_M)
+    first, last = course_deg[: max(1, len(course_deg) - reach)], course_deg[min(reach, len(course_deg) - 1) :]
+    return len(course_deg) > 1 and float(np.abs(last - first[: len(last)]).max()) > _BACK_DEG
 
 
 def _heading(line_m: Floats) -> float:

@@ -29,6 +29,8 @@ from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.degraded_map import DROPPED, WARP_M, degrade
+from sasgeo_bench.tasks.flight_choice import Airspace
+from sasgeo_bench.tasks.flight_sampling import FlightDrawer
 from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
 from sasgeo_bench.tasks.private_seed import seed_record
@@ -38,6 +40,7 @@ from sasgeo_bench.tasks.split import Block, Split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, Suite, no_larger
+from sasgeo_bench.tasks.suites.flights import FlightSuite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.suites.synthetic_age import ageing_of
 from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
@@ -172,6 +175,11 @@ def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     group = request.group or suite.card.group
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
     suite = replace(suite, variants=suite.usable(scene))
+    if isinstance(suite, FlightSuite):
+        airspace = Airspace(region=base, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group)
+        flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
+        pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)
+        return tuple(_write(request, pilot, [flight.site for flight in flights.values()], tell))
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
     drawer, sites = _edited(request, drawer, base, sites)
@@ -322,14 +330,15 @@ def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
     )
 
 
-def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
+def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
     jobs = drawer.jobs(sites)
     why = {job.query_id: drawer.why_not(job) for job in jobs}
     left = [job for job in jobs if why[job.query_id] is None]
     reasons = Counter(why.values())
     for reason in sorted(filter(None, reasons)):
         where = f"{drawer.suite.card.name} on {request.region.id}"
-        tell(f"{where}: {counted(reasons[reason], 'query', 'queries')} left out, {reason}")
+        named = ("flight", "flights") if isinstance(drawer, FlightDrawer) else ("query", "queries")
+        tell(f"{where}: {counted(reasons[reason], *named)} left out, {reason}")
     by_map: dict[str, list[Job]] = {}
     if not left:
         raise _nothing_to_ask(request, drawer.suite, reasons)
@@ -343,20 +352,10 @@ def _write(request: Request, drawer: Drawer, sites: Sequence[Site], tell: Tell) 
         hidden["profile"] = request.choice.profile.model_dump(mode="json", exclude={"classes"})
     for region, own in sorted(by_map.items()):
         about = _about(request, drawer, region, sites, own)
-        made = put_task(_drawn(drawer, own), about, hidden, out=request.out, tell=tell)
+        made = put_task(drawer.drawn(own), about, hidden, out=request.out, tell=tell)
         drawn = f"{counted(made.queries, 'query', 'queries')} at {counted(len(sites), 'site')}"
         tell(f"{name} on {region}: {drawn} in {made.folder}")
         yield made
-
-
-def _drawn(drawer: Drawer, jobs: Sequence[Job]) -> Iterator[tuple[Query, Truth]]:
-    """Draw queries in their order; pictures site by site first, since a place is painted once for all of its views."""
-    if not drawer.suite.is_pictured:
-        yield from map(drawer.draw, jobs)
-        return
-    by_site = sorted(jobs, key=lambda job: (job.site.index, job.variant.detector, job.variant.name))
-    drawn = {job.query_id: drawer.draw(job) for job in by_site}
-    yield from (drawn[job.query_id] for job in jobs)
 
 
 def put_task(
@@ -406,7 +405,9 @@ def _check_unmixed(truth_folder: Path, hidden: Mapping[str, Any]) -> None:
         raise StoreError(message)
 
 
-def _about(request: Request, drawer: Drawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]) -> dict[str, Any]:
+def _about(
+    request: Request, drawer: Drawer | FlightDrawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]
+) -> dict[str, Any]:
     """Return the contents of `task.json`: how the queries were drawn, but not where they lie."""
     card = drawer.suite.card
     state = drawer.scene.state(region)

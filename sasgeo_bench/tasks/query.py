@@ -2,11 +2,12 @@
 """Query: what a matcher may see; its head: the same without the view. Truth: what only the scorer sees."""
 
 import datetime as dt
+import math
 from dataclasses import dataclass, field
 from itertools import product
 from typing import TYPE_CHECKING, Final, Literal, Self
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, PoseError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
@@ -21,7 +22,7 @@ COPIES: Final = "twins"  # measured: exact copies of the place among the candida
 TASK_VERSION: Final = 3  # of queries.parquet and truth.parquet: raised when the same request gives other queries
 TASK_VERSIONS: Final = (1, 2, TASK_VERSION)  # readable versions: their files are alike
 
-Track = Literal["retrieval", "localization"]
+Track = Literal["retrieval", "localization", "sequence"]
 Yaw = Literal["known", "weak", "unknown"]
 Role = Literal["control", "stress", "falsifier"]
 # Families of errors of perception: three models of a detector, and looks of pictures, which a segmenter sees.
@@ -41,6 +42,7 @@ SHUFFLED: Final = "shuffled map"
 TURNED: Final = "turned map"
 TWINS: Final = "identical twins"
 BLIND: Final = "all unknown"
+_FRAME_DIGITS: Final = 6  # at the end of the id of a view
 YAW_SIGMA_DEG: Final = {"known": 5.0, "weak": 20.0, "unknown": None}
 
 
@@ -116,6 +118,66 @@ class _Question:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """Where a query stands in a flight, and what the odometer says of the way to it.
+
+    Parameters
+    ----------
+    sequence_id : str
+        The flight; reveals nothing about where it is.
+    frame : int
+        0 for the first view of the flight, then 1, 2, ...
+    increment : tuple of float, optional
+        Right and up, metres, and the turn of the heading, degrees clockwise, in the axes of the view before. None for
+        the first view, and where the odometer lost its way.
+    covariance : tuple of float, optional
+        Of the increment as the odometer believes: 3 x 3, row by row, in m2, m deg and deg2; None without an increment.
+
+    Raises
+    ------
+    PoseError
+        If a number is not finite, there are not three and nine of them, only one of the two is given, or a first view
+        has an increment.
+
+    Examples
+    --------
+    >>> Step(sequence_id="f1", frame=1, increment=(0.5, 50.0, -2.0), covariance=(1, 0, 0, 0, 1, 0, 0, 0, 4)).increment
+    (0.5, 50.0, -2.0)
+    """
+
+    sequence_id: str
+    frame: int
+    increment: tuple[float, float, float] | None = None
+    covariance: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the numbers."""
+        counts = [0 if values is None else len(values) for values in (self.increment, self.covariance)]
+        numbers = (*(self.increment or ()), *(self.covariance or ()))
+        is_whole = counts == [0, 0] or (counts == [3, 9] and self.frame > 0)
+        if not is_whole or not all(map(math.isfinite, numbers)) or self.frame < 0:
+            message = (
+                "a step has a frame from 0 on and, after the first, 3 finite numbers with a covariance of 9 or "
+                f"neither, got {self!r}"
+            )
+            raise PoseError(message)
+
+
+def view_id(sequence_id: str, frame: int) -> str:
+    """Return the query id of a view of a flight; ids sort by flight, then by time.
+
+    >>> view_id("00ff", 12), flight_id(view_id("00ff", 12))
+    ('00ff00000c', '00ff')
+    """
+    return f"{sequence_id}{frame:0{_FRAME_DIGITS}x}"
+
+
+def flight_id(query_id: str) -> str:
+    """Return the flight that the query of a view belongs to (`view_id`)."""
+    return query_id[:-_FRAME_DIGITS]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Query(_Question):
     """One question to a matcher.
 
@@ -123,8 +185,8 @@ class Query(_Question):
     ----------
     query_id : str
         Reveals nothing about the answer.
-    track : {"retrieval", "localization"}
-        Whether to rank `candidates` or to find poses.
+    track : {"retrieval", "localization", "sequence"}
+        Whether to rank `candidates`, to find the pose of a view, or to follow a flight.
     suite, suite_version, part : str, int, str
         Its suite, and "train", "calibration", "test", or "crossfit".
     region : str
@@ -142,6 +204,9 @@ class Query(_Question):
     frames : tuple of Frame
         Pictures, oldest first, each with its believed camera in the view's frame; empty where perception is modelled.
         Until a segmenter has made evidence of them, all of `evidence` is unknown.
+    step : Step, optional
+        Where the query stands in a flight; None for a view alone. Only the first view of a flight has a prior of place
+        and heading.
     """
 
     evidence: Evidence
@@ -150,6 +215,7 @@ class Query(_Question):
     prior: Prior
     vectors: "gpd.GeoDataFrame | None" = None
     frames: tuple[Frame, ...] = ()
+    step: Step | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,7 +2,7 @@
 """Queries and truths of a suite at its sites: ids, priors, candidates and strata, the same for all suites."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
 
@@ -113,6 +113,15 @@ class Drawer:
         state = self.scene.state(self.suite.map_region(self.scene, job.variant))
         is_choice = len(self._decoys(state, job)) >= LEAST_CANDIDATES
         return None if is_choice else f"fewer than {LEAST_CANDIDATES} candidates"
+
+    def drawn(self, jobs: Sequence[Job]) -> Iterator[tuple[Query, Truth]]:
+        """Yield queries and truths in their order; pictures are drawn site by site, since a place is painted once."""
+        if not self.suite.is_pictured:
+            yield from map(self.draw, jobs)
+            return
+        by_site = sorted(jobs, key=lambda job: (job.site.index, job.variant.detector, job.variant.name))
+        found = {job.query_id: self.draw(job) for job in by_site}
+        yield from (found[job.query_id] for job in jobs)
 
     def draw(self, job: Job) -> tuple[Query, Truth]:
         """Draw one query and its truth."""

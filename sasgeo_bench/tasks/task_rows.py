@@ -16,7 +16,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.tasks.frames import FRAME, frame_of, frame_row
-from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, Query, Truth
+from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, Query, Step, Truth
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -39,7 +39,6 @@ _VECTOR: Final = pa.struct(
 _ASKED_VERSION: Final = 1  # raised if the same row asks for another answer, not if other rows are drawn
 _META: Final = {"attribution": ATTRIBUTION, "licence": LICENCE, "task_version": str(TASK_VERSION)}
 
-# The columns from the sequence's to the increment's are for flights, which no suite draws yet.
 QUERY_SCHEMA: Final = pa.schema(
     [
         ("query_id", pa.string()),
@@ -155,7 +154,20 @@ def query_row(query: Query) -> dict[str, Any]:
             "vectors": None if query.vectors is None else _vector_rows(query.vectors),
             "frames": [frame_row(frame) for frame in query.frames] or None,
         }
+        | _step_row(query.step)
     )
+
+
+def _step_row(step: Step | None) -> dict[str, Any]:
+    """Return the columns of a flight; no column for a view alone."""
+    if step is None:
+        return {}
+    numbers = {"increment": step.increment, "increment_covariance": step.covariance}
+    return {
+        "sequence_id": step.sequence_id,
+        "frame": step.frame,
+        **{name: None if values is None else list(values) for name, values in numbers.items()},
+    }
 
 
 def _pose_row(pose: Pose) -> dict[str, float]:
@@ -193,6 +205,20 @@ def query_of(row: dict[str, Any]) -> Query:
         candidates=tuple(Pose(**pose) for pose in row["candidates"] or ()),
         vectors=None if row["vectors"] is None else _vectors_of(row["vectors"]),
         frames=tuple(map(frame_of, row.get("frames") or ())),
+        step=_step_of(row),
+    )
+
+
+def _step_of(row: dict[str, Any]) -> Step | None:
+    """Return where the query of a row stands in a flight, None for a view alone."""
+    if row.get("sequence_id") is None:
+        return None
+    increment, covariance = row["increment"], row["increment_covariance"]
+    return Step(
+        sequence_id=row["sequence_id"],
+        frame=row["frame"],
+        increment=None if increment is None else tuple(increment),
+        covariance=None if covariance is None else tuple(covariance),
     )
 
 

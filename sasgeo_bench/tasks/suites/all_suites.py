@@ -13,6 +13,12 @@ from sasgeo_bench.tasks.suites import (
     board_controls,
     clean,
     false_unknown,
+    flight_clean,
+    flight_gap,
+    flight_kidnap,
+    flight_overconfident,
+    flight_real_age,
+    flight_start,
     grade_separation,
     growth,
     instance_twins,
@@ -32,6 +38,7 @@ from sasgeo_bench.tasks.suites import (
     volatile_lure,
 )
 from sasgeo_bench.tasks.suites.base import Suite
+from sasgeo_bench.tasks.suites.flights import FlightSuite
 
 SUITES: Final[dict[str, Suite]] = {
     suite.card.name: suite
@@ -67,10 +74,23 @@ PICTURE_SUITES: Final[dict[str, Suite]] = {
         real_image.SUITE,
     )
 }
+# Queries of these are the views of a flight in order; they are drawn where they are named.
+FLIGHT_SUITES: Final[dict[str, FlightSuite]] = {
+    suite.card.name: suite
+    for suite in (
+        flight_clean.SUITE,
+        flight_real_age.SUITE,
+        flight_start.SUITE,
+        flight_gap.SUITE,
+        flight_kidnap.SUITE,
+        flight_overconfident.SUITE,
+    )
+}
 # With the controls, which every board draws in addition to its experiment.
 EVERY_SUITE: Final[dict[str, Suite]] = {
     **SUITES,
     **PICTURE_SUITES,
+    **FLIGHT_SUITES,
     board_controls.SUITE.card.name: board_controls.SUITE,
 }
 

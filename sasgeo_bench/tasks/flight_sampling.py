@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flights of a suite over a region, and their queries and truths: views in order, with odometry between them."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.flights.drift_profile import load_profile
+from sasgeo_bench.flights.odometry import Odometry, draw_odometry
+from sasgeo_bench.flights.trajectory import Trajectory
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.tasks.flight_choice import Airspace, Flight, pose_of, rows
+from sasgeo_bench.tasks.query import PriorGroup, Query, Step, Truth, flight_id, view_id
+from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Job, drawn_share, make_prior
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Draft, Scene, Seeds, Shot, Site, Variant, changed_share
+from sasgeo_bench.tasks.suites.flights import FlightSuite, Mission
+
+_SEQUENCE_DIGITS: Final = 18  # of the id of a flight
+_MOST_GAP: Final = 1 / 3  # of a flight
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightDrawer:
+    """Draw the flights of one suite on one region; `carried` caches where carried drones come from."""
+
+    airspace: Airspace
+    flights: dict[int, Flight]
+    choice: Choice = EVERYTHING
+    carried: dict[tuple[int, float], Trajectory | None] = field(default_factory=dict)
+
+    @property
+    def suite(self) -> FlightSuite:
+        """Return the suite."""
+        return self.airspace.suite
+
+    @property
+    def scene(self) -> Scene:
+        """Return what it draws from."""
+        return self.airspace.scene
+
+    def jobs(self, sites: Sequence[Site]) -> list[Job]:
+        """Return all flights in the order of their ids; the id of a job is that of its first view."""
+        jobs = [
+            Job(
+                query_id=view_id(self._seeds(site).digest("flight", variant.name).hex()[:_SEQUENCE_DIGITS], 0),
+                site=site,
+                variant=variant,
+                track="sequence",
+            )
+            for site in sites
+            for detector in self.suite.drawn_by(self.choice.detectors)
+            for variant in (replace(item, detector=detector) for item in self.suite.variants)
+            if self.choice.takes(variant, "sequence")
+        ]
+        return sorted(jobs, key=lambda job: job.query_id)
+
+    def why_not(self, job: Job) -> str | None:
+        """Return why a flight is left out, or None: its stress does not fit, or no stress does that it is held against.
+
+        A flight may be too short for its gap, or have nowhere to be carried from.
+        """
+        own = self._misfit(job.site, job.variant)
+        if own is not None or job.variant.role == "stress":
+            return own
+        stresses = [
+            item for item in self.suite.variants if item.role == "stress" and self.choice.takes(item, job.track)
+        ]
+        misfits = [self._misfit(job.site, item) for item in stresses]
+        return misfits[0] if misfits and None not in misfits else None
+
+    def _misfit(self, site: Site, variant: Variant) -> str | None:
+        """Return why what happens to a variant cannot happen to a flight, or None."""
+        mission, flight = self.suite.mission(variant), self.flights[site.index]
+        if mission.gaps_m and _gap_m(flight, mission) is None:
+            return "a gap is a third of its flight at most"
+        if mission.carried_m and self._elsewhere(flight, mission.carried_m) is None:
+            return f"no flight ends {mission.carried_m:g} m from its middle"
+        return None
+
+    def drawn(self, jobs: Sequence[Job]) -> Iterator[tuple[Query, Truth]]:
+        """Yield the views of flights in order, each with its truth."""
+        for job in jobs:
+            yield from self._flown(job)
+
+    def _flown(self, job: Job) -> Iterator[tuple[Query, Truth]]:
+        mission, flight = self.suite.mission(job.variant), self.flights[job.site.index]
+        before = self._elsewhere(flight, mission.carried_m) if mission.carried_m else None
+        views = flight.views if before is None else _joined(before, flight)
+        steps, distance_m = self._odometry(views, flight, mission), views.distance_m
+        measured: dict[str, float] = {}
+        if before is not None:
+            carried_m = float(distance_m[flight.middle] - distance_m[flight.middle - 1])
+            measured["carried_m"] = round(carried_m, 1)
+            distance_m = np.where(np.arange(len(views)) < flight.middle, distance_m, distance_m - carried_m)
+        unseen = _unseen(flight, mission)
+        for frame in range(len(views)):
+            is_lost = mission.is_lost and frame == flight.middle
+            told = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
+            own = {"distance_m": round(float(distance_m[frame]), 1), "is_seen": float(not unseen[frame])}
+            yield self._view(job, mission, pose_of(views, frame, flight.scale), told, own | measured)
+
+    def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
+        """Return what the odometer says: to the middle and from there on what it says in the control."""
+
+        def draw(flown: Trajectory) -> Odometry:
+            rng = self._seeds(flight.site).rng("odometry", mission.draw)
+            return draw_odometry(flown, load_profile(mission.profile), belief=mission.belief, rng=rng)
+
+        told, control, into = draw(views), draw(flight.views), flight.middle - 1
+        both = {item.name: (getattr(told, item.name), getattr(control, item.name)) for item in fields(Odometry)}
+        return Odometry(**{name: np.concatenate([own[:into], usual[into:]]) for name, (own, usual) in both.items()})
+
+    def _seeds(self, site: Site) -> Seeds:
+        return self.airspace.seeds_of(site.index)
+
+    def _elsewhere(self, flight: Flight, carried_m: float) -> Trajectory | None:
+        key = (flight.site.index, carried_m)
+        if key not in self.carried:
+            self.carried[key] = self.airspace.elsewhere(flight, carried_m)
+        return self.carried[key]
+
+    def _view(
+        self, job: Job, mission: Mission, pose: Pose, step: Step, measured: dict[str, float]
+    ) -> tuple[Query, Truth]:
+        """Draw one view."""
+        scene, variant, group = self.scene, job.variant, mission.group or self.airspace.group
+        seeds = self._seeds(job.site)
+        of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
+        site = replace(job.site, pose=pose, density=drawn_share(scene.map, pose, variant))
+        draft = self.suite.draw(Shot(scene=scene, site=site, variant=variant, seeds=of_view))
+        evidence = draft.evidence
+        if not measured["is_seen"]:
+            evidence = evidence.replace(np.full_like(evidence.cells, UNKNOWN))
+        prior = make_prior(pose, group, rng=seeds.rng("prior", group.name)) if step.frame == 0 else _no_prior(group)
+        state = scene.state(self.suite.map_region(scene, variant))
+        query = Query(
+            query_id=view_id(step.sequence_id, step.frame),
+            track="sequence",
+            suite=self.suite.card.name,
+            suite_version=self.suite.card.version,
+            part=self.airspace.split.part_in_task(next(block for block in scene.blocks if block.id == site.block)),
+            region=state.region,
+            evidence=evidence,
+            observed_on=scene.world.date,
+            season=draft.season,
+            prior=prior,
+            prior_group=group.name,
+            step=step,
+        )
+        return query, self._truth(job, query, site, replace(draft, measured=draft.measured | measured))
+
+    def _truth(self, job: Job, query: Query, site: Site, draft: Draft) -> Truth:
+        variant, state = job.variant, self.scene.state(query.region)
+        changed = draft.changed_share
+        if changed is None:
+            views = (variant.view(place, site.pose) for place in (self.scene.world, state))
+            changed = 0.0 if state is self.scene.world else changed_share(*views)
+        is_blank = drawn_share(state, site.pose, variant) < LEAST_DRAWN
+        return Truth(
+            query_id=query.query_id,
+            is_present=True,
+            pose=site.pose,
+            candidate=-1,
+            pair_id=self._seeds(site).digest("pair").hex()[:16],
+            role=variant.role,
+            kind=variant.kind,
+            strength=variant.strength,
+            strength_unit=self.suite.card.strength_unit,
+            unknown_share=query.evidence.unknown_share,
+            changed_share=changed,
+            feature_density=site.density,
+            alias_index=None,
+            block=site.block,
+            scene=",".join(self.scene.scenes),
+            measured=draft.measured | ({UNANSWERABLE: 1.0} if is_blank else {}),
+            detector=variant.detector,
+        )
+
+
+def _joined(before: Trajectory, flight: Flight) -> Trajectory:
+    """Return a flight with another first half; the second begins one step of time after it."""
+    after = rows(flight.views, slice(flight.middle, None))
+    step_s = float(np.median(np.diff(after.time_s)))
+    later_s = after.time_s - after.time_s[0] + before.time_s[-1] + step_s
+    return Trajectory(
+        time_s=np.concatenate([before.time_s, later_s]),
+        position_m=np.concatenate([before.position_m, after.position_m]),
+        quaternion_xyzw=np.concatenate([before.quaternion_xyzw, after.quaternion_xyzw]),
+    )
+
+
+def _gap_m(flight: Flight, mission: Mission) -> float | None:
+    """Return the longest gap of a mission that is not too long for a flight."""
+    return max((gap_m for gap_m in mission.gaps_m if gap_m <= _MOST_GAP * flight.length_m), default=None)
+
+
+def _unseen(flight: Flight, mission: Mission) -> NDArray[np.bool_]:
+    """Return which views show nothing: those of the gap in the middle, or as many evenly spread."""
+    distance_m, gap_m = flight.views.distance_m, _gap_m(flight, mission)
+    if gap_m is None:
+        return np.zeros(len(distance_m), dtype=bool)
+    found = np.abs(distance_m - flight.length_m / 2) <= gap_m / 2
+    if mission.is_scattered:
+        evenly = np.linspace(0, len(found) - 1, int(found.sum()) + 2).round().astype(int)[1:-1]
+        found = np.isin(np.arange(len(found)), evenly)
+    return found
+
+
+def _step(sequence_id: str, frame: int, steps: Odometry, *, is_lost: bool) -> Step:
+    """Return what is known of the way to a view."""
+    if frame == 0 or is_lost or steps.is_lost[frame - 1]:
+        return Step(sequence_id=sequence_id, frame=frame)
+    at = frame - 1
+    increment = (float(steps.right_m[at]), float(steps.up_m[at]), float(steps.yaw_deg[at]))
+    return Step(
+        sequence_id=sequence_id,
+        frame=frame,
+        increment=increment,
+        covariance=tuple(steps.covariance[at].ravel().tolist()),
+    )
+
+
+def _no_prior(group: PriorGroup) -> Prior:
+    """Return the prior of a view that is not the first: the scale alone."""
+    return Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=group.scale_sigma)

@@ -16,10 +16,13 @@ from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.tasks.flight_choice import Airspace, Flight
+from sasgeo_bench.tasks.flight_sampling import FlightDrawer
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
-from sasgeo_bench.tasks.split import blocks_of
+from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.split import blocks_of, find_split
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, Variant
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
@@ -41,6 +44,9 @@ TOWN_OF = {
     "volatile-lure": "town-old-town large",
     "alias": "town-agricultural huge",
     "controls": "town-suburb large",
+    "flight-real-age": "town-suburb",
+    **dict.fromkeys(("flight-clean", "flight-start", "flight-gap", "flight-kidnap"), "town-grid"),
+    "flight-overconfident": "town-grid",
 }
 # One overpass, little room for wide views; the others get as many as are asked for.
 SITES = {"grade-separation": 1, "no-priors": 3}
@@ -173,5 +179,47 @@ def carried(scene, edited) -> Callable[[str], Carried]:
             after, sites = replace(after, twins=edit.twins), edit.sites
             assert len(sites) == count
         return Carried(suite=suite, scene=after, plain=plain, sites=sites, seeds=seeds, edit=edit)
+
+    return of_suite
+
+
+@dataclass(frozen=True, kw_only=True)
+class Flown:
+    """A suite's flights at one site: where they may go, the control's path, and the views of each variant in order."""
+
+    airspace: Airspace
+    flight: Flight
+    views: dict[Variant, list[tuple[Query, Truth]]]
+
+    def of(self, role: str, kind: str = "", strength: float | None = None) -> list[tuple[Query, Truth]]:
+        """The one flight of a role whose kind begins so, of a strength where there are several."""
+        (found,) = (
+            pairs
+            for variant, pairs in self.views.items()
+            if variant.role == role and variant.kind.startswith(kind) and strength in (None, variant.strength)
+        )
+        return found
+
+
+@pytest.fixture(scope="session")
+def flown(scene, town) -> Callable[[str], Flown]:
+    """The flights of a suite over the town that can carry it, at its first site."""
+    split = find_split("crossfit")
+
+    @cache
+    def of_suite(name: str) -> Flown:
+        suite, where = FLIGHT_SUITES[name], TOWN_OF[name]
+        over = scene(where, name)
+        assert suite.lack(over) is None
+        suite = replace(suite, variants=suite.usable(over))
+        seeds = Seeds(root=1, names=(over.map.region, name))
+        airspace = Airspace(
+            region=town(where), scene=over, suite=suite, split=split, seeds=seeds, group=suite.card.group
+        )
+        flights = airspace.choose(count=1, may_be_fewer=False)
+        drawer = FlightDrawer(airspace=airspace, flights=flights)
+        jobs = drawer.jobs([flight.site for flight in flights.values()])
+        views = {job.variant: list(drawer.drawn([job])) for job in jobs if drawer.why_not(job) is None}
+        return Flown(airspace=airspace, flight=flights[0], views=views)
 
     return of_suite

@@ -3,6 +3,7 @@
 
 import datetime as dt
 import math
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.errors import FlightError, counted
 from sasgeo_bench.texts import plain
 
 Floats = NDArray[np.float64]
@@ -21,6 +22,7 @@ MOST_BYTES: Final = 64 * 2**20  # of a log
 MOST_POINTS: Final = 1_000_000
 FASTEST_MPS: Final = 100.0  # between two points: no drone of this benchmark is faster
 
+_LARGEST: Final = 1e30  # a number beyond is a fault; times in ns are 2e18
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
 _HIGHEST_M: Final = 10_000.0
@@ -48,19 +50,19 @@ class LogSource:
             value = math.nan if "_" in text else float(text)
         except ValueError:
             value = math.nan
-        if not math.isfinite(value):
-            message = f"{name} is no number, {shown(text)}: mend the value, or delete the point"
+        if not abs(value) < _LARGEST:
+            message = f"{name} is no number, {shown(text)}: mend the value (decimals with a point), or delete the point"
             raise self.fault(message, number)
         return value
 
-    def moment(self, text: str | None, number: int) -> dt.datetime:
-        """Return a time as ISO 8601 has it; one without a zone is UTC."""
+    def moment(self, text: str | None, number: int) -> float:
+        """Return a time as ISO 8601 has it, in seconds since 1970; one without a zone is UTC."""
         try:
             moment = dt.datetime.fromisoformat((text or "").strip())
         except ValueError as error:
             message = f"time is no date and time like 2025-05-01T10:00:00Z, {shown(text or '')}: mend it"
             raise self.fault(message, number) from error
-        return moment if moment.tzinfo else moment.replace(tzinfo=dt.UTC)
+        return (moment if moment.tzinfo else moment.replace(tzinfo=dt.UTC)).timestamp()
 
     def check_size(self) -> None:
         """Raise `FlightError` if there is no such file, or if it is too large."""
@@ -107,16 +109,26 @@ class FlightLog:
     def of(cls, source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats]) -> Self:
         """Return a log of checked columns; `numbers` are the lines or points in the file, for messages.
 
+        Points at 0, 0 before the first fix are left out, and so are points that repeat the time of the point before, or
+        its place where there are no times. A warning counts them.
+
         Raises
         ------
         FlightError
-            If there are fewer than two points, a place is none on Earth or 0, 0 (no fix), time does not increase, the
-            flight is faster than 100 m/s, or a height or an angle is out of range.
+            If fewer than two points are left, a place is none on Earth or 0, 0 (no fix), time goes back, the flight is
+            faster than 100 m/s, or a height or an angle is out of range.
         """
+        start = first_fix(source, columns["lon_deg"], columns["lat_deg"])
+        numbers, columns = numbers[start:], {name: column[start:] for name, column in columns.items()}
+        _check_places(source, numbers, columns)
+        is_new = np.append(True, _gained(columns) != 0)[: len(numbers)]
+        if not is_new.all():
+            told = "time" if "time_s" in columns else "place"
+            _tell_left_out(source, int((~is_new).sum()), f"with the {told} of the point before")
+            numbers, columns = np.asarray(numbers)[is_new], {name: column[is_new] for name, column in columns.items()}
         if len(numbers) < 2:  # noqa: PLR2004 - a way
             message = f"a flight has two points at least, the log has {len(numbers)}: export more of it"
             raise source.fault(message)
-        _check_places(source, numbers, columns)
         _check_times(source, numbers, columns)
         for name, most in {**_ANGLES, "height_m": _HIGHEST_M}.items():
             if name in columns:
@@ -132,6 +144,14 @@ class FlightLog:
 def steps_m(lon_deg: Floats, lat_deg: Floats) -> Floats:
     """Return the distances between successive points on the ellipsoid, shape (N - 1,), metres."""
     return np.asarray(_WGS84.inv(lon_deg[:-1], lat_deg[:-1], lon_deg[1:], lat_deg[1:])[2])
+
+
+def first_fix(source: LogSource, lon_deg: Floats, lat_deg: Floats) -> int:
+    """Return the index of the first point that is not at 0, 0, and warn of those before; 0 if there is none."""
+    first = int(np.argmax((lon_deg != 0) | (lat_deg != 0))) if len(lon_deg) else 0
+    if first:
+        _tell_left_out(source, first, "at 0, 0 before the first fix")
+    return first
 
 
 def shown(text: str) -> str:
@@ -174,15 +194,20 @@ def _check_places(source: LogSource, numbers: Sequence[int], columns: Mapping[st
 
 
 def _check_times(source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats]) -> None:
-    moved_m = steps_m(columns["lon_deg"], columns["lat_deg"])
     if "time_s" not in columns:
-        text = "repeats the point before, and has no time: delete it"
-        _check(source, numbers, moved_m > 0, text, later=1)
         return
-    gained_s = np.diff(columns["time_s"])
+    gained_s = _gained(columns)
     back = "time goes back by {:g} s: sort the points, or keep one flight"
-    same = "the same time as the point before: keep one point of each time"
-    _check(source, numbers, gained_s > 0, lambda at: back.format(-gained_s[at]) if gained_s[at] else same, later=1)
-    speed_mps = moved_m / gained_s
+    _check(source, numbers, gained_s > 0, lambda at: back.format(-gained_s[at]), later=1)
+    speed_mps = steps_m(columns["lon_deg"], columns["lat_deg"]) / gained_s
     text = "moves at {:.0f} m/s since the point before, {:g} at most: delete points that jump, check the unit of time"
     _check(source, numbers, speed_mps <= FASTEST_MPS, lambda at: text.format(speed_mps[at], FASTEST_MPS), later=1)
+
+
+def _gained(columns: Mapping[str, Floats]) -> Floats:
+    """Return what is new from point to point, seconds, or metres where there are no times."""
+    return np.diff(columns["time_s"]) if "time_s" in columns else steps_m(columns["lon_deg"], columns["lat_deg"])
+
+
+def _tell_left_out(source: LogSource, count: int, which: str) -> None:
+    warnings.warn(f"{plain(source.path.name)}: left out {counted(count, 'point')} {which}", stacklevel=2)

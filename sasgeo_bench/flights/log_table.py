@@ -5,7 +5,7 @@ A name is compared without its topic ("GPS." of "GPS.Lat"), in small letters, ev
 as "_". Names decide units; where they do not, these rules do, and what they leave open is refused:
 
 - latitude and longitude are degrees; if all are whole numbers and one is beyond 180, they are 1e-7 degrees;
-- time: text is ISO 8601; numbers are in the one unit of s, ms, us and ns by which the flight has a mean speed of
+- time: dates are ISO 8601; numbers are in the one unit of s, ms, us and ns by which the flight has a mean speed of
   0.1 to 100 m/s, of which there is one at most;
 - heights are metres; whole numbers of which one is beyond 10,000 are millimetres, as in MAVLink;
 - angles are degrees if one is beyond 2 pi; whole numbers of which one is beyond 360 are 0.01 degrees, as in MAVLink.
@@ -14,8 +14,9 @@ as "_". Names decide units; where they do not, these rules do, and what they lea
 import csv
 import math
 import re
+from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -23,7 +24,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.flights.log_points import FASTEST_MPS, FlightLog, LogSource, shown, steps_m
+from sasgeo_bench.flights.log_points import FASTEST_MPS, FlightLog, LogSource, first_fix, shown, steps_m
 from sasgeo_bench.texts import message_of
 
 Floats = NDArray[np.float64]
@@ -33,6 +34,7 @@ _DEG: Final = math.degrees(1.0)  # of a radian
 _AXES: Final = ("yaw", "pitch", "roll")
 _SLOWEST_MPS: Final = FASTEST_MPS / 1000  # a thousandth: units lie a factor of 1000 apart, so one fits at most
 _TIME_UNITS: Final = (1.0, 1e-3, 1e-6, 1e-9)
+_DATE: Final = re.compile(r"\d[-/.:]\d+[-/.:]\d|\dT\d")  # of a time that is no number, in any order
 _MOST_NAMES: Final = 12  # of columns in a message
 _HIGHEST_M: Final = 10_000.0  # whole numbers beyond are no metres
 
@@ -69,6 +71,12 @@ class _Column:
     at: int
     name: str  # as in the file
     factor: float | None
+    is_date: bool = False
+
+    def value(self, source: LogSource, field: str, row: Sequence[str], number: int) -> float:
+        """Return what a line has in this column."""
+        text = row[self.at]
+        return source.moment(text, number) if self.is_date else source.number(text, field, number)
 
 
 def read_csv(path: Path) -> FlightLog:
@@ -93,17 +101,23 @@ def read_csv(path: Path) -> FlightLog:
     rows = _rows(source)
     _, header = next(rows, (0, []))
     found = _find(source, header)
-    numbers: list[int] = []
-    cells: dict[str, list[str]] = {field: [] for field in found}
+    numbers = array("q")
+    values = {field: array("d") for field in found}
     for number, row in rows:
         if len(row) != len(header):
             message = f"{len(row)} cells, the head has {len(header)}: mend the line"
             raise source.fault(message, number)
+        if not numbers and "time" in found:
+            found["time"] = _dated(found["time"], row)
         numbers.append(number)
         source.check_count(len(numbers))
         for field, column in found.items():
-            cells[field].append(row[column.at])
-    return FlightLog.of(source, numbers, _converted(source, numbers, found, cells))
+            values[field].append(column.value(source, field, row, number))
+    # Before the unit of time is found by the speed: from 0, 0 it is a long way.
+    places = (np.array(values[field]) for field in ("longitude", "latitude"))
+    start = first_fix(source, *places)
+    columns = _converted(source, found, {field: np.array(column[start:]) for field, column in values.items()})
+    return FlightLog.of(source, numbers[start:], columns)
 
 
 def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
@@ -144,7 +158,7 @@ def _find(source: LogSource, header: Sequence[str]) -> dict[str, _Column]:
         names_text = _listed(header) if header else "none"
         message = f"no column of {' and '.join(lacking)}, found {names_text}: name them lat and lon"
         raise source.fault(message)
-    return found
+    return found if "yaw" in found else {field: found[field] for field in found if field not in _AXES}
 
 
 def _listed(names: Sequence[str]) -> str:
@@ -152,30 +166,29 @@ def _listed(names: Sequence[str]) -> str:
     return ", ".join(shown(name) for name in names[:_MOST_NAMES]) + more
 
 
-def _converted(
-    source: LogSource, numbers: Sequence[int], found: dict[str, _Column], cells: dict[str, list[str]]
-) -> dict[str, Floats]:
+def _dated(column: _Column, row: Sequence[str]) -> _Column:
+    """Return a column of time as that of dates, if its first cell is one."""
+    is_date = column.factor is None and _DATE.search(row[column.at]) is not None
+    return replace(column, is_date=True, factor=1.0) if is_date else column
+
+
+def _converted(source: LogSource, found: dict[str, _Column], values: dict[str, Floats]) -> dict[str, Floats]:
     """Return the columns of a log in seconds, metres and degrees."""
-
-    def _values(field: str) -> Floats:
-        rows = zip(cells[field], numbers, strict=True)
-        return np.array([source.number(text, field, number) for text, number in rows], dtype=np.float64)
-
-    lat, lon = _values("latitude"), _values("longitude")
-    is_scaled = _is_whole(lat, lon) and max(np.abs(lat).max(initial=0), np.abs(lon).max(initial=0)) > 180  # noqa: PLR2004
-    columns = {"lon_deg": lon * 1e-7, "lat_deg": lat * 1e-7} if is_scaled else {"lon_deg": lon, "lat_deg": lat}
-    if is_scaled:  # as the nearest numbers to what is meant: 0.1 times 3 is not 0.3
-        columns = {name: column.round(7) for name, column in columns.items()}
+    lat, lon = values["latitude"], values["longitude"]
+    columns = {"lon_deg": lon, "lat_deg": lat}
+    if _is_whole(lat, lon) and max(np.abs(lat).max(initial=0), np.abs(lon).max(initial=0)) > 180:  # noqa: PLR2004
+        # As the nearest numbers to what is meant: 0.1 times 3 is not 0.3.
+        columns = {name: (column * 1e-7).round(7) for name, column in columns.items()}
     if "time" in found:
-        columns["time_s"] = _times(source, numbers, found["time"], cells["time"], columns)
+        columns["time_s"] = _times(source, found["time"], values["time"], columns)
     if "height" in found:
-        height, factor = _values("height"), found["height"].factor
+        height, factor = values["height"], found["height"].factor
         is_mm = _is_whole(height) and np.abs(height).max(initial=0) > _HIGHEST_M
         columns["height_m"] = height * (factor or (1e-3 if is_mm else 1.0))
     if "yaw" in found:
-        angles = {axis: _values(axis) for axis in _AXES if axis in found}
-        factor = _angle_factor(source, [found[axis] for axis in angles], list(angles.values()))
-        columns |= {f"{axis}_deg": angle * (found[axis].factor or factor) for axis, angle in angles.items()}
+        axes = [axis for axis in _AXES if axis in found]
+        factor = _angle_factor(source, [found[axis] for axis in axes], [values[axis] for axis in axes])
+        columns |= {f"{axis}_deg": values[axis] * (found[axis].factor or factor) for axis in axes}
     return columns
 
 
@@ -183,17 +196,12 @@ def _is_whole(*columns: Floats) -> bool:
     return all(bool((column == np.rint(column)).all()) for column in columns)
 
 
-def _times(
-    source: LogSource, numbers: Sequence[int], column: _Column, cells: Sequence[str], places: dict[str, Floats]
-) -> Floats:
+def _times(source: LogSource, column: _Column, ticks: Floats, places: dict[str, Floats]) -> Floats:
     """Return seconds since the first point."""
-    pairs = list(zip(cells, numbers, strict=True))
-    if cells and column.factor is None and re.match(r"\s*\d{4}-", cells[0]):
-        moments = [source.moment(text, number) for text, number in pairs]
-        return np.array([(moment - moments[0]).total_seconds() for moment in moments])
-    ticks = np.array([source.number(text, "time", number) for text, number in pairs], dtype=np.float64)
-    ticks -= ticks[:1]
-    if column.factor is not None or len(ticks) < 2 or (np.diff(ticks) <= 0).any():  # noqa: PLR2004 - refused as they are
+    ticks = ticks - ticks[:1]
+    if column.is_date:
+        return ticks.round(6)
+    if column.factor is not None or not ticks[-1:].any() or (np.diff(ticks) < 0).any():  # refused as they are
         return ticks * (column.factor or 1.0)
     with np.errstate(all="ignore"):  # places are checked later, what is none on Earth has no distance
         per_tick = float(np.nansum(steps_m(places["lon_deg"], places["lat_deg"]))) / float(ticks[-1])

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """GPX and KML: one track of a file, without document types or entities, point by point."""
 
-import datetime as dt
+import io
+import re
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,6 +20,8 @@ from sasgeo_bench.texts import message_of
 
 _POINTS: Final = ("trkpt", "rtept")  # of a track and of a route
 _DEEPEST: Final = 64  # elements in each other
+_MOST_ELEMENTS: Final = 3_000_000  # of a file: others than tracks take the time of a million points at most
+_LONG_TAG: Final = re.compile(rb"<[^<>]{100000}")  # attributes without end take minutes
 _ABOVE_GROUND: Final = "relativeToGround"  # of KML's altitudes; the others count from the sea, or are none
 
 
@@ -26,24 +30,27 @@ class _Track:
     """What was read of a file so far."""
 
     source: LogSource
-    places: list[tuple[float, float]] = field(default_factory=list)
-    moments: list[dt.datetime] = field(default_factory=list)
-    heights_m: list[float] = field(default_factory=list)
+    lon_deg: "array[float]" = field(default_factory=lambda: array("d"))
+    lat_deg: "array[float]" = field(default_factory=lambda: array("d"))
+    moments: "array[float]" = field(default_factory=lambda: array("d"))
+    heights_m: "array[float]" = field(default_factory=lambda: array("d"))
 
     def log(self) -> FlightLog:
         """Return the log; times are of all points or of none."""
-        count = len(self.places)
-        numbers = range(1, count + 1)
+        count = len(self)
         if self.moments and len(self.moments) != count:
             message = f"{len(self.moments)} of {count} points have a time: give each one, or none"
             raise self.source.fault(message)
-        lon_deg, lat_deg = np.array(self.places, dtype=np.float64).reshape(-1, 2).T
-        columns = {"lon_deg": lon_deg, "lat_deg": lat_deg}
+        columns = {"lon_deg": np.array(self.lon_deg), "lat_deg": np.array(self.lat_deg)}
         if self.moments:
-            columns["time_s"] = np.array([(moment - self.moments[0]).total_seconds() for moment in self.moments])
+            columns["time_s"] = (np.array(self.moments) - self.moments[0]).round(6)
         if self.heights_m:
             columns["height_m"] = np.array(self.heights_m)
-        return FlightLog.of(self.source, numbers, columns)
+        return FlightLog.of(self.source, range(1, count + 1), columns)
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.lat_deg)
 
 
 def read_gpx(path: Path) -> FlightLog:
@@ -63,7 +70,7 @@ def read_gpx(path: Path) -> FlightLog:
             _add_place(track if name == _POINTS[0] else route, [element.get("lon"), element.get("lat")])
         elif event == "end" and name == "time" and parent in _POINTS:
             _add_time(track if parent == _POINTS[0] else route, element.text)
-    return (track if track.places else route).log()
+    return (track if len(track) else route).log()
 
 
 def read_kml(path: Path) -> FlightLog:
@@ -109,8 +116,8 @@ def _close(line: _Track, coordinates: str, mode: str) -> None:
     """Read the points of a LineString; keep heights if all points have one, above the ground."""
     for place in coordinates.split():
         _add_place(line, place.split(","))
-    if mode != _ABOVE_GROUND or len(line.heights_m) != len(line.places):
-        line.heights_m.clear()
+    if mode != _ABOVE_GROUND or len(line.heights_m) != len(line):
+        del line.heights_m[:]
 
 
 def _add_time(line: _Track, text: str | None) -> None:
@@ -120,7 +127,7 @@ def _add_time(line: _Track, text: str | None) -> None:
 
 
 def _add_place(line: _Track, parts: Sequence[str | None]) -> None:
-    number = len(line.places) + 1
+    number = len(line) + 1
     line.source.check_count(number)
     if len(parts) not in (2, 3):
         message = f"{shown(' '.join(map(str, parts)))} is no longitude, latitude and altitude: mend the coordinates"
@@ -129,30 +136,31 @@ def _add_place(line: _Track, parts: Sequence[str | None]) -> None:
         line.source.number(text, name, number)
         for text, name in zip(parts, ("longitude", "latitude", "altitude"), strict=False)
     )
-    line.places.append((lon_deg, lat_deg))
+    line.lon_deg.append(lon_deg)
+    line.lat_deg.append(lat_deg)
     line.heights_m.extend(height_m)
 
 
 def _elements(source: LogSource) -> Iterator[tuple[str, Element, str]]:
     """Yield elements, with the name of what they stand in, as they begin and end; keep none of them in memory.
 
-    Refuse document types and entities, what nests deeper than any track, and what is no XML.
+    Refuse document types and entities, what is larger or nests deeper than any track, and what is no XML.
     """
-    source.check_size()
     open_ones: list[Element] = []
+    count = 0
     try:
-        with source.path.open("rb") as file:
-            for event, element in iterparse(file, events=("start", "end"), forbid_dtd=True):
-                if event == "end":
-                    open_ones.pop()
-                yield event, element, _name(open_ones[-1]) if open_ones else ""
-                if event == "start":
-                    open_ones.append(element)
-                elif open_ones:
-                    open_ones[-1].remove(element)
-                if len(open_ones) > _DEEPEST:
-                    message = f"elements nest more than {_DEEPEST} deep: export it anew"
-                    raise source.fault(message)
+        for event, element in iterparse(io.BytesIO(_content(source)), events=("start", "end"), forbid_dtd=True):
+            if event == "end":
+                open_ones.pop()
+            yield event, element, _name(open_ones[-1]) if open_ones else ""
+            if event == "start":
+                open_ones.append(element)
+                count += 1
+            elif open_ones:
+                open_ones[-1].remove(element)
+            if len(open_ones) > _DEEPEST or count > _MOST_ELEMENTS:
+                message = f"more than {_MOST_ELEMENTS} elements, or {_DEEPEST} in each other: keep the track alone"
+                raise source.fault(message)
     except FlightError:
         raise
     except DefusedXmlException as error:
@@ -161,9 +169,19 @@ def _elements(source: LogSource) -> Iterator[tuple[str, Element, str]]:
     except (ParseError, ValueError, LookupError) as error:
         message = f"no sound XML ({message_of(error)}): export it anew"
         raise source.fault(message) from error
+
+
+def _content(source: LogSource) -> bytes:
+    source.check_size()
+    try:
+        content = source.path.read_bytes()
     except OSError as error:
         message = f"cannot be read ({message_of(error)}): check its rights"
         raise source.fault(message) from error
+    if _LONG_TAG.search(content):
+        message = "a tag has more than 100000 characters: export it anew"
+        raise source.fault(message)
+    return content
 
 
 def _name(element: Element) -> str:

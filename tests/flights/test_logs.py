@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights import log_points, log_table
+from sasgeo_bench.flights import log_points, log_table, log_xml
 from sasgeo_bench.flights.logs import read_flight, read_log
 from sasgeo_bench.flights.plans import flight_area
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
@@ -210,12 +210,17 @@ def test_angles_are_degrees_radians_or_hundredths(written: Callable, head: str, 
         (_csv("lat,lon", "47.14,9.52", "97.14,9.52"), "line 3: latitude 97.14, longitude 9.52 are no degrees on Earth"),
         (_csv("lat,lon", "47.14,9.52", "47.14,189.5"), "line 3: latitude 47.14, longitude 189.5 are no degrees"),
         (_csv("lat,lon", "471400000,95200000", "1900000000,95200000"), "line 3: latitude 190, longitude 9.52"),
-        (_csv("lat,lon", "0,0", "47.14,9.52"), "line 2: latitude and longitude are 0, which is no fix"),
-        (_csv("lat,lon", "47.14,9.52", "47.14,9.52"), "line 3: repeats the point before, and has no time"),
+        (_csv("lat,lon", "47.14,9.52", "0,0"), "line 3: latitude and longitude are 0, which is no fix"),
+        (_csv("lat,lon", "0,0", "0,0"), "line 2: latitude and longitude are 0, which is no fix"),
+        (_csv("lat;lon", "47,14;9,52"), "line 2: latitude is no number, '47,14': .*decimals with a point"),
         (_csv("lat,lon", "47.14,9.52", "47.14"), "line 3: 1 cells, the head has 2"),
         (_csv("lat,lon", "47.14,9.52", '47.1,"9.5'), "line 3: no sound CSV"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "47.1401,9.52,2"), "line 3: time goes back by 1 s: sort"),
-        (_csv("lat,lon,time", "47.14,9.52,3", "47.1401,9.52,3"), "line 3: the same time as the point before"),
+        (_csv("lat,lon,time_s", "47.14,9.52,-1e308", "47.1401,9.52,1e308"), "line 2: time is no number, '-1e308'"),
+        (
+            _csv("lat,lon,time", "47.14,9.52,01/05/2025 10:00", "47.1401,9.52,3"),
+            "line 2: time is no date and time like",
+        ),
         (_csv("lat,lon,time", "47.14,9.52,3", "47.1401,9.52,"), "line 3: time is missing"),
         (_csv("lat,lon,time", "47.14,9.52,2025-05-01T10:00:00", "47.2,9.52,6"), "line 3: time is no date and time"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "48.14,9.52,4"), "line 3: moves at 111183 m/s since the point before"),
@@ -242,14 +247,14 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
         ("a.gpx", "<gpx><trk>", "no sound XML"),
         ("a.gpx", '<?xml version="1.0" encoding="martian"?><gpx/>', "no sound XML"),
         ("a.gpx", "lat,lon", "no sound XML"),
-        ("a.gpx", "<gpx>" + "<a>" * 9000, "elements nest more than 64 deep"),
+        ("a.gpx", "<gpx>" + "<a>" * 9000, "more than 3000000 elements, or 64 in each other: keep the track alone"),
         ("a.gpx", _gpx(_points()).replace("<time>", "<time/><time>"), "point 1: time is no date and time"),
         ("a.gpx", "<gpx/>", "two points at least, the log has 0"),
         ("a.gpx", _gpx(_points(1)), "two points at least, the log has 1"),
         ("a.gpx", _gpx(_points()).replace("</trk>", "</trk><trk></trk>"), "more than one track"),
         ("a.gpx", _gpx(_points()).replace("<time>2025-05-01T10:00:02Z</time>", ""), "4 of 5 points have a time"),
         ("a.gpx", _gpx(_points()).replace("10:00:02Z", "10:00:00Z"), "point 3: time goes back by 1 s"),
-        ("a.gpx", _gpx(_points()).replace("10:00:02Z", "10:00:01Z"), "point 3: the same time as the point before"),
+        ("a.gpx", f"<gpx {' '.join(f'a{at}=' + repr('') for at in range(20000))}/>", "a tag has more than 100000 char"),
         ("a.gpx", _gpx(_points()).replace("2025-05-01T10:00:02Z", "&#9;noon"), "point 3: time is no date and time"),
         ("a.gpx", _gpx(_points()).replace('lat="47.1402"', 'lat="NaN"'), "point 3: latitude is no number, 'NaN'"),
         ("a.gpx", _gpx(_points()).replace('lat="47.1402"', ""), "point 3: latitude is missing"),
@@ -299,6 +304,33 @@ def test_any_bytes_are_read_or_refused_in_one_line(
     path = tmp_path_factory.mktemp("any") / f"a{suffix}"
     path.write_bytes(content)
     assert _refused(path)
+
+
+@pytest.mark.parametrize("unit", ["time_s", "timestamp"])
+def test_points_before_the_first_fix_and_of_one_time_are_left_out_with_a_word(written: Callable, unit: str) -> None:
+    """Logs of PX4 and ArduPilot begin at 0, 0; those with times in whole seconds repeat them."""
+    rows = [f"{at // 2},{LAT + at * 5e-5 if at > 3 else 0},{LON if at > 3 else 0},8" for at in range(20)]
+    path = written("a.csv", _csv(f"{unit},lat,lon,height", *rows))
+    with pytest.warns(UserWarning, match=r"a\.csv: left out") as told:
+        log = read_log(path)
+    assert [str(each.message) for each in told] == [
+        "a.csv: left out 4 points at 0, 0 before the first fix",
+        "a.csv: left out 8 points with the time of the point before",
+    ]
+    assert log.time_s is not None
+    assert log.time_s.tolist() == list(range(8))
+    assert log.lat_deg[:2] == pytest.approx([LAT + 2e-4, LAT + 3e-4])
+
+
+def test_points_of_one_place_without_times_are_left_out_with_a_word(written: Callable) -> None:
+    with pytest.warns(UserWarning, match=r"a\.kml: left out 1 point with the place of the point before"):
+        log = read_log(written("a.kml", LINE.format("9.52,47.14 9.52,47.14 9.52,47.15")))
+    assert log.lat_deg.tolist() == [47.14, 47.15]
+
+
+def test_more_elements_than_a_track_has_are_refused(written: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(log_xml, "_MOST_ELEMENTS", 8)
+    assert "more than 8 elements" in _refused(written("a.gpx", "<gpx>" + "<a/>" * 8))
 
 
 def test_no_name_of_a_column_stands_for_two_fields() -> None:

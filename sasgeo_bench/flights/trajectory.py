@@ -128,12 +128,12 @@ class Trajectory:
         """
         times = np.asarray(time_s, dtype=np.float64)
         if times.size and (times.min() < self.time_s[0] or times.max() > self.time_s[-1]):
-            message = f"times from {times.min():g} to {times.max():g} s, the trajectory has {self.span_text()}"
+            message = f"times from {times.min():.3f} to {times.max():.3f} s, the trajectory has {self.span_text()}"
             raise FlightError(message)
         position = np.stack([np.interp(times, self.time_s, axis) for axis in self.position_m.T], axis=1)
         turned = Slerp(self.time_s, self.rotation)(times) if len(self) > 1 else self.rotation
         return type(self)(time_s=times, position_m=position, quaternion_xyzw=turned.as_quat())
 
     def span_text(self) -> str:
-        """Return from when to when it goes, for messages."""
-        return f"{self.time_s[0]:g} to {self.time_s[-1]:g} s"
+        """Return from when to when it goes, for messages; times may count from 1970, so to the millisecond."""
+        return f"{self.time_s[0]:.3f} to {self.time_s[-1]:.3f} s"

@@ -5,8 +5,11 @@ import gzip
 import io
 import math
 import zlib
+from array import array
 from pathlib import Path
 from typing import Final
+
+import numpy as np
 
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.files.folders import fresh_file
@@ -15,20 +18,20 @@ from sasgeo_bench.flights.trajectory import Trajectory
 MOST_BYTES: Final = 300_000_000  # of text, unpacked
 MOST_POSES: Final = 2_000_000
 _COLUMNS: Final = 8
+_LARGEST: Final = 1e12  # seconds or metres: what is larger has another unit
 _GZIP: Final = b"\x1f\x8b"
 _FORM: Final = "a line is 'time_s x y z qx qy qz qw', 8 numbers with spaces between"
 _UNIT: Final = 1e-3  # as in trajectory.py, which names the pose; here the line is named
 
 
-def read_tum(path: Path, *, most_bytes: int = MOST_BYTES, most_poses: int = MOST_POSES) -> Trajectory:
+def read_tum(path: Path) -> Trajectory:
     r"""Read a trajectory from a TUM file, whole or not at all.
 
     Parameters
     ----------
     path : Path
         Text, or gzipped text, which is told by its first bytes. Lines that begin with "#" and empty lines are skipped.
-    most_bytes, most_poses : int
-        Limits on the unpacked text and on its poses.
+        `MOST_BYTES` of unpacked text and `MOST_POSES` are read at most.
 
     Returns
     -------
@@ -54,26 +57,26 @@ def read_tum(path: Path, *, most_bytes: int = MOST_BYTES, most_poses: int = MOST
     ...     read_tum(path).distance_m.tolist()
     [0.0, 5.0]
     """
-    times: list[float] = []
-    rows: list[list[float]] = []
-    for number, content in enumerate(io.BytesIO(_content_of(path, most_bytes)), start=1):
+    table = array("d")
+    last_s = -math.inf
+    for number, content in enumerate(io.BytesIO(_content_of(path)), start=1):
         line = _decoded(content, f"{path}, line {number}")
         if not line.strip() or line.lstrip().startswith("#"):
             continue
         values = _pose(line, f"{path}, line {number}")
-        if times and values[0] <= times[-1]:
+        if values[0] <= last_s:
             message = f"{path}, line {number}: time {values[0]!r} does not increase: sort the lines, keep one of a time"
             raise FlightError(message)
-        if len(rows) == most_poses:
-            message = f"{path}, line {number}: more than {most_poses} poses: keep every second one, or cut the file"
+        if len(table) == MOST_POSES * _COLUMNS:
+            message = f"{path}, line {number}: more than {MOST_POSES} poses: keep every second one, or cut the file"
             raise FlightError(message)
-        times.append(values[0])
-        rows.append(values[1:])
-    if not rows:
+        table.extend(values)
+        last_s = values[0]
+    if not table:
         message = f"{path} holds no pose: {_FORM}"
         raise FlightError(message)
-    position, quaternion = [row[:3] for row in rows], [row[3:] for row in rows]
-    return Trajectory(time_s=times, position_m=position, quaternion_xyzw=quaternion)  # type: ignore[arg-type] # converted there
+    poses = np.frombuffer(table).reshape(-1, _COLUMNS)
+    return Trajectory(time_s=poses[:, 0], position_m=poses[:, 1:4], quaternion_xyzw=poses[:, 4:])
 
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
@@ -84,18 +87,21 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
             out.write(" ".join([f"{time:.6f}", *(f"{x:.4f}" for x in place), *(f"{x:.9f}" for x in turn)]) + "\n")
 
 
-def _content_of(path: Path, most_bytes: int) -> bytes:
+def _content_of(path: Path) -> bytes:
     try:
+        if path.is_fifo():
+            message = f"{path} is a pipe, which is not read: name a TUM file, plain or gzipped"
+            raise FlightError(message)
         with path.open("rb") as file:
             is_packed = file.read(2) == _GZIP
-        with gzip.open(path, "rb") if is_packed else path.open("rb") as source:
-            content = source.read(most_bytes + 1)
+            file.seek(0)
+            content = (gzip.GzipFile(fileobj=file) if is_packed else file).read(MOST_BYTES + 1)
     except (OSError, EOFError, zlib.error) as error:
         text = getattr(error, "strerror", None) or str(error)
         message = f"{path} cannot be read as a trajectory ({text}): name a TUM file, plain or gzipped, that is whole"
         raise FlightError(message) from error
-    if len(content) > most_bytes:
-        message = f"{path} holds more than {most_bytes} bytes of text: cut the file, or leave out poses"
+    if len(content) > MOST_BYTES:
+        message = f"{path} holds more than {MOST_BYTES} bytes of text: cut the file, or leave out poses"
         raise FlightError(message)
     return content
 
@@ -119,6 +125,9 @@ def _pose(line: str, where: str) -> list[float]:
         count = f"{len(words)} words" if len(words) < _COLUMNS else "more than 8 words"
         found = count if len(words) != _COLUMNS else "words that are no finite numbers"
         message = f"{where}: {found}: {_FORM}"
+        raise FlightError(message)
+    if max(map(abs, values)) >= _LARGEST:
+        message = f"{where}: a number of {max(map(abs, values)):g}: give times in seconds, positions in metres"
         raise FlightError(message)
     length = math.hypot(*values[4:])
     if abs(length - 1) > _UNIT:

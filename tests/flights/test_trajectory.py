@@ -81,5 +81,10 @@ def test_a_quaternion_of_another_order_or_length_is_refused() -> None:
 
 def test_times_outside_are_refused() -> None:
     """Nothing is extrapolated."""
-    with pytest.raises(FlightError, match=r"times from -1 to 1 s, the trajectory has 0 to 2 s"):
+    with pytest.raises(FlightError, match=r"times from -1\.000 to 1\.000 s, the trajectory has 0\.000 to 2\.000 s"):
         _straight().at([-1.0, 1.0])
+
+
+def test_times_since_1970_are_told_apart_in_messages() -> None:
+    """Six digits would show both ends as 1.41339e+09."""
+    assert _straight(time_s=[1413393212.25, 1413393214.5]).span_text() == "1413393212.250 to 1413393214.500 s"

@@ -2,6 +2,7 @@
 """TUM files: read whole or refused in one line that names the file, the line and the mend."""
 
 import gzip
+import os
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import FlightError
+from sasgeo_bench.flights import tum
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.flights.tum import read_tum, write_tum
 
@@ -51,6 +53,7 @@ def test_gzipped_text_is_told_by_its_first_bytes_not_by_its_name(lay) -> None:
         ("1.0 0 0 8_0 0 0 0 1", "line 3: words that are no finite numbers"),
         ("1.0 0 0 0x8 0 0 0 1", "line 3: words that are no finite numbers"),
         ("1.0 0 0 \x1b[31m 0 0 0 1", "line 3: words that are no finite numbers"),
+        (f"1400000000000000000 {POSE}", r"line 3: a number of 1\.4e\+18: give times in seconds, positions in metres"),
         (f"0.0 {POSE}", r"line 3: time 0\.0 does not increase: sort the lines"),
         ("1.0 0 0 80 1 0 0 1", r"line 3: the quaternion has length 1\.41421, not 1: the order is qx qy qz qw"),
     ],
@@ -79,16 +82,20 @@ def test_a_file_without_poses_or_damaged_is_refused(lay, content, found) -> None
         read_tum(lay(content))
 
 
-def test_no_file_a_folder_and_a_file_over_the_limits_are_refused(lay, tmp_path) -> None:
+def test_no_file_a_folder_a_pipe_and_a_file_over_the_limits_are_refused(lay, tmp_path, monkeypatch) -> None:
     with pytest.raises(FlightError, match="cannot be read as a trajectory"):
         read_tum(tmp_path / "missing.txt")
     with pytest.raises(FlightError, match="cannot be read as a trajectory"):
         read_tum(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(FlightError, match="pipe is a pipe, which is not read"):
+        read_tum(tmp_path / "pipe")
+    monkeypatch.setattr(tum, "MOST_POSES", 2)
     with pytest.raises(FlightError, match="line 6: more than 2 poses"):
-        read_tum(lay(TEXT), most_poses=2)
-    bomb = lay(gzip.compress(b"#" * 1_000_000))
+        read_tum(lay(TEXT))
+    monkeypatch.setattr(tum, "MOST_BYTES", 1000)
     with pytest.raises(FlightError, match="more than 1000 bytes of text"):
-        read_tum(bomb, most_bytes=1000)
+        read_tum(lay(gzip.compress(b"#" * 1_000_000)))
 
 
 @given(st.lists(st.tuples(*[st.floats(-1e5, 1e5)] * 3, *[st.floats(-180, 180)] * 2), min_size=1, max_size=5))

@@ -11,6 +11,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table, tell
 from sasgeo_bench.errors import FlightError, counted
+from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, measure_drift, pair_run
 from sasgeo_bench.flights.drift_fit import fit_profile
@@ -28,13 +29,15 @@ def measure_drift_command(
 ) -> None:
     """Measure drift of odometry against truth by segment length; runs of one truth file are one cluster."""
     lengths = _read_lengths(lengths_m)
+    _check_outputs([*truth, *estimate], [path for path in (results, profile) if path is not None])
     runs = _read_runs(truth, estimate, lost_s)
     flights = counted(len({run.sequence for run in runs}), "sequence")
     tell(f"{counted(len(runs), 'run')} of {flights}, {sum(run.path_m for run in runs):.0f} m tracked")
     figures = measure_drift(runs, lengths_m=lengths)
     print_table(_table_of(figures))
     if results is not None:
-        write_frame(figures, results, attrs={"runs": len(runs), "lost_s": lost_s})
+        with fresh_file(results, mend="name another place, or free some space") as scratch:
+            write_frame(figures, scratch, attrs={"runs": len(runs), "lost_s": lost_s})
         tell(f"wrote {results}")
     if profile is not None:
         fitted = fit_profile(runs, name=profile.stem, lengths_m=lengths)
@@ -61,18 +64,29 @@ def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float) -> list[P
     if len(truth) != len(estimate):
         message = f"give one --estimate for each --truth, got {len(truth)} truths and {len(estimate)} estimates"
         raise FlightError(message)
-    truths = {path.resolve(): read_tum(path) for path in dict.fromkeys(truth)}
+    truths = {path: read_tum(path) for path in dict.fromkeys(truth)}
     runs = []
     for true_path, path in zip(truth, estimate, strict=True):
+        believed = read_tum(path)
         try:
-            run = pair_run(
-                truths[true_path.resolve()], read_tum(path), sequence=str(true_path.resolve()), lost_s=lost_s
-            )
+            run = pair_run(truths[true_path], believed, sequence=str(true_path.resolve()), lost_s=lost_s)
         except FlightError as error:
-            message = f"{path} against {true_path}: {error}" if str(path) not in str(error) else str(error)
+            message = f"{path} against {true_path}: {error}"
             raise FlightError(message) from error
         runs.append(run)
     return runs
+
+
+def _check_outputs(inputs: list[Path], outputs: list[Path]) -> None:
+    """Refuse to write a file over an input, or two into one."""
+    for at, path in enumerate(outputs):
+        if path in outputs[:at] or any(_is_same(path, other) for other in inputs):
+            message = f"{path} is named twice, to read from and to write to: name another file"
+            raise FlightError(message)
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    return path.exists() and other.exists() and path.samefile(other)
 
 
 def _table_of(figures: pd.DataFrame) -> Table:

@@ -13,7 +13,7 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from sasgeo_bench.errors import FlightError
+from sasgeo_bench.errors import FlightError, counted
 from sasgeo_bench.flights.odometry import path_steps_m
 from sasgeo_bench.flights.trajectory import Trajectory
 
@@ -33,7 +33,9 @@ _JUMP_M: Final = 1.0
 _JUMP_SHARE: Final = 0.1
 _JUMP_DEG: Final = 10.0
 _MOST_TILT_DEG: Final = 10.0
+_MOST_JUMPS: Final = 10  # of a short run; of a longer one, half of its steps
 _NODES: Final = 10  # of the shortest segment
+_MOST_NODES: Final = 1_000_000  # of a path
 _LEAST_SPREAD: Final = 0.02  # of points around their mean, in segment lengths, to tell a scale from
 _M_PER_KM: Final = 1000.0
 _PERCENT: Final = 100.0
@@ -52,7 +54,13 @@ class Stretch:
     path_m: Floats
 
     def resampled(self, spacing_m: float) -> "Stretch":
-        """Return the stretch at equal distances of path."""
+        """Return the stretch at equal distances of path; raise `FlightError` if these are too many."""
+        if not self.path_m[-1] <= _MOST_NODES * spacing_m:
+            message = (
+                f"a path of {self.path_m[-1]:g} m has more than {_MOST_NODES} steps of {spacing_m:g} m, a tenth of the "
+                "shortest segment: choose longer ones, and check that positions are in metres"
+            )
+            raise FlightError(message)
         path_m = np.arange(0.0, self.path_m[-1] + 1e-9, spacing_m)
         return Stretch(
             flown=_between(path_m, self.path_m, self.flown),
@@ -95,13 +103,13 @@ def pair_run(truth: Trajectory, estimate: Trajectory, *, sequence: str, lost_s: 
     Raises
     ------
     FlightError
-        If the times do not overlap, or attitudes differ by more than a turn about the vertical.
+        If the times do not overlap, attitudes differ by more than a turn about the vertical, or most steps are resets.
     """
     is_timed = (estimate.time_s >= truth.time_s[0]) & (estimate.time_s <= truth.time_s[-1])
     if is_timed.sum() < 2:  # noqa: PLR2004 - one step
-        spans = [f"{each.time_s[0]:.3f} to {each.time_s[-1]:.3f} s" for each in (estimate, truth)]
         message = (
-            f"the estimate ({spans[0]}) and the truth ({spans[1]}) share fewer than two poses: give both one clock"
+            f"{is_timed.sum()} of {counted(len(estimate), 'pose')} of the estimate ({estimate.span_text()}) within the "
+            f"time of the truth ({truth.span_text()}), two are needed: give both one clock, in seconds"
         )
         raise FlightError(message)
     true = truth.at(estimate.time_s[is_timed])
@@ -187,7 +195,8 @@ def measure_drift(
     Raises
     ------
     FlightError
-        If there is no run, or a length is not positive. A length that no run reaches has NaN and no segments.
+        If there is no run, a length is not positive, or a path has more than a million steps of a tenth of the
+        shortest. A length that no run reaches has NaN and no segments; of one sequence alone, `lo` and `hi` are NaN.
 
     Notes
     -----
@@ -259,6 +268,7 @@ def _length_rows(
             drawn = bootstrap_means(np.array(means)[:, None], draws=draws, rng=rng)[:, 0]
             rest = (1 - LEVEL) / 2
             ends = np.array([np.mean(means), *np.quantile(drawn, [rest, 1 - rest])])
+            ends[1:] += 0.0 if len(means) > 1 else math.nan  # of one sequence nobody knows how much they differ
             row |= dict(zip(("value", "lo", "hi"), (np.sqrt(ends) if rms else ends).tolist(), strict=True))
         yield row
 
@@ -328,6 +338,12 @@ def _cut(whole: Stretch, is_long: NDArray[np.bool_], sequence: str) -> PairedRun
     error_m = np.abs(np.diff(whole.believed) * np.exp(-1j * whole.turn_rad[:-1]) - np.diff(whole.flown))
     is_jump = error_m > _JUMP_M + _JUMP_SHARE * path_m
     is_jump |= np.abs(np.diff(whole.turn_rad)) > math.radians(_JUMP_DEG)
+    if is_jump.sum() > max(_MOST_JUMPS, len(is_jump) / 2):
+        message = (
+            f"{is_jump.sum()} of {len(is_jump)} steps are off by more than {_JUMP_M:g} m and a tenth of their length, "
+            f"or {_JUMP_DEG:g} degrees: check that both files are of one flight, and positions are in metres"
+        )
+        raise FlightError(message)
     ends = np.concatenate([[0], np.flatnonzero(is_lost | is_jump) + 1, [len(whole.flown)]])
     stretches = tuple(
         Stretch(

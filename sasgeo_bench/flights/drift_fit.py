@@ -77,8 +77,8 @@ def fit_profile(
     Returns
     -------
     FittedDrift
-        Rates of resets and dropouts are those counted; jumps are not fitted but set to 1 m and 1 degree. A scale that
-        wanders over more than the longest segment looks like a bias, and is part of it.
+        Rates of resets and dropouts are those counted; jumps are not fitted but set to 1 m, 1 degree and the spread of
+        the scale. A scale that wanders over more than the longest segment looks like a bias, and is part of it.
 
     Raises
     ------
@@ -303,7 +303,9 @@ def _profile(
         "source": f"Measured: {flights}, {km:.2f} km, segments of {shown} m.",
         "limits": f"Nothing is known beyond {max(lengths_m):g} m.",
     }
-    jumps = Resets(per_km=resets / km, position_m=1.0, yaw_deg=1.0) if resets else Resets()
+    # A reset ends the scale of the run: another of the same spread follows.
+    scale_pct = drift["scale"].model_dump()["bias_pct"]
+    jumps = Resets(per_km=resets / km, position_m=1.0, yaw_deg=1.0, scale_pct=scale_pct) if resets else Resets()
     lost_m = sum(run.lost_m for run in runs)
     gaps = Dropouts(per_km=lost / (km + lost_m / 1000), length_m=lost_m / lost) if lost else Dropouts()
     content = {"id": name, **about, **(card or {}), "run_spread": _run_spread(runs, min(lengths_m)), **drift}

@@ -127,7 +127,7 @@ def read_drift_profile(path: Path) -> DriftProfile:
             raise ConfigError(message)
         text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        message = f"{path} cannot be read as a drift profile ({error}): {mend}"
+        message = f"{path} cannot be read as a drift profile ({getattr(error, 'strerror', None) or error}): {mend}"
         raise ConfigError(message) from error
     return parse_toml(text, DriftProfile, source=str(path))
 

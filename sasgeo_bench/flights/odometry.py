@@ -286,7 +286,9 @@ def _draw_lost(steps_m: Floats, profile: DriftProfile, rng: np.random.Generator)
     """Draw which steps are lost: any that touches a dropout."""
     ends = np.cumsum(steps_m)
     begins = np.sort(rng.uniform(0, ends[-1], size=rng.poisson(profile.dropouts.per_km * ends[-1] / _M_PER_KM)))
-    is_lost = np.zeros(len(steps_m), dtype=bool)
-    for begin, length in zip(begins, rng.exponential(profile.dropouts.length_m, size=len(begins)), strict=True):
-        is_lost |= (ends > begin) & (ends - steps_m < begin + length)
-    return is_lost
+    lengths = rng.exponential(profile.dropouts.length_m, size=len(begins))
+    first, after = np.searchsorted(ends, begins, side="right"), np.searchsorted(ends - steps_m, begins + lengths)
+    edges = np.zeros(len(steps_m) + 1, dtype=np.int64)
+    np.add.at(edges, first, 1)
+    np.add.at(edges, after, -1)
+    return np.asarray(np.cumsum(edges[:-1]) > 0)

@@ -71,14 +71,29 @@ def test_figures_and_a_fitted_profile_are_written_where_asked(program, pairs, tm
         (("--truth", "lonely.txt"), "give one --estimate for each --truth, got 4 truths and 3 estimates"),
         (("--truth", "no.txt", "--estimate", "no.txt"), "no.txt cannot be read as a trajectory (No such file"),
         (("--truth", "bad.txt", "--estimate", "bad.txt"), "bad.txt, line 1: 3 words: a line is 'time_s x y z"),
-        (("--truth", "late.txt", "--estimate", "truth-1.txt"), "truth-1.txt against late.txt: the estimate (0.000 to"),
+        (("--truth", "late.txt", "--estimate", "truth-1.txt"), "truth-1.txt against late.txt: 0 of 151 poses of the"),
+        (("--truth", "loop", "--estimate", "truth-1.txt"), "loop cannot be read as a trajectory (Too many levels"),
+        (("--results", "truth-1.txt"), "truth-1.txt is named twice, to read from and to write to: name another file"),
+        (("--results", "new", "--profile", "new"), "new is named twice"),
         (("--lost-s", "-1"), "lost-s"),
     ],
 )
 def test_a_mistake_gets_one_line(mistake, pairs, tmp_path, words, told) -> None:
     (tmp_path / "bad.txt").write_text("0 1 2\n")
+    (tmp_path / "loop").symlink_to("loop")
     (tmp_path / "late.txt").write_text("1e9 0 0 0 0 0 0 1\n1000000001 5 0 0 0 0 0 1\n")
     assert told in mistake("measure-drift", *pairs, *words)
+
+
+def test_results_that_cannot_be_written_leave_nothing_behind(program, pairs, tmp_path) -> None:
+    (tmp_path / "folder").mkdir()
+    before = sorted(tmp_path.iterdir())
+    code, _, err = program("measure-drift", *pairs, "--results", "folder")
+    assert code == 2
+    assert err.splitlines()[-1].startswith(
+        "sasgeo-bench: folder cannot be written (Is a directory): name another place"
+    )
+    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_profile_that_cannot_be_named_or_written_gets_one_line_after_the_table(program, pairs, tmp_path) -> None:

@@ -18,6 +18,7 @@ from sasgeo_bench.flights.drift_profile import (
     Dropouts,
     HeadingDrift,
     Resets,
+    ScaleDrift,
     load_profile,
 )
 from sasgeo_bench.flights.odometry import dead_reckon, draw_odometry
@@ -136,7 +137,7 @@ def test_runs_of_one_sequence_are_one_cluster() -> None:
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        ({"time_s": 1e6}, r"share fewer than two poses: give both one clock"),
+        ({"time_s": 1e6}, r"0 of 61 poses of the estimate \(1000000\.000 to 1000030\.000 s\) .* give both one clock"),
         ({"pitch_deg": 90.0}, "differ by 90 degrees of tilt"),
     ],
 )
@@ -159,6 +160,29 @@ def test_lengths_that_cannot_be_are_refused(lengths_m) -> None:
         measure_drift([run], lengths_m=lengths_m)
     with pytest.raises(FlightError, match="one run at least"):
         measure_drift([])
+
+
+def test_an_estimate_in_other_units_is_refused_and_not_taken_for_resets() -> None:
+    flown = flight(300.0)
+    with pytest.raises(FlightError, match=r"60 of 60 steps are off by more than 1 m .* are of one flight, and"):
+        pair_run(flown, changed(flown, position_m=100 * flown.position_m), sequence="a")
+
+
+@pytest.mark.parametrize(("length_m", "size"), [(1e-9, 1.0), (10.0, 1e9)])
+def test_paths_of_more_steps_than_memory_holds_are_refused(length_m, size) -> None:
+    flown = flight(300.0)
+    large = changed(flown, position_m=size * flown.position_m)
+    run = pair_run(large, large, sequence="a")
+    with pytest.raises(FlightError, match=r"has more than 1000000 steps of .*: choose longer ones"):
+        segment_errors(run, length_m, spacing_m=length_m / 10)
+
+
+def test_a_figure_of_one_sequence_has_no_interval() -> None:
+    runs = drawn_runs(load_profile("wheel-poor"), 2, flown=flight(600.0))
+    for count, has_interval in ((1, False), (2, True)):
+        row = value_of(measure_drift(runs[:count], lengths_m=[100.0], draws=50), "position_pct", 100.0)
+        assert row["value"] > 0
+        assert bool(np.isfinite([row["lo"], row["hi"]]).all()) is has_interval
 
 
 # Drawn from a profile
@@ -199,6 +223,14 @@ def test_resets_and_dropouts_are_counted_at_their_rates() -> None:
     # A step is lost if a part of it is: with steps of 5 m, 5 m more than the dropout.
     assert value_of(figures, "lost_pct")["value"] == pytest.approx(6.5, abs=2.5)
     assert value_of(figures, "position_pct", 50.0)["value"] < 1e-6
+
+
+def test_a_fitted_scale_does_not_end_with_the_first_reset() -> None:
+    rare = {"scale": ScaleDrift(bias_pct=3.0), "resets": Resets(per_km=1.0, position_m=20.0, scale_pct=3.0)}
+    runs = drawn_runs(load_profile("perfect").model_copy(update=rare), 8)
+    fitted = fit_profile(runs, name="mine", lengths_m=[100.0, 200.0], draws=10).profile
+    assert fitted.scale.bias_pct > 1
+    assert fitted.resets.scale_pct == fitted.scale.bias_pct
 
 
 def test_a_profile_needs_two_sequences_and_a_name() -> None:

@@ -6,22 +6,27 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import shapely
+from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, FlightError
 from sasgeo_bench.flights.kinematics import fly
 from sasgeo_bench.flights.plans import KINDS, PlanKind, flight_area, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.pose import Pose, rotation
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.sampling import drawn_share
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Site
-from sasgeo_bench.tasks.suites.flights import EXTENT, HEIGHT_M, LENGTHS_M, SPACING_M, UNEVEN, FlightSuite
+from sasgeo_bench.tasks.suites.flights import EXTENT, HEIGHT_M, LENGTHS_M, LOITER_M, SPACING_M, UNEVEN, FlightSuite
+
+Floats = NDArray[np.float64]
 
 _TRIES: Final = 6  # paths of a kind and length before it does not fit
-_CARRIES: Final = 40  # paths that may end where a carried drone is taken from
-_CARRY_SPREAD: Final = 1.25  # a distance carried is right up to this factor
+_CARRIES: Final = 20  # shapes of the path that may end where a carried drone is taken from
+_PLACES: Final = 24  # tried for each shape
+_CARRY_SPREAD: Final = 1.25  # most that a distance carried is more or less than asked for, as a factor
 _CARRY_ROOM: Final = 1.5  # length of the path before the carrying, in that of the half it stands for
 _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
@@ -109,23 +114,20 @@ class Airspace:
 
     def elsewhere(self, flight: Flight, carried_m: float) -> Trajectory | None:
         """Return another first half for a flight, which ends so far from its middle; None if none is found."""
-        halves = (self._half(flight, carried_m, attempt) for attempt in range(_CARRIES))
-        return next((half for half in halves if half is not None), None)
-
-    def _half(self, flight: Flight, carried_m: float, attempt: int) -> Trajectory | None:
-        """Draw a first half; return None unless it ends at the distance and suits the flight."""
-        rng = self.seeds_of(flight.site.index).rng("carried", f"{carried_m:g}", attempt)
-        middle = flight.middle
-        length_m = max(_CARRY_ROOM * middle * flight.spacing_m, min(LENGTHS_M))
-        views = self._views("waypoints", length_m, flight.spacing_m, rng)
-        if views is None or len(views) < middle:
-            return None
-        half = rows(views, slice(0, middle))
-        off_m = float(np.hypot(*(half.position_m[-1] - flight.views.position_m[middle])[:2]))
-        if not carried_m / _CARRY_SPREAD <= off_m <= carried_m * _CARRY_SPREAD:
-            return None
-        is_fit = self._is_in_one_part(half, flight.views) and self._is_drawn(half, flight.scale)
-        return half if is_fit else None
+        area, seeds = flight_area(self.region, self.suite.clear_m(self.scene)), self.seeds_of(flight.site.index)
+        length_m = max(_CARRY_ROOM * flight.middle * flight.spacing_m, min(LENGTHS_M))
+        for attempt in range(_CARRIES):
+            rng = seeds.rng("carried", f"{carried_m:g}", attempt)
+            views = self._views("waypoints", length_m, flight.spacing_m, rng)
+            if views is None or len(views) < flight.middle:
+                continue
+            shape = rows(views, slice(0, flight.middle))
+            for _ in range(_PLACES):
+                half = _placed(shape, flight.views.position_m[flight.middle, :2], carried_m, rng)
+                is_over = bool(area.covers(shapely.MultiPoint(half.position_m[:, :2])))
+                if is_over and self._is_in_one_part(half, flight.views) and self._is_drawn(half, flight.scale):
+                    return half
+        return None
 
     def _views(self, kind: PlanKind, length_m: float, spacing_m: float, rng: np.random.Generator) -> Trajectory | None:
         """Return the poses of the views of a flight, None if no such path fits.
@@ -134,6 +136,7 @@ class Airspace:
         off.
         """
         margin_m = self.suite.clear_m(self.scene)
+        length_m = min(length_m, LOITER_M) if kind == "loiter" else length_m
         try:
             path_m = plan_flight(self.region, kind, length_m=length_m, rng=rng, margin_m=margin_m)
         except FlightError:
@@ -166,6 +169,16 @@ class Airspace:
         poses = [pose_of(views, frame, scale) for frame in range(len(views))]
         means = [np.mean([drawn_share(state, pose, variant) for pose in poses]) for state in maps]
         return float(min(means)) >= self.suite.card.min_density
+
+
+def _placed(shape: Trajectory, middle_m: Floats, carried_m: float, rng: np.random.Generator) -> Trajectory:
+    """Turn and move a path so that it ends about `carried_m` from a place, in any direction."""
+    far_m = carried_m * _CARRY_SPREAD ** rng.uniform(-1, 1)
+    bearing, turn_deg = rng.uniform(0, 2 * np.pi), float(rng.uniform(0, 360))
+    position_m = shape.position_m.copy()
+    end_m = middle_m + far_m * np.array([np.sin(bearing), np.cos(bearing)])
+    position_m[:, :2] = end_m + (position_m[:, :2] - position_m[-1, :2]) @ rotation(turn_deg).T
+    return Trajectory.of_angles(time_s=shape.time_s, position_m=position_m, yaw_deg=shape.yaw_deg + turn_deg)
 
 
 def rows(views: Trajectory, which: slice) -> Trajectory:

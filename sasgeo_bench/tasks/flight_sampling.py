@@ -14,12 +14,11 @@ from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.flight_choice import Airspace, Flight, pose_of, rows
-from sasgeo_bench.tasks.query import PriorGroup, Query, Step, Truth, flight_id, view_id
+from sasgeo_bench.tasks.query import SEQUENCE_DIGITS, PriorGroup, Query, Step, Truth, flight_id, view_id
 from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Job, drawn_share, make_prior
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Draft, Scene, Seeds, Shot, Site, Variant, changed_share
 from sasgeo_bench.tasks.suites.flights import FlightSuite, Mission
 
-_SEQUENCE_DIGITS: Final = 18  # of the id of a flight
 _MOST_GAP: Final = 1 / 3  # of a flight
 
 
@@ -46,7 +45,7 @@ class FlightDrawer:
         """Return all flights in the order of their ids; the id of a job is that of its first view."""
         jobs = [
             Job(
-                query_id=view_id(self._seeds(site).digest("flight", variant.name).hex()[:_SEQUENCE_DIGITS], 0),
+                query_id=view_id(self._seeds(site).digest("flight", variant.name).hex()[:SEQUENCE_DIGITS], 0),
                 site=site,
                 variant=variant,
                 track="sequence",

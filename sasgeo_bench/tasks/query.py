@@ -42,6 +42,7 @@ SHUFFLED: Final = "shuffled map"
 TURNED: Final = "turned map"
 TWINS: Final = "identical twins"
 BLIND: Final = "all unknown"
+SEQUENCE_DIGITS: Final = 18  # of the id of a flight; the id of a view has more
 _FRAME_DIGITS: Final = 6  # at the end of the id of a view
 YAW_SIGMA_DEG: Final = {"known": 5.0, "weak": 20.0, "unknown": None}
 

@@ -19,6 +19,7 @@ from sasgeo_bench.tasks.split import Place, SplitFile, blocks_of, find_split, ma
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import Choice, Scene, Seeds
+from sasgeo_bench.tasks.suites.flights import LOITER_M
 from sasgeo_bench.tasks.task_files import read_queries, read_truths, write_task
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from sasgeo_bench.tasks.task_rows import QUERY_SCHEMA, asked_sha256, query_bytes, query_from, query_of, query_row
@@ -172,6 +173,14 @@ def test_all_that_the_views_of_a_flight_may_show_is_mapped_and_the_longest_fligh
     for east_m, north_m in flight.views.position_m[:, :2]:
         assert west + REACH_M < east_m < east - REACH_M
         assert south + REACH_M < north_m < north - REACH_M
+
+
+def test_a_loiter_makes_few_laps_where_other_kinds_fly_far(airspace, monkeypatch):
+    kinds = {}
+    for kind in ("loiter", "waypoints"):
+        monkeypatch.setattr(flight_choice, "KINDS", (kind,))
+        kinds[kind] = airspace.choose(count=1, may_be_fewer=False)[0].length_m
+    assert kinds["loiter"] <= LOITER_M < kinds["waypoints"]
 
 
 @pytest.mark.usefixtures("short")

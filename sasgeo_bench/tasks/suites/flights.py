@@ -13,6 +13,7 @@ SPACING_M: Final = (40.0, 60.0)  # flown between two views, on average: each fli
 UNEVEN: Final = (0.7, 1.3)  # single steps in that average: were they even, they would tell an odometer's scale
 HEIGHT_M: Final = 120.0  # above the ground: a view of 192 m is 1.6 times as wide
 LENGTHS_M: Final = (10_000.0, 4_000.0, 2_000.0, 1_000.0)  # of a flight, the longest that suits the ground
+LOITER_M: Final = 2_000.0  # of a loiter at most: more laps would see the same ground again
 EXTENT: Final = 2.5  # a flight is at most so many times as long as the square root of the ground's area
 START: Final = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
 AGAIN: Final = "again"  # names other draws of perception and odometry, for falsifiers

@@ -24,8 +24,9 @@ from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.build import check_task, has_truths
 from sasgeo_bench.tasks.duplicates import constellations, search_split
+from sasgeo_bench.tasks.flight_sheet import flight_panels, is_of_flights, write_flight_sheet
 from sasgeo_bench.tasks.panels import panels
-from sasgeo_bench.tasks.query import BY
+from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
 from sasgeo_bench.tasks.sheet import write_sheet
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.split_map import write_split_map
@@ -41,9 +42,9 @@ class InspectOptions(Options):
     """Flags of inspect."""
 
     query: Annotated[
-        str | None, typer.Option(help="of a task or a run: this query alone, by the beginning of its id")
+        str | None, typer.Option(help="of a task or a run: this query (or flight) alone, by the beginning of its id")
     ] = None
-    rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries on the contact sheet")] = 12
+    rows: Annotated[int, typer.Option(min=1, max=60, help="of a task: queries, or flights, on the contact sheet")] = 12
     strip: Annotated[
         int | None,
         typer.Option(
@@ -108,17 +109,24 @@ def _refuse_strip(target: str, strip: int | None) -> None:
 
 
 def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
-    """Print what a task is and draw its contact sheet."""
+    """Print what a task is and draw its contact sheet; of flights, maps of their paths, unless a view is named."""
     about = read_task(folder)
     truth_folder = out / "truth" / about["suite"] / about["region"]
-    chosen = panels(folder, truth_folder, out=out, count=rows, query_id=query)
+    path = out / "sheets" / f"{about['suite']}-{about['region']}{f'-{query}' if query else ''}.png"
+    is_of_view = query is not None and len(query) > SEQUENCE_DIGITS
+    maps = (
+        flight_panels(folder, truth_folder, count=rows, flight=query) if is_of_flights(about) and not is_of_view else ()
+    )
+    chosen = () if maps else panels(folder, truth_folder, out=out, count=rows, query_id=query)
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in about.items():
         table.add_row(name, _text_of(value))
     print_table(table)
-    path = out / "sheets" / f"{about['suite']}-{about['region']}{f'-{query}' if query else ''}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
+    if maps:
+        write_flight_sheet(path, about=about, shown=maps, region_folder=out / "regions" / about["region"])
+    else:
+        write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
     say(f"contact sheet: {path}")
 
 

@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of the flights of a task: the true path, what each view sees, and where the odometer alone would lead."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from numpy.typing import NDArray
+
+from sasgeo_bench.canvas import Page, page, panels, without_ticks
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.layers import read_layers, read_overview
+from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import built_anew
+from sasgeo_bench.tasks.query import PUBLISHED, Truth, flight_id
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+TRUE: Final = "#111111"
+RECKONED: Final = "#d6006c"
+PRIOR: Final = "#1f5fbf"
+LOST: Final = "#7b2fa0"
+_COLUMNS: Final = ("query_id", "increment", "prior_easting_m", "prior_northing_m", "prior_radius_m")
+_MOST_ACROSS: Final = 6  # panels; a site with more variants takes two rows
+_PANEL_INCHES: Final = 3.4
+_ONE_INCHES: Final = 8.0  # of a flight that is drawn alone
+_FINE_CELLS: Final = 3000  # on a side of a panel, up to which the map is read as it is
+_OVERVIEW_CELLS: Final = 4000  # of the whole map, where it is not
+_DRAWN_CELLS: Final = 900
+_MANY: Final = 120  # views: their dots are smaller
+_PALE: Final = 0.6  # of the map's colours that is white
+_AROUND: Final = 0.12  # of the extent of the paths, left free around them
+_ASTRAY: Final = 0.35  # of the extent of the true paths, by which reckoned ones may widen a panel
+_LEAST_M: Final = 300.0  # half a panel
+_RANK: Final = {"control": 0, "stress": 1, "falsifier": 2}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlightPanel:
+    """One flight of N views: what its truths and queries say.
+
+    `increments` are right, up and turn of the steps to each view but the first, NaN where the odometer says nothing.
+    `prior_m` is the disc of the start (easting, northing, radius), None if it may be anywhere.
+    """
+
+    flight: str
+    truth: Truth  # of the first view
+    place_m: Floats  # (N, 2)
+    yaw_deg: Floats
+    is_seen: Bools
+    increments: Floats  # (N - 1, 3)
+    prior_m: tuple[float, float, float] | None
+
+    @property
+    def reckoned_m(self) -> Floats:
+        """Return where the odometer alone would lead from the true start, shape (N, 2); it stays where it is lost."""
+        return reckon(self.place_m[0], float(self.yaw_deg[0]), self.increments)
+
+    @property
+    def lost(self) -> NDArray[np.int64]:
+        """Return the views to which the odometer lost its way."""
+        return np.flatnonzero(np.isnan(self.increments[:, 0])) + 1
+
+    @property
+    def carried_to(self) -> int | None:
+        """Return the view to which the drone was carried, the one after its longest step; None if it was not."""
+        if "carried_m" not in self.truth.measured:
+            return None
+        return int(np.argmax(np.hypot(*np.diff(self.place_m, axis=0).T))) + 1
+
+
+def reckon(start_m: Floats, yaw_deg: float, increments: Floats) -> Floats:
+    """Return the places that increments lead to from a true start.
+
+    Parameters
+    ----------
+    start_m : ndarray, shape (2,)
+        Easting and northing, metres.
+    yaw_deg : float
+        Heading at the start, degrees clockwise from grid north.
+    increments : ndarray, shape (N - 1, 3)
+        Right and up, metres, and the turn, degrees clockwise; NaN where nothing is known, which counts as no motion.
+
+    Returns
+    -------
+    ndarray, shape (N, 2)
+        Easting and northing, metres.
+
+    Examples
+    --------
+    Ten metres north, a turn to the right, and five metres ahead, which is east:
+
+    >>> reckon(np.zeros(2), 0.0, np.array([[0.0, 10.0, 90.0], [0.0, 5.0, 0.0]])).round(6).tolist()
+    [[0.0, 0.0], [0.0, 10.0], [5.0, 10.0]]
+    """
+    known = np.nan_to_num(increments)
+    yaws = np.radians(yaw_deg + np.concatenate([[0.0], np.cumsum(known[:-1, 2])]))
+    moved = (known[:, 0] + 1j * known[:, 1]) * np.exp(-1j * yaws)
+    at = complex(*start_m) + np.concatenate([[0.0], np.cumsum(moved)])
+    return np.stack([at.real, at.imag], axis=1)
+
+
+def is_of_flights(about: Mapping[str, Any]) -> bool:
+    """Return whether a task, by its `task.json`, has flights.
+
+    >>> is_of_flights({"counts": {"sequence": 80}}), is_of_flights({"counts": {"localization": 8}})
+    (True, False)
+    """
+    return "sequence" in about["counts"]
+
+
+def flight_panels(
+    task_folder: Path, truth_folder: Path, *, count: int = 12, flight: str | None = None
+) -> tuple[FlightPanel, ...]:
+    """Choose the flights of as many whole sites as `count` panels hold, one site at least; a site's control first.
+
+    With `flight`, only the one whose id begins so.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing or damaged, or the truths are those of other queries.
+    ConfigError
+        If there is no such flight.
+    """
+    truths: dict[str, list[Truth]] = {}
+    for truth in task_files.read_truths(truth_folder):
+        truths.setdefault(flight_id(truth.query_id), []).append(truth)
+    if flight is None:
+        chosen = _of_sites(truths, count)
+    else:
+        chosen = [name for name in truths if name.startswith(flight)][:1]
+        if not chosen:
+            message = (
+                f"{task_folder} holds no flight {flight!r}: it has {counted(len(truths), 'flight')}, as "
+                f"{', '.join(list(truths)[:3])}"
+            )
+            raise ConfigError(message)
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in chosen}
+    for batch in task_files.read_batches(task_folder / task_files.QUERIES, _COLUMNS):
+        for row in batch.to_pylist():
+            rows.get(flight_id(row["query_id"]), []).append(row)
+    for name in chosen:
+        if [row["query_id"] for row in rows[name]] != [truth.query_id for truth in truths[name]]:
+            message = f"{truth_folder} does not hold the truths of {task_folder}: make the queries again"
+            raise StoreError(message)
+    return tuple(_panel(name, truths[name], rows[name]) for name in chosen)
+
+
+def _of_sites(truths: Mapping[str, Sequence[Truth]], count: int) -> list[str]:
+    """Return the flights of whole sites, in the order in which they are drawn."""
+    sites: dict[str, list[str]] = {}
+    for name, (first, *_) in sorted(truths.items(), key=lambda item: item[1][0].pair_id):
+        sites.setdefault(first.pair_id, []).append(name)
+    most = max(map(len, sites.values()), default=1)
+
+    def order(name: str) -> tuple[int, float, str, str]:
+        first = truths[name][0]
+        return (_RANK[first.role], first.strength, first.kind, first.detector)
+
+    return [name for names in list(sites.values())[: max(1, count // most)] for name in sorted(names, key=order)]
+
+
+def _panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str, Any]]) -> FlightPanel:
+    poses = [truth.pose for truth in truths if truth.pose is not None]
+    first = rows[0]
+    disc = tuple(first[f"prior_{item}_m"] for item in ("easting", "northing", "radius"))
+    return FlightPanel(
+        flight=name,
+        truth=truths[0],
+        place_m=np.array([(pose.easting_m, pose.northing_m) for pose in poses]),
+        yaw_deg=np.array([pose.yaw_deg for pose in poses]),
+        is_seen=np.array([truth.measured.get("is_seen", 1.0) > 0 for truth in truths]),
+        increments=np.array([row["increment"] or [np.nan] * 3 for row in rows[1:]], dtype=np.float64).reshape(-1, 3),
+        prior_m=None if disc[2] is None else disc,
+    )
+
+
+def write_flight_sheet(
+    path: Path, *, about: Mapping[str, Any], shown: Sequence[FlightPanel], region_folder: Path
+) -> None:
+    """Write the maps of flights as PNG, a row for each site; `about` is `task.json`, `region_folder` its map's.
+
+    Raise `StoreError` if the map has been rebuilt since the queries were drawn.
+    """
+    manifest = region_files.read_manifest(region_folder)
+    if not task_files.is_of_map(about, manifest):
+        raise StoreError(built_anew(about["region"]))
+    places = list(_places(shown))
+    across = 1 + max((column for _, column in places), default=0)
+    inches = _ONE_INCHES if len(shown) == 1 else _PANEL_INCHES
+    sheet = Page(
+        title=f"{about['title']}: {about['region']}",
+        facts=f"{about['what']} Flights of a row are of one site. Number of a stress: {about['strength_unit']}.",
+        note="North is up. inspect --query ID draws one flight alone, or the sheet of one view by its whole id.",
+        data=ATTRIBUTION,
+        rows=1 + max((row for row, _ in places), default=0),
+        columns=across,
+        panel_inches=(inches, inches),
+        keys=_keys(shown),
+    )
+    with page(path, sheet) as charts:
+        for _ in panels(charts, 0):
+            pass
+        grounds: dict[str, _Ground] = {}
+        for (row, column), panel in zip(places, shown, strict=True):
+            charts[row][column].set_visible(True)
+            site = panel.truth.pair_id
+            if site not in grounds:
+                bounds_m = _bounds_m([other for other in shown if other.truth.pair_id == site])
+                grounds = {site: _Ground.of(region_folder, manifest, bounds_m)}
+            _draw(charts[row][column], panel, grounds[site])
+
+
+def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
+    """Yield row and column of each panel: a site begins a row, and takes a second one if it has many variants."""
+    sizes: dict[str, int] = {}
+    for panel in shown:
+        sizes[panel.truth.pair_id] = sizes.get(panel.truth.pair_id, 0) + 1
+    begin = 0
+    for size in sizes.values():
+        lines = -(-size // _MOST_ACROSS)
+        across = -(-size // lines)
+        yield from ((begin + at // across, at % across) for at in range(size))
+        begin += lines
+
+
+def _bounds_m(shown: Sequence[FlightPanel]) -> tuple[float, float, float, float]:
+    """Return the square that the panels of a site show: west, east, south, north."""
+    true = np.concatenate([panel.place_m for panel in shown])
+    low, high = true.min(axis=0), true.max(axis=0)
+    reach_m = _ASTRAY * float((high - low).max())
+    reckoned = np.clip(np.concatenate([panel.reckoned_m for panel in shown]), low - reach_m, high + reach_m)
+    low, high = np.minimum(low, reckoned.min(axis=0)), np.maximum(high, reckoned.max(axis=0))
+    half_m = max(_LEAST_M, (0.5 + _AROUND) * float((high - low).max()))
+    east_m, north_m = ((low + high) / 2).tolist()
+    return (east_m - half_m, east_m + half_m, north_m - half_m, north_m + half_m)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Ground:
+    """The pale map under the panels of a site, west, east, south and north of it, and of the panels."""
+
+    picture: Floats
+    extent_m: tuple[float, float, float, float]
+    bounds_m: tuple[float, float, float, float]
+
+    @classmethod
+    def of(cls, folder: Path, manifest: Manifest, bounds_m: tuple[float, float, float, float]) -> Self:
+        """Read the map below the panels; where it is large, as coarsely as it is drawn."""
+        west, south, east, north = manifest.bounds_m
+        cell_m, path = manifest.cell_size_m, folder / region_files.LAYERS
+        left, right = (int(np.clip((at - west) // cell_m, 0, manifest.cols)) for at in bounds_m[:2])
+        bottom, top = (int(np.clip((north - at) // cell_m, 0, manifest.rows)) for at in bounds_m[2:])
+        if max(right - left, bottom - top) > _FINE_CELLS:
+            layers, extent_m = read_overview(path, longest_cells=_OVERVIEW_CELLS), (west, east, south, north)
+        else:
+            layers = read_layers(path, window=(top, left, bottom - top, right - left))
+            extent_m = (west + left * cell_m, west + right * cell_m, north - bottom * cell_m, north - top * cell_m)
+        step = max(1, max(layers.shape[1:]) // _DRAWN_CELLS)
+        picture = _PALE + (1 - _PALE) * paint_overview(manifest, layers[:, ::step, ::step])
+        return cls(picture=picture, extent_m=extent_m, bounds_m=bounds_m)
+
+
+def _draw(chart: Axes, panel: FlightPanel, ground: _Ground) -> None:
+    """Draw one flight over its map."""
+    chart.imshow(ground.picture, extent=ground.extent_m, interpolation="antialiased")
+    if panel.prior_m is not None:
+        chart.add_patch(Circle(panel.prior_m[:2], panel.prior_m[2], fill=False, ec=PRIOR, lw=1.2, ls=(0, (4, 2))))
+    reckoned, place, jump = panel.reckoned_m, panel.place_m, panel.carried_to
+    for part in np.split(np.arange(len(place)), [] if jump is None else [jump]):
+        chart.plot(*place[part].T, color="white", lw=3.2, zorder=2)
+        chart.plot(*place[part].T, color=TRUE, lw=1.1, zorder=3)
+    if jump is not None:
+        ahead = {"arrowstyle": "-|>", "color": LOST, "lw": 1.4, "ls": "--", "shrinkA": 0, "shrinkB": 0}
+        chart.annotate("", place[jump], place[jump - 1], arrowprops=ahead, zorder=6)
+    chart.plot(*place[panel.is_seen].T, ".", ms=3.5 if len(place) < _MANY else 2.0, color=TRUE, zorder=4)
+    chart.plot(*place[~panel.is_seen].T, "o", ms=3.6, mfc="white", mec=TRUE, mew=0.7, zorder=5)
+    chart.plot(*reckoned.T, color="white", lw=2.4, zorder=3.4)
+    chart.plot(*reckoned.T, color=RECKONED, lw=1.2, zorder=3.5)
+    chart.plot(*reckoned[-1], "s", ms=5, mfc=RECKONED, mec="white", mew=0.8, zorder=6)
+    chart.plot(*place[panel.lost].T, "x", ms=7, mew=2, color=LOST, zorder=7)
+    chart.plot(*place[0], "^", ms=7, mfc=TRUE, mec="white", mew=0.9, zorder=7)
+    chart.plot(*place[-1], "s", ms=5.5, mfc=TRUE, mec="white", mew=0.9, zorder=5.5)
+    chart.set(xlim=ground.bounds_m[:2], ylim=ground.bounds_m[2:], aspect="equal", facecolor="#e8e8e8")
+    without_ticks(chart)
+    _draw_bar(chart, ground.bounds_m)
+    chart.set_title("\n".join(_words(panel)))
+
+
+def _draw_bar(chart: Axes, bounds_m: tuple[float, float, float, float]) -> None:
+    """Draw a bar of a round length in the lower left corner."""
+    west, east, south, _ = bounds_m
+    length_m = max(step for step in (100, 200, 500, 1000, 2000, 5000) if step <= max(100.0, (east - west) / 4))
+    left_m, bottom_m = west + 0.04 * (east - west), south + 0.04 * (east - west)
+    chart.plot([left_m, left_m + length_m], [bottom_m] * 2, color="white", lw=5, solid_capstyle="butt", zorder=8)
+    chart.plot([left_m, left_m + length_m], [bottom_m] * 2, color="black", lw=2.2, solid_capstyle="butt", zorder=9)
+    box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0}
+    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m} m"  # noqa: PLR2004 - metres in a kilometre
+    middle_m = (left_m + length_m / 2, bottom_m + 0.02 * (east - west))
+    chart.text(*middle_m, text, ha="center", va="bottom", fontsize=7.5, bbox=box, zorder=9)
+
+
+def _words(panel: FlightPanel) -> tuple[str, ...]:
+    """Return the title of a panel: what the flight is, how long, and how far off reckoning ends."""
+    truth = panel.truth
+    age_years = truth.measured.get("age_years", 0.0)
+    step = f", map {age_years:.1f} years old" if age_years else f": {truth.strength:g}"
+    steps_m = np.hypot(*np.diff(panel.place_m, axis=0).T)
+    length_km = (steps_m.sum() - truth.measured.get("carried_m", 0.0)) / 1000
+    unseen = int((~panel.is_seen).sum())
+    facts = [f"{length_km:.1f} km", f"{len(panel.place_m)} views"]
+    facts += [f"{unseen} see nothing"] if unseen else []
+    facts += [f"carried {truth.measured['carried_m']:.0f} m"] if "carried_m" in truth.measured else []
+    off_m = float(np.hypot(*(panel.reckoned_m[-1] - panel.place_m[-1])))
+    return (
+        f"{truth.role}: {truth.kind}{step if truth.role == 'stress' else ''}"
+        + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
+        ", ".join(facts),
+        f"odometer alone ends {off_m:.0f} m off",
+        f"flight {panel.flight}",
+    )
+
+
+def _keys(shown: Sequence[FlightPanel]) -> list[Artist]:
+    """Return the handles of the legend, of what is drawn."""
+    kinds: list[tuple[bool, str, dict[str, Any]]] = [
+        (True, "true path and views", {"color": TRUE, "lw": 1.2, "marker": ".", "ms": 5}),
+        (True, "start", {"color": "none", "marker": "^", "mfc": TRUE, "mec": "white", "ms": 8}),
+        (True, "end", {"color": "none", "marker": "s", "mfc": TRUE, "mec": "white", "ms": 7}),
+        (
+            any(not panel.is_seen.all() for panel in shown),
+            "view that sees nothing",
+            {"color": "none", "marker": "o", "mfc": "white", "mec": TRUE, "ms": 5},
+        ),
+        (True, "odometer alone, from the true start", {"color": RECKONED, "lw": 1.4, "marker": "s", "ms": 5}),
+        (
+            any(len(panel.lost) for panel in shown),
+            "odometer lost on the way here",
+            {"color": "none", "marker": "x", "mec": LOST, "mew": 2, "ms": 7},
+        ),
+        (any(panel.carried_to for panel in shown), "carried", {"color": LOST, "lw": 1.4, "ls": "--"}),
+        (
+            any(panel.prior_m is not None for panel in shown),
+            "disc that the start is known to lie in",
+            {"color": PRIOR, "lw": 1.2, "ls": "--"},
+        ),
+    ]
+    return [Line2D([], [], label=label, **style) for is_drawn, label, style in kinds if is_drawn]

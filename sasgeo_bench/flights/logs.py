@@ -121,7 +121,8 @@ def read_flight(
     >>> round(flown.distance_m[-1] / 100), round(np.mean(flown.yaw_deg))
     (8, 88)
     """
-    for name, value in (("step_s", step_s), ("speed_mps", speed_mps), ("height_m", height_m)):
+    wishes = {"least_m": least_m, "height_m": height_m, "speed_mps": speed_mps, "step_s": step_s}
+    for name, value in wishes.items():
         if value is not None and not (math.isfinite(value) and value > 0):
             message = f"{name} must be positive, got {value!r}"
             raise FlightError(message)
@@ -176,8 +177,12 @@ def _resampled(flown: Trajectory, path: Path, step_s: float) -> Trajectory:
         raise FlightError(message)
     first_s, last_s = float(flown.time_s[0]), float(flown.time_s[-1])
     count = math.floor((last_s - first_s) / step_s) + 1
+    if count < 2:  # noqa: PLR2004 - a way
+        message = f"{path.name} lasts {last_s - first_s:g} s, less than one step of {step_s:g} s: take a smaller step_s"
+        raise FlightError(message)
     if count > MOST_POINTS:
-        message = f"{path.name} lasts {last_s - first_s:.0f} s, {MOST_POINTS * step_s:.0f} s are read at most: cut it"
+        lasts = f"{path.name} lasts {last_s - first_s:.0f} s, more than {MOST_POINTS} steps of {step_s:g} s"
+        message = f"{lasts}: cut it, or take a larger step_s"
         raise FlightError(message)
     return flown.at(np.minimum(first_s + step_s * np.arange(count), last_s))
 

@@ -27,9 +27,7 @@ _TURN_STEP_M: Final = 10.0  # by which turns along a way are measured
 _SMOOTHING_M: Final = 15.0  # standard deviation: a drone follows a road's course, not its every vertex
 _AHEAD_M: Final = 30.0  # over which the direction at a junction is measured
 _SHARPEST_DEG: Final = 120.0  # at a junction; sharper ones are U-turns
-_LINK_M: Final = (
-    60.0  # two turns nearer to each other count as one: over a link between carriageways there is no way back
-)
+_LINK_M: Final = 60.0  # nearer turns count as one: over a link between carriageways there is no way back
 _BACK_DEG: Final = 150.0  # within that length, on one way: turning loops and hairpins are not followed
 _STRAIGHT_DEG: Final = 40.0  # by which a turn is e times less likely
 _AGAIN: Final = 0.2  # of the chance of a way that was flown before

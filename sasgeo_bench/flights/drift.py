@@ -36,7 +36,7 @@ _MOST_TILT_DEG: Final = 10.0
 _MOST_JUMPS: Final = 10  # of a short run; of a longer one, half of its steps
 _NODES: Final = 10  # of the shortest segment
 _MOST_NODES: Final = 1_000_000  # of a path
-_LEAST_SPREAD: Final = 0.02  # of points around their mean, in segment lengths, to tell a scale from
+LEAST_SPREAD: Final = 0.02  # of points around their mean, in segment lengths, to tell a scale from
 _M_PER_KM: Final = 1000.0
 _PERCENT: Final = 100.0
 
@@ -227,23 +227,17 @@ def measure_drift(
     return pd.DataFrame([*rows, *_rate_rows(runs)], columns=names)
 
 
-def poisson_interval(count: int, *, level: float = LEVEL) -> tuple[float, float]:
-    """Return the exact interval of the mean of a Poisson count (Garwood, Biometrika 1936).
+def poisson_interval(count: int) -> tuple[float, float]:
+    """Return the exact interval (95 %) of the mean of a Poisson count (Garwood, Biometrika 1936).
 
     Nothing seen does not mean never:
 
     >>> tuple(round(end, 2) for end in poisson_interval(0))
     (0.0, 3.69)
     """
-    rest = (1 - level) / 2
+    rest = (1 - LEVEL) / 2
     lo = float(chi2.ppf(rest, 2 * count)) / 2 if count else 0.0
     return lo, float(chi2.ppf(1 - rest, 2 * count + 2)) / 2
-
-
-def bootstrap_means(values: Floats, *, draws: int, rng: np.random.Generator) -> Floats:
-    """Return means of rows drawn with replacement, shape (draws, M), from values of clusters, shape (K, M)."""
-    picks = rng.integers(0, len(values), size=(draws, len(values)))
-    return np.asarray(values[picks].mean(axis=1))
 
 
 def _length_rows(
@@ -265,7 +259,7 @@ def _length_rows(
         figure = f"{name}_rms" if rms and name != "scale_pct" else name
         row: dict[str, object] = {"figure": figure, "length_m": length_m, "sequences": len(means), "segments": segments}
         if means:
-            drawn = bootstrap_means(np.array(means)[:, None], draws=draws, rng=rng)[:, 0]
+            drawn = np.array(means)[rng.integers(len(means), size=(draws, len(means)))].mean(axis=1)
             rest = (1 - LEVEL) / 2
             ends = np.array([np.mean(means), *np.quantile(drawn, [rest, 1 - rest])])
             ends[1:] += 0.0 if len(means) > 1 else math.nan  # of one sequence nobody knows how much they differ
@@ -303,7 +297,7 @@ def _errors_of(part: Stretch, count: int, spacing_m: float) -> Segments:
     error_m = np.abs(moved - (flown[count:] - flown[:-count]))
     spread = _window_products(flown, flown, count).real
     common = np.abs(_window_products(flown, believed, count))
-    is_spread = spread > (count + 1) * (_LEAST_SPREAD * count * spacing_m) ** 2
+    is_spread = spread > (count + 1) * (LEAST_SPREAD * count * spacing_m) ** 2
     scale = np.divide(common, spread, out=np.full(len(spread), np.nan), where=is_spread & (common > 0))
     return Segments(
         position_pct=_PERCENT * error_m / (count * spacing_m),

@@ -19,7 +19,16 @@ from scipy.optimize import nnls
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights.drift import DRAWS, LENGTHS_M, LEVEL, PairedRun, Stretch, segment_errors, spacing_of
+from sasgeo_bench.flights.drift import (
+    DRAWS,
+    LEAST_SPREAD,
+    LENGTHS_M,
+    LEVEL,
+    PairedRun,
+    Stretch,
+    segment_errors,
+    spacing_of,
+)
 from sasgeo_bench.flights.drift_profile import DriftProfile, Dropouts, HeadingDrift, Resets, ScaleDrift, SlipDrift
 from sasgeo_bench.flights.processes import heading_law, lattice_covariance, lattice_heading
 
@@ -40,14 +49,10 @@ _GAIN: Final = 0.9  # of the misfit, for a heading that saturates to be preferre
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FittedDrift:
-    """A profile, and `parameters`: `name`, `value`, `lo`, `hi` (95 %, bootstrap over sequences) of each that is fitted.
-
-    `figures` holds, by figure and length, the root mean squares that were measured and those of the profile.
-    """
+    """A profile, and `name`, `value`, `lo`, `hi` (95 %, bootstrap over sequences) of each parameter that is fitted."""
 
     profile: DriftProfile
     parameters: pd.DataFrame
-    figures: pd.DataFrame
 
 
 def fit_profile(
@@ -114,9 +119,7 @@ def fit_profile(
         "scale": ScaleDrift(bias_pct=values[1]),
         "heading": HeadingDrift(walk_deg_at_100m=values[2], rate_deg_at_100m=values[3], length_m=heading_m),
     }
-    profile = _profile(name, runs, drift, lengths_m, card)
-    figures = _figures(lengths_m, measured=_mean(squares), modelled=_mean(design) @ variances)
-    return FittedDrift(profile=profile, parameters=parameters, figures=figures)
+    return FittedDrift(profile=_profile(name, runs, drift, lengths_m, card), parameters=parameters)
 
 
 def law_figures(profile: DriftProfile, runs: Sequence[PairedRun], *, lengths_m: Sequence[float]) -> pd.DataFrame:
@@ -133,20 +136,9 @@ def law_figures(profile: DriftProfile, runs: Sequence[PairedRun], *, lengths_m: 
             *(heading.walk_deg_at_100m, heading.rate_deg_at_100m),
         ]
     )
-    modelled = design @ values**2
-    return _figures(lengths_m, measured=modelled, modelled=modelled)[["figure", "length_m", "modelled"]]
-
-
-def _figures(lengths_m: Sequence[float], *, measured: Floats, modelled: Floats) -> pd.DataFrame:
     names = ("position_pct_rms", "yaw_deg_rms", "scale_pct")
-    return pd.DataFrame(
-        {
-            "figure": [name for _ in lengths_m for name in names],
-            "length_m": np.repeat(np.array(lengths_m, dtype=np.float64), len(names)),
-            "measured": np.sqrt(measured),
-            "modelled": np.sqrt(modelled),
-        }
-    )
+    rows = [(name, float(length)) for length in lengths_m for name in names]
+    return pd.DataFrame(rows, columns=["figure", "length_m"]).assign(modelled=np.sqrt(design @ values**2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,7 +242,7 @@ def _segment_design(part: Stretch, count: int, law: _UnitLaw, spacing_m: float) 
     # The scale of the points is that of their errors along the vectors from the mean: step k moves all after it.
     after = np.cumsum(np.conj(points)[:, ::-1], axis=1)[:, ::-1][:, 1:] * steps
     scale = _PERCENT**2 * (_quadratic(law.along, after.real) + _quadratic(law.across, after.imag))
-    least = (count + 1) * (0.02 * count * spacing_m) ** 2  # as in drift.py, where the scale of less is not measured
+    least = (count + 1) * (LEAST_SPREAD * count * spacing_m) ** 2  # the scale of less is not measured
     scale = np.divide(scale, spread[:, None] ** 2, out=np.full(scale.shape, np.nan), where=spread[:, None] > least)
     return np.stack([position, np.broadcast_to(law.turn, position.shape), scale], axis=1)
 

@@ -78,27 +78,6 @@ class Odometry:
         return len(self.right_m)
 
 
-def true_odometry(flown: Trajectory) -> Odometry:
-    """Return the increments of a trajectory, without any error.
-
-    A body that heads east and flies 10 m east goes up in its own axes:
-
-    >>> flown = Trajectory.of_angles(time_s=[0.0, 1.0], position_m=[[0, 0, 80], [10, 0, 80]], yaw_deg=[90.0, 90.0])
-    >>> steps = true_odometry(flown)
-    >>> steps.right_m.round(6).tolist(), steps.up_m.round(6).tolist()
-    ([0.0], [10.0])
-    """
-    step = _true_steps(flown)
-    count = len(step)
-    return Odometry(
-        right_m=step.real,
-        up_m=step.imag,
-        yaw_deg=_turns_deg(flown),
-        covariance=np.tile(np.diag([_FLOOR_M**2, _FLOOR_M**2, _FLOOR_DEG**2]), (count, 1, 1)),
-        is_lost=np.zeros(count, dtype=bool),
-    )
-
-
 def draw_odometry(
     flown: Trajectory, profile: DriftProfile, *, belief: Belief = "honest", rng: np.random.Generator
 ) -> Odometry:

@@ -47,7 +47,7 @@ DOCUMENTS = (
 
 # Commands of the program that are not run, each with its reason; all are held against its flags.
 ONLY_PARSED = {
-    r"vaduz": "needs an extract of Liechtenstein",
+    r"vaduz|liechtenstein": "needs an extract of Liechtenstein",
     r"--extracts|--extract ": "needs extracts",
     r"--imagery|zanzibar": "needs aerial pictures; tests/regions/test_imagery.py makes some",
     r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",

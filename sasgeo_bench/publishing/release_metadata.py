@@ -44,13 +44,14 @@ QUERY_TEXTS: Final = {
     "prior_yaw_deg": "noisy heading, degrees clockwise from grid north; null where unknown",
     "prior_yaw_sigma_deg": "standard deviation of that heading, degrees; null where unknown",
     "prior_scale_sigma": "standard deviation of the view's scale around 1",
-    "candidates": "retrieval: the poses to rank; empty for localization",
+    "candidates": "retrieval: the poses to rank; empty for localization and flights",
     "vectors": "perceived lines and outlines: class, level, is_bridge, and WKB in metres right and up from the middle "
     "of the view; null in most suites",
-    "sequence_id": "sequence of the view; null in every suite of today",
-    "frame": "number within the sequence; null in every suite of today",
-    "increment": "motion since the frame before; null in every suite of today",
-    "increment_covariance": "covariance of that motion; null in every suite of today",
+    "sequence_id": "flight of the view; null for a view alone",
+    "frame": "number of the view within its flight, from 0; null for a view alone",
+    "increment": "what the odometer says since the view before: right and up in its axes, metres, and the turn, degrees "
+    "clockwise; null at the first view, where the odometer is lost, and for a view alone",
+    "increment_covariance": "what the odometer believes of it: 3 x 3 row by row, m2, m deg and deg2; null without one",
     "frames": "pictures with the cameras that are believed; null where perception is modelled",
     "asked_sha256": "hash of the row and its map: an answer says which query it answers by it",
 }

@@ -49,8 +49,8 @@ QUERY_TEXTS: Final = {
     "of the view; null in most suites",
     "sequence_id": "flight of the view; null for a view alone",
     "frame": "number of the view within its flight, from 0; null for a view alone",
-    "increment": "what the odometer says since the view before: right and up in its axes, metres, and the turn, degrees "
-    "clockwise; null at the first view, where the odometer is lost, and for a view alone",
+    "increment": "what the odometer says since the view before: right and up in its axes, metres, and the turn, "
+    "degrees clockwise; null at the first view, where the odometer is lost, and for a view alone",
     "increment_covariance": "what the odometer believes of it: 3 x 3 row by row, m2, m deg and deg2; null without one",
     "frames": "pictures with the cameras that are believed; null where perception is modelled",
     "asked_sha256": "hash of the row and its map: an answer says which query it answers by it",

@@ -136,7 +136,9 @@ def draw_odometry(
     drift = law.draw(rng)
     is_lost = _draw_lost(steps_m, profile, rng)
     moved = step * np.exp(drift.log_length - 1j * drift.course_rad) + drift.jump_m
-    covariance = law.covariance(step, drift.resets) / (OPTIMISM**2 if belief == "optimistic" else 1.0)
+    # Of what the odometer takes for its way: covariances of the true steps would tell their length.
+    believed = _Law(profile=profile, steps_m=np.abs(moved))
+    covariance = believed.covariance(moved, drift.resets) / (OPTIMISM**2 if belief == "optimistic" else 1.0)
     covariance[is_lost] = np.diag([LOST_M**2, LOST_M**2, LOST_DEG**2])
     yaw_deg = wrap_deg(_turns_deg(flown) + np.degrees(drift.turn_rad) + drift.jump_deg)
     return Odometry(

@@ -259,3 +259,14 @@ def test_profiles_that_are_none_are_refused(tmp_path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match="cannot be written"):
         write_drift_profile(load_profile("perfect"), tmp_path / "file" / "mine.toml")
+
+
+def test_covariances_tell_no_more_of_the_way_than_the_increments_do() -> None:
+    """Solved for the length of a step, the variance of the turn gives what the odometer says, not the truth."""
+    flown = straight(step_m=25.0)
+    poor = load_profile("wheel-poor")
+    steps = draw_odometry(flown, poor, rng=np.random.default_rng(8))
+    per_m = poor.heading.walk_deg_at_100m**2 / 100
+    told_m = steps.covariance[:, 2, 2] / per_m
+    assert told_m == pytest.approx(np.hypot(steps.right_m, steps.up_m), rel=1e-6, abs=1e-4)
+    assert np.abs(told_m - 25.0).max() > 0.1

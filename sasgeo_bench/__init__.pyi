@@ -30,12 +30,16 @@ from .matching.matcher import Training as Training
 from .matching.plugins import load_matcher as load_matcher
 from .matching.plugins import load_rejector as load_rejector
 from .matching.plugins import load_segmenter as load_segmenter
+from .matching.plugins import load_tracker as load_tracker
 from .matching.results import Prediction as Prediction
 from .matching.segmenter import ImageTraining as ImageTraining
 from .matching.segmenter import LearningSegmenter as LearningSegmenter
 from .matching.segmenter import Segmenter as Segmenter
 from .matching.segmenter import SegmenterCard as SegmenterCard
 from .matching.segmenter import check_segmentation as check_segmentation
+from .matching.tracker import Fix as Fix
+from .matching.tracker import Tracker as Tracker
+from .matching.tracker import check_fix as check_fix
 from .osm.features import make_features as make_features
 from .osm.taxonomy import load_taxonomy as load_taxonomy
 from .regions.evidence import ABSENT as ABSENT

@@ -40,7 +40,7 @@ PROSE = [  # rows of tables and code may be longer
 NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.py"))
 PATHS = re.compile(r"\b(?:sasgeo_bench|baselines|benchmarks|tests|docs)/[\w./-]*\w\.(?:py|md|toml|sh)\b")
 MOST_TERMS = 60
-ENTRY_POINTS = ("sasgeo_bench.matchers", "sasgeo_bench.rejectors", "sasgeo_bench.segmenters")
+ENTRY_POINTS = tuple(f"sasgeo_bench.{kind}" for kind in ("matchers", "rejectors", "segmenters", "trackers"))
 
 
 def read(path: Path) -> str:

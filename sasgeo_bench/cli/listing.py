@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""List regions, suites, matchers, rejectors and segmenters; each command imports what it lists."""
+"""List regions, suites, matchers, trackers, rejectors and segmenters; each command imports what it lists."""
 
 from collections.abc import Mapping
 
@@ -13,6 +13,7 @@ from sasgeo_bench.matching.plugins import (
     ORACLE_SEGMENTER,
     REJECTORS,
     SEGMENTERS,
+    TRACKERS,
     list_entry_points,
 )
 
@@ -52,6 +53,11 @@ def list_matchers_command() -> None:
 def list_rejectors_command() -> None:
     """List the rejectors that are installed, and where each comes from."""
     _list("rejector", REJECTORS, {})
+
+
+def list_trackers_command() -> None:
+    """List the trackers that are installed, and where each comes from."""
+    _list("tracker", TRACKERS, {ORACLE: ("sasgeo-bench", "a control, given the truths")})
 
 
 def list_segmenters_command() -> None:

@@ -69,6 +69,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     },
     "Flights": {
         "measure-drift": "flights",
+        "list-trackers": "listing",
     },
     "Datasets of others": {
         "import-dataset": "importing",

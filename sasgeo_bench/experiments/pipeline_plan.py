@@ -29,7 +29,7 @@ from sasgeo_bench.tasks.build import is_of_region, look_of, made_tasks, why_to_d
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import BY, CONTROLS, PriorGroup, base_of
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES, find_suite
+from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES, PICTURE_SUITES, find_suite
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
@@ -294,9 +294,12 @@ def plan_pipeline(
 
 
 def _check_pictures(spec: PipelineFile) -> None:
-    """Refuse suites of pictures that no segmenter sees, and segmenters of suites without pictures."""
+    """Refuse suites of pictures that no segmenter sees, segmenters of suites without pictures, and flights."""
     for task in spec.task:
         for name in task.suites:
+            if name in FLIGHT_SUITES:
+                message = f"pipeline {spec.id!r}: suite {name!r} is of flights, which no board scores yet: leave it out"
+                raise ConfigError(message)
             if find_suite(name).is_pictured == bool(task.segmenters):
                 continue
             what = "draws pictures, and no segmenter sees them" if not task.segmenters else "draws no pictures"

@@ -15,8 +15,10 @@ from sasgeo_bench.texts import message_of, one_line
 if TYPE_CHECKING:
     from sasgeo_bench.matching.matcher import Matcher, Rejector
     from sasgeo_bench.matching.segmenter import Segmenter
+    from sasgeo_bench.matching.tracker import Tracker
 
 MATCHERS: Final = "sasgeo_bench.matchers"
+TRACKERS: Final = "sasgeo_bench.trackers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 SEGMENTERS: Final = "sasgeo_bench.segmenters"
 SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
@@ -26,7 +28,7 @@ YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are n
 ORACLE: Final = "oracle_pose"
 ORACLE_SEGMENTER: Final = "oracle_segmenter"
 _RESERVED: Final = {MATCHERS: ORACLE, SEGMENTERS: ORACLE_SEGMENTER}
-KINDS: Final = {MATCHERS: "matcher", REJECTORS: "rejector", SEGMENTERS: "segmenter"}
+KINDS: Final = {MATCHERS: "matcher", TRACKERS: "tracker", REJECTORS: "rejector", SEGMENTERS: "segmenter"}
 
 
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
@@ -126,6 +128,30 @@ def load_matcher(spec: str) -> "Matcher":
     matcher: Matcher = _made(spec, _find(spec, MATCHERS))
     _check(spec, matcher, MatcherCard, MATCHERS, ("prepare", "match"))
     return matcher
+
+
+def load_tracker(spec: str) -> "Tracker":
+    """Import and make the tracker of a name, or of "module:Class"; raise `MatchError` as `load_matcher` does.
+
+    >>> load_tracker("dead_reckoning").card.tracks
+    ('sequence',)
+    """
+    from sasgeo_bench.matching.matcher import MatcherCard  # noqa: PLC0415 - as in load_matcher
+
+    tracker: Tracker = _made(spec, _find(spec, TRACKERS))
+    _check(spec, tracker, MatcherCard, TRACKERS, ("prepare", "start", "step"))
+    return tracker
+
+
+def load_method(spec: str) -> "Matcher | Tracker":
+    """Import and make a matcher or a tracker; a class of one's own is a tracker if it has `step`.
+
+    Raise `MatchError` as `load_matcher` does.
+    """
+    if ":" in spec:
+        return load_tracker(spec) if callable(getattr(_find(spec, TRACKERS), "step", None)) else load_matcher(spec)
+    is_tracker = spec in list_entry_points(TRACKERS) and spec not in list_entry_points()
+    return load_tracker(spec) if is_tracker else load_matcher(spec)
 
 
 def load_segmenter(spec: str) -> "Segmenter":

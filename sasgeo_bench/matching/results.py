@@ -36,6 +36,10 @@ class Prediction:
         and in files whose author gives none. Rows of older programs have the matcher's own clock here.
     matcher_s : float, optional
         Of `match` alone by the clock of the matcher's own process; no metric uses it.
+    is_accepted : bool, optional
+        Of a tracker: whether its estimate, the first pose, may be relied on.
+    covariance : tuple of float, optional
+        Of a tracker's estimate: 3 x 3, row by row, in the order east, north, yaw; m2, m deg and deg2.
     """
 
     query_id: str
@@ -46,6 +50,8 @@ class Prediction:
     message: str = ""
     latency_s: float | None = None
     matcher_s: float | None = None
+    is_accepted: bool | None = None
+    covariance: tuple[float, ...] | None = None
 
 
 def matcher_hash(spec: str, version: str, code: bytes, settings: str) -> str:

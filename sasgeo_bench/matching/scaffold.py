@@ -19,7 +19,18 @@ _LONGEST: Final = 60
 _TAKEN: Final = frozenset(
     {
         *sys.stdlib_module_names,
-        *("affine", "cv2", "filelock", "geopandas", "lazy_loader", "matplotlib", "numpy", "osmium", "pandas"),
+        *(
+            "affine",
+            "cv2",
+            "defusedxml",
+            "filelock",
+            "geopandas",
+            "lazy_loader",
+            "matplotlib",
+            "numpy",
+            "osmium",
+            "pandas",
+        ),
         *("pooch", "psutil", "pyarrow", "pydantic", "pyproj", "rasterio", "rich"),
         *("scipy", "shapely", "tqdm", "typer", "click"),
         *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),

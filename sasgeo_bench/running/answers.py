@@ -8,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import groupby
 from typing import Final, Generic, TypeVar
 
 from sasgeo_bench.errors import MatchError, StoreError
@@ -48,17 +49,19 @@ def pays(*, left: int, askers: int, start_s: float, pace_s: float | None) -> boo
 
 
 class Schedule(Generic[Item]):
-    """Queries of several maps, shared by threads; `lines` holds the queries of each map, and their number.
+    """Queries of several maps, shared by threads.
 
-    >>> schedule = Schedule([(iter("ab"), 2), (iter("c"), 1)])
+    `lines` holds the queries of each map in groups, each of which one thread answers, and the number of queries.
+
+    >>> schedule = Schedule([(iter(["ab", "c"]), 3), (iter("d"), 1)])
     >>> while (number := schedule.take()) is not None:
-    ...     print(number, *schedule.items(number))
-    0 a b
-    1 c
+    ...     print(number, *schedule.groups(number))
+    0 ab c
+    1 d
     """
 
     def __init__(
-        self, lines: Sequence[tuple[Iterator[Item], int]], *, clock: Callable[[], float] = time.monotonic
+        self, lines: Sequence[tuple[Iterator[Sequence[Item]], int]], *, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self._lines = [_Line(items, count) for items, count in lines]
         self._clock = clock
@@ -83,17 +86,17 @@ class Schedule(Generic[Item]):
         in_need = (line for line in self._lines if line.pays())
         return max(in_need, key=lambda line: line.left / (line.askers + 1), default=None)
 
-    def items(self, number: int) -> Iterator[Item]:
-        """Yield queries of a map, each to one thread only; measure the time until the thread asks for the next."""
+    def groups(self, number: int) -> Iterator[Sequence[Item]]:
+        """Yield groups of a map, each to one thread only; measure the time until the thread asks for the next."""
         line, is_first = self._lines[number], True
         while not self.is_stopped:
-            item = line.draw()
-            if item is None:
+            group = line.draw()
+            if group is None:
                 break
             begun = self._clock()
-            yield item
+            yield group
             with self._changed:
-                line.note(self._clock() - begun, is_first=is_first)
+                line.note(self._clock() - begun, len(group), is_first=is_first)
                 self._changed.notify_all()
             is_first = False
         with self._changed:
@@ -114,27 +117,27 @@ class Schedule(Generic[Item]):
 class _Line(Generic[Item]):
     """Queries of one map, and measurements of the time they take."""
 
-    def __init__(self, items: Iterator[Item], count: int) -> None:
+    def __init__(self, groups: Iterator[Sequence[Item]], count: int) -> None:
         self.left = count
         self.askers = 0
-        self._items = items
+        self._groups = groups
         self._lock = threading.Lock()
         self._start_s = 0.0
         self._spent_s, self._count = 0.0, 0
 
-    def draw(self) -> Item | None:
-        """Return the next query, or None."""
+    def draw(self) -> Sequence[Item] | None:
+        """Return the next group of queries, or None."""
         with self._lock:
-            item = next(self._items, None)
-            self.left = 0 if item is None else self.left - 1
-            return item
+            group = next(self._groups, None)
+            self.left = 0 if group is None else self.left - len(group)
+            return group
 
-    def note(self, seconds: float, *, is_first: bool) -> None:
-        """Record the time of a query; the first of a process includes its start, and is not part of the pace."""
+    def note(self, seconds: float, count: int, *, is_first: bool) -> None:
+        """Record the time of a group; the first of a process includes its start, and is not part of the pace."""
         if is_first:
             self._start_s = max(self._start_s, seconds)
         else:
-            self._spent_s, self._count = self._spent_s + seconds, self._count + 1
+            self._spent_s, self._count = self._spent_s + seconds, self._count + count
 
     def pays(self) -> bool:
         """Return whether one more process pays."""
@@ -208,7 +211,7 @@ def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) 
     groups = [[_Writer(part, watch=watch) for part in group] for group in by_map(plan.request.spec, parts)]
     maps = [_Map(plan, group) for group in groups]
     writers = [writer for group in groups for writer in group]
-    schedule = Schedule([(place.questions(), place.count) for place in maps])
+    schedule = Schedule([(place.groups(), place.count) for place in maps])
     threads = min(jobs, sum(place.count for place in maps))
     with ExitStack() as ends:
         for writer in writers:
@@ -249,7 +252,12 @@ class _Map:
         asks = "imagery" in plan.card.needs
         self._is_pictured = asks and read_manifest(writers[0].part.region).imagery is not None
 
-    def questions(self) -> Iterator[Question]:
+    def groups(self) -> Iterator[list[Question]]:
+        """Yield queries in groups: each view alone, and all views of a flight together, since their order counts."""
+        for _, group in groupby(self._questions(), key=lambda item: flight_of(item[1])):
+            yield list(group)
+
+    def _questions(self) -> Iterator[Question]:
         """Yield the queries of all tasks, each with the writer of its row; hold one row group in memory."""
         for writer in self._writers:
             writer.begin()
@@ -260,31 +268,43 @@ class _Map:
                 yield writer, query, blob
 
     def ask(self, schedule: Schedule[Question], number: int) -> None:
-        """Prepare the map in a new process with the first query, then answer queries until none is left."""
-        top_k, ready, is_warm = self._plan.request.top_k, self._failed_training(), False
+        """Prepare the map in a new process with the first query, then answer groups of queries until none is left."""
+        ready = self._failed_training()
         with self._process() as worker:
-            for writer, query, blob in schedule.items(number):
+            is_warm = False
+            for group in schedule.groups(number):
                 if ready is None:
                     result = self._plan.training_result
                     region, text = self._writers[0].part.region, None if result is None else result.text
                     ready = guarded(self._plan, partial(worker.prepare, region, text))
                     self._check_map(ready)
-                    if schedule.is_stopped:
-                        return
+                if schedule.is_stopped:
+                    return
                 if self._failed_training() is None:
-                    writer.add_process(worker, ready)
-                reason = self._lacks(query)
-                if reason is not None:
-                    writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
-                    continue
-                reply = ready
-                if ready.status == "ok":
-                    ask = partial(worker.match, blob, top_k=top_k)
-                    if not is_warm:
-                        guarded(self._plan, ask)
-                        is_warm = True
-                    reply = guarded(self._plan, ask)
-                writer.add(self._row(query, reply), cpu_s=reply.cpu_s)
+                    for writer in {id(item[0]): item[0] for item in group}.values():
+                        writer.add_process(worker, ready)
+                if ready.status == "ok" and not is_warm and self._lacks(group[0][1]) is None:
+                    guarded(self._plan, partial(worker.match, group[0][2], top_k=self._plan.request.top_k))
+                    is_warm = True
+                self._ask_group(schedule, worker, ready, group)
+
+    def _ask_group(
+        self, schedule: Schedule[Question], worker: Worker | Oracle, ready: Reply, group: Sequence[Question]
+    ) -> None:
+        """Answer the queries of a group in order; a flight ends with the first view that fails."""
+        failed = None if ready.status == "ok" else ready
+        for writer, query, blob in group:
+            if schedule.is_stopped:
+                return
+            reason = self._lacks(query)
+            if reason is not None:
+                writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
+                continue
+            reply = failed or guarded(self._plan, partial(worker.match, blob, top_k=self._plan.request.top_k))
+            row = self._row(query, reply)
+            writer.add(row, cpu_s=reply.cpu_s)
+            if query.step is not None and failed is None and row.status != "ok":
+                failed = Reply(status=row.status, message=f"since view {query.step.frame} of the flight: {row.message}")
 
     def _lacks(self, query: Query) -> str | None:
         """Return why a query is not applicable to the matcher, or None."""
@@ -323,6 +343,11 @@ class _Map:
         return Worker(spec=request.spec, reach=reach_of(request, (part.region,)), limits=request.limits)
 
 
+def flight_of(query: Query) -> str:
+    """Return the flight of a view, or the id of a view alone."""
+    return query.query_id if query.step is None else query.step.sequence_id
+
+
 def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
     """Make a row of a reply, checked against the query."""
     if reply.status != "ok":
@@ -340,6 +365,8 @@ def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
         diagnostics=match.diagnostics,
         latency_s=reply.seconds,
         matcher_s=reply.own_s,
+        is_accepted=reply.is_accepted,
+        covariance=reply.covariance,
     )
 
 

@@ -3,7 +3,8 @@
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +21,7 @@ from sasgeo_bench.running.oracle import CARD
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, map_of, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_rows import asked_under, tie_key
 
@@ -358,9 +360,10 @@ def _part(
         )
         raise StoreError(message)
     index, count = request.shard
-    own = [name for name in asked if _shard_of(name, count) == index - 1][: request.limit]
+    unit_of = unit_of_task(about)
+    own = [name for name in asked if _shard_of(unit_of(name), count) == index - 1][: request.limit]
     done = {tie.query_id for tie in ties if tie.status not in request.again and tie.answers(asked)}
-    left = tuple(name for name in own if name not in done)
+    left = whole_units(own, done, unit_of)
     return RunPart(
         task=task,
         about=about,
@@ -374,6 +377,21 @@ def _part(
         imagery=imagery,
         key=key,
     )
+
+
+def unit_of_task(about: Mapping[str, Any]) -> Callable[[str], str]:
+    """Return a function from the id of a query to that of what is asked at once: a flight, or the query itself."""
+    return flight_id if "sequence" in about.get("counts", {}) else str
+
+
+def whole_units(names: Sequence[str], done: AbstractSet[str], unit_of: Callable[[str], str]) -> tuple[str, ...]:
+    """Return the queries that are left: a flight of which a view has no answer is asked from its first view on.
+
+    >>> whole_units(["a0", "a1", "b0", "b1"], {"a0", "a1", "b0"}, lambda name: name[0])
+    ('b0', 'b1')
+    """
+    open_units = {unit_of(name) for name in names if name not in done}
+    return tuple(name for name in names if unit_of(name) in open_units)
 
 
 def _rendered_imagery(card: MatcherCard, region: Path) -> str | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import STATUSES, Prediction
+from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.tasks.task_rows import ASKED, POSE_FIELDS, is_like, poses_of
 from sasgeo_bench.texts import (
@@ -40,7 +41,10 @@ PREDICTION_SCHEMA: Final = pa.schema(
 )
 RUN_SCHEMA: Final = PREDICTION_SCHEMA.append(pa.field(ASKED, pa.string()))  # of a submission
 MATCHER_S: Final = "matcher_s"
-PART_SCHEMA: Final = RUN_SCHEMA.append(pa.field(MATCHER_S, pa.float64()))  # of a run's own parts
+# Of trackers, and not in files of others unless they follow flights.
+FIX_FIELDS: Final = (pa.field("is_accepted", pa.bool_()), pa.field("covariance", pa.list_(pa.float64())))
+_OPTIONAL: Final = (pa.field(MATCHER_S, pa.float64()), *FIX_FIELDS)
+PART_SCHEMA: Final = pa.schema([*RUN_SCHEMA, *_OPTIONAL], metadata=RUN_SCHEMA.metadata)  # of a run's own parts
 
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
@@ -57,6 +61,8 @@ def prediction_row(prediction: Prediction) -> dict[str, Any]:
         "message": prediction.message,
         "latency_s": prediction.latency_s,
         MATCHER_S: prediction.matcher_s,
+        "is_accepted": prediction.is_accepted,
+        "covariance": None if prediction.covariance is None else list(prediction.covariance),
     }
 
 
@@ -92,6 +98,8 @@ def _with_candidates(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float
         message=row["message"] or "",
         latency_s=row["latency_s"],
         matcher_s=row.get(MATCHER_S),
+        is_accepted=row.get("is_accepted"),
+        covariance=None if row.get("covariance") is None else tuple(row["covariance"]),
     )
 
 
@@ -105,7 +113,7 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
     """
     found = {field.name: field.type for field in table.schema}
     # Rows of a run state the matcher's own time as well; a file of somebody else need not.
-    known = [*PREDICTION_SCHEMA, *([pa.field(MATCHER_S, pa.float64())] if MATCHER_S in found else [])]
+    known = [*PREDICTION_SCHEMA, *(field for field in _OPTIONAL if field.name in found)]
     counts = {field: table.schema.names.count(field.name) for field in known}
     twice = [(field.name, f"{count} columns", str(field.type)) for field, count in counts.items() if count > 1]
     return twice or [
@@ -144,6 +152,8 @@ def row_faults(table: pa.Table) -> Iterator[RowFault]:
         is_wrong = ~is_null & ~_is_within(name, values)
         shown = [f"{name} is {value:g}" for value in values] if is_wrong.any() else []
         yield from _faults(name, is_wrong, shown, f"{bounds_text(name)} or null")
+    if "covariance" in table.column_names:
+        yield from _of_covariances(table["covariance"])
     yield from _of_candidates(table["candidates"])
     yield from _of_diagnostics(table["diagnostics"])
 
@@ -202,6 +212,18 @@ def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
         is_wrong = ~_is_within(name, values)
         shown = [f"{name} is {value:g}" for value in values[is_wrong]]
         yield from _firsts("candidates", rows[is_wrong], shown, bounds_text(name))
+
+
+def _of_covariances(column: pa.ChunkedArray) -> Iterator[RowFault]:
+    """Check that every covariance is null, or nine numbers."""
+    whole = column.cast(pa.list_(pa.float64())).combine_chunks()
+    is_null = np.asarray(whole.is_null())
+    rows, values = pc.list_parent_indices(whole).to_numpy(), _numbers(pc.list_flatten(whole))
+    sound = np.bincount(rows[np.abs(values) <= MOST_VARIANCE], minlength=len(whole)) == SIDE**2
+    counts = np.bincount(rows, minlength=len(whole))
+    shown = [f"{count} numbers" for count in counts.tolist()]
+    is_wrong = ~is_null & ~(sound & (counts == SIDE**2))
+    yield from _faults("covariance", is_wrong, shown, f"{SIDE**2} numbers within {MOST_VARIANCE:g}, or null")
 
 
 def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:

@@ -12,6 +12,7 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import MOST_SAID, Match, MatcherCard, Need, check_learned
 from sasgeo_bench.matching.results import Status
+from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE
 from sasgeo_bench.tasks.query import Track
 from sasgeo_bench.texts import (
     BOUNDS,
@@ -49,9 +50,14 @@ class PluginReply:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reply(PluginReply):
-    """Reply of a matcher: loading returns its `card` too; preparing, by how much memory grew; a query, the `match`."""
+    """Reply of a matcher: loading returns its `card` too; preparing, by how much memory grew; a query, the `match`.
+
+    A tracker's says whether its estimate is accepted, and its covariance, 3 x 3 row by row.
+    """
 
     match: Match | None = None
+    is_accepted: bool | None = None
+    covariance: tuple[float, ...] | None = None
     card: MatcherCard | None = None
     grown_bytes: int | None = None
 
@@ -86,6 +92,7 @@ Diagnostic = Annotated[
     tuple[Annotated[Line, Field(min_length=1, max_length=MOST_NAME)], Annotated[float, _bounded("diagnostics")]],
     Strict(strict=False),
 ]
+Variance = Annotated[float, Field(ge=-MOST_VARIANCE, le=MOST_VARIANCE)]
 Seconds = Annotated[float, Field(ge=0, le=MOST_S)]
 
 
@@ -158,6 +165,8 @@ class _Row(Strictly):
     candidates: Annotated[list[Candidate], Field(max_length=MOST_CANDIDATES)]
     confidence: Annotated[float, _bounded("confidence")] | None
     diagnostics: Annotated[list[Diagnostic], Field(max_length=MOST_DIAGNOSTICS), AfterValidator(_once)]
+    is_accepted: bool | None = None
+    covariance: Annotated[list[Variance], Field(min_length=SIDE**2, max_length=SIDE**2)] | None = None
 
 
 class _Matched(Strictly):
@@ -175,7 +184,14 @@ class _Matched(Strictly):
             confidence=row.confidence,
             diagnostics=dict(row.diagnostics),
         )
-        return Reply(status="ok", own_s=self.seconds, cpu_s=self.cpu_s, match=match)
+        return Reply(
+            status="ok",
+            own_s=self.seconds,
+            cpu_s=self.cpu_s,
+            match=match,
+            is_accepted=row.is_accepted,
+            covariance=None if row.covariance is None else tuple(row.covariance),
+        )
 
 
 _KINDS: Final[Mapping[str, type[_Loaded | _Trained | _Prepared | _Matched]]] = {

@@ -3,9 +3,10 @@
 
 import logging
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -17,7 +18,7 @@ from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running import prediction_files, prediction_rows
 from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Watch, answer, pool_costs
-from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map
+from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map, unit_of_task, whole_units
 from sasgeo_bench.running.training import trained
 from sasgeo_bench.tasks import task_files
 
@@ -81,7 +82,7 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
     # Other tasks' ids need not travel with every chunk, nor the blocks of a split.
     bare = replace(plan, parts=(), request=replace(plan.request, split=None))
     for number, part in enumerate(parts):
-        for ids in _chunks(part.left, threads):
+        for ids in _chunks(part.left, threads, unit_of_task(part.about)):
             chunk = replace(part, left=ids, asked={name: part.asked[name] for name in ids})
             where[client.submit(_answer_chunk, bare, chunk, pure=False)] = (number, len(ids))
     for future in as_completed(where):
@@ -93,12 +94,18 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
         yield (*where[future], cost)
 
 
-def _chunks(ids: Sequence[str], threads: int) -> Iterator[tuple[str, ...]]:
-    """Split ids into chunks, several for each thread."""
+def _chunks(ids: Sequence[str], threads: int, unit_of: Callable[[str], str]) -> Iterator[tuple[str, ...]]:
+    """Split ids into chunks, several for each thread; no flight is split."""
     size = -(-len(ids) // (threads * _CHUNKS_PER_THREAD))
     size = min(max(size, LEAST_ITEMS), _MOST_QUERIES)
-    for start in range(0, len(ids), size):
-        yield tuple(ids[start : start + size])
+    chunk: list[str] = []
+    for _, unit in groupby(ids, key=unit_of):
+        chunk += unit
+        if len(chunk) >= size:
+            yield tuple(chunk)
+            chunk = []
+    if chunk:
+        yield tuple(chunk)
 
 
 def _answer_chunk(plan: RunPlan, part: RunPart) -> Cost:
@@ -199,7 +206,7 @@ def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
     found = []
     for part in parts:
         done = prediction_files.ids_done(part.folder, part.asked, again=plan.request.again)
-        left = tuple(name for name in part.left if name not in done)
+        left = whole_units(part.left, done, unit_of_task(part.about))
         if left:
             found.append(replace(part, left=left))
     return found

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serve a runner inside the sandbox: load, learn, prepare, match; every failure becomes a message."""
+"""Serve a runner inside the sandbox: load, learn, prepare, match or step; every failure becomes a message."""
 
 import errno
 import hashlib
@@ -14,11 +14,13 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Self
 
+import numpy as np
 import psutil
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import Learner, Match, Matcher, Training, check_learned, check_match
-from sasgeo_bench.matching.plugins import load_matcher
+from sasgeo_bench.matching.plugins import load_method
+from sasgeo_bench.matching.tracker import Tracker, check_fix, match_of
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import wire
@@ -62,27 +64,29 @@ class PluginServer(ABC):
 
 
 class Server(PluginServer):
-    """Answers for a matcher."""
+    """Answers for a matcher, or a tracker."""
 
     def __init__(self, channel: socket.socket, *, spec: str) -> None:
         super().__init__(channel, spec=spec)
-        self.matcher: Matcher | None = None
+        self.matcher: Matcher | Tracker | None = None
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
         if message["kind"] == "load":
-            self.matcher = load_matcher(self.spec)
+            self.matcher = load_method(self.spec)
             about = {"card": asdict(self.matcher.card), "code": code_hash(self.matcher)}
             return {"status": "ok", **about, "learns": isinstance(self.matcher, Learner)}, b""
         if self.matcher is None:
-            self.matcher = load_matcher(self.spec)
+            self.matcher = load_method(self.spec)
         if message["kind"] == "learn":
             return _learn(self.matcher, message, blob), b""
         if message["kind"] == "prepare":
             return _prepare(self.matcher, message), b""
+        if isinstance(self.matcher, Tracker):
+            return _step(self.matcher, message, blob), b""
         return _match(self.matcher, message, blob), b""
 
 
-def _prepare(matcher: Matcher, message: dict[str, Any]) -> dict[str, Any]:
+def _prepare(matcher: Matcher | Tracker, message: dict[str, Any]) -> dict[str, Any]:
     reading = _Cost()
     region = read_region(Path(message["region"]), around=lambda: reading)
     with (preparing := _Cost()):
@@ -97,6 +101,23 @@ def _match(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, 
     found = matcher.match(query, top_k=message["top_k"])
     seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
     row = match_row(check_match(found, query, top_k=message["top_k"]))
+    return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
+
+
+def _step(tracker: Tracker, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+    """Answer the next view of a flight; its first one begins it."""
+    query = query_from(blob)
+    if query.step is None:
+        fault = f"{tracker.card.name} follows flights, and this query is a view alone"
+        raise MatchError(fault)
+    start, start_cpu = time.perf_counter(), time.process_time()
+    if query.step.frame == 0:
+        tracker.start(query.prior)
+    found = tracker.step(query)
+    seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
+    fix = check_fix(found, top_k=message["top_k"])
+    covariance = None if fix.covariance is None else np.asarray(fix.covariance).ravel().tolist()
+    row = match_row(match_of(fix)) | {"is_accepted": fix.is_accepted, "covariance": covariance}
     return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
 
 
@@ -127,7 +148,7 @@ class _Cost:
         self.grown_bytes += _resident_bytes() - self._before
 
 
-def _learn(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+def _learn(matcher: Matcher | Tracker, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
     if not isinstance(matcher, Learner):
         fault = f"{matcher.card.name} has no learn()"
         raise MatchError(fault)

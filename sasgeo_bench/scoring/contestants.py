@@ -57,9 +57,12 @@ class ScoredTask:
 def read_scored_task(folder: Path, root: Path) -> ScoredTask:
     """Read a task and its truths from their own root, and check that they match.
 
-    Raise StoreError if either is missing or damaged, or they do not belong together.
+    Raise StoreError if either is missing or damaged, they do not belong together, or the task is of flights.
     """
     about = task_files.read_task(folder)
+    if "sequence" in about["counts"]:
+        message = f"{folder} holds flights, and boards score single views so far: leave it out"
+        raise StoreError(message)
     truth = root / str(about["suite"]) / str(about["region"])
     task_files.check_truths(folder, truth)
     heads, truths = tuple(task_files.read_heads(folder)), tuple(task_files.read_truths(truth))

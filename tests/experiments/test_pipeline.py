@@ -694,3 +694,10 @@ def test_reference_imagery_that_tells_nothing_or_too_much_is_refused(tmp_path, o
     with pytest.raises(ConfigError, match=words) as error:
         plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
     assert "\n" not in str(error.value)
+
+
+def test_a_suite_of_flights_is_refused(tmp_path):
+    text = TEXT.replace('suites = ["clean"]', 'suites = ["flight-gap"]')
+    assert text != TEXT
+    with pytest.raises(ConfigError, match="suite 'flight-gap' is of flights, which no board scores yet: leave it out"):
+        plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)

@@ -17,6 +17,7 @@ from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.query import flight_id, view_id
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
@@ -60,7 +61,7 @@ def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
     run(alone, tell=lambda _: None)
     plan = plan_run(request_of(task, tmp_path / "two", name="Held", dask="local:2"))
     part = plan.parts[0]
-    (place / "hold").write_text(" ".join(next(iter(runner._chunks(part.left, 2)))), encoding="utf-8")
+    (place / "hold").write_text(" ".join(next(iter(runner._chunks(part.left, 2, str)))), encoding="utf-8")
     killed, asked, costs = [], [], []
     with runner.connected("local:2") as client:
         for number, _, cost in runner.answer_on(client, plan, [part]):
@@ -121,9 +122,17 @@ def test_jobs_and_a_cluster_are_not_asked_for_together(task, tmp_path):
 def test_chunks_hold_every_id_once_and_are_neither_tiny_nor_huge():
     for count, threads in ((1, 4), (60, 2), (5000, 2), (100_000, 64)):
         ids = tuple(map(str, range(count)))
-        chunks = list(runner._chunks(ids, threads))
+        chunks = list(runner._chunks(ids, threads, str))
         assert tuple(name for chunk in chunks for name in chunk) == ids
         assert all(8 <= len(chunk) <= 256 for chunk in chunks[:-1])
+
+
+def test_no_chunk_ends_in_the_middle_of_a_flight():
+    ids = tuple(view_id(f"{flight:018x}", frame) for flight in range(7) for frame in range(30))
+    chunks = list(runner._chunks(ids, 2, flight_id))
+    assert tuple(name for chunk in chunks for name in chunk) == ids
+    assert len(chunks) > 1
+    assert all(len(chunk) % 30 == 0 for chunk in chunks)
 
 
 def test_workers_that_die_over_and_over_end_the_run_with_one_line(task, tmp_path, monkeypatch):

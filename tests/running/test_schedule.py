@@ -2,6 +2,7 @@
 """Maps are shared out first, then help goes where it pays; every query is given once, and nobody waits for ever."""
 
 from concurrent.futures import ThreadPoolExecutor
+from itertools import chain
 
 import pytest
 
@@ -19,14 +20,14 @@ class Clock:
 
 
 def schedule_of(*counts, clock=None):
-    lines = [(iter([(number, at) for at in range(count)]), count) for number, count in enumerate(counts)]
+    lines = [(iter([[(number, at)] for at in range(count)]), count) for number, count in enumerate(counts)]
     return Schedule(lines, clock=clock or Clock())
 
 
 def test_each_thread_gets_a_map_of_its_own_first():
     schedule = schedule_of(100, 1, 1)
     assert [schedule.take() for _ in range(3)] == [0, 1, 2]
-    assert list(schedule.items(1)) == [(1, 0)]
+    assert list(schedule.groups(1)) == [[(1, 0)]]
 
 
 def test_help_goes_to_the_map_with_most_left_for_each_who_works_on_it():
@@ -38,9 +39,9 @@ def test_help_goes_to_the_map_with_most_left_for_each_who_works_on_it():
 
 def test_two_that_ask_about_one_map_get_each_query_once():
     schedule = schedule_of(5)
-    first, second = schedule.items(0), schedule.items(0)
+    first, second = schedule.groups(0), schedule.groups(0)
     found = [next(first), next(second), next(second), *first, *second]
-    assert found == [(0, at) for at in range(5)]
+    assert found == [[(0, at)] for at in range(5)]
     assert [schedule.take(), schedule.take()] == [0, None]
 
 
@@ -67,7 +68,7 @@ def test_a_thread_waits_until_it_is_known_whether_help_pays(pace_s, is_helped):
     assert schedule.take() == 0
     with ThreadPoolExecutor(max_workers=1) as pool:
         helper = pool.submit(schedule.take)
-        asked = schedule.items(0)
+        asked = schedule.groups(0)
         next(asked)
         clock.now += 2.5  # the start, and one query
         next(asked)
@@ -87,14 +88,14 @@ def test_whoever_waits_is_let_go_when_a_map_holds_less_than_it_said():
     assert schedule.take() == 0
     with ThreadPoolExecutor(max_workers=1) as pool:
         helper = pool.submit(schedule.take)
-        assert list(schedule.items(0)) == ["a"]
+        assert list(schedule.groups(0)) == ["a"]
         assert helper.result(timeout=600) is None
 
 
 def test_after_a_stop_nothing_is_given_and_nobody_waits():
     schedule = schedule_of(4, 4)
     assert schedule.take() == 0
-    asked = schedule.items(0)
+    asked = schedule.groups(0)
     next(asked)
     assert not schedule.wait_for_stop(0.0)
     assert schedule.take() == 1
@@ -103,9 +104,21 @@ def test_after_a_stop_nothing_is_given_and_nobody_waits():
         schedule.stop()
         assert helper.result(timeout=600) is None
     assert list(asked) == []
-    assert list(schedule.items(1)) == []
+    assert list(schedule.groups(1)) == []
     assert schedule.is_stopped
     assert schedule.wait_for_stop(0.0)
+
+
+def test_a_group_goes_to_one_thread_and_counts_by_its_queries():
+    clock = Clock()
+    schedule = Schedule([(iter(["abcd", "efgh"]), 8)], clock=clock)
+    assert schedule.take() == 0
+    asked = schedule.groups(0)
+    assert next(asked) == "abcd"
+    clock.now += 1.0  # the start
+    assert next(asked) == "efgh"
+    assert schedule.take() is None  # nothing is left, though the last group is not answered yet
+    assert list(asked) == []
 
 
 def test_many_threads_share_out_everything_once():
@@ -115,7 +128,7 @@ def test_many_threads_share_out_everything_once():
     def ask():
         found = []
         while (number := schedule.take()) is not None:
-            found += schedule.items(number)
+            found += chain.from_iterable(schedule.groups(number))
         return found
 
     with ThreadPoolExecutor(max_workers=6) as pool:

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Interface of trackers: plugins that follow a flight view by view, and their answer, a fix."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import Match, MatcherCard, check_match
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.tasks.query import Query
+
+SIDE: Final = 3  # of a covariance: east, north, yaw
+MOST_VARIANCE: Final = 1e12  # m2 or deg2
+_LEAST_RATIO: Final = 1e-12  # of the smallest to the largest eigenvalue, with yaw in degrees
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fix:
+    """Answer to one view of a flight: where the drone is now, by all that was seen until now.
+
+    Parameters
+    ----------
+    pose : Pose, optional
+        The estimate; None where nothing is known yet, and the flight goes on.
+    covariance : ndarray or nested sequence of float, shape (3, 3), optional
+        Of the estimate, in the order east, north, yaw; m2, m deg and deg2. None if the tracker gives none.
+    is_accepted : bool
+        Whether the estimate may be relied on. A tracker that merely reckons on after a doubtful view says False.
+    confidence : float, optional
+        Probability, 0..1, that the estimate is right.
+    modes : sequence of (Pose, float)
+        Further hypotheses with weights of 0..1, best first.
+    diagnostics : mapping of str to float
+        Further numbers for a reader.
+
+    Examples
+    --------
+    >>> fix = Fix(pose=Pose(easting_m=500.0, northing_m=0.0, yaw_deg=90.0), covariance=np.diag([9.0, 9.0, 4.0]))
+    >>> check_fix(fix, top_k=5).is_accepted
+    True
+    """
+
+    pose: Pose | None
+    covariance: NDArray[np.float64] | Sequence[Sequence[float]] | None = None
+    is_accepted: bool = True
+    confidence: float | None = None
+    modes: Sequence[tuple[Pose, float]] = ()
+    diagnostics: Mapping[str, float] = field(default_factory=dict)
+
+
+@runtime_checkable
+class Tracker(Protocol):
+    """A method that follows flights. It is made without arguments, in a process of its own, and sees no truth.
+
+    The views of a flight come one at a time: when `step` is called, later views are not in its process yet.
+    """
+
+    card: MatcherCard
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Index a map; called and timed once for each map. `learned` is the text of `learn`, None without one."""
+        ...
+
+    def start(self, prior: Prior) -> None:
+        """Begin a flight on the map prepared last, and forget the one before."""
+        ...
+
+    def step(self, query: Query) -> Fix:
+        """Answer the next view; `query.step` says which it is, and what the odometer says of the way to it."""
+        ...
+
+
+def check_fix(fix: object, *, top_k: int) -> Fix:
+    """Check an answer of `step` with at most `top_k` poses, and return it with floats for numbers.
+
+    Raise `MatchError` if it is no Fix, a number is out of range, weights are not between 0 and 1 or out of order, or
+    the covariance is not a symmetric positive definite matrix of 3 x 3.
+    """
+    if not isinstance(fix, Fix):
+        message = f"step() returned {type(fix).__name__}, expected sasgeo_bench.matching.tracker.Fix"
+        raise MatchError(message)
+    if not isinstance(fix.is_accepted, bool | np.bool_):
+        message = f"is_accepted is a {type(fix.is_accepted).__name__}, expected True or False"
+        raise MatchError(message)
+    if fix.pose is None and (fix.is_accepted or fix.modes):
+        message = "a fix without a pose is not accepted and has no modes: say is_accepted=False"
+        raise MatchError(message)
+    found = check_match(match_of(fix), None, top_k=top_k)
+    if found.poses and not 0 <= found.scores[-1] <= found.scores[0] <= 1:
+        message = f"weights of modes lie in 0..1, got {found.scores[-1]:g}"
+        raise MatchError(message)
+    return replace(
+        fix,
+        pose=found.poses[0] if found.poses else None,
+        covariance=None if fix.covariance is None else _covariance(fix.covariance),
+        is_accepted=bool(fix.is_accepted),
+        confidence=found.confidence,
+        modes=tuple(zip(found.poses[1:], found.scores[1:], strict=True)),
+        diagnostics=found.diagnostics,
+    )
+
+
+def match_of(fix: Fix) -> Match:
+    """Return a fix as an answer of ranked poses: the estimate first, with score 1, then the modes by weight."""
+    try:
+        modes = [(pose, weight) for pose, weight in fix.modes]
+    except (TypeError, ValueError) as error:
+        message = "modes holds something else than pairs of a pose and a weight"
+        raise MatchError(message) from error
+    first = () if fix.pose is None else (fix.pose,)
+    return Match(
+        poses=(*first, *(pose for pose, _ in modes)),
+        scores=(*(1.0 for _ in first), *(weight for _, weight in modes)),
+        confidence=fix.confidence,
+        diagnostics=fix.diagnostics,
+    )
+
+
+def _covariance(given: object) -> NDArray[np.float64]:
+    """Return a covariance as an array; raise `MatchError` if it is none."""
+    try:
+        found = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        message = f"covariance is a {type(given).__name__}, expected 3 x 3 numbers"
+        raise MatchError(message) from error
+    if found.shape != (SIDE, SIDE) or not np.isfinite(found).all() or np.abs(found).max() > MOST_VARIANCE:
+        message = f"covariance has shape {found.shape}, expected 3 x 3 numbers of {MOST_VARIANCE:g} at most"
+        raise MatchError(message)
+    values = np.linalg.eigvalsh((found + found.T) / 2)
+    if not np.allclose(found, found.T, rtol=1e-6, atol=1e-9) or values[0] <= _LEAST_RATIO * values[-1]:
+        message = "covariance is not symmetric and positive definite: NEES needs its inverse; or give none"
+        raise MatchError(message)
+    return found

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trackers: views come in order and one at a time, a flight is asked whole, and a failure costs its flight alone."""
+
+import shutil
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.leaderboard.board import ScoreRequest
+from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.runner import run
+from sasgeo_bench.running.worker import Limits
+from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.query import flight_id
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+TOWN = "town-riverside"
+PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory, lay_towns):
+    """A task of three flights, and the trackers beside it."""
+    root = tmp_path_factory.mktemp("flights")
+    lay_towns(root / "out", TOWN)
+    wanted = Wanted(
+        suites=("flight-overconfident",),
+        regions=(TOWN,),
+        split="crossfit",
+        count=1,
+        seed=4,
+        out=root / "out",
+        may_be_fewer=True,
+    )
+    for request in plan_requests(wanted, tell=lambda _: None):
+        make_tasks(request, tell=lambda _: None)
+    shutil.copy(Path(__file__).with_name("wayward.py"), root / "wayward.py")
+    return root
+
+
+@pytest.fixture
+def task(flown, monkeypatch):
+    monkeypatch.chdir(flown)
+    monkeypatch.syspath_prepend(str(flown))
+    return flown / "out" / "tasks" / "flight-overconfident" / TOWN
+
+
+def run_of(task, out, name, **changes):
+    """Run a tracker; return its rows by flight, in the order of views."""
+    spec = name if name.islower() else f"wayward:{name}"
+    request = replace(RunRequest(spec=spec, tasks=(task,), out=out, limits=PATIENT), **changes)
+    plan = plan_run(request)
+    run(plan, tell=lambda _: None)
+    found = defaultdict(list)
+    for item in sorted(prediction_files.read_predictions(plan.parts[0].folder), key=lambda item: item.query_id):
+        found[flight_id(item.query_id)].append(item)
+    return dict(found)
+
+
+def views_of(rows):
+    return [int(item.diagnostics["views"]) for item in rows]
+
+
+@pytest.mark.parametrize("jobs", [1, 3])
+def test_views_of_a_flight_come_in_order_to_one_process(task, tmp_path, jobs):
+    flights = run_of(task, tmp_path, "Counting", jobs=jobs)
+    assert len(flights) == 3
+    assert sum(map(len, flights.values())) == len(task_files.read_ids(task))
+    for rows in flights.values():
+        assert views_of(rows) == list(range(1, len(rows) + 1))
+        assert len({item.diagnostics["process"] for item in rows}) == 1
+        assert {item.diagnostics["has_place"] for item in rows} == {1.0}
+
+
+def test_no_view_to_come_is_in_the_process_of_a_tracker(task, tmp_path):
+    rows = [item for rows in run_of(task, tmp_path, "Counting").values() for item in rows]
+    assert {item.diagnostics["held"] for item in rows} == {1.0}
+
+
+def test_a_tracker_reads_neither_the_views_to_come_nor_the_truths(task):
+    rows = [item for rows in run_of(task, task.parents[2], "ReadsAhead").values() for item in rows]
+    assert {(item.status, item.diagnostics.get("read")) for item in rows} <= {("ok", 0.0), ("refused", None)}
+
+
+def test_a_fix_is_stored_with_its_covariance_and_modes(task, tmp_path):
+    row = next(iter(run_of(task, tmp_path, "Counting").values()))[0]
+    assert row.is_accepted is True
+    assert row.covariance == (4.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 1.0)
+    assert [score for _, score in row.candidates] == [1.0, 0.5]
+
+
+@pytest.mark.parametrize(
+    ("way", "status", "told"),
+    [
+        ("hangs", "timeout", "no answer within"),
+        ("dies", "crash", "exit status 3"),
+        ("raises", "crash", "no more today"),
+        ("singular", "invalid", "not symmetric and positive definite"),
+        ("text", "invalid", "step() returned str"),
+    ],
+)
+def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_path, way, status, told):
+    first = flight_id(min(task_files.read_ids(task)))
+    (flown / "fails").write_text(f"{first} {way}", encoding="utf-8")
+    flights = run_of(task, tmp_path, "Failing", limits=replace(PATIENT, match_s=5.0 if way == "hangs" else 600.0))
+    failed = flights.pop(first)
+    assert [item.status for item in failed] == ["ok", "ok"] + [status] * (len(failed) - 2)
+    assert told in failed[2].message
+    assert all("since view 2 of the flight: " in item.message for item in failed[3:])
+    for rows in flights.values():
+        assert {item.status for item in rows} == {"ok"}
+        assert views_of(rows) == list(range(1, len(rows) + 1))
+
+
+def test_a_flight_that_was_cut_off_is_asked_from_its_first_view(task, tmp_path):
+    """Rows of a whole flight stay; the other begins anew, since a tracker needs what came before."""
+    ids = sorted(task_files.read_ids(task))
+    whole = [name for name in ids if flight_id(name) == flight_id(ids[0])]
+    request = RunRequest(spec="wayward:Counting", tasks=(task,), out=tmp_path, limits=PATIENT, limit=len(whole) + 5)
+    run(plan_run(request), tell=lambda _: None)
+    plan = plan_run(replace(request, limit=None))
+    assert plan.parts[0].left == tuple(name for name in ids if name not in whole)
+    flights = run_of(task, tmp_path, "Counting")
+    assert all(views_of(rows) == list(range(1, len(rows) + 1)) for rows in flights.values())
+
+
+def test_shards_hold_whole_flights_and_all_of_them(task, tmp_path):
+    request = RunRequest(spec="dead_reckoning", tasks=(task,), out=tmp_path, limits=PATIENT)
+    parts = [plan_run(replace(request, shard=(number, 2))).parts[0].left for number in (1, 2)]
+    assert not {flight_id(name) for name in parts[0]} & {flight_id(name) for name in parts[1]}
+    assert sorted([*parts[0], *parts[1]]) == sorted(task_files.read_ids(task))
+
+
+def test_odometry_alone_begins_at_the_prior_and_drifts_and_the_start_alone_stays(task, tmp_path):
+    reckoned = run_of(task, tmp_path, "dead_reckoning")
+    stayed = run_of(task, tmp_path, "prior_only")
+    queries = {query.query_id: query for query in task_files.read_queries(task)}
+    for flight, rows in reckoned.items():
+        prior = queries[rows[0].query_id].prior
+        begin, end = rows[0].candidates[0][0], rows[-1].candidates[0][0]
+        assert (begin.easting_m, begin.northing_m) == prior.center_m
+        assert {item.candidates[0][0] for item in stayed[flight]} == {begin}
+        assert end != begin
+        assert rows[-1].covariance[0] > rows[0].covariance[0] == pytest.approx(prior.radius_m**2 / 4, rel=1e-6)
+        assert {item.is_accepted for item in rows} == {False}
+
+
+def test_the_oracle_follows_flights_and_a_matcher_of_single_views_does_not(task, tmp_path):
+    truths = {
+        item.query_id: item.pose for item in task_files.read_truths(task.parents[2] / "truth" / task.parent.name / TOWN)
+    }
+    rows = [item for rows in run_of(task, tmp_path, "oracle_pose").values() for item in rows]
+    assert all(item.candidates[0][0] == truths[item.query_id] and item.is_accepted for item in rows)
+    rows = [item for rows in run_of(task, tmp_path, "random").values() for item in rows]
+    assert {(item.status, item.message) for item in rows} == {("not applicable", "track sequence")}
+
+
+def test_a_board_of_flights_is_refused_in_one_line(task, tmp_path):
+    run_of(task, tmp_path, "prior_only")
+    root = task.parents[2]
+    board, truth = tmp_path / "boards" / "flights", root / "truth"
+    request = ScoreRequest(predictions=(tmp_path / "runs",), root=root, board=board, tasks=(task,), truth=truth)
+    with pytest.raises(StoreError, match="holds flights, and boards score single views so far: leave it out"):
+        make_board(request, tell=lambda _: None)
+    assert not board.exists()

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+# ruff: noqa: ARG002 - the door has its arguments
+"""Trackers that break what they can; each is run by a test, none is installed."""
+
+import gc
+import os
+import time
+from pathlib import Path
+
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import MatcherCard
+from sasgeo_bench.matching.tracker import Fix
+from sasgeo_bench.tasks.query import Query
+
+SAID = {"version": "1", "title": "Wayward", "source": "original", "ours": "all", "licence": "Apache-2.0"}
+HERE = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+
+
+class Counting:
+    """Says how many views it has had since the flight began, how many queries it holds, and which process it is in."""
+
+    card = MatcherCard(name="counting", tracks=("sequence",), **SAID)
+
+    def prepare(self, region, learned):
+        self.region = region
+
+    def start(self, prior):
+        self.views = 0
+        self.has_place = prior.has_place
+
+    def step(self, query):
+        self.views += 1
+        held = sum(isinstance(item, Query) for item in gc.get_objects())
+        told = {"views": self.views, "held": held, "process": os.getpid(), "has_place": self.has_place}
+        return Fix(pose=HERE, covariance=[[4, 0, 0], [0, 4, 0], [0, 0, 1]], modes=[(HERE, 0.5)], diagnostics=told)
+
+
+class ReadsAhead(Counting):
+    """Looks for the views to come, and for the truths, wherever they may lie."""
+
+    card = MatcherCard(name="reads-ahead", tracks=("sequence",), **SAID)
+
+    def step(self, query):
+        root = Path(__file__).parent / "out"
+        for folder in ("tasks", "truth"):
+            for path in (root / folder).rglob("*.parquet"):
+                path.read_bytes()
+                return Fix(pose=HERE, diagnostics={"read": 1.0})
+        return Fix(pose=HERE, diagnostics={"read": 0.0})
+
+
+class Failing(Counting):
+    """Fails at the third view of the flight that a file beside it names, in the way that the file says."""
+
+    card = MatcherCard(name="failing", tracks=("sequence",), **SAID)
+
+    def step(self, query):
+        flight, way = Path(__file__).with_name("fails").read_text(encoding="utf-8").split()
+        if query.step.sequence_id != flight or query.step.frame != 2:
+            return super().step(query)
+        if way == "hangs":
+            time.sleep(3600)
+        if way == "dies":
+            os._exit(3)
+        if way == "raises":
+            message = "no more today"
+            raise ValueError(message)
+        if way == "singular":
+            return Fix(pose=HERE, covariance=[[1, 1, 0], [1, 1, 0], [0, 0, 1]])
+        return "a text"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What every test shares: no network, reproducible hypothesis runs, and the folder of real extracts."""
 
+import gc
 import math
 import os
 import shutil
@@ -46,6 +47,12 @@ progress.EVERY_S = math.inf  # else lines of progress come between others wherev
 
 BUILDERS = ("test_build.py", "test_cli.py", "test_results.py", "test_town.py")  # build or start something in each test
 LOOPBACK = ("127.", "localhost", "::1")
+
+
+def pytest_collection_finish() -> None:
+    """Leave out of garbage collection what is there for good: thousands of tests, and the modules they import."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by markers

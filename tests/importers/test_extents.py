@@ -59,7 +59,7 @@ def test_a_region_file_covers_an_area_or_meets_it_in_part(tmp_path):
 def test_a_shipped_region_is_known_and_a_made_up_town_is_not(tmp_path):
     (vaduz,) = find_extents(dense(tmp_path / "vaduz", {"000000": (9.522, 47.15)}))
     (town,) = find_extents(dense(tmp_path / "town", {"000000": (11.05, 48.05)}))
-    assert vaduz.covered_by == ("vaduz",)
+    assert vaduz.covered_by == ("liechtenstein", "vaduz")
     assert (town.covered_by, town.touched_by) == ((), ())
     assert vaduz.extracts == ("europe",)
 

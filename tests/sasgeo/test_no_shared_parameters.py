@@ -37,6 +37,7 @@ ARGUED: Mapping[str, str] = {
     "observed.py:_FACING_DEG = 30": "between a road and a border; the other is the tilt of a camera",
     "integrity.py:APART_M = 25": "the widest tolerance of the benchmark's success",
     "learning.py:WRONG_M = 25": "the widest tolerance of the benchmark's success",
+    "mapped.py:_APART_M = 10000": "more than any distance on a map between two nodes that are compared; the other is 10 km",
     "mapped.py:CROWD_M = 150": "about a view's width, over which the density of nodes is counted",
     "mapped.py:PAIRED_M = 20": "the least distance of reading.APART_M, less what scale and slack take",
     "nodes.py:ARM_M = 12": "past the curbs of a junction, where a road has its direction",

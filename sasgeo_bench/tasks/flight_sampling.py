@@ -104,12 +104,11 @@ class FlightDrawer:
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:
         """Return what the odometer says: to the middle and from there on what it says in the control."""
-
-        def draw(flown: Trajectory) -> Odometry:
-            rng = self._seeds(flight.site).rng("odometry", mission.draw)
-            return draw_odometry(flown, load_profile(mission.profile), belief=mission.belief, rng=rng)
-
-        told, control, into = draw(views), draw(flight.views), flight.middle - 1
+        seeds, profile, into = self._seeds(flight.site), load_profile(mission.profile), flight.middle - 1
+        told, control = (
+            draw_odometry(flown, profile, belief=mission.belief, rng=seeds.rng("odometry", mission.draw))
+            for flown in (views, flight.views)
+        )
         both = {item.name: (getattr(told, item.name), getattr(control, item.name)) for item in fields(Odometry)}
         return Odometry(**{name: np.concatenate([own[:into], usual[into:]]) for name, (own, usual) in both.items()})
 

@@ -163,12 +163,12 @@ def _of_sites(truths: Mapping[str, Sequence[Truth]], count: int) -> list[str]:
     for name, (first, *_) in sorted(truths.items(), key=lambda item: item[1][0].pair_id):
         sites.setdefault(first.pair_id, []).append(name)
     most = max(map(len, sites.values()), default=1)
+    chosen = list(sites.values())[: max(1, count // most)]
+    return [name for names in chosen for name in sorted(names, key=lambda name: _order(truths[name][0]))]
 
-    def order(name: str) -> tuple[int, float, str, str]:
-        first = truths[name][0]
-        return (_RANK[first.role], first.strength, first.kind, first.detector)
 
-    return [name for names in list(sites.values())[: max(1, count // most)] for name in sorted(names, key=order)]
+def _order(truth: Truth) -> tuple[int, float, str, str]:
+    return (_RANK[truth.role], truth.strength, truth.kind, truth.detector)
 
 
 def _panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str, Any]]) -> FlightPanel:

@@ -63,22 +63,19 @@ def test_the_covariance_of_many_steps_is_that_of_drawn_ones():
     rng = np.random.default_rng(3)
     step_cov = np.diag([0.5, 1.0, 0.25])
     told = tuple(step_cov.ravel().tolist())
-    count, drawn = 20, []
+    count = 20
     pose, covariance = HERE, np.diag([4.0, 4.0, 1.0])
     for frame in range(1, count + 1):
         step = Step(sequence_id="f", frame=frame, increment=(2.0, 30.0, 5.0), covariance=told)
         pose, covariance = advance(pose, covariance, step)
-    for _ in range(4000):
-        east, north, turn = rng.normal(size=3) * (2.0, 2.0, 1.0)
-        at = Pose(easting_m=HERE.easting_m + east, northing_m=HERE.northing_m + north, yaw_deg=HERE.yaw_deg + turn)
-        yaw_deg = HERE.yaw_deg + turn
-        for frame in range(1, count + 1):
-            off = rng.normal(size=3) * np.sqrt(np.diag(step_cov))
-            moved = (2.0 + off[0], 30.0 + off[1], 5.0 + off[2])
-            yaw_deg += moved[2]
-            at, _ = advance(at, covariance, Step(sequence_id="f", frame=frame, increment=moved, covariance=told))
-        drawn.append((at.easting_m, at.northing_m, yaw_deg))
-    assert np.cov(np.array(drawn).T) == pytest.approx(covariance, rel=0.15, abs=0.15 * covariance[2, 2])
+    start = rng.normal(size=(3, 20_000)) * np.sqrt([[4.0], [4.0], [1.0]])
+    place, yaw_deg = HERE.easting_m + start[0] + 1j * (HERE.northing_m + start[1]), HERE.yaw_deg + start[2]
+    for _ in range(count):
+        right_m, up_m, turn_deg = rng.normal(size=start.shape) * np.sqrt(np.diag(step_cov))[:, None]
+        place = place + (2.0 + right_m + 1j * (30.0 + up_m)) * np.exp(-1j * np.radians(yaw_deg))
+        yaw_deg = yaw_deg + 5.0 + turn_deg
+    drawn = np.array([place.real, place.imag, yaw_deg])
+    assert np.cov(drawn) == pytest.approx(covariance, rel=0.15, abs=0.15 * covariance[2, 2])
 
 
 def test_a_lost_step_keeps_the_place_and_widens_it():

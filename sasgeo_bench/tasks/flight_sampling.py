@@ -95,11 +95,12 @@ class FlightDrawer:
             carried_m = float(distance_m[flight.middle] - distance_m[flight.middle - 1])
             measured["carried_m"] = round(carried_m, 1)
             distance_m = np.where(np.arange(len(views)) < flight.middle, distance_m, distance_m - carried_m)
-        unseen = _unseen(flight, mission)
+        unseen, time_s = _unseen(flight, mission), views.time_s - views.time_s[0]
         for frame in range(len(views)):
             is_lost = mission.is_lost and frame == flight.middle
             told = _step(flight_id(job.query_id), frame, steps, is_lost=is_lost)
-            own = {"distance_m": round(float(distance_m[frame]), 1), "is_seen": float(not unseen[frame])}
+            flown = {"distance_m": round(float(distance_m[frame]), 1), "time_s": round(float(time_s[frame]), 2)}
+            own = flown | {"is_seen": float(not unseen[frame])}
             yield self._view(job, mission, pose_of(views, frame, flight.scale), told, own | measured)
 
     def _odometry(self, views: Trajectory, flight: Flight, mission: Mission) -> Odometry:

@@ -88,6 +88,15 @@ def test_a_site_is_one_flight_for_all_variants_and_shares_pair_block_and_scale(f
             np.testing.assert_array_equal(poses(pairs), poses(control))
 
 
+@pytest.mark.parametrize("name", ["flight-clean", "flight-kidnap"])
+def test_truths_say_when_each_view_was_taken_at_speeds_that_a_drone_flies(flown, name):
+    for pairs in flown(name).views.values():
+        time_s, distance_m = (np.array([truth.measured[key] for _, truth in pairs]) for key in ("time_s", "distance_m"))
+        assert time_s[0] == 0
+        assert np.diff(time_s).min() > 1
+        assert 3 < distance_m[-1] / time_s[-1] < 12
+
+
 @pytest.mark.parametrize("name", [name for name in FLIGHT_SUITES if name not in {"flight-gap", "flight-kidnap"}])
 def test_control_and_stress_see_the_same_with_the_same_errors_and_a_falsifier_errs_anew(flown, name):
     made = flown(name)

@@ -64,9 +64,14 @@ from .running.testing import tiny_place as tiny_place
 from .search.chart import Chart as Chart
 from .search.chart import block_max as block_max
 from .search.chart import fade as fade
+from .search.field import Field as Field
+from .search.field import Template as Template
+from .search.find import score_at as score_at
 from .search.plan import Disc as Disc
 from .search.plan import Mode as Mode
 from .search.plan import turns_of as turns_of
+from .search.surface import Surface as Surface
+from .search.surface import surface as surface
 from .search.vote_search import VotePlan as VotePlan
 from .search.votes import VoteGains as VoteGains
 from .search.votes import make_template as make_template

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scores of all places: correlations of classes in the Fourier domain; local refinement of the modes."""
+"""Best modes of all places: peaks of the correlations; local refinement of the modes."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -12,17 +12,15 @@ from typing import Final, Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
+from sasgeo_bench.geometry.pose import Pose, wrap_deg
+from sasgeo_bench.search.correlation import Correlation
 from sasgeo_bench.search.field import FULL, Field, Level, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Disc, Mode, Null, Tile, Turns
-from sasgeo_bench.search.votes import correlated, map_spectrum
 
 _SPARE: Final = 4  # peaks of one heading for each requested mode, since neighbours are dropped
 _LOW: Final = np.float32(-1e30)  # score of a place that is not allowed
-_BLUR: Final = 3  # squares of the view across a coarse cell before rotation: odd, so that nothing is shifted
 _NEXT: Final = 1.5  # steps within which peaks are neighbours
 _NOTHING: Final = 1e-9
 
@@ -33,7 +31,7 @@ def dense(
     """Return the best modes of every tile, no two of them neighbours, and statistics of all places."""
     if not len(template.active) or not any(tile.allowed.any() for tile in tiles):
         return [[] for _ in tiles], Null(best=0.0, mean=0.0, deviation=0.0, places=0)
-    votes = _Votes.of(level, template, tiles, turns)
+    votes = Correlation.of(level, template, tiles, turns)
     highest = [np.full(tile.allowed.shape, _LOW, dtype=np.float32) for tile in tiles]
     locks = [Lock() for _ in tiles]
 
@@ -62,63 +60,6 @@ def dense(
 def _null(scores: NDArray[np.float32]) -> Null:
     wide = scores.astype(np.float64)
     return Null(best=float(wide.max()), mean=float(wide.mean()), deviation=float(wide.std()), places=len(wide))
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Votes:
-    """Transforms of the map under each tile at each right angle, and the template to correlate.
-
-    `bands` of the view on `frame` are resampled onto `around`, cells of the level around its middle.
-    """
-
-    bands: NDArray[np.float32]
-    frame: Grid
-    around: Grid
-    size: int
-    shapes: tuple[tuple[int, int], ...]
-    spectra: tuple[tuple[NDArray[np.complex64], ...], ...]
-
-    @classmethod
-    def of(cls, level: Level, template: Template, tiles: Sequence[Tile], turns: Turns) -> Self:
-        """Transform the windows of all tiles once, padded by the reach of the largest template."""
-        step_m, largest = level.grid.cell_size_m, max(base.scale for base in turns.bases)
-        half = math.ceil(template.reach_m * largest / step_m) + 1
-        shapes = tuple((tile.allowed.shape[0], tile.allowed.shape[1]) for tile in tiles)
-        size = int(fft.next_fast_len(max(max(shape) for shape in shapes) + 2 * half, real=True))
-        windows = [
-            level.window(tile.row - half, tile.col - half, (rows + 2 * half, cols + 2 * half), template.active)
-            for tile, (rows, cols) in zip(tiles, shapes, strict=True)
-        ]
-        is_used = [any(window[at].any() for window in windows) for at in range(len(template.active))]
-        used = np.flatnonzero(is_used) if any(is_used) else np.arange(1)
-        spectra = []
-        for window in windows:
-            turned = (np.rot90(window[used], quarter, (1, 2)) for quarter in range(turns.quarters))
-            spectra.append(tuple(map_spectrum(each, (size, size)) for each in turned))
-        ratio = step_m / template.cell_size_m
-        bands, frame = pooled(template, level, max(1, round(ratio / _BLUR)))
-        bands = bands[used]  # classes that the map lacks here add nothing
-        width = 2 * math.floor(step_m / frame.cell_size_m / 2) + 1
-        bands = np.stack([cv2.blur(band, (width, width), borderType=cv2.BORDER_CONSTANT) for band in bands])
-        reach_m, side = (half + 0.5) * step_m, 2 * half + 1
-        around = Grid(epsg=0, west_m=-reach_m, north_m=reach_m, cell_size_m=step_m, rows=side, cols=side)
-        return cls(bands=bands, frame=frame, around=around, size=size, shapes=shapes, spectra=tuple(spectra))
-
-    def scores(self, base: Pose) -> Iterator[tuple[int, Pose, NDArray[np.float32]]]:
-        """Score all places of every tile for a heading and those at right angles to it."""
-        spectrum = fft.rfft2(self._laid(base), s=(self.size, self.size))
-        for at, (windows, (rows, cols)) in enumerate(zip(self.spectra, self.shapes, strict=True)):
-            for quarter, window in enumerate(windows):
-                score = correlated(window, spectrum, (self.size, self.size))
-                valid = score[:rows, :cols] if quarter % 2 == 0 else score[:cols, :rows]
-                turn = replace(base, yaw_deg=base.yaw_deg + 90 * quarter)
-                yield at, turn, np.ascontiguousarray(np.rot90(valid, -quarter))
-
-    def _laid(self, base: Pose) -> NDArray[np.float32]:
-        """Resample the view onto cells of the level, rotated and scaled; sums are preserved."""
-        to_view = between(self.around, inverse(base), self.frame)
-        laid = np.stack([warped(band, to_view, self.around.shape) for band in self.bands])
-        return laid * np.float32((self.around.cell_size_m / (base.scale * self.frame.cell_size_m)) ** 2)
 
 
 @dataclass(frozen=True, kw_only=True)

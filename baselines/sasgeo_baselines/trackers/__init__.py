@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Trackers: methods that follow a flight."""

@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The particle filters on a made-up map: they find a place without errors, and survive what a flight brings."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from sasgeo_baselines.trackers.swapf import DistanceMaps, SwaPf
+
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.tracker import check_fix
+from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.tasks.query import Step
+
+FILTERS = {"swapf": SwaPf}
+VIEW, STEP_M, VIEWS = 128, 30.0, 12
+START = Pose(easting_m=1160.0, northing_m=8420.0, yaw_deg=20.0)
+COVARIANCE = (0.25, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.25)
+PRIOR = Prior(center_m=(1200.0, 8450.0), radius_m=100.0, yaw_deg=25.0, yaw_sigma_deg=10.0, scale_sigma=0.01)
+ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.01)
+
+
+@pytest.fixture(scope="module")
+def region(made):
+    return made.region_of(made.textured(5, 640))
+
+
+@pytest.fixture(scope="module")
+def prepared(region):
+    """A tracker by its name, prepared once: `start` forgets the flight before."""
+
+    @cache
+    def of_name(name):
+        tracker = FILTERS[name]()
+        tracker.prepare(region, None)
+        return tracker
+
+    return of_name
+
+
+@pytest.fixture(scope="module")
+def flight(made, region):
+    """Views of a straight flight without errors, and where each was taken."""
+    poses = [
+        Pose(easting_m=east_m, northing_m=north_m, yaw_deg=START.yaw_deg)
+        for east_m, north_m in START.to_map(np.array([(0.0, frame * STEP_M) for frame in range(VIEWS)])).tolist()
+    ]
+    views = []
+    for frame, pose in enumerate(poses):
+        step = Step(sequence_id="f", frame=frame)
+        step = replace(step, increment=(0.0, STEP_M, 0.0), covariance=COVARIANCE) if frame else step
+        evidence = made.view_of(region, pose, size_cells=VIEW)
+        views.append(replace(made.query_of(evidence, PRIOR), track="sequence", step=step))
+    return tuple(views), tuple(poses)
+
+
+def fly(tracker, views, prior=PRIOR):
+    """Follow a flight, and check each fix."""
+    tracker.start(prior)
+    return [check_fix(tracker.step(view), top_k=5) for view in views]
+
+
+def away_m(fix, pose):
+    return np.hypot(fix.pose.easting_m - pose.easting_m, fix.pose.northing_m - pose.northing_m)
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_flight_without_errors_is_followed(name, prepared, flight):
+    views, poses = flight
+    fixes = fly(prepared(name), views)
+    assert away_m(fixes[-1], poses[-1]) <= 10.0
+    assert abs(fixes[-1].pose.yaw_deg - START.yaw_deg) <= 10.0
+    assert fixes[-1].is_accepted
+    assert not fixes[0].is_accepted
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_flight_is_answered_alike_whatever_was_flown_before(name, prepared, flight):
+    views, _ = flight
+    first = fly(prepared(name), views[:4])
+    other = [replace(view, step=replace(view.step, sequence_id="g")) for view in views[:4]]
+    assert fly(prepared(name), other)[-1].pose != first[-1].pose  # chance comes from the name of the flight
+    again = fly(prepared(name), views[:4])
+    assert [fix.pose for fix in again] == [fix.pose for fix in first]
+    assert all((fix.covariance == same.covariance).all() for fix, same in zip(again, first, strict=True))
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_unknown_views_lost_steps_and_an_unknown_start_are_survived(name, prepared, flight):
+    views, _ = flight
+    blind = views[0].evidence.replace(np.full_like(views[0].evidence.cells, UNKNOWN))
+    odd = [
+        replace(views[0], evidence=blind),
+        views[1],
+        replace(views[2], evidence=blind),
+        replace(views[3], step=Step(sequence_id="f", frame=3)),
+        views[4],
+    ]
+    fixes = fly(prepared(name), odd, ANYWHERE)
+    spreads_m = [np.sqrt(np.trace(fix.covariance[:2, :2])) for fix in fixes]
+    assert spreads_m[0] == pytest.approx(np.hypot(640, 640) / np.sqrt(12), rel=0.05)
+    assert spreads_m[3] > 100.0  # nobody knows where the odometer lost its way, but for the edges of the map
+    assert not fixes[3].is_accepted
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_view_that_is_unknown_only_spreads_the_belief(name, prepared, flight):
+    views, _ = flight
+    blind = views[0].evidence.replace(np.full_like(views[0].evidence.cells, UNKNOWN))
+    *_, before, after = fly(prepared(name), [*views[:6], replace(views[6], evidence=blind)])
+    assert np.trace(after.covariance[:2, :2]) > np.trace(before.covariance[:2, :2])
+
+
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_filter_says_what_must_come_first(name, flight):
+    views, _ = flight
+    with pytest.raises(RuntimeError, match="prepare"):
+        FILTERS[name]().start(PRIOR)
+    with pytest.raises(RuntimeError, match="start"):
+        FILTERS[name]().step(views[0])
+
+
+def test_distance_maps_of_a_large_map_are_coarser_and_agree(region):
+    fine, coarse = DistanceMaps.of(region), DistanceMaps.of(region, most_cells=200 * 200)
+    assert (fine.grid.cell_size_m, coarse.grid.cell_size_m) == (2.0, 4.0)
+    cells = np.argwhere(np.ones(coarse.grid.shape, dtype=bool))
+    rows, cols = fine.grid.to_cells(coarse.grid.to_centres_m(cells)).T
+    steps_m = 34.0 / 250
+    differences = fine.distance[:, rows, cols].astype(float) - coarse.distance.reshape(len(coarse.distance), -1)
+    assert np.abs(differences).max() * steps_m <= 1.5

@@ -11,6 +11,8 @@ from .geometry.grid import Grid as Grid
 from .geometry.pose import Pose as Pose
 from .geometry.pose import Prior as Prior
 from .geometry.pose import inverse as inverse
+from .geometry.pose import rotation as rotation
+from .geometry.pose import wrap_deg as wrap_deg
 from .matching.controls.blind import at_place as at_place
 from .matching.controls.blind import is_blind as is_blind
 from .matching.controls.blind import middle_m as middle_m
@@ -19,6 +21,10 @@ from .matching.controls.blind import points_of as points_of
 from .matching.controls.blind import ranked_candidates as ranked_candidates
 from .matching.controls.fft_vote import DenseMatcher as DenseMatcher
 from .matching.controls.fft_vote import PoseCheck as PoseCheck
+from .matching.controls.reckoning import advance as advance
+from .matching.controls.reckoning import start_of as start_of
+from .matching.follower import Follower as Follower
+from .matching.follower import FollowPlan as FollowPlan
 from .matching.matcher import WITHHELD as WITHHELD
 from .matching.matcher import Learner as Learner
 from .matching.matcher import Match as Match
@@ -100,6 +106,7 @@ from .sensing.tiny_images import tiny_images as tiny_images
 from .sensing.tiny_images import with_picture as with_picture
 from .tasks.frames import Frame as Frame
 from .tasks.query import Query as Query
+from .tasks.query import Step as Step
 from .tasks.query import Truth as Truth
 from .tasks.task_files import read_queries as read_queries
 from .tasks.task_files import read_task as read_task

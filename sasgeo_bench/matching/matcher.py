@@ -54,8 +54,9 @@ class MatcherCard:
         The implementer's own part of it.
     licence : str
         SPDX name of the code's licence.
-    tracks : tuple of {"retrieval", "localization"}
-        Tracks that it answers; on others its row is "not applicable".
+    tracks : tuple of {"retrieval", "localization", "sequence"}
+        Tracks that it answers; on others its row is "not applicable". A matcher with "localization" and without
+        "sequence" is asked about flights by way of a `Follower`.
     needs : tuple of str
         Of `NEEDS`: what a query must hold, or its map: "image" is a picture of the query, "imagery" that of the map;
         without it the row is "not applicable".
@@ -325,16 +326,23 @@ def _diagnostics(given: object) -> dict[str, float]:
     return found
 
 
+def is_followed(card: MatcherCard) -> bool:
+    """Return whether a matcher finds single views alone, and so follows flights by `follower.Follower`."""
+    return "localization" in card.tracks and "sequence" not in card.tracks
+
+
 def lacks(card: MatcherCard, query: Query, *, is_taught: bool = False, is_pictured: bool = False) -> str | None:
     """Return why a query is not applicable to a matcher, or None: its track, or a need of the card that it lacks.
 
-    `is_taught` says whether the matcher was trained, `is_pictured` whether the searched map has imagery.
+    `is_taught` says whether the matcher was trained, `is_pictured` whether the searched map has imagery. A matcher of
+    single views that is asked about a flight (`is_followed`) is told place and heading for each view.
     """
-    if query.track not in card.tracks:
+    is_told = query.track == "sequence" and is_followed(card)
+    if query.track not in card.tracks and not is_told:
         return f"track {query.track}"
     has = {
-        "position": query.prior.center_m is not None or bool(query.candidates),
-        "yaw": query.prior.yaw_deg is not None,
+        "position": is_told or query.prior.center_m is not None or bool(query.candidates),
+        "yaw": is_told or query.prior.yaw_deg is not None,
         "scale": True,
         "vectors": query.vectors is not None,
         "image": bool(query.frames),

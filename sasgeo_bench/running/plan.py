@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
+from sasgeo_bench.matching.follower import follower_record
 from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, read_learned
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_points
@@ -76,7 +77,8 @@ class RunPart:
 
     `about` is the content of `task.json`; `asked` gives the hash that the row of each pending query carries
     (`task_rows.asked_under`); `aside` counts rows of earlier queries, of other training, or of other imagery. `imagery`
-    is the hash of rendered imagery that the matcher looks at, and `key` what its rows are tied to.
+    is the hash of rendered imagery that the matcher looks at, `follower` says how a matcher of single views is asked
+    about flights (`follower.follower_record`), and `key` what its rows are tied to.
     """
 
     task: Path
@@ -89,6 +91,7 @@ class RunPart:
     done: int
     aside: int
     imagery: str | None = None
+    follower: Mapping[str, Any] | None = None
     key: str | None = None
 
 
@@ -349,7 +352,8 @@ def _part(
         raise ConfigError(message)
     region = map_of(task, about)
     imagery = _rendered_imagery(card, region)
-    key = tie_key(key, imagery)
+    follower = follower_record(card) if _is_of_flights(about) else None
+    key = tie_key(key, imagery, None if follower is None else follower["hash"])
     asked = {name: asked_under(one, key) for name, one in task_files.read_asked(task).items()}
     ties = prediction_files.read_ties(folder) if folder.is_dir() else []
     is_same_task = (before or {}).get("queries_sha256") == about["files"][task_files.QUERIES]["sha256"]
@@ -375,13 +379,18 @@ def _part(
         done=len(own) - len(left),
         aside=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
         imagery=imagery,
+        follower=follower,
         key=key,
     )
 
 
 def unit_of_task(about: Mapping[str, Any]) -> Callable[[str], str]:
     """Return a function from the id of a query to that of what is asked at once: a flight, or the query itself."""
-    return flight_id if "sequence" in about.get("counts", {}) else str
+    return flight_id if _is_of_flights(about) else str
+
+
+def _is_of_flights(about: Mapping[str, Any]) -> bool:
+    return "sequence" in about.get("counts", {})
 
 
 def whole_units(names: Sequence[str], done: AbstractSet[str], unit_of: Callable[[str], str]) -> tuple[str, ...]:

@@ -18,6 +18,8 @@ from sasgeo_bench.files.parquet import read_schema, read_table, write_table
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import (
+    FIX_FIELDS,
+    FLOWN_SCHEMA,
     PART_SCHEMA,
     PREDICTION_SCHEMA,
     differing_columns,
@@ -137,9 +139,9 @@ def read_key(folder: Path) -> str | None:
 
 
 def key_of(about: Mapping[str, Any]) -> str | None:
-    """Return what the rows of a `run.json` are tied to: the training result, and the hash of rendered imagery.
+    """Return what the rows of a `run.json` are tied to: training, rendered imagery, and how flights are followed.
 
-    Raise `MatchError` if either is damaged.
+    Raise `MatchError` if one of them is damaged.
 
     >>> key_of({}), len(key_of({"rendered_imagery": "ab"}))
     (None, 64)
@@ -148,7 +150,12 @@ def key_of(about: Mapping[str, Any]) -> str | None:
     if imagery is not None and not isinstance(imagery, str):
         message = f"rendered_imagery is {imagery!r}, expected a hash"
         raise MatchError(message)
-    return tie_key(None if record is None else record.key, imagery)
+    follower = about.get("follower")
+    follows = follower.get("hash") if isinstance(follower, dict) else None
+    if follower is not None and not isinstance(follows, str):
+        message = f"follower is {one_line(repr(follower))}, expected settings with a hash"
+        raise MatchError(message)
+    return tie_key(None if record is None else record.key, imagery, follows)
 
 
 def read_predictions(path: str | Path) -> Iterator[Prediction]:
@@ -203,6 +210,7 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
 
     Of two for one query the first counts, in the order of `runs`. The same predictions give the same file, whatever
     parts they came in. With `asked`, only answers to these queries (`task_files.read_asked`) are taken from folders.
+    Answers of trackers keep `is_accepted` and `covariance`.
 
     Raises
     ------
@@ -221,8 +229,9 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
         for prediction in _to_merge(path, asked):
             found.setdefault(prediction.query_id, prediction)
     rows = [prediction_row(found[name]) for name in sorted(found)]
+    is_flown = any(row[field.name] is not None for row in rows for field in FIX_FIELDS)
     with fresh_file(into, mend="check your rights and the free space") as scratch:
-        write_table(pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA), scratch)
+        write_table(pa.Table.from_pylist(rows, schema=FLOWN_SCHEMA if is_flown else PREDICTION_SCHEMA), scratch)
     return len(rows)
 
 
@@ -269,7 +278,8 @@ def _who(about: Mapping[str, Any]) -> str:
 
 def _is_ours(path: Path) -> bool:
     try:
-        return path.is_file() and read_schema(path, mend=_MEND).names == PREDICTION_SCHEMA.names
+        known = (PREDICTION_SCHEMA.names, FLOWN_SCHEMA.names)
+        return path.is_file() and read_schema(path, mend=_MEND).names in known
     except StoreError:
         return False
 

@@ -43,6 +43,7 @@ RUN_SCHEMA: Final = PREDICTION_SCHEMA.append(pa.field(ASKED, pa.string()))  # of
 MATCHER_S: Final = "matcher_s"
 # Of trackers, and not in files of others unless they follow flights.
 FIX_FIELDS: Final = (pa.field("is_accepted", pa.bool_()), pa.field("covariance", pa.list_(pa.float64())))
+FLOWN_SCHEMA: Final = pa.schema([*PREDICTION_SCHEMA, *FIX_FIELDS], metadata=PREDICTION_SCHEMA.metadata)
 _OPTIONAL: Final = (pa.field(MATCHER_S, pa.float64()), *FIX_FIELDS)
 PART_SCHEMA: Final = pa.schema([*RUN_SCHEMA, *_OPTIONAL], metadata=RUN_SCHEMA.metadata)  # of a run's own parts
 

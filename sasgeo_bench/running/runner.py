@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.files.folders import locked
+from sasgeo_bench.matching.follower import card_on_flights
 from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
@@ -290,7 +291,7 @@ def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
         part.folder,
         {
             "schema_version": prediction_rows.SCHEMA_VERSION,
-            "matcher": asdict(plan.card),
+            "matcher": asdict(plan.card if part.follower is None else card_on_flights(plan.card)),
             "spec": plan.request.spec,
             "hash": plan.hash,
             "suite": about["suite"],
@@ -303,6 +304,7 @@ def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
             "warm_up": "one query of each process is asked twice and timed the second time",
             "learned": None if plan.training_record is None else asdict(plan.training_record),
             **({} if part.imagery is None else {"rendered_imagery": part.imagery}),
+            **({} if part.follower is None else {"follower": dict(part.follower)}),
             "map_bytes": _map_bytes(part),
             **cost_fields,
             "licence": LICENCE,

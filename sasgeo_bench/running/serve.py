@@ -12,24 +12,39 @@ from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import TYPE_CHECKING, Any, Final, Self
 
 import numpy as np
 import psutil
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matching.matcher import Learner, Match, Matcher, Training, check_learned, check_match
+from sasgeo_bench.matching.matcher import (
+    Learner,
+    Match,
+    Matcher,
+    Training,
+    check_learned,
+    check_match,
+    is_followed,
+)
 from sasgeo_bench.matching.plugins import load_method
 from sasgeo_bench.matching.tracker import Tracker, check_fix, match_of
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import wire
+from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.task_rows import pairs_from, query_from
 from sasgeo_bench.texts import message_of, one_line
 
+if TYPE_CHECKING:
+    from sasgeo_bench.geometry.grid import Grid
+
 MOST_MAPS: Final = 2  # cached while a matcher trains
 # Modules of this package that answers depend on: after a change there, queries are asked anew.
-TOOLS: Final = ("matching.controls", "regions.evidence", "regions.graph", "regions.network", "search", "tasks.vectors")
+TOOLS: Final = (
+    *("matching.controls", "matching.follower", "regions.evidence", "regions.graph", "regions.network", "search"),
+    "tasks.vectors",
+)
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
@@ -69,6 +84,8 @@ class Server(PluginServer):
     def __init__(self, channel: socket.socket, *, spec: str) -> None:
         super().__init__(channel, spec=spec)
         self.matcher: Matcher | Tracker | None = None
+        self._grid: Grid | None = None
+        self._follower: Tracker | None = None
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
         if message["kind"] == "load":
@@ -80,23 +97,33 @@ class Server(PluginServer):
         if message["kind"] == "learn":
             return _learn(self.matcher, message, blob), b""
         if message["kind"] == "prepare":
-            return _prepare(self.matcher, message), b""
+            return self._prepare(self.matcher, message), b""
+        query = query_from(blob)
         if isinstance(self.matcher, Tracker):
-            return _step(self.matcher, message, blob), b""
-        return _match(self.matcher, message, blob), b""
+            return _step(self.matcher, message, query), b""
+        if query.step is not None and is_followed(self.matcher.card):
+            return _step(self._following(self.matcher), message, query), b""
+        return _match(self.matcher, message, query), b""
+
+    def _prepare(self, matcher: Matcher | Tracker, message: dict[str, Any]) -> dict[str, Any]:
+        reading = _Cost()
+        region = read_region(Path(message["region"]), around=lambda: reading)
+        self._grid = region.grid
+        with (preparing := _Cost()):
+            matcher.prepare(region, message["learned"])
+        grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
+        return {"status": "ok", "seconds": preparing.seconds - reading.seconds, "grown_bytes": grown_bytes}
+
+    def _following(self, matcher: Matcher) -> Tracker:
+        """Return the tracker that asks a matcher of single views about flights."""
+        if self._follower is None:
+            from sasgeo_bench.matching.follower import Follower  # noqa: PLC0415 - else it would be code of all matchers
+
+            self._follower = Follower(matcher, grid=self._grid)
+        return self._follower
 
 
-def _prepare(matcher: Matcher | Tracker, message: dict[str, Any]) -> dict[str, Any]:
-    reading = _Cost()
-    region = read_region(Path(message["region"]), around=lambda: reading)
-    with (preparing := _Cost()):
-        matcher.prepare(region, message["learned"])
-    grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
-    return {"status": "ok", "seconds": preparing.seconds - reading.seconds, "grown_bytes": grown_bytes}
-
-
-def _match(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
-    query = query_from(blob)
+def _match(matcher: Matcher, message: dict[str, Any], query: Query) -> dict[str, Any]:
     start, start_cpu = time.perf_counter(), time.process_time()
     found = matcher.match(query, top_k=message["top_k"])
     seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
@@ -104,9 +131,8 @@ def _match(matcher: Matcher, message: dict[str, Any], blob: bytes) -> dict[str, 
     return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
 
 
-def _step(tracker: Tracker, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
+def _step(tracker: Tracker, message: dict[str, Any], query: Query) -> dict[str, Any]:
     """Answer the next view of a flight; its first one begins it."""
-    query = query_from(blob)
     if query.step is None:
         fault = f"{tracker.card.name} follows flights, and this query is a view alone"
         raise MatchError(fault)
@@ -192,17 +218,15 @@ class Maps(Mapping[str, Region]):
 def code_hash(plugin: object, tools: Sequence[str] | None = None) -> str:
     """Return the SHA-256 of the code that makes answers: the plugin's own, and the tools, `TOOLS`, that it has loaded.
 
-    Its own is the file of its class or, in a package, all Python files next to and below it, by name.
+    Its own is the file of its class or, in a package, all Python files next to and below it, by name; of a tracker that
+    asks a `matcher`, also that one's.
     """
-    module = sys.modules.get(type(plugin).__module__)
-    name = getattr(module, "__file__", None)
     digest = hashlib.sha256()
-    if name is None:
+    named = _own_files(plugin)
+    if not named:
         return digest.hexdigest()
-    own = Path(name)
-    is_package = "." in type(plugin).__module__ or own.name == "__init__.py"
-    files = sorted(own.parent.rglob("*.py")) if is_package else [own]
-    named = {path.relative_to(own.parent).as_posix(): path for path in files}
+    asked = getattr(plugin, "matcher", None)
+    named |= {f"matcher:{name}": path for name, path in (() if asked is None else _own_files(asked).items())}
     loaded = [sys.modules.get(f"sasgeo_bench.{tool}") for tool in (TOOLS if tools is None else tools)]
     for path in (Path(tool.__file__) for tool in loaded if tool is not None and tool.__file__):
         for part in sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]:
@@ -210,6 +234,18 @@ def code_hash(plugin: object, tools: Sequence[str] | None = None) -> str:
     for shown, path in named.items():
         digest.update(shown.encode() + b"\0" + path.read_bytes() + b"\0")
     return digest.hexdigest()
+
+
+def _own_files(plugin: object) -> dict[str, Path]:
+    """Return the files of a plugin's own code by name; none if its class is of no file."""
+    module = sys.modules.get(type(plugin).__module__)
+    name = getattr(module, "__file__", None)
+    if name is None:
+        return {}
+    own = Path(name)
+    is_package = "." in type(plugin).__module__ or own.name == "__init__.py"
+    files = sorted(own.parent.rglob("*.py")) if is_package else [own]
+    return {path.relative_to(own.parent).as_posix(): path for path in files}
 
 
 def _resident_bytes() -> int:

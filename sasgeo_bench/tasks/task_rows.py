@@ -77,12 +77,13 @@ ASKED: Final = "asked_sha256"  # hash of a query and its map; an answer carries 
 VIEW_BYTES: Final = "view_bytes"  # column of stored results, which hold no views: bytes of each view
 FILE_SCHEMA: Final = QUERY_SCHEMA.append(pa.field(ASKED, pa.string()))
 
+STEP_COLUMNS: Final = ("sequence_id", "frame", "increment")  # of views of flights; null for others
 HEAD_SCHEMA: Final = pa.schema(
     [
         QUERY_SCHEMA.field(name)
         for name in (
             *("query_id", "track", "suite", "suite_version", "part", "region"),
-            *("rows", "cell_size_m", "prior_group", "candidates"),
+            *("rows", "cell_size_m", "prior_group", "candidates", *STEP_COLUMNS),
         )
     ]
 )
@@ -114,7 +115,10 @@ TRUTH_SCHEMA: Final = pa.schema(
 )
 
 # Columns that older files lack, and the value that is meant by it.
-ADDED: Final = {"detector": PUBLISHED, "frames": None}
+ADDED: Final = {
+    "detector": PUBLISHED,
+    **dict.fromkeys(("frames", *STEP_COLUMNS, "increment_covariance")),
+}
 
 # Columns of queries and truths that may be null.
 MAY_BE_NULL: Final = frozenset(
@@ -282,13 +286,18 @@ def truth_sha256(truth: Truth) -> str:
     return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
 
 
-def tie_key(learned: str | None, imagery: str | None) -> str | None:
-    """Return the key of what decides an answer besides the question: what was learned, and rendered imagery looked at.
+def tie_key(learned: str | None, *others: str | None) -> str | None:
+    """Return the key of what decides an answer besides the question: what was learned, and hashes of other things.
+
+    Others are rendered imagery that was looked at, and how flights are followed.
 
     >>> tie_key("ab", None), len(tie_key(None, "cd"))
     ('ab', 64)
     """
-    return learned if imagery is None else hashlib.sha256(f"{learned} {imagery}".encode()).hexdigest()
+    key = learned
+    for other in others:
+        key = key if other is None else hashlib.sha256(f"{key} {other}".encode()).hexdigest()
+    return key
 
 
 def asked_under(asked: str, key: str | None) -> str:

@@ -8,9 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.matching import follower
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
@@ -151,13 +152,43 @@ def test_odometry_alone_begins_at_the_prior_and_drifts_and_the_start_alone_stays
         assert {item.is_accepted for item in rows} == {False}
 
 
-def test_the_oracle_follows_flights_and_a_matcher_of_single_views_does_not(task, tmp_path):
+def test_merged_answers_of_a_tracker_keep_what_only_fixes_have(task, tmp_path):
+    flights = run_of(task, tmp_path, "Counting", limit=4)
+    into = tmp_path / "merged.parquet"
+    for _ in range(2):  # the second time in place of the first
+        prediction_files.merge_runs([tmp_path / "runs"], into)
+        found = {item.query_id: item for item in prediction_files.read_predictions(into)}
+        rows = [item for rows in flights.values() for item in rows]
+        assert found == {item.query_id: replace(item, matcher_s=None) for item in rows}
+        assert {(item.is_accepted, item.covariance[0]) for item in found.values()} == {(True, 4.0)}
+
+
+def test_a_matcher_of_single_views_follows_flights_and_its_run_says_how(task, tmp_path, monkeypatch):
+    flights = run_of(task, tmp_path, "prior_centre", limit=4)
+    rows = [item for rows in flights.values() for item in rows]
+    assert {(item.status, item.is_accepted) for item in rows} == {("ok", True)}
+    assert {item.covariance[0] for item in rows} == {25.0}
+    assert flights == run_of(task, tmp_path, "prior_centre", limit=4)
+    plan = plan_run(RunRequest(spec="prior_centre", tasks=(task,), out=tmp_path, limits=PATIENT, limit=4))
+    about = prediction_files.read_run(plan.parts[0].folder)
+    assert about["follower"]["gate"] == 3.5
+    assert "on flights, of sasgeo-bench" in about["matcher"]["ours"]
+    assert not plan.parts[0].left
+    monkeypatch.setattr(follower, "_VERSION", 2)
+    again = plan_run(plan.request)
+    assert again.hash == plan.hash
+    assert (len(again.parts[0].left), again.parts[0].aside) == (4, 4)
+    with pytest.raises(MatchError, match="follower is 7, expected settings with a hash"):
+        prediction_files.key_of({"follower": 7})
+
+
+def test_the_oracle_follows_flights_and_a_matcher_that_only_ranks_does_not(task, tmp_path):
     truths = {
         item.query_id: item.pose for item in task_files.read_truths(task.parents[2] / "truth" / task.parent.name / TOWN)
     }
     rows = [item for rows in run_of(task, tmp_path, "oracle_pose").values() for item in rows]
     assert all(item.candidates[0][0] == truths[item.query_id] and item.is_accepted for item in rows)
-    rows = [item for rows in run_of(task, tmp_path, "random").values() for item in rows]
+    rows = [item for rows in run_of(task, tmp_path, "Ranks").values() for item in rows]
     assert {(item.status, item.message) for item in rows} == {("not applicable", "track sequence")}
 
 

@@ -68,3 +68,15 @@ class Failing(Counting):
         if way == "singular":
             return Fix(pose=HERE, covariance=[[1, 1, 0], [1, 1, 0], [0, 0, 1]])
         return "a text"
+
+
+class Ranks:
+    """Ranks candidates, and finds no place."""
+
+    card = MatcherCard(name="ranks", tracks=("retrieval",), **SAID)
+
+    def prepare(self, region, learned):
+        self.region = region
+
+    def match(self, query, *, top_k):
+        raise NotImplementedError

@@ -17,7 +17,7 @@ from sasgeo_bench.tasks.query import Query, Step
 
 Covariance = NDArray[np.float64]  # (3, 3): east, north, yaw in m2, m deg, deg2
 
-_ANY_YAW_DEG: Final = 360.0 / math.sqrt(12)  # standard deviation of a heading of which nothing is known
+ANY_YAW_DEG: Final = 360.0 / math.sqrt(12)  # standard deviation of a heading of which nothing is known
 _LOST_M: Final = 1000.0  # added to a position where the odometer lost its way
 _LOST_DEG: Final = 90.0
 _FLOOR: Final = 1e-6  # m2 and deg2: keeps a covariance invertible
@@ -31,7 +31,7 @@ def start_of(prior: Prior, grid: Grid) -> tuple[Pose, Covariance]:
     else:
         west_m, south_m, east_m, north_m = grid.bounds_m
         place_m2 = ((east_m - west_m) ** 2 / 12, (north_m - south_m) ** 2 / 12)
-    yaw_deg = _ANY_YAW_DEG if prior.yaw_sigma_deg is None else prior.yaw_sigma_deg
+    yaw_deg = ANY_YAW_DEG if prior.yaw_sigma_deg is None else prior.yaw_sigma_deg
     return pose, np.diag([*place_m2, yaw_deg**2])
 
 

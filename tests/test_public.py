@@ -117,6 +117,8 @@ def test_a_dry_run_returns_the_folders_and_writes_none(tmp_path):
         ("sasgeo_bench.running.serve", {"pandas", "geopandas", "rasterio", "pyproj", "scipy", "matplotlib"}),
         ("sasgeo_bench.cli.listing", {"numpy", "pandas", "pydantic"}),
         ("sasgeo_bench.cli.regions", {"matplotlib", "scipy.optimize"}),
+        ("sasgeo_bench.tasks.build", {"matplotlib", "scipy.interpolate", "scipy.signal", "scipy.stats"}),
+        ("sasgeo_baselines.map_density_prior", {"pandas", "scipy"}),
     ],
 )
 def test_a_process_imports_slow_libraries_only_where_it_uses_them(code, unused):

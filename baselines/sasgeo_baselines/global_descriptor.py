@@ -9,7 +9,6 @@ from typing import Final, Self
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.distance import pdist
 
 from sasgeo_bench import (
     PRESENT,
@@ -228,6 +227,8 @@ def distances(places_m: NDArray[np.float64], *, reach_m: float) -> NDArray[np.fl
 
     Each distance is split between its two nearest bins, so that small moves make small differences.
     """
+    from scipy.spatial.distance import pdist  # noqa: PLC0415 - slow to import, and most matchers need no distances
+
     made = np.zeros(BINS)
     if len(places_m) > 1:
         at = np.minimum(pdist(places_m) * ((BINS - 1) / reach_m), BINS - 1)

@@ -15,9 +15,7 @@ from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.flights.trajectory import Trajectory
@@ -298,6 +296,8 @@ def _smooth(line_m: Floats) -> Floats:
 
 def _move(path_m: Floats, cruise_mps: float, limits: Limits, step_s: float) -> _Motion:
     """Return when a drone is where along a path."""
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - slow to import, and most processes fly nothing
+
     along_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path_m, axis=0).T)))
     curve = CubicSpline(along_m, path_m)
     first, second = curve(along_m, 1), curve(along_m, 2)
@@ -383,6 +383,8 @@ def _wander(rng: np.random.Generator, count: int, step_s: float, tau_s: float) -
 
     Two equal filters of first order in a row; their joint gain is (1 + a^2) / (1 - a^2)^3.
     """
+    from scipy.signal import lfilter  # noqa: PLC0415 - slow to import, and most processes fly nothing
+
     keep = math.exp(-step_s / tau_s)
     before = math.ceil(_SETTLING * tau_s / step_s)
     gain = math.sqrt((1 - keep**2) ** 3 / (1 + keep**2))

@@ -10,7 +10,6 @@ from typing import Final, Literal, get_args
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.flights.corridors import Corridors, Ways
@@ -194,6 +193,8 @@ def _corridor(wish: _Wish, rng: np.random.Generator) -> Floats | None:
 
 def _transit(wish: _Wish, rng: np.random.Generator) -> Floats | None:
     """Draw a curve between two places, past one waypoint or two."""
+    from scipy.interpolate import CubicSpline  # noqa: PLC0415 - slow to import, and most processes fly nothing
+
     for _ in range(_DRAWS):
         count = int(rng.integers(1, 3))
         at = np.array([0.0, *(np.arange(1, count + 1) + rng.uniform(-0.2, 0.2, count)) / (count + 1), 1.0])

@@ -23,6 +23,7 @@ from .matching.controls.fft_vote import DenseMatcher as DenseMatcher
 from .matching.controls.fft_vote import PoseCheck as PoseCheck
 from .matching.controls.reckoning import advance as advance
 from .matching.controls.reckoning import start_of as start_of
+from .matching.follower import Belief as Belief
 from .matching.follower import Follower as Follower
 from .matching.follower import FollowPlan as FollowPlan
 from .matching.matcher import WITHHELD as WITHHELD

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
@@ -18,7 +19,7 @@ from sasgeo_bench.matching.controls.reckoning import Covariance, advance, start_
 from sasgeo_bench.matching.matcher import MOST_SAID, Match, Matcher, MatcherCard, check_match, is_followed
 from sasgeo_bench.matching.tracker import SIDE, Fix
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.tasks.query import Query, Step
 from sasgeo_bench.texts import MOST_DIAGNOSTICS
 
 _VERSION: Final = 1
@@ -85,6 +86,26 @@ class Belief:
         """Return the standard deviation of the heading, degrees."""
         return math.sqrt(max(0.0, float(self.covariance[2, 2])))
 
+    def gap(self, pose: Pose) -> NDArray[np.float64]:
+        """Return how far a pose lies from the estimate, shape (3,): east, north, metres, and yaw, degrees.
+
+        >>> here, there = (Pose(easting_m=east_m, northing_m=0.0, yaw_deg=-east_m) for east_m in (0.0, 2.0))
+        >>> Belief(pose=here, covariance=np.eye(3)).gap(there).tolist()
+        [2.0, 0.0, -2.0]
+        """
+        east_m, north_m = pose.easting_m - self.pose.easting_m, pose.northing_m - self.pose.northing_m
+        return np.array([east_m, north_m, float(wrap_deg(pose.yaw_deg - self.pose.yaw_deg))])
+
+    def distance(self, pose: Pose, covariance: Covariance) -> float:
+        """Return the Mahalanobis distance to another estimate, of which the covariance is given.
+
+        >>> here, there = (Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg) for yaw_deg in (359.0, 1.0))
+        >>> Belief(pose=here, covariance=np.diag([16.0, 16.0, 3.0])).distance(there, np.diag([9.0, 9.0, 1.0]))
+        1.0
+        """
+        gap = self.gap(pose)
+        return math.sqrt(max(0.0, float(gap @ np.linalg.solve(self.covariance + covariance, gap))))
+
 
 class Follower:
     """Follows a flight with a matcher of single views: a tracker, by odometry and answers that fit it.
@@ -92,7 +113,8 @@ class Follower:
     Each view is asked as a localization query whose prior is the belief. An answer that is confident enough and fits
     the belief becomes the new belief; after any other, the odometry is added up and the estimate is not accepted.
     `sasgeo-bench run` does this by itself where a matcher of single views is asked about flights. Derive from it, with
-    a card of your own, for other settings (`FollowPlan`) or another covariance (`covariance_of`).
+    a card of your own, for other settings (`FollowPlan`), another covariance (`covariance_of`), motion (`moved`), or
+    another use of answers (`corrected`).
 
     Parameters
     ----------
@@ -143,25 +165,37 @@ class Follower:
         if self._belief is None or query.step is None:
             message = f"{self.card.name}: call start() first, and step() with the views of a flight"
             raise RuntimeError(message)
-        pose, covariance = advance(self._belief.pose, self._belief.covariance, query.step)
-        belief = self._widened(replace(self._belief, pose=pose, covariance=sound(covariance)))
+        belief = _sound(self._widened(self.moved(self._belief, query.step)))
         asked = replace(query, track="localization", prior=self.prior_of(belief, query.prior), step=None)
         found = check_match(self.matcher.match(asked, top_k=self.plan.top_k), asked, top_k=self.plan.top_k)
-        own = self.covariance_of(found, query)
-        away = distance(belief.pose, found.poses[0], belief.covariance + own) if found.poses else None
-        is_good = self._is_good(found, away)
-        if is_good:
-            self._belief = Belief(pose=found.poses[0], covariance=own)
-        else:
-            self._belief = replace(belief, idle=belief.idle + 1)
-        told = dict(found.diagnostics) | _told(asked.prior, away)
+        corrected, is_accepted = self.corrected(belief, found, query)
+        self._belief = _sound(corrected)
+        told = dict(found.diagnostics)
+        if asked.prior.radius_m is not None and len(told) < MOST_DIAGNOSTICS:
+            told["searched_m"] = asked.prior.radius_m
         return Fix(
             pose=self._belief.pose,
             covariance=self._belief.covariance,
-            is_accepted=is_good,
-            confidence=found.confidence if is_good else None,
-            diagnostics=told if len(told) <= MOST_DIAGNOSTICS else {},
+            is_accepted=is_accepted,
+            confidence=found.confidence if is_accepted else None,
+            diagnostics=told,
         )
+
+    def moved(self, belief: Belief, step: Step) -> Belief:
+        """Return a belief after the way to the next view: the odometry is added up."""
+        pose, covariance = advance(belief.pose, belief.covariance, step)
+        return replace(belief, pose=pose, covariance=covariance)
+
+    def corrected(self, belief: Belief, found: Match, query: Query) -> tuple[Belief, bool]:
+        """Return the belief after an answer, and whether its pose may be relied on.
+
+        Here an answer that fits is taken up in place of the belief, and after any other the belief stays.
+        """
+        covariance = self.covariance_of(found, query)
+        is_sure = found.confidence is None or found.confidence >= self.plan.least_confidence
+        if found.poses and is_sure and belief.distance(found.poses[0], covariance) <= self.plan.gate:
+            return Belief(pose=found.poses[0], covariance=covariance), True
+        return replace(belief, idle=belief.idle + 1), False
 
     def covariance_of(self, found: Match, query: Query) -> Covariance:
         """Return the covariance of the first pose of an answer: the same for all, unless you know better."""
@@ -194,48 +228,22 @@ class Follower:
         yaw_deg2 = _grown(belief.yaw_sigma_deg, self._first.yaw_sigma_deg, self.plan.widen)
         return replace(belief, covariance=belief.covariance + np.diag([place_m2, place_m2, yaw_deg2]))
 
-    def _is_good(self, found: Match, away: float | None) -> bool:
-        is_sure = found.confidence is None or found.confidence >= self.plan.least_confidence
-        return away is not None and is_sure and away <= self.plan.gate
-
 
 def _grown(sigma: float, most: float, factor: float) -> float:
     """Return the variance to add so that a standard deviation grows by a factor, but not beyond the most it may be."""
     return max(0.0, min(sigma * factor, most) ** 2 - sigma**2)
 
 
-def distance(one: Pose, other: Pose, covariance: Covariance) -> float:
-    """Return the Mahalanobis distance between two poses, given the covariance of their difference.
-
-    >>> here, there = (Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg) for yaw_deg in (359.0, 1.0))
-    >>> distance(here, there, np.diag([25.0, 25.0, 4.0]))
-    1.0
-    """
-    east_m, north_m = other.easting_m - one.easting_m, other.northing_m - one.northing_m
-    gap = np.array([east_m, north_m, float(wrap_deg(other.yaw_deg - one.yaw_deg))])
-    return math.sqrt(max(0.0, float(gap @ np.linalg.solve(covariance, gap))))
-
-
-def sound(covariance: Covariance) -> Covariance:
-    """Return a covariance of a pose that is symmetric, invertible and of finite size, however long odometry was added.
-
-    >>> np.sqrt(np.diag(sound(np.diag([2500.0, 400.0, 1e6])))).round(1).tolist()
-    [50.0, 20.0, 103.9]
-    """
-    spread_m = math.sqrt(max(covariance[0, 0], covariance[1, 1], 0.0))
-    spread_deg = math.sqrt(max(covariance[2, 2], 0.0))
-    most_deg = reckoning.ANY_YAW_DEG
-    place, yaw = min(1.0, _NO_MORE_M / max(spread_m, 1.0)), min(1.0, most_deg / max(spread_deg, 1.0))
+def _sound(belief: Belief) -> Belief:
+    """Make a covariance symmetric, invertible and of finite size, however long odometry was added."""
+    covariance = (belief.covariance + belief.covariance.T) / 2
+    spread_m, spread_deg = math.sqrt(max(covariance[0, 0], covariance[1, 1], 0.0)), belief.yaw_sigma_deg
+    place, yaw = min(1.0, _NO_MORE_M / max(spread_m, 1.0)), min(1.0, reckoning.ANY_YAW_DEG / max(spread_deg, 1.0))
     factors = np.diag([place, place, yaw])
-    found = factors @ (covariance + covariance.T) @ factors / 2
+    found = factors @ covariance @ factors
     floor = _SHARE * float(np.trace(found))
-    return np.asarray(found if np.linalg.eigvalsh(found)[0] > floor else found + floor * np.eye(SIDE))
-
-
-def _told(prior: Prior, away: float | None) -> dict[str, float]:
-    """Return numbers for a reader: the radius that was searched, and how far the answer was from the belief."""
-    radius = {} if prior.radius_m is None else {"searched_m": prior.radius_m}
-    return radius | ({} if away is None else {"mahalanobis": away})
+    is_low = np.linalg.eigvalsh(found)[0] <= floor
+    return replace(belief, covariance=found + floor * np.eye(SIDE) if is_low else found)
 
 
 def card_on_flights(card: MatcherCard, plan: FollowPlan | None = None) -> MatcherCard:

@@ -49,6 +49,7 @@ from sasgeo_bench.regions.region import (
 from sasgeo_bench.regions.region_spec import RegionFile
 
 PREVIEW_CELLS: Final = 2048
+CUT_AWAY: Final = "cut away"  # reason why ground of an edited map is unknown
 _OFFSET_SEED: Final = 0  # of the tiles drawn anew for an interval: the same pictures give the same bytes
 
 
@@ -289,28 +290,38 @@ def _write_into(
     return manifest
 
 
-def build_edited(plan: BuildPlan, base: Region, features: gpd.GeoDataFrame, *, suffix: str, note: str) -> Path:
+def build_edited(
+    plan: BuildPlan,
+    base: Region,
+    features: gpd.GeoDataFrame,
+    *,
+    suffix: str,
+    note: str,
+    coverage: shapely.Geometry | None = None,
+) -> Path:
     """Write a region with edited features next to its base, as `<id>+<suffix>`, and return its folder.
 
-    It has no imagery, which would show what was there before. Coverage and provenance stay those of the base; `note`
-    says in the manifest what was edited. Raise `StoreError` if
-    the folder cannot be written.
+    It has no imagery, which would show what was there before. Provenance stays that of the base, and so does the mapped
+    area unless a smaller `coverage` is given; `note` says in the manifest what was edited. Raise `StoreError` if the
+    folder cannot be written.
     """
     name = f"{plan.folder.name}+{suffix}"
-    inputs = hashlib.sha256(f"{base.manifest.inputs_sha256}/{note}/{fingerprint(features)}".encode()).hexdigest()
+    cut = "" if coverage is None else coverage.wkt
+    inputs = hashlib.sha256(f"{base.manifest.inputs_sha256}/{note}/{fingerprint(features)}{cut}".encode()).hexdigest()
     spec = plan.spec.model_copy(update={"id": name, "title": f"{plan.spec.title} ({suffix})"})
     edited = replace(plan, spec=spec, folder=plan.folder.parent / name, inputs_sha256=inputs, pictures=())
     record = base.manifest
     reading = Reading(
         features=features,
-        coverage=base.coverage,
+        coverage=base.coverage if coverage is None else coverage,
         coverage_source=record.coverage.source,
         osm_timestamp=record.extract.osm_timestamp,
         drops=record.drops,
         hidden=record.hidden,
         notes=record.notes,
         warnings=(*record.warnings, note),
-        unknown_m2=record.coverage.unknown_m2,
+        unknown_m2=record.coverage.unknown_m2
+        | ({} if coverage is None else {CUT_AWAY: base.coverage.area - coverage.area}),
         cuts=record.coverage.cuts,
     )
     _write_unless_current(

@@ -12,7 +12,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-import geopandas as gpd
 import numpy as np
 
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
@@ -20,15 +19,12 @@ from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.progress import Tell, spread
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.build import build_edited, build_region, plan_build
-from sasgeo_bench.regions.evidence import LayerBits
-from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.regions.layers import burn_layers, make_paint
+from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.degraded_map import DROPPED, WARP_M, degrade
+from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps, nothing_to_ask
 from sasgeo_bench.tasks.flight_choice import Airspace
 from sasgeo_bench.tasks.flight_sampling import FlightDrawer
 from sasgeo_bench.tasks.frames import LABELS
@@ -44,7 +40,6 @@ from sasgeo_bench.tasks.suites.flights import FlightSuite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.suites.synthetic_age import ageing_of
 from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
-from sasgeo_bench.tasks.twin import paste
 
 _SKIP: Final = " (--skip passes on to the next suite)"
 
@@ -178,11 +173,12 @@ def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     if isinstance(suite, FlightSuite):
         airspace = Airspace(region=base, scene=scene, suite=suite, split=request.split, seeds=seeds, group=group)
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
+        airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
         pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)
         return tuple(_write(request, pilot, [flight.site for flight in flights.values()], tell))
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
-    drawer, sites = _edited(request, drawer, base, sites)
+    drawer, sites = edit_maps(request, drawer, base, sites)
     return tuple(_write(request, drawer, sites, tell))
 
 
@@ -213,7 +209,7 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
     elsewhere: State | None = None
     imagery = base.imagery if base.imagery is not None and not base.imagery.record.is_rendered else None
     if "degraded map" in needs and imagery is not None:
-        others = (_degraded(request, suite, base),)
+        others = (degraded_map(request, suite, base),)
     if "older maps" in needs:
         others = tuple(
             State.of(_built(request, request.region, date, tell), name=f"{request.region.id}@{date.isoformat()}")
@@ -236,16 +232,6 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
         profile=request.choice.profile,
     )
     return scene, base
-
-
-def _degraded(request: Request, suite: Suite, base: Region) -> State:
-    """Return the region's map with the faults of worse mapping, which is built next to it."""
-    plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
-    rng = Seeds(root=request.seed, names=(request.region.id, suite.card.name)).rng("degraded map")
-    features = degrade(base.features, base.grid, rng)
-    note = f"degraded: {DROPPED:.0%} of the buildings dropped, the rest {WARP_M:g} m off, for suite {suite.card.name}"
-    folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
-    return State.of(region_files.read_region(folder), name=folder.name)
 
 
 def look_of(split: Split, block: Block) -> Family:
@@ -271,65 +257,6 @@ def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell)
     return region_files.read_region(plan.folder)
 
 
-def _edited(request: Request, drawer: Drawer, base: Region, sites: tuple[Site, ...]) -> tuple[Drawer, tuple[Site, ...]]:
-    """Apply the suite's edit to map and world; drop sites without a twin."""
-    suite, scene, seeds = drawer.suite, drawer.scene, drawer.seeds
-    edit = suite.edit(scene, sites, seeds)
-    # With many sites there may be no room for the copies of any.
-    while request.may_be_fewer and edit is not None and not edit.sites and len(sites) > 1:
-        sites = sites[: len(sites) // 2]
-        edit = suite.edit(scene, sites, seeds)
-    if edit is None:
-        return drawer, sites
-    if not edit.sites:
-        message = f"{request.region.id} has no room for a copy of a site, as suite {suite.card.name!r} needs"
-        raise ConfigError(message)
-    if len(edit.sites) < request.count and not request.may_be_fewer:
-        message = (
-            f"{request.region.id} has room for the copies of {len(edit.sites)} of {len(sites)} sites of suite "
-            f"{suite.card.name!r}: lower --n or pass --up-to"
-        )
-        raise ConfigError(message)
-    # Tried on the unedited map, so that no edited map is written without a query to ask on it.
-    trial = replace(drawer, scene=replace(scene, twins=edit.twins))
-    reasons = Counter(map(trial.why_not, trial.jobs(edit.sites)))
-    if None not in reasons:
-        raise _nothing_to_ask(request, suite, reasons)
-    plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
-    world = scene.world
-    if edit.world_pastes is not None:
-        world = _state_of(base, paste(base.features, edit.world_pastes))
-    if not edit.map_pastes:
-        return trial, edit.sites
-    features = paste(base.features, edit.map_pastes)
-    note = f"edited: {len(edit.map_pastes)} parts pasted for suite {suite.card.name}"
-    folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
-    edited = State.of(region_files.read_region(folder))
-    world = edited if edit.world_pastes is None else world
-    return replace(drawer, scene=replace(scene, map=edited, world=world, twins=edit.twins)), edit.sites
-
-
-def _nothing_to_ask(request: Request, suite: Suite, reasons: Counter[str | None]) -> ConfigError:
-    """Return an error that gives the most frequent reason why no query can be asked."""
-    reason = reasons.most_common(1)[0][0]
-    return ConfigError(f"{request.region.id} is too small or too empty for suite {suite.card.name!r}: {reason}")
-
-
-def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
-    """Return a state that is seen and never searched: layers in memory, no graph."""
-    paint = make_paint(features, base.classes, base.coverage)
-    return State(
-        region=base.manifest.id,
-        date=base.manifest.extract.date,
-        grid=base.grid,
-        classes=base.classes,
-        bits=LayerBits.of(burn_layers(paint, base.grid)),
-        features=features,
-        graph=build_graph(features.iloc[:0]),
-        coverage=base.coverage,
-    )
-
-
 def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
     jobs = drawer.jobs(sites)
     why = {job.query_id: drawer.why_not(job) for job in jobs}
@@ -341,9 +268,9 @@ def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site
         tell(f"{where}: {counted(reasons[reason], *named)} left out, {reason}")
     by_map: dict[str, list[Job]] = {}
     if not left:
-        raise _nothing_to_ask(request, drawer.suite, reasons)
+        raise nothing_to_ask(request, drawer.suite, reasons)
     for job in left:
-        by_map.setdefault(drawer.suite.map_region(drawer.scene, job.variant), []).append(job)
+        by_map.setdefault(drawer.map_of(job), []).append(job)
     name = drawer.suite.card.name
     # With the seed anyone could draw the truths again, so it stays with them.
     hidden: dict[str, Any] = {**seed_record(request.seed), "count": request.count, "maps": len(by_map)}

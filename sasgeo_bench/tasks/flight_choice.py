@@ -2,6 +2,7 @@
 """Choose the flights of a suite over a region: paths in one part of the split, over ground where enough is drawn."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,6 +20,7 @@ from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.sampling import drawn_share
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Site
+from sasgeo_bench.tasks.suites.flight_plots import ChangedMapSuite, Plot, ground_of
 from sasgeo_bench.tasks.suites.flights import EXTENT, HEIGHT_M, LENGTHS_M, LOITER_M, SPACING_M, UNEVEN, FlightSuite
 
 Floats = NDArray[np.float64]
@@ -33,12 +35,13 @@ _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
 @dataclass(frozen=True, kw_only=True)
 class Flight:
-    """A flight over a region: N views, their mean spacing, and the scale that all of them have."""
+    """A flight over a region: N views, their mean spacing, the scale that all have, and how maps are changed for it."""
 
     site: Site
     views: Trajectory
     spacing_m: float
     scale: float
+    plot: Plot | None = None
 
     @property
     def length_m(self) -> float:
@@ -83,7 +86,11 @@ class Airspace:
         ConfigError
             If there is room for fewer; with `may_be_fewer`, only if there is room for none.
         """
-        flights = {index: flight for index in range(count) if (flight := self._flight(index)) is not None}
+        flights: dict[int, Flight] = {}
+        for index in range(count):
+            flight = self._flight(index, list(flights.values()))
+            if flight is not None:
+                flights[index] = flight
         if not flights or (len(flights) < count and not may_be_fewer):
             message = (
                 f"{self.scene.map.region} has room for {len(flights)} of {count} flights of suite "
@@ -93,7 +100,7 @@ class Airspace:
             raise ConfigError(message)
         return flights
 
-    def _flight(self, index: int) -> Flight | None:
+    def _flight(self, index: int, before: Sequence[Flight]) -> Flight | None:
         """Return the longest flight that is found, of the kind whose turn it is if possible."""
         seeds, sigmas = self.seeds_of(index), (-_SCALE_CUT, _SCALE_CUT)
         extent_m = math.sqrt(flight_area(self.region, self.suite.clear_m(self.scene)).area)
@@ -107,10 +114,21 @@ class Airspace:
                     views = self._views(kind, length_m, spacing_m, rng)
                     if views is None:
                         break
-                    if self._is_in_one_part(views) and self._is_drawn(views, scale):
-                        site = Site(index=index, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
-                        return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale)
+                    if not self._is_in_one_part(views):
+                        continue
+                    plot = self._plot(views, before, rng)
+                    if (plot is None) == isinstance(self.suite, ChangedMapSuite) or not self._is_drawn(views, scale):
+                        continue
+                    site = Site(index=index, pose=pose_of(views, 0, scale), block=self._block(views), density=0.0)
+                    return Flight(site=site, views=views, spacing_m=spacing_m, scale=scale, plot=plot)
         return None
+
+    def _plot(self, views: Trajectory, before: Sequence[Flight], rng: np.random.Generator) -> Plot | None:
+        """Return how maps are changed for a flight after those before it; None if they are not, or have no room."""
+        if not isinstance(self.suite, ChangedMapSuite):
+            return None
+        ground = ground_of(self.scene, [(flight.views, flight.plot) for flight in before if flight.plot is not None])
+        return self.suite.plot(views, ground, rng)
 
     def elsewhere(self, flight: Flight, carried_m: float) -> Trajectory | None:
         """Return another first half for a flight, which ends so far from its middle; None if none is found."""

@@ -14,8 +14,19 @@ from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.flight_choice import Airspace, Flight, pose_of, rows
-from sasgeo_bench.tasks.query import SEQUENCE_DIGITS, PriorGroup, Query, Step, Truth, flight_id, view_id
+from sasgeo_bench.tasks.query import (
+    SEQUENCE_DIGITS,
+    TWIN_EAST,
+    TWIN_NORTH,
+    PriorGroup,
+    Query,
+    Step,
+    Truth,
+    flight_id,
+    view_id,
+)
 from sasgeo_bench.tasks.sampling import LEAST_DRAWN, UNANSWERABLE, Job, drawn_share, make_prior
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Draft, Scene, Seeds, Shot, Site, Variant, changed_share
 from sasgeo_bench.tasks.suites.flights import FlightSuite, Mission
 
@@ -53,9 +64,18 @@ class FlightDrawer:
             for site in sites
             for detector in self.suite.drawn_by(self.choice.detectors)
             for variant in (replace(item, detector=detector) for item in self.suite.variants)
-            if self.choice.takes(variant, "sequence")
+            if self.choice.takes(variant, "sequence") and self._is_of(site, variant)
         ]
         return sorted(jobs, key=lambda job: job.query_id)
+
+    def _is_of(self, site: Site, variant: Variant) -> bool:
+        """Return whether a site has a variant: where maps are changed for a flight, only one strength of its stress."""
+        plot = self.flights[site.index].plot
+        return plot is None or variant.role != "stress" or variant.strength == plot.strength
+
+    def map_of(self, job: Job) -> str:
+        """Return the name of the map that a flight is searched on."""
+        return self.suite.map_of(self.scene, job.variant, job.site.index)
 
     def why_not(self, job: Job) -> str | None:
         """Return why a flight is left out, or None: its stress does not fit, or no stress does that it is held against.
@@ -90,7 +110,7 @@ class FlightDrawer:
         before = self._elsewhere(flight, mission.carried_m) if mission.carried_m else None
         views = flight.views if before is None else _joined(before, flight)
         steps, distance_m = self._odometry(views, flight, mission), views.distance_m
-        measured: dict[str, float] = {}
+        measured = _changes(flight, job.variant)
         if before is not None:
             carried_m = float(distance_m[flight.middle] - distance_m[flight.middle - 1])
             measured["carried_m"] = round(carried_m, 1)
@@ -134,8 +154,14 @@ class FlightDrawer:
         evidence = draft.evidence
         if not measured["is_seen"]:
             evidence = evidence.replace(np.full_like(evidence.cells, UNKNOWN))
-        prior = make_prior(pose, group, rng=seeds.rng("prior", group.name)) if step.frame == 0 else _no_prior(group)
-        state = scene.state(self.suite.map_region(scene, variant))
+        state, plot = scene.state(self.map_of(job)), self.flights[job.site.index].plot
+        copy = None if plot is None or plot.copy_m is None else _moved(pose, plot.copy_m)
+        if copy is not None:
+            measured |= _likeness(state, pose, copy, variant)
+        prior = _no_prior(group)
+        if step.frame == 0:
+            rivals_m = () if copy is None else ((copy.easting_m, copy.northing_m),)
+            prior = make_prior(pose, group, rng=seeds.rng("prior", group.name), rivals_m=rivals_m)
         query = Query(
             query_id=view_id(step.sequence_id, step.frame),
             track="sequence",
@@ -158,10 +184,11 @@ class FlightDrawer:
         if changed is None:
             views = (variant.view(place, site.pose) for place in (self.scene.world, state))
             changed = 0.0 if state is self.scene.world else changed_share(*views)
-        is_blank = drawn_share(state, site.pose, variant) < LEAST_DRAWN
+        is_present = state.knows(site.pose)
+        is_blank = is_present and drawn_share(state, site.pose, variant) < LEAST_DRAWN
         return Truth(
             query_id=query.query_id,
-            is_present=True,
+            is_present=is_present,
             pose=site.pose,
             candidate=-1,
             pair_id=self._seeds(site).digest("pair").hex()[:16],
@@ -178,6 +205,33 @@ class FlightDrawer:
             measured=draft.measured | ({UNANSWERABLE: 1.0} if is_blank else {}),
             detector=variant.detector,
         )
+
+
+def _changes(flight: Flight, variant: Variant) -> dict[str, float]:
+    """Return what truths say of the changes of the map that a variant searches."""
+    if flight.plot is None:
+        return {}
+    if variant.role == "control":
+        return dict.fromkeys(flight.plot.stress.measured, 0.0)
+    return flight.plot.of(variant.role).measured
+
+
+def _moved(pose: Pose, by_m: tuple[float, float]) -> Pose:
+    return replace(pose, easting_m=pose.easting_m + by_m[0], northing_m=pose.northing_m + by_m[1])
+
+
+def _likeness(state: State, pose: Pose, copy: Pose, variant: Variant) -> dict[str, float]:
+    """Return how like a view of the map is to that at its copy: equal cells of all present in either, and if all are.
+
+    Of an exact copy, also the way to it.
+    """
+    here, there = (variant.view(state, at) for at in (pose, copy))
+    is_copied = bool(np.array_equal(here.cells, there.cells))
+    found = {"copy_likeness": round(1 - changed_share(here, there), 4), "is_copied": float(is_copied)}
+    if not is_copied:
+        return found
+    east_m, north_m = copy.easting_m - pose.easting_m, copy.northing_m - pose.northing_m
+    return found | {TWIN_EAST: round(east_m, 2), TWIN_NORTH: round(north_m, 2)}
 
 
 def _joined(before: Trajectory, flight: Flight) -> Trajectory:

@@ -21,7 +21,7 @@ from sasgeo_bench.regions.preview import paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
-from sasgeo_bench.tasks.query import PUBLISHED, Truth, flight_id
+from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, Truth, flight_id
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -30,8 +30,11 @@ TRUE: Final = "#111111"
 RECKONED: Final = "#d6006c"
 PRIOR: Final = "#1f5fbf"
 LOST: Final = "#7b2fa0"
+OFF_MAP: Final = "#ffc928"
+COPY: Final = "#00796b"
 _COLUMNS: Final = ("query_id", "increment", "prior_easting_m", "prior_northing_m", "prior_radius_m")
 _MOST_ACROSS: Final = 6  # panels; a site with more variants takes two rows
+_ALONE_ACROSS: Final = 3  # panels, where each site has one
 _PANEL_INCHES: Final = 3.4
 _ONE_INCHES: Final = 8.0  # of a flight that is drawn alone
 _FINE_CELLS: Final = 3000  # on a side of a panel, up to which the map is read as it is
@@ -42,6 +45,7 @@ _PALE: Final = 0.6  # of the map's colours that is white
 _AROUND: Final = 0.12  # of the extent of the paths, left free around them
 _ASTRAY: Final = 0.35  # of the extent of the true paths, by which reckoned ones may widen a panel
 _LEAST_M: Final = 300.0  # half a panel
+_IN_A_ROW: Final = "Flights of a row are of one site. "
 _RANK: Final = {"control": 0, "stress": 1, "falsifier": 2}
 
 
@@ -58,8 +62,15 @@ class FlightPanel:
     place_m: Floats  # (N, 2)
     yaw_deg: Floats
     is_seen: Bools
+    is_on_map: Bools
+    copy_m: Floats  # (N, 2), where the map shows the same; NaN where it does not
     increments: Floats  # (N - 1, 3)
     prior_m: tuple[float, float, float] | None
+
+    @property
+    def is_copied(self) -> Bools:
+        """Return which views the map shows a second time."""
+        return np.asarray(~np.isnan(self.copy_m[:, 0]))
 
     @property
     def reckoned_m(self) -> Floats:
@@ -173,14 +184,18 @@ def _order(truth: Truth) -> tuple[int, float, str, str]:
 
 def _panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str, Any]]) -> FlightPanel:
     poses = [truth.pose for truth in truths if truth.pose is not None]
+    place_m = np.array([(pose.easting_m, pose.northing_m) for pose in poses])
     first = rows[0]
     disc = tuple(first[f"prior_{item}_m"] for item in ("easting", "northing", "radius"))
     return FlightPanel(
         flight=name,
         truth=truths[0],
-        place_m=np.array([(pose.easting_m, pose.northing_m) for pose in poses]),
+        place_m=place_m,
         yaw_deg=np.array([pose.yaw_deg for pose in poses]),
         is_seen=np.array([truth.measured.get("is_seen", 1.0) > 0 for truth in truths]),
+        is_on_map=np.array([truth.is_present for truth in truths]),
+        copy_m=place_m
+        + np.array([[truth.measured.get(name, np.nan) for name in (TWIN_EAST, TWIN_NORTH)] for truth in truths]),
         increments=np.array([row["increment"] or [np.nan] * 3 for row in rows[1:]], dtype=np.float64).reshape(-1, 3),
         prior_m=None if disc[2] is None else disc,
     )
@@ -197,11 +212,12 @@ def write_flight_sheet(
     if not task_files.is_of_map(about, manifest):
         raise StoreError(built_anew(about["region"]))
     places = list(_places(shown))
+    row_is_site = len({panel.truth.pair_id for panel in shown}) < len(shown)
     across = 1 + max((column for _, column in places), default=0)
     inches = _ONE_INCHES if len(shown) == 1 else _PANEL_INCHES
     sheet = Page(
         title=f"{about['title']}: {about['region']}",
-        facts=f"{about['what']} Flights of a row are of one site. Number of a stress: {about['strength_unit']}.",
+        facts=f"{about['what']} {_IN_A_ROW if row_is_site else ''}Number of a stress: {about['strength_unit']}.",
         note="North is up. inspect --query ID draws one flight alone, or the sheet of one view by its whole id.",
         data=ATTRIBUTION,
         rows=1 + max((row for row, _ in places), default=0),
@@ -223,10 +239,16 @@ def write_flight_sheet(
 
 
 def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
-    """Yield row and column of each panel: a site begins a row, and takes a second one if it has many variants."""
+    """Yield row and column of each panel: a site begins a row, and takes a second one if it has many variants.
+
+    Where each site has one panel alone, rows are filled.
+    """
     sizes: dict[str, int] = {}
     for panel in shown:
         sizes[panel.truth.pair_id] = sizes.get(panel.truth.pair_id, 0) + 1
+    if len(sizes) == len(shown):
+        yield from (divmod(at, _ALONE_ACROSS) for at in range(len(shown)))
+        return
     begin = 0
     for size in sizes.values():
         lines = -(-size // _MOST_ACROSS)
@@ -237,7 +259,7 @@ def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
 
 def _bounds_m(shown: Sequence[FlightPanel]) -> tuple[float, float, float, float]:
     """Return the square that the panels of a site show: west, east, south, north."""
-    true = np.concatenate([panel.place_m for panel in shown])
+    true = np.concatenate([panel.place_m for panel in shown] + [panel.copy_m[panel.is_copied] for panel in shown])
     low, high = true.min(axis=0), true.max(axis=0)
     reach_m = _ASTRAY * float((high - low).max())
     reckoned = np.clip(np.concatenate([panel.reckoned_m for panel in shown]), low - reach_m, high + reach_m)
@@ -285,6 +307,9 @@ def _draw(chart: Axes, panel: FlightPanel, ground: _Ground) -> None:
         ahead = {"arrowstyle": "-|>", "color": LOST, "lw": 1.4, "ls": "--", "shrinkA": 0, "shrinkB": 0}
         chart.annotate("", place[jump], place[jump - 1], arrowprops=ahead, zorder=6)
     chart.plot(*place[panel.is_seen].T, ".", ms=3.5 if len(place) < _MANY else 2.0, color=TRUE, zorder=4)
+    chart.plot(*panel.copy_m.T, color="white", lw=3.2, zorder=2)
+    chart.plot(*panel.copy_m.T, ".-", color=COPY, lw=1.1, ms=4, zorder=3)
+    chart.plot(*place[~panel.is_on_map].T, "D", ms=3.8, mfc=OFF_MAP, mec=TRUE, mew=0.7, zorder=5)
     chart.plot(*place[~panel.is_seen].T, "o", ms=3.6, mfc="white", mec=TRUE, mew=0.7, zorder=5)
     chart.plot(*reckoned.T, color="white", lw=2.4, zorder=3.4)
     chart.plot(*reckoned.T, color=RECKONED, lw=1.2, zorder=3.5)
@@ -321,6 +346,9 @@ def _words(panel: FlightPanel) -> tuple[str, ...]:
     unseen = int((~panel.is_seen).sum())
     facts = [f"{length_km:.1f} km", f"{len(panel.place_m)} views"]
     facts += [f"{unseen} see nothing"] if unseen else []
+    copied = int(panel.is_copied.sum())
+    facts += [f"{copied} that the map shows twice"] if copied else []
+    facts += [f"{(~panel.is_on_map).sum()} off the map"] if not panel.is_on_map.all() else []
     facts += [f"carried {truth.measured['carried_m']:.0f} m"] if "carried_m" in truth.measured else []
     off_m = float(np.hypot(*(panel.reckoned_m[-1] - panel.place_m[-1])))
     return (
@@ -342,6 +370,16 @@ def _keys(shown: Sequence[FlightPanel]) -> list[Artist]:
             any(not panel.is_seen.all() for panel in shown),
             "view that sees nothing",
             {"color": "none", "marker": "o", "mfc": "white", "mec": TRUE, "ms": 5},
+        ),
+        (
+            any(not panel.is_on_map.all() for panel in shown),
+            "view off the map",
+            {"color": "none", "marker": "D", "mfc": OFF_MAP, "mec": TRUE, "ms": 5},
+        ),
+        (
+            any(panel.is_copied.any() for panel in shown),
+            "where the map shows the same as on the true path",
+            {"color": COPY, "lw": 1.2, "marker": ".", "ms": 5},
         ),
         (True, "odometer alone, from the true start", {"color": RECKONED, "lw": 1.4, "marker": "s", "ms": 5}),
         (

@@ -95,6 +95,10 @@ class Drawer:
         ]
         return sorted(jobs, key=lambda job: job.query_id)
 
+    def map_of(self, job: Job) -> str:
+        """Return the name of the map that a query searches."""
+        return self.suite.map_region(self.scene, job.variant)
+
     def _site_seeds(self, site: Site) -> Seeds:
         return self.seeds.under("site", site.index)
 
@@ -110,7 +114,7 @@ class Drawer:
             return f"less than {LEAST_DRAWN:.0%} of the map is drawn there"
         if job.track != "retrieval":
             return None
-        state = self.scene.state(self.suite.map_region(self.scene, job.variant))
+        state = self.scene.state(self.map_of(job))
         is_choice = len(self._decoys(state, job)) >= LEAST_CANDIDATES
         return None if is_choice else f"fewer than {LEAST_CANDIDATES} candidates"
 
@@ -130,7 +134,7 @@ class Drawer:
         group = draft.group or self.group
         if job.track == "retrieval":  # a disc around the truth would show which of the candidates is right
             group = replace(group, radius_m=None)
-        state = self.scene.state(self.suite.map_region(self.scene, job.variant))
+        state = self.scene.state(self.map_of(job))
         pose = draft.pose or site.pose
         rivals_m = self._rivals_m(job, draft)
         prior = make_prior(pose, group, rng=seeds.rng("prior", group.name), rivals_m=rivals_m)

@@ -60,6 +60,12 @@ class State:
         """Return the mapped cells, shape (rows, cols)."""
         return np.asarray(self.bits.bits >> np.uint32(31) == 0)
 
+    def knows(self, pose: Pose) -> bool:
+        """Return whether the cell at a place is on the map."""
+        row, col = self.grid.to_cells(np.array([(pose.easting_m, pose.northing_m)]))[0].tolist()
+        is_within = 0 <= row < self.grid.rows and 0 <= col < self.grid.cols
+        return is_within and not bool(self.bits.bits[row, col] >> np.uint32(31))
+
     def is_mapped(self, en_m: NDArray[np.float64], half_m: float) -> bool:
         """Return whether a square around a place is wholly mapped."""
         row, col = self.grid.to_cells(np.asarray(en_m)[None, :])[0].tolist()

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Final
 import lazy_loader  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
 import shapely
+import shapely.affinity
 from numpy.typing import NDArray
 
 from sasgeo_bench.osm.features import check_features
@@ -37,13 +38,27 @@ _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
 class Paste:
     """One copy: the features in a disc around `source_m` replace those in a disc around `target_m`.
 
-    `change` edits the copy in the coordinates of the source; None copies it unchanged.
+    `change` edits the copy in the coordinates of the source; None copies it unchanged. With an `outline`, also in these
+    coordinates, only that part of the changed disc is copied.
     """
 
     source_m: tuple[float, float]
     target_m: tuple[float, float]
     radius_m: float
     change: Change | None = None
+    outline: shapely.Polygon | None = None
+
+    @property
+    def shift_m(self) -> tuple[float, float]:
+        """Return the way from the source to the target, east and north."""
+        return (self.target_m[0] - self.source_m[0], self.target_m[1] - self.source_m[1])
+
+    @property
+    def area(self) -> shapely.Polygon:
+        """Return the ground that is replaced."""
+        if self.outline is None:
+            return _disc(self.target_m, self.radius_m)
+        return shapely.affinity.translate(self.outline, *self.shift_m)
 
 
 def paste(features: "gpd.GeoDataFrame", pastes: Sequence[Paste]) -> "gpd.GeoDataFrame":
@@ -53,8 +68,7 @@ def paste(features: "gpd.GeoDataFrame", pastes: Sequence[Paste]) -> "gpd.GeoData
     """
     if not pastes:
         return features
-    discs = [_disc(item.target_m, item.radius_m) for item in pastes]
-    kept = _cut(features, shapely.union_all(discs), keep_inside=False)
+    kept = without(features, shapely.union_all([item.area for item in pastes]))
     # Neither the order of the rows nor the numbers of the ways say which place is the original.
     copies, first_id = [], int(features["osm_id"].max()) + 1
     for item in sorted(pastes, key=lambda paste: paste.target_m):
@@ -73,12 +87,18 @@ def around(features: "gpd.GeoDataFrame", center_m: tuple[float, float], radius_m
     return _cut(features, _disc(center_m, radius_m), keep_inside=True)
 
 
+def without(features: "gpd.GeoDataFrame", area: shapely.Geometry) -> "gpd.GeoDataFrame":
+    """Return the features outside an area, cut at its rim."""
+    return _cut(features, area, keep_inside=False)
+
+
 def _copy(features: "gpd.GeoDataFrame", item: Paste, *, first_id: int) -> "gpd.GeoDataFrame":
     piece = around(features, item.source_m, item.radius_m)
     if item.change is not None:
         piece = item.change(piece)
-    shift = np.subtract(item.target_m, item.source_m)
-    moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + shift).round(_FINE_DECIMALS))
+    if item.outline is not None:
+        piece = _cut(piece, item.outline, keep_inside=True)
+    moved = shapely.transform(piece.geometry.to_numpy(), lambda at: (at + item.shift_m).round(_FINE_DECIMALS))
     again = piece.set_geometry(gpd.GeoSeries(moved, index=piece.index, crs=features.crs))
     return again.assign(osm_id=first_id + np.unique(again["osm_id"], return_inverse=True)[1])
 
@@ -116,13 +136,17 @@ def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> N
 
 
 def mirror(
-    features: "gpd.GeoDataFrame", classes: Sequence[str], center_m: tuple[float, float], *, within_m: float = math.inf
+    features: "gpd.GeoDataFrame",
+    classes: Sequence[str] | None,
+    center_m: tuple[float, float],
+    *,
+    within_m: float = math.inf,
 ) -> "gpd.GeoDataFrame":
-    """Mirror the features of some classes from east to west about a place, which keeps their kind and amount.
+    """Mirror features of some classes, or all (None), from east to west about a place; kind and amount stay.
 
     What crosses the circle `within_m` around the place is cut there, and its outer part stays.
     """
-    is_one = features["class"].isin(list(classes)).to_numpy()
+    is_one = np.ones(len(features), dtype=bool) if classes is None else features["class"].isin(list(classes)).to_numpy()
     if math.isfinite(within_m):
         if not is_one.any():
             return features

@@ -13,9 +13,11 @@ from sasgeo_bench.tasks.suites import (
     board_controls,
     clean,
     false_unknown,
+    flight_alias,
     flight_clean,
     flight_gap,
     flight_kidnap,
+    flight_off_map,
     flight_overconfident,
     flight_real_age,
     flight_start,
@@ -84,6 +86,8 @@ FLIGHT_SUITES: Final[dict[str, FlightSuite]] = {
         flight_gap.SUITE,
         flight_kidnap.SUITE,
         flight_overconfident.SUITE,
+        flight_alias.SUITE,
+        flight_off_map.SUITE,
     )
 }
 # With the controls, which every board draws in addition to its experiment.

@@ -67,6 +67,10 @@ class FlightSuite(Suite):
         """Perceive one view."""
         return Draft(evidence=shot.perceived())
 
+    def map_of(self, scene: Scene, variant: Variant, site: int) -> str:  # noqa: ARG002 - all sites are alike
+        """Return the name of the map that a variant searches at a site, given by its index."""
+        return self.map_region(scene, variant)
+
 
 def carries(scene: Scene, distance_m: float) -> bool:
     """Return whether a drone can be carried so far over the map: half of its longer side, or less."""

@@ -8,6 +8,7 @@ from functools import cache
 
 import geopandas as gpd
 import pytest
+import shapely
 
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import LayerBits
@@ -24,6 +25,7 @@ from sasgeo_bench.tasks.split import blocks_of, find_split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, Variant
+from sasgeo_bench.tasks.suites.flight_plots import changed, changes_of
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
 
@@ -47,6 +49,7 @@ TOWN_OF = {
     "flight-real-age": "town-suburb",
     **dict.fromkeys(("flight-clean", "flight-start", "flight-gap", "flight-kidnap"), "town-grid"),
     "flight-overconfident": "town-grid",
+    **dict.fromkeys(("flight-off-map", "flight-alias"), "town-suburb"),
 }
 # One overpass, little room for wide views; the others get as many as are asked for.
 SITES = {"grade-separation": 1, "no-priors": 3}
@@ -143,14 +146,15 @@ def scene(town) -> Callable[..., Scene]:
 
 
 @pytest.fixture(scope="session")
-def edited(town) -> Callable[[str, gpd.GeoDataFrame], State]:
-    """A town's state with other features, made in memory."""
+def edited(town) -> Callable[..., State]:
+    """A town's state with other features, perhaps on less ground, made in memory."""
 
-    def of_features(name: str, features: gpd.GeoDataFrame) -> State:
+    def of_features(name: str, features: gpd.GeoDataFrame, coverage: shapely.Geometry | None = None) -> State:
         base = town(name)
-        layers = burn_layers(make_paint(features, base.classes, base.coverage), base.grid)
+        mapped = base.coverage if coverage is None else coverage
+        layers = burn_layers(make_paint(features, base.classes, mapped), base.grid)
         graph = build_graph(features, bounds_m=base.grid.bounds_m)
-        return replace(State.of(base), bits=LayerBits.of(layers), features=features, graph=graph)
+        return replace(State.of(base), bits=LayerBits.of(layers), features=features, graph=graph, coverage=mapped)
 
     return of_features
 
@@ -202,8 +206,8 @@ class Flown:
 
 
 @pytest.fixture(scope="session")
-def flown(scene, town) -> Callable[[str], Flown]:
-    """The flights of a suite over the town that can carry it, at its first site."""
+def flown(scene, town, edited) -> Callable[[str], Flown]:
+    """The flights of a suite over the town that can carry it, at its first site, its maps changed in memory."""
     split = find_split("crossfit")
 
     @cache
@@ -217,6 +221,12 @@ def flown(scene, town) -> Callable[[str], Flown]:
             region=town(where), scene=over, suite=suite, split=split, seeds=seeds, group=suite.card.group
         )
         flights = airspace.choose(count=1, may_be_fewer=False)
+        if flights[0].plot is not None:
+            parts = [
+                changed(over.map.features, over.map.coverage, changes_of([(0, flights[0].plot)], at)) for at in (0, 1)
+            ]
+            maps = tuple(replace(edited(where, *part), region=f"{where}+{at}") for at, part in enumerate(parts))
+            airspace = replace(airspace, scene=replace(over, others=maps))
         drawer = FlightDrawer(airspace=airspace, flights=flights)
         jobs = drawer.jobs([flight.site for flight in flights.values()])
         views = {job.variant: list(drawer.drawn([job])) for job in jobs if drawer.why_not(job) is None}

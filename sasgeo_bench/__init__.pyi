@@ -68,6 +68,8 @@ from .running.segmenter_testing import check_segmenter as check_segmenter
 from .running.testing import TinyPlace as TinyPlace
 from .running.testing import check_matcher as check_matcher
 from .running.testing import tiny_place as tiny_place
+from .sasgeo.by_hand import map_by_hand as map_by_hand
+from .sasgeo.by_hand import view_by_hand as view_by_hand
 from .search.chart import Chart as Chart
 from .search.chart import block_max as block_max
 from .search.chart import fade as fade

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Read and write a region on disk: `region.json` and the files it names; written whole or not at all."""
 
+import json
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
@@ -13,7 +15,7 @@ from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, GridError, StoreError
 from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, VERIFIED, open_table, read_frame, write_frame
+from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, read_frame, read_table, write_frame
 from sasgeo_bench.osm.features import check_features
 from sasgeo_bench.regions.imagery import ORTHO, Imagery
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, Manifest, MapGraph, Region
@@ -22,6 +24,7 @@ from sasgeo_bench.texts import json_text
 if TYPE_CHECKING:
     import geopandas as gpd
     import pandas as pd
+    from pyproj import CRS
 
 Table = TypeVar("Table", bound="pd.DataFrame")
 
@@ -178,20 +181,34 @@ def _check_file(path: Path, record: FileRecord) -> None:
 
 
 def _read_geometry(path: Path) -> "gpd.GeoDataFrame":
-    """Read a table of geometry, after a check of its size."""
+    """Read a table of geometry as `geopandas.read_parquet` does, which parses the same CRS anew for each table."""
     import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
     from pyproj.exceptions import CRSError  # noqa: PLC0415
 
-    with open_table(path, mend=_MEND, most_rows=MOST_VALUES):
-        pass
+    table = read_table(path, mend=_MEND, most_rows=MOST_VALUES)
     try:
-        return gpd.read_parquet(path, **VERIFIED)
+        about = json.loads(table.schema.metadata[b"geo"])
+        name = about["primary_column"]
+        column = about["columns"][name]
+        bounds = {each[0] for each in column.get("covering", {}).get("bbox", {}).values()}  # derived from the geometry
+        frame = table.drop_columns(sorted(bounds)).to_pandas()
+        frame[name] = shapely.from_wkb(frame[name].to_numpy())
+        frame.attrs = json.loads(table.schema.metadata.get(b"PANDAS_ATTRS", b"{}"))
+        return gpd.GeoDataFrame(frame, geometry=name, crs=_crs(json.dumps(column["crs"])))
     except (
-        *(OSError, ValueError, KeyError, TypeError, AttributeError),
+        *(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError),
         *(pa.ArrowException, CRSError, shapely.errors.ShapelyError),
     ) as error:
         message = f"{path} cannot be read ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
+
+
+@cache
+def _crs(projjson: str) -> "CRS":
+    """Parse a CRS, once: it takes as long as the table of a town."""
+    from pyproj import CRS  # noqa: PLC0415
+
+    return CRS.from_json(projjson)
 
 
 def differing_files(folder: Path) -> list[str]:

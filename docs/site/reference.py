@@ -30,16 +30,8 @@ from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.running.prediction_rows import PART_SCHEMA
 from sasgeo_bench.scoring.contrasts import Finding
 from sasgeo_bench.scoring.controls import Verdict
-from sasgeo_bench.scoring.metrics import (
-    METRICS,
-    TRACKS,
-    CostMetric,
-    MeanMetric,
-    Metric,
-    QuantileMetric,
-    RejectionMetric,
-    ThresholdMetric,
-)
+from sasgeo_bench.scoring.metric import CostMetric, MeanMetric, Metric, QuantileMetric, RejectionMetric, ThresholdMetric
+from sasgeo_bench.scoring.metrics import METRICS, TRACKS
 from sasgeo_bench.scoring.rows import Row
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import Place, SplitFile

@@ -27,7 +27,7 @@ from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
 from sasgeo_bench.tasks.build import is_of_region, look_of, made_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
-from sasgeo_bench.tasks.query import BY, CONTROLS, PriorGroup, base_of
+from sasgeo_bench.tasks.query import BY, CONTROLS, SEQUENCE, PriorGroup, base_of
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES, PICTURE_SUITES, find_suite
 from sasgeo_bench.tasks.suites.base import Choice
@@ -277,6 +277,7 @@ def plan_pipeline(
         raise ConfigError(message)
     _check_kinds(spec)
     _check_pictures(spec)
+    _check_flights(spec)
     _check_look(spec, requests)
     kept = needed(requests, spec.learning) if requests else ()
     left = {item.region.id for item in requests} - {item.region.id for item in kept}
@@ -294,17 +295,24 @@ def plan_pipeline(
 
 
 def _check_pictures(spec: PipelineFile) -> None:
-    """Refuse suites of pictures that no segmenter sees, segmenters of suites without pictures, and flights."""
+    """Refuse suites of pictures that no segmenter sees, and segmenters of suites without pictures."""
     for task in spec.task:
         for name in task.suites:
-            if name in FLIGHT_SUITES:
-                message = f"pipeline {spec.id!r}: suite {name!r} is of flights, which no board scores yet: leave it out"
-                raise ConfigError(message)
             if find_suite(name).is_pictured == bool(task.segmenters):
                 continue
             what = "draws pictures, and no segmenter sees them" if not task.segmenters else "draws no pictures"
             mend = "name segmenters" if not task.segmenters else "leave segmenters out, or name it in another [[task]]"
             message = f"pipeline {spec.id!r}: suite {name!r} {what}: {mend}"
+            raise ConfigError(message)
+
+
+def _check_flights(spec: PipelineFile) -> None:
+    """Refuse contrasts on a track that their suites do not have: they would count nothing."""
+    for item in spec.contrast:
+        odd = next((name for name in item.suites if (name in FLIGHT_SUITES) != (item.track == SEQUENCE)), None)
+        if odd is not None:
+            what = f"is of flights, say track = {SEQUENCE!r}" if odd in FLIGHT_SUITES else "has no flights"
+            message = f"contrast {item.name!r} has track {item.track!r}, and suite {odd!r} {what}"
             raise ConfigError(message)
 
 

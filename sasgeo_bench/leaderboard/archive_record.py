@@ -9,7 +9,7 @@ from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.scoring.entries import CardRecord
 from sasgeo_bench.scoring.verdicts import ContrastMetric
-from sasgeo_bench.tasks.query import Detector
+from sasgeo_bench.tasks.query import Detector, Track
 from sasgeo_bench.texts import FOLDER, one_line
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -36,7 +36,7 @@ class ContrastRecord(_Record):
     kinds: list[str] = []
     detectors: list[Detector] = []
     metric: ContrastMetric = "primary"
-    track: Literal["localization", "retrieval"] = "localization"
+    track: Track = "localization"
     min_effect: Annotated[float, Field(ge=0, le=1)] = 0.03
 
 

@@ -90,7 +90,8 @@ class Board:
     `remarks` are those of rejectors on their fits; `protection` has no row where no answer has a protection level,
     `acceptance` none where no place is absent.
     `judged` are the results of rejectors by matcher and rejector, `measured` the measurements of truths by query id,
-    and `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so
+    of flights those of their first view, `views` the rows of views of flights by matcher (`flights.view_frame`), and
+    `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so
     does `predictions`. `apart` are the reasons for excluding entries from ranks, `on_private` the results on a private
     seed, `failures` the entries that failed, and why.
     """
@@ -109,6 +110,7 @@ class Board:
     acceptance: pd.DataFrame = field(default_factory=pd.DataFrame)
     judged: Mapping[tuple[str, str], pd.DataFrame] = field(default_factory=dict)
     measured: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    views: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     truths: Mapping[str, Truth] = field(default_factory=dict)
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)

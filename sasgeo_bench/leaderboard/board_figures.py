@@ -12,6 +12,13 @@ import pandas as pd
 
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
+from sasgeo_bench.leaderboard.flight_plots import (
+    distance_frame,
+    draw_distance,
+    draw_intervals,
+    interval_frame,
+    kinds_of,
+)
 from sasgeo_bench.leaderboard.plot_tables import (
     ages_frame,
     reliability_frame,
@@ -40,7 +47,7 @@ from sasgeo_bench.leaderboard.pooled_tables import (
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.scoring.contrasts import Contrast, by_place
 from sasgeo_bench.scoring.protection import ProtectionLevels, protection_levels
-from sasgeo_bench.scoring.score import FIX_M
+from sasgeo_bench.scoring.score import FIX_M, single_views
 from sasgeo_bench.scoring.strata import GROUP, queries_of, steps_frame
 from sasgeo_bench.tasks.split import Split
 
@@ -59,6 +66,7 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
     """
     shown = shown_matchers(board.table, contrasts)
     queries = queries_of(board.scores)
+    alone = {name: single_views(frame) for name, frame in board.scores.items()}
     steps = steps_frame(board.table, queries, shown)
     if steps.empty:  # a table without a row does not know its types, by which it is held against others
         steps = steps.astype({name: queries[name].dtype for name in ("strength", "view_cells")})
@@ -76,13 +84,13 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
         "differences by place": lambda: _forests(board, contrasts),
         "recall against K": lambda: _each(
             "recall",
-            recall_frame(board.scores, board.predictions, board.truths, shown),
+            recall_frame(alone, board.predictions, board.truths, shown),
             GROUP[1:],
             draw_recall,
             shown,
         ),
         "the distribution of errors": lambda: _each(
-            "errors", errors_frame(board.scores, board.table, shown), GROUP[1:], draw_errors, shown
+            "errors", errors_frame(alone, board.table, shown), GROUP[1:], draw_errors, shown
         ),
         "success against cost": lambda: _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
         "risk against coverage": lambda: _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
@@ -97,6 +105,12 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
             "cost", cost_frame(board.judged, calibrated, shown), GROUP[1:], draw_costs, shown
         ),
         "protection levels against errors": lambda: _stanfords(board, shown, split),
+        "error along flights": lambda: _each(
+            "distance", distance_frame(board.views, board.scores, shown), GROUP, draw_distance, shown
+        ),
+        "how rarely the map may be asked on flights": lambda: _each(
+            "interval", interval_frame(board.table, kinds_of(board.scores), shown), GROUP, draw_intervals, shown
+        ),
     }
     drawn: dict[str, dict[str, Draw]] = {}
     for kind, make in kinds.items():

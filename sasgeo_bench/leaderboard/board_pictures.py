@@ -32,6 +32,7 @@ from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running.failures import Failures, stops_all
 from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.score import single_views
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import CONTROLS, Truth, base_of
@@ -260,7 +261,7 @@ def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
             if name in board.scores:
                 rejector = operating_rejector(board.judged, name, contrasts)
                 judged = None if rejector is None else board.judged[name, rejector]
-                frames.append(find_cases(board.scores[name], name, judged))
+                frames.append(find_cases(single_views(board.scores[name]), name, judged))
     return pd.concat(frames, ignore_index=True)
 
 

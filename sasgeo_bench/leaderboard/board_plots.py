@@ -57,6 +57,7 @@ def line_keys(names: Sequence[str], *, has_marks: bool = True) -> list[Line2D]:
 
 PRIMARY: Final = {
     "success_25m": "success (share of queries\nwithin 25 m and 5 deg)",
+    "distance_within_25m": "share of the flown distance\nwithin 25 m",
     "recall_1": "recall@1\n(share of queries)",
 }
 INTERVALS: Final = (

@@ -32,6 +32,7 @@ from sasgeo_bench.leaderboard.tables import (
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, is_bin, is_step
+from sasgeo_bench.tasks.query import SEQUENCE
 
 SHOWN_COSTS: Final = (  # and of the table of costs
     *("latency_p50", "latency_p95", "prepare", "peak_memory"),
@@ -39,6 +40,14 @@ SHOWN_COSTS: Final = (  # and of the table of costs
 )
 _SOUND: Final = ("ok", "not applicable")  # all else is a miss
 _PRIOR_ALONE: Final = "prior_centre"
+_ODOMETER_ALONE: Final = "dead_reckoning"
+_OF_FLIGHTS: Final = (
+    "accepted",
+    "false_accepted",
+    "error_p95",
+    "first_fix",
+    "longest_without_fix_m",
+)  # beside the first
 _WHOLE: Final = frozenset({ALL, STRESS})  # no kinds
 MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1280 px holds
 
@@ -207,7 +216,7 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
     tie_of = {name: number for number, tie in enumerate(ties) for name in tie.names}
     ranked = sum(not pd.isna(row["rank_best"]) for row in found.values())
     rows = tuple(_row(book, key, found[name], tie_of.get(name), ranked) for name in order)
-    titles = (primary, "rank", "within_25m", "control", "false fixes", "detectable", "n", "missing", "blocks")
+    titles = (primary, "rank", *_besides(track), "control", "false fixes", "detectable", "n", "missing", "blocks")
     table = Table(
         name=file_stem("board", suite, track, prior_group),
         title=f"{suite}: {track}, {prior_words(prior_group)}",
@@ -218,7 +227,12 @@ def suite_table(book: Book, key: Key, names: Sequence[str]) -> Table:
         rows=rows,
         notes=_notes(book, ties, found, ranked),
     )
-    return table.without_empty(WITHIN.name, "false fixes", "control", "detectable", "missing")
+    return table.without_empty(*_besides(track), "false fixes", "control", "detectable", "missing")
+
+
+def _besides(track: str) -> tuple[str, ...]:
+    """Return the figures that a table shows beside the primary one, of the same queries."""
+    return _OF_FLIGHTS if track == SEQUENCE else (WITHIN.name,)
 
 
 def _value(row: Record) -> float:
@@ -237,7 +251,7 @@ def _row(book: Book, key: Key, main: Record, tie: int | None, ranked: int) -> Ro
             book.name_cell(name),
             figure_cell(main, has_bar=True),
             rank_cell(main, ranked=ranked, mark=mark),
-            figure_cell(book.pick(key, name, WITHIN.name, stratum)),
+            *(figure_cell(book.pick(key, name, metric, stratum)) for metric in _besides(key[1])),
             figure_cell(book.pick(key, name, primary, CONTROL)),
             figure_cell(book.pick(key, name, FALSE_ABSENT.name)),
             number_cell(float(main["detectable"])),
@@ -261,12 +275,13 @@ def _notes(book: Book, ties: Sequence[Tie], found: Mapping[str, Record], ranked:
 
 
 def _for_nothing(book: Book, key: Key) -> str:
-    """Return what the prior alone and guessing reach."""
+    """Return what the prior alone and guessing reach; of flights the odometer alone."""
     _, track, _ = key
     primary = primary_of(track).name
-    alone = next((name for name in book.matchers[key] if name_alone(name) == _PRIOR_ALONE), None)
+    what, control = ("the odometer alone", _ODOMETER_ALONE) if track == SEQUENCE else ("the prior alone", _PRIOR_ALONE)
+    alone = next((name for name in book.matchers[key] if name_alone(name) == control), None)
     found = {
-        "the prior alone": None if alone is None else book.main(key, alone, primary),
+        what: None if alone is None else book.main(key, alone, primary),
         "chance": book.main(key, book.matchers[key][0], CHANCE.name),
     }
     texts = [f"{name} {number_text(row['value'])} (n = {row['n']})" for name, row in found.items() if row is not None]

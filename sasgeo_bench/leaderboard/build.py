@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs, files of predictions and truths -> a board: the order of the steps."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -25,13 +25,14 @@ from sasgeo_bench.scoring.contestants import (
 )
 from sasgeo_bench.scoring.contrasts import hold_contrasts
 from sasgeo_bench.scoring.controls import gains_without_stress, hold_controls, hold_falsifiers
+from sasgeo_bench.scoring.cost import COLUMNS as COST_COLUMNS
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.entries import find_entries, leave_out, set_apart
 from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
 from sasgeo_bench.scoring.protection import protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, evaluate_rejectors, rules_of
 from sasgeo_bench.scoring.rows import EntryLabel, name_alone, with_entry_labels
-from sasgeo_bench.scoring.score import SCORER_VERSION
+from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
 from sasgeo_bench.scoring.verdicts import with_causes
 from sasgeo_bench.tasks.query import base_of
@@ -58,7 +59,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     judgings = [
         RejectionTask(
             matcher=entry.name,
-            scores=board.with_calibration[entry.name],
+            scores=single_views(board.with_calibration[entry.name]),
             predictions=board.predictions[entry.name],
             rules=rules,
             split=request.split,
@@ -76,6 +77,15 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
         tell(f"{request.board} had rows of {names}, which this board has not; their answers are where they were")
     write_files(request, board, make_extras(request, board, tell), [rule.card for rule in rules.values()])
     return board
+
+
+def _asked_rows(scores: pd.DataFrame, views: pd.DataFrame | None) -> pd.DataFrame:
+    """Return a row for each query that was asked; that of a view is answered if its fix is accepted."""
+    if views is None:
+        return scores
+    flown = views.assign(is_answered=views["is_accepted"])
+    parts = [frame[[*COST_COLUMNS]] for frame in (single_views(scores), flown)]
+    return pd.concat([part for part in parts if len(part)], ignore_index=True)
 
 
 def _contest(request: ScoreRequest, failures: Failures, tell: Tell) -> Contest:
@@ -128,13 +138,30 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
         table=pd.DataFrame(),
         verdicts=verdicts,
         tasks=tasks,
-        measured={name: truth.measured for name, truth in truths.items()},
+        measured={name: truth.measured for name, truth in truths.items()} | _of_flights(contest.tasks),
         truths=truths,
+        views=_of_rows(contest.views, scores),
         everyone=tuple(item.entry for item in contest.answers),
         apart=apart,
         on_private=on_private,
         failures=failures,
     )
+
+
+def _of_flights(tasks: Sequence[ScoredTask]) -> dict[str, Mapping[str, float]]:
+    """Return what was measured at the first view of each flight by the flight's id."""
+    firsts = {head.query_id: head.sequence_id for task in tasks for head in task.heads if head.frame == 0}
+    truths = (truth for task in tasks if task.is_of_flights for truth in task.truths)
+    return {str(firsts[truth.query_id]): truth.measured for truth in truths if truth.query_id in firsts}
+
+
+def _of_rows(views: Mapping[str, pd.DataFrame], scores: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
+    """Return the views of the flights that are among scored rows."""
+    return {
+        name: frame[frame["sequence_id"].isin(scores[name]["query_id"])].reset_index(drop=True)
+        for name, frame in views.items()
+        if name in scores
+    }
 
 
 def _ranks(board: Board, draws: int, tell: Tell, progress: Progress) -> list[pd.DataFrame] | None:
@@ -157,7 +184,12 @@ def _costs(board: Board, tasks: Sequence[ScoredTask], tell: Tell) -> list[pd.Dat
     for entry in board.entries:
         scores = board.scores[entry.name]
         with board.failures.of(f"costs of {entry.name}"):
-            costs = Costs(scores=scores, runs=entry.runs, view_bytes=views, area_km2=areas)
+            costs = Costs(
+                scores=_asked_rows(scores, board.views.get(entry.name)),
+                runs=entry.runs,
+                view_bytes=views,
+                area_km2=areas,
+            )
             found.append(cost_figures(entry.name, costs))
         answered = scores["is_answered"].to_numpy(bool)
         rest = scores.loc[~answered, "status"].replace("ok", "withheld").value_counts()
@@ -175,7 +207,7 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
     levels = []
     for name in scores:
         with board.failures.of(f"protection levels of {name}"):
-            rows = board.with_calibration[name]
+            rows = single_views(board.with_calibration[name])
             levels.append(protection_frame(name, rows, board.predictions[name], request.split))
     some = [frame for frame in levels if len(frame)]
     return replace(

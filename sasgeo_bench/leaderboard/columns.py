@@ -20,7 +20,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",
     "detectable": "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf "
     "if none, - where nobody is ranked",
-    "n": "Queries in the denominator. Rows with different n do not compare: they are of different queries",
+    "n": "Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones",
     "missing": "Queries without a row; they count as misses",
     "blocks": "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
     "places, then blocks in them",
@@ -29,7 +29,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "of what was measured at the truth",
     "kind": "Kind of stress, or of its absence",
     "rejector": "Estimates of each answer how likely it is false; own: the matcher's own confidence, fitted to nothing",
-    "track": "localization: find the place on the map; retrieval: pick it among candidates",
+    "track": "localization: find the place on the map; retrieval: pick it among candidates; sequence: follow a flight",
     "contrast": "Pair of entries that was registered before anything was run",
     "first": "First entry of the pair, and what it reaches",
     "second": "Second entry of the pair, and what it reaches",
@@ -97,6 +97,7 @@ TERMS: Final = {  # what tables show that is no column
     "-": "nothing to show: no such query, no rank, nobody to compare with",
     "the prior alone": "what `prior_centre` reaches, which looks at nothing: it answers with the middle of the prior's "
     "disc, or of the map without one; of candidates with the one nearest to the middle of all",
+    "the odometer alone": "what `dead_reckoning` reaches: it adds up the odometer's steps from the middle of the prior",
     "chance": "what guessing among the candidates reaches",
     "prior group": "what is known before: radius in m (rnone: anywhere), heading known to 5, 20 or 360 deg, scale in %",
 }

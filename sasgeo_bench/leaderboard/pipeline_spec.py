@@ -67,7 +67,7 @@ class ContrastSpec(Document):
     kinds: list[Short] = []
     detectors: list[Detector] = []
     metric: ContrastMetric = "primary"
-    track: Literal["localization", "retrieval"] = "localization"
+    track: Track = "localization"
     min_effect: Annotated[float, Field(gt=0, le=1)] = 0.03
     pilot: PilotSpec | None = None
     why: Prose = ""

@@ -26,7 +26,8 @@ from sasgeo_bench.scoring.intervals import (
     percentile_interval,
     wilson_share,
 )
-from sasgeo_bench.scoring.metrics import FALSE_ABSENT, MeanMetric, primary_of
+from sasgeo_bench.scoring.metric import MeanMetric
+from sasgeo_bench.scoring.metrics import FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, REPRODUCED, RUN_HERE, name_alone
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP

@@ -20,7 +20,7 @@ import pyarrow.compute as pc
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import SITE_FOLDERS, fresh_folder, hashes_of, list_files, locked, resolve_link
 from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.files.parquet import MOST_VALUES, read_table, write_table
+from sasgeo_bench.files.parquet import MOST_VALUES, read_schema, read_table, write_table
 from sasgeo_bench.leaderboard.board_files import BOARD_FILES
 from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.matching import learned_file
@@ -48,9 +48,17 @@ from sasgeo_bench.publishing.archive_folder import (
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row, predictions_of
+from sasgeo_bench.running.prediction_rows import FIX_FIELDS, PREDICTION_SCHEMA, prediction_row, predictions_of
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, TRUTH_SCHEMA, VIEW_BYTES, asked_under, with_added
+from sasgeo_bench.tasks.task_rows import (
+    ASKED,
+    HEAD_SCHEMA,
+    STEP_COLUMNS,
+    TRUTH_SCHEMA,
+    VIEW_BYTES,
+    asked_under,
+    with_added,
+)
 from sasgeo_bench.texts import FOLDER, json_text, one_line
 
 MOST_BYTES: Final = 10_000_000
@@ -64,6 +72,7 @@ _TEXTS: Final = (  # columns of short texts that come again
 _SPLIT: Final = ("candidates.list.element.score", "latency_s")
 _MADE_AGAIN: Final = (".csv", ".tex")  # of a board: the same tables for other programs
 _MEND: Final = "fetch the results again"
+_AGAIN: Final = "make the queries again"
 _AND: Final = "; "
 _NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
 
@@ -205,17 +214,24 @@ def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
                 "region_json": region.read_text(encoding="utf-8") if region.is_file() else None,
             }
         )
-        heads = read_table(item.task / task_files.QUERIES, mend="make the queries again", columns=HEAD_SCHEMA.names)
+        heads = _heads_of(item.task / task_files.QUERIES)
         asked, view_bytes = task_files.read_asked(item.task), task_files.read_view_bytes(item.task)
         names = heads["query_id"].to_pylist()
         heads = heads.append_column(ASKED, pa.array([asked[name] for name in names], pa.string()))
         heads = heads.append_column(VIEW_BYTES, pa.array([view_bytes[name] for name in names], pa.int64()))
         queries.append(_numbered(heads, number))
-        truth = read_table(item.truth / task_files.TRUTH, mend="make the queries again", columns=TRUTH_SCHEMA.names)
+        truth = read_table(item.truth / task_files.TRUTH, mend=_AGAIN, columns=TRUTH_SCHEMA.names)
         truths.append(_numbered(with_added(truth), number))
     _write_table(pa.Table.from_pylist(rows, schema=TASK_SCHEMA), folder / "tasks.parquet")
     _write_table(pa.concat_tables(queries), folder / "queries.parquet")
     _write_table(pa.concat_tables(truths), folder / "truths.parquet")
+
+
+def _heads_of(path: Path) -> pa.Table:
+    """Read queries without their views; tasks of older programs lack the columns of flights."""
+    there = read_schema(path, mend=_AGAIN).names
+    rows = read_table(path, mend=_AGAIN, columns=[name for name in HEAD_SCHEMA.names if name in there])
+    return with_added(rows, STEP_COLUMNS).select(HEAD_SCHEMA.names)
 
 
 def _numbered(table: pa.Table, number: int) -> pa.Table:
@@ -245,11 +261,15 @@ def _file_of(about: Mapping[str, Any]) -> str:
 def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *, is_lean: bool) -> int:
     """Write all answers, one run after the other, and return how many bytes they are."""
     tables = []
+    is_flown = any(
+        item.is_accepted is not None for listed in runs.values() for run in listed for item in run.predictions
+    )
+    plain = pa.schema([*PREDICTION_SCHEMA, *(FIX_FIELDS if is_flown else ())], metadata=PREDICTION_SCHEMA.metadata)
     for name, listed in runs.items():
         rows = [prediction_row(_lean(item) if is_lean else item) for run in listed for item in run.predictions]
-        table = pa.Table.from_pylist(rows, schema=PREDICTION_SCHEMA)
+        table = pa.Table.from_pylist(rows, schema=plain)
         tables.append(table.append_column(MATCHER, pa.array([name] * len(rows), pa.string())))
-    schema = PREDICTION_SCHEMA.append(pa.field(MATCHER, pa.string()))
+    schema = plain.append(pa.field(MATCHER, pa.string()))
     _write_table(pa.concat_tables([schema.empty_table(), *tables]), folder / PREDICTIONS, split=_SPLIT)
     return (folder / PREDICTIONS).stat().st_size
 
@@ -314,7 +334,7 @@ def unpack_tasks(folder: Path, into: Path) -> tuple[Path, ...]:
 def _read_tables(folder: Path) -> dict[str, pa.Table]:
     read_settings(folder)  # checks every file against its hash
     tables = {name: read_table(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
-    return tables | {"truths": with_added(tables["truths"])}
+    return tables | {"truths": with_added(tables["truths"]), "queries": with_added(tables["queries"], STEP_COLUMNS)}
 
 
 def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:

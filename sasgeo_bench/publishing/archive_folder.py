@@ -28,7 +28,7 @@ from sasgeo_bench.leaderboard.archive_record import ArchiveRecord, VersionRecord
 from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
 from sasgeo_bench.running.prediction_rows import differing_columns, row_faults
 from sasgeo_bench.tasks.query import Detector, PriorGroup
-from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, POSE_FIELDS, TRUTH_SCHEMA, VIEW_BYTES
+from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, POSE_FIELDS, STEP_COLUMNS, TRUTH_SCHEMA, VIEW_BYTES
 from sasgeo_bench.texts import one_line
 
 PACK: Final = "pack.json"
@@ -143,8 +143,8 @@ _SCHEMAS: Final = {
     "truths": TRUTH_SCHEMA.append(pa.field(TASK, pa.int32())),
 }
 _PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
-_MAY_BE_NULL: Final = {*POSE_FIELDS, "alias_index", "region_json", LEARNED}
-_TRACKS: Final = ("retrieval", "localization")
+_MAY_BE_NULL: Final = {*POSE_FIELDS, *STEP_COLUMNS, "alias_index", "region_json", LEARNED}
+_TRACKS: Final = ("retrieval", "localization", "sequence")
 _ROLES: Final = ("control", "stress", "falsifier")
 _KINDS: Final = (
     *(pa.types.is_string, pa.types.is_integer, pa.types.is_floating),

@@ -12,7 +12,7 @@ from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.matching.plugins import ORACLE
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.tasks import task_files, task_rows
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth
 
 CARD: Final = MatcherCard(
     name=ORACLE,
@@ -68,14 +68,17 @@ class Oracle:
             raise StoreError(message)
         found = right_answer(asked, truth)
         reply = Reply(status="ok", seconds=time.perf_counter() - start, match=found)
-        return reply if asked.step is None else replace(reply, is_accepted=bool(found.poses), covariance=_SURE)
+        return reply if asked.step is None else replace(reply, is_accepted=truth.is_present, covariance=_SURE)
 
 
 def right_answer(query: Query, truth: Truth) -> Match:
-    """Return the right answer: the true pose, the right candidate with true heading and scale, or none."""
-    if not truth.is_present or truth.pose is None:
-        return WITHHELD
+    """Return the right answer: the true pose, the right candidate with true heading and scale, or none.
+
+    A flight goes on off the map: its oracle knows where, and does not say that it may be relied on.
+    """
     pose = truth.pose
+    if pose is None or not (truth.is_present or query.track == SEQUENCE):
+        return WITHHELD
     if query.track == "retrieval":
         right = query.candidates[truth.candidate]
         pose = replace(pose, easting_m=right.easting_m, northing_m=right.northing_m)

@@ -15,6 +15,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.controls import hold_controls
 from sasgeo_bench.scoring.entries import Entry
+from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.scoring.rows import AS_SUBMITTED
 from sasgeo_bench.scoring.score import score_task, settle_not_applicable
 from sasgeo_bench.scoring.validate import submission_faults, validate
@@ -53,16 +54,18 @@ class ScoredTask:
     view_bytes: dict[str, int]
     area_km2: float | None
 
+    @property
+    def is_of_flights(self) -> bool:
+        """Return whether its queries are views of flights."""
+        return "sequence" in self.about["counts"]
+
 
 def read_scored_task(folder: Path, root: Path) -> ScoredTask:
     """Read a task and its truths from their own root, and check that they match.
 
-    Raise StoreError if either is missing or damaged, they do not belong together, or the task is of flights.
+    Raise StoreError if either is missing or damaged, or they do not belong together.
     """
     about = task_files.read_task(folder)
-    if "sequence" in about["counts"]:
-        message = f"{folder} holds flights, and boards score single views so far: leave it out"
-        raise StoreError(message)
     truth = root / str(about["suite"]) / str(about["region"])
     task_files.check_truths(folder, truth)
     heads, truths = tuple(task_files.read_heads(folder)), tuple(task_files.read_truths(truth))
@@ -222,11 +225,15 @@ def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: 
 
 @dataclass(frozen=True, kw_only=True)
 class Contest:
-    """Entries with their answers, the tasks, and all scored rows by entry, including those of controls."""
+    """Entries with their answers, the tasks, and all scored rows by entry, including those of controls.
+
+    `views` are the rows of the views of flights by entry (`flights.view_frame`), of entries that were asked any.
+    """
 
     answers: tuple[EntryAnswers, ...]
     tasks: tuple[ScoredTask, ...]
     scores: dict[str, pd.DataFrame]
+    views: dict[str, pd.DataFrame]
 
 
 def score_entries(
@@ -246,17 +253,20 @@ def score_entries(
     """
     folders = [task.folder for task in tasks]
     scores: dict[str, pd.DataFrame] = {}
+    views: dict[str, pd.DataFrame] = {}
     for item in answers:
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
                 check_submitted(item.entry, folders, split)
-            scored = _scored(item, tasks, split, by_region, by_block)
+            scored, seen = _scored(item, tasks, split, by_region, by_block)
             hold_controls({item.entry.name: scored})  # so that an error names the entry
             scores[item.entry.name] = scored
+            if seen is not None:
+                views[item.entry.name] = seen
     if not scores and failures.first is not None:
         raise failures.first
     left = tuple(item for item in answers if item.entry.name in scores)
-    return Contest(answers=left, tasks=tuple(tasks), scores=scores)
+    return Contest(answers=left, tasks=tuple(tasks), scores=scores, views=views)
 
 
 def scored_rows(contest: Contest, split: Split | None, *, tell: Callable[[str], None]) -> dict[str, pd.DataFrame]:
@@ -326,17 +336,22 @@ def _scored(
     split: Split | None,
     by_region: Collection[str],
     by_block: Collection[str],
-) -> pd.DataFrame:
-    """Return one row per query of all tasks that an entry was asked."""
+) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+    """Return one row per query or flight of all tasks that an entry was asked, and the rows of views of flights."""
     of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
-    frames = []
+    frames, views = [], []
     for task in tasks:
         if task.folder not in answers.asked:
             continue
         names = [head.query_id for head in task.heads]
         mine = {name: answers.predictions[name] for name in names if name in answers.predictions}
-        frame = score_task(task.heads, task.truths, mine, **of_split)
+        if task.is_of_flights:
+            frame, seen = score_flights(task.heads, task.truths, mine, **of_split)
+            views.append(seen)
+        else:
+            frame = score_task(task.heads, task.truths, mine, **of_split)
         suite = task.about["suite"]
         frame = frame.assign(block=frame["region"]) if suite in by_region else frame
         frames.append(frame.assign(place=frame["block"], country=frame["block"]) if suite in by_block else frame)
-    return settle_not_applicable(pd.concat(frames, ignore_index=True))
+    scored = settle_not_applicable(pd.concat(frames, ignore_index=True))
+    return scored, pd.concat(views, ignore_index=True) if views else None

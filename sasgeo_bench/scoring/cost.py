@@ -14,6 +14,7 @@ from sasgeo_bench.scoring.score import NOT_APPLICABLE
 
 BYTES_PER_KB: Final = 1e3
 BYTES_PER_MB: Final = 1e6
+COLUMNS: Final = ("query_id", "track", "status", "is_answered", "latency_s", "block", "place")  # of the rows it reads
 _MOST: Final = 1e18  # seconds or bytes of a run: more is no measurement
 
 

@@ -209,6 +209,30 @@ def share_interval(value: float, drawn: tuple[ArrayLike, ArrayLike], trials: flo
     )
 
 
+def amount_interval(value: float, drawn: tuple[ArrayLike, ArrayLike]) -> BoardInterval:
+    """Return the 95 % intervals of a mean of values without an upper bound, such as a count for each kilometre.
+
+    Arguments are as of `share_interval`, but for trials: no distribution is known that would widen draws of few
+    clusters, so there is no interval where nothing varies.
+
+    >>> found = amount_interval(2.0, (np.linspace(1.0, 3.0, 101), np.full(101, 2.0)))
+    >>> round(found.lo, 2), round(found.hi, 2), found.how
+    (1.06, 2.94, 'places')
+    """
+    places, blocks = (percentile_interval(value, one) for one in drawn)
+    if math.isnan(value) or not (places.lo < places.hi or blocks.lo < blocks.hi):
+        return BoardInterval(value=value)
+    lo, hi = float(np.fmin(places.lo, blocks.lo)), float(np.fmax(places.hi, blocks.hi))
+    return BoardInterval(
+        value=value,
+        lo=lo,
+        hi=hi,
+        lo_blocks=blocks.lo,
+        hi_blocks=blocks.hi,
+        how="places" if (places.lo, places.hi) == (lo, hi) else "blocks",
+    )
+
+
 @dataclass(frozen=True, kw_only=True)
 class BoardDraws:
     """Draws of the same queries by places and, beside them, by blocks; sites are drawn within either.

@@ -4,110 +4,36 @@
 To add a metric, write its function and add one row to `METRICS`.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.scoring import cost
+from sasgeo_bench.scoring import cost, flight_metrics
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.decisions import COST_RATIOS, brier, calibration_error, decision_cost
 from sasgeo_bench.scoring.integrity_metric import augrc, aurc, auroc, excess_aurc, false_fix_rate
+from sasgeo_bench.scoring.metric import (
+    CostMetric,
+    MeanMetric,
+    Metric,
+    QuantileMetric,
+    RejectionMetric,
+    ThresholdMetric,
+)
 from sasgeo_bench.scoring.pose import PoseErrors, Ranks, area_values, hits, reciprocal_ranks, successes
+from sasgeo_bench.tasks.query import SEQUENCE
 
 RISKS: Final = (0.01, 0.05)  # of a false fix among accepted answers; thresholds are chosen for them
 ABSENT_RATES: Final = (0.01, 0.05)  # of absent places that are accepted; thresholds are chosen for them
-TRACKS: Final = ("localization", "retrieval")
+LOCALIZATION: Final = "localization"
+TRACKS: Final = (LOCALIZATION, "retrieval", SEQUENCE)
+_SINGLE: Final = TRACKS[:2]  # tracks of views alone
 SUCCESS_M: Final = (25.0, 10.0, 5.0)
 RECALL_AT: Final = (1, 5)
 COVERAGES: Final = (0.5, 0.8)
 _INF: Final = float("inf")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Metric:
-    """A metric as a board prints it.
-
-    `name` is as in the column `metric` of `leaderboard.parquet`, `meaning` one or two sentences for a reader of the
-    board, `source` the reference of the definition, `unit` "1" for none, `bounds` the least and greatest possible
-    value.
-    """
-
-    name: str
-    meaning: str
-    source: str
-    unit: str = "1"
-    better: Literal["higher", "lower"] = "lower"
-    bounds: tuple[float, float] = (0.0, 1.0)
-
-    @property
-    def worst(self) -> float:
-        """Return the value of a method that fails at everything."""
-        return self.bounds[self.better == "lower"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MeanMetric(Metric):
-    """A mean over queries, printed on some tracks; matchers are ranked by the primary one.
-
-    `values` maps scored rows to one finite value for each, `counts` to a mask of the denominator, the same for every
-    matcher.
-    """
-
-    tracks: tuple[str, ...]
-    values: Callable[[pd.DataFrame], Floats]
-    counts: Callable[[pd.DataFrame], Bools]
-    is_primary: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class QuantileMetric(Metric):
-    """A quantile of the pose errors in a column of scored rows, including infinite errors."""
-
-    column: str
-    share: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RejectionMetric(Metric):
-    """A metric of matcher x rejector; `needs_chances` if the confidence must be a probability.
-
-    `compute(answers, weights=...)` takes `decisions.Answers` of N queries and weights of shape (N,).
-    """
-
-    compute: Callable[..., float]
-    needs_chances: bool = False
-    has_interval: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ThresholdMetric(Metric):
-    """A share of queries at a threshold chosen on calibration places.
-
-    The threshold kept the false fixes among the accepted ones at `limit`, or, if it `is_of_absent`, the accepted ones
-    among absent places. `what` is the share: of all queries that are "covered", of the accepted ones that are false
-    ("risk"), of the present places whose fix is right and accepted ("right"), or of the "absent" ones accepted.
-    """
-
-    limit: float
-    what: Literal["covered", "risk", "right", "absent"]
-    is_of_absent: bool = False
-
-    @property
-    def accepted(self) -> str:
-        """Return the column of judged rows with what the threshold accepts."""
-        return f"accepted_absent_{self.limit:g}" if self.is_of_absent else f"accepted_{self.limit:g}"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CostMetric(Metric):
-    """Cost of the answers of one matcher, by track or of all tracks together."""
-
-    compute: Callable[[cost.Costs], float]
-    is_by_track: bool = False
 
 
 def errors_of(scores: pd.DataFrame) -> PoseErrors:
@@ -145,14 +71,14 @@ ANSWERED: Final = _mean(
     name="answered",
     meaning="Share of present places that were answered, rightly or not",
     source="share of queries",
-    tracks=TRACKS,
+    tracks=_SINGLE,
     values=_answers,
 )
 FALSE_ABSENT: Final = MeanMetric(
     name="answered_absent",
     meaning="Share of absent places that were answered; each such answer is a false fix",
     source="share of queries",
-    tracks=TRACKS,
+    tracks=_SINGLE,
     values=_answers,
     counts=lambda scores: ~is_present(scores),  # any answer is a false fix
 )
@@ -161,21 +87,21 @@ WITHIN: Final = _mean(  # shows the effect of wrong headings on the primary metr
     meaning="Share of queries with a fix within 25 m of the place, whatever the heading and whichever candidate: what "
     "counts as a fix that is not false",
     source="the SASGeo paper, Eq. (12)",
-    tracks=TRACKS,
+    tracks=_SINGLE,
     values=lambda scores: scores["is_right"].to_numpy(float),
 )
 CEILING: Final = _mean(  # the same for every matcher
     name="ceiling",
     meaning="The most that a matcher can expect of the first figure: 1 in k where k places are the same",
     source="measured by the suite",
-    tracks=TRACKS,
+    tracks=_SINGLE,
     values=lambda scores: scores["ceiling"].to_numpy(float),
 )
 CHANCE: Final = _mean(  # the same for every matcher
     name="chance_1",
     meaning="What guessing among the candidates reaches",
     source="1 / number of candidates",
-    tracks=TRACKS[1:],
+    tracks=_SINGLE[1:],
     values=lambda scores: 1.0 / np.maximum(scores["pool"].to_numpy(float), 1.0),
 )
 _MEANS: Final = (
@@ -184,7 +110,7 @@ _MEANS: Final = (
             name=f"success_{within_m:g}m",
             meaning=f"Share of queries whose pose is within {within_m:g} m and 5 deg. No answer is a miss",
             source="share of all queries within metres and 5 deg",
-            tracks=TRACKS[:1],
+            tracks=(LOCALIZATION,),
             values=partial(_successes, within_m=within_m),
             is_primary=within_m == SUCCESS_M[0],
         )
@@ -196,7 +122,7 @@ _MEANS: Final = (
         name="success_auc_50m",
         meaning="Area under the success rate over its tolerance, up to 50 m",
         source="exact area of a step function",
-        tracks=TRACKS[:1],
+        tracks=(LOCALIZATION,),
         values=lambda scores: area_values(errors_of(scores)),
     ),
     *(
@@ -205,7 +131,7 @@ _MEANS: Final = (
             meaning=f"Share of queries whose right candidate is among the first {k}. Ties count in proportion, no "
             "answer is a miss",
             source="ties as in McSherry and Najork, ECIR 2008",
-            tracks=TRACKS[1:],
+            tracks=_SINGLE[1:],
             values=partial(_hits, k=k),
             is_primary=k == RECALL_AT[0],
         )
@@ -216,11 +142,12 @@ _MEANS: Final = (
         name="mrr",
         meaning="Mean of one over the rank of the right candidate",
         source="Voorhees, TREC-8 1999; ties as in McSherry and Najork, ECIR 2008",
-        tracks=TRACKS[1:],
+        tracks=_SINGLE[1:],
         values=lambda scores: reciprocal_ranks(ranks_of(scores)),
     ),
     ANSWERED,
     FALSE_ABSENT,
+    *flight_metrics.MEANS,
 )
 _error = partial(QuantileMetric, bounds=(0.0, _INF), source="Hyndman and Fan, American Statistician 1996, type 1")
 QUANTILES: Final = (
@@ -247,6 +174,7 @@ QUANTILES: Final = (
         column="log_scale_error",
         share=0.5,
     ),
+    *flight_metrics.QUANTILES,
 )
 REJECTION: Final = (
     RejectionMetric(
@@ -433,6 +361,11 @@ def means_of(track: str) -> tuple[MeanMetric, ...]:
     ['within_25m', 'ceiling', 'recall_1', 'recall_5', 'chance_1', 'mrr', 'answered', 'answered_absent']
     """
     return tuple(metric for metric in _MEANS if track in metric.tracks)
+
+
+def quantiles_of(track: str) -> tuple[QuantileMetric, ...]:
+    """Return the quantiles of errors that are printed on a track; none where candidates are ranked."""
+    return tuple(metric for metric in QUANTILES if metric.track == track)
 
 
 def primary_of(track: str) -> MeanMetric:

@@ -15,7 +15,8 @@ from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_wei
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.integrity_metric import drawn_areas
 from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, effective_count, share_interval
-from sasgeo_bench.scoring.metrics import REJECTION, THRESHOLDS, RejectionMetric, ThresholdMetric
+from sasgeo_bench.scoring.metric import RejectionMetric, ThresholdMetric
+from sasgeo_bench.scoring.metrics import REJECTION, THRESHOLDS
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads
 
 AS_DRAWN: Final = "as drawn"

@@ -12,7 +12,7 @@ import pandas as pd
 
 from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.scoring.intervals import BoardInterval
-from sasgeo_bench.scoring.metrics import Metric
+from sasgeo_bench.scoring.metric import Metric
 from sasgeo_bench.scoring.score import MISSING
 
 ALL_SUITES: Final = "all suites"
@@ -20,7 +20,9 @@ AS_SUBMITTED: Final = "as submitted"  # source of the answers: their author,
 RUN_HERE: Final = "run here"  # our run of the code, on queries of a public seed only,
 REPRODUCED: Final = "reproduced"  # or of a private seed too, where it is not shown to be worse,
 NOT_REPRODUCED: Final = "not reproduced"  # or is shown to be worse
-UNRANKED: Final = frozenset({"random", "prior_centre", "map_density_prior"})  # controls: not ranked
+UNRANKED: Final = frozenset(  # controls: not ranked
+    {"random", "prior_centre", "map_density_prior", "dead_reckoning", "prior_only"}
+)
 _THREADS: Final = 4  # each holds some 100 MB of draws
 
 Item = TypeVar("Item")

@@ -13,7 +13,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.pose import MISS, Rank, first_pose, pose_errors, rank_candidate, rank_of
-from sasgeo_bench.tasks.query import CEILING, COPIES, Head, Truth, base_of
+from sasgeo_bench.tasks.query import CEILING, COPIES, SEQUENCE, Head, Truth, base_of
 
 SCORER_VERSION: Final = 6  # raise it if the same predictions get other scores; a board has one version
 FIX_M: Final = 25.0  # mission tolerance e_max of Eq. 12: a fix beyond it is false, on both tracks
@@ -121,16 +121,8 @@ def score_task(
     places of the split, `country_of` places to countries. Raise MetricError if a query has no truth or a prediction
     belongs to no query.
     """
-    by_id = {truth.query_id: truth for truth in truths}
     asked = list(heads)
-    lost = next((head.query_id for head in asked if head.query_id not in by_id), None)
-    if lost is not None:
-        message = f"query {lost} has no truth: these are the truths of other queries, make the queries again"
-        raise MetricError(message)
-    foreign = next(iter(set(predictions) - {head.query_id for head in asked}), None)
-    if foreign is not None:
-        message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
-        raise MetricError(message)
+    by_id = truths_of(asked, truths, predictions)
     answers = [predictions.get(head.query_id) for head in asked]
     errors = _errors([by_id[head.query_id] for head in asked], answers)
     places = [(place_of or {}).get(by_id[head.query_id].block, base_of(head.region)) for head in asked]
@@ -139,6 +131,27 @@ def score_task(
         for head, prediction, error, place in zip(asked, answers, errors, places, strict=True)
     ]
     return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
+
+
+def single_views(scores: pd.DataFrame) -> pd.DataFrame:
+    """Return the scored rows that are of views alone, and not of flights."""
+    return scores[(scores["track"] != SEQUENCE).to_numpy(bool)].reset_index(drop=True)
+
+
+def truths_of(
+    asked: Sequence[Head], truths: Iterable[Truth], predictions: Mapping[str, Prediction]
+) -> dict[str, Truth]:
+    """Return the truths by query id; raise MetricError if one is missing, or a prediction belongs to no query."""
+    by_id = {truth.query_id: truth for truth in truths}
+    lost = next((head.query_id for head in asked if head.query_id not in by_id), None)
+    if lost is not None:
+        message = f"query {lost} has no truth: these are the truths of other queries, make the queries again"
+        raise MetricError(message)
+    foreign = next(iter(set(predictions) - {head.query_id for head in asked}), None)
+    if foreign is not None:
+        message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
+        raise MetricError(message)
+    return by_id
 
 
 def _errors(truths: Sequence[Truth], answers: Sequence[Prediction | None]) -> list[Errors]:

@@ -17,8 +17,9 @@ from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
 from sasgeo_bench.scoring.compare import RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
-from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, share_interval
-from sasgeo_bench.scoring.metrics import COSTS, QUANTILES, MeanMetric, QuantileMetric, means_of, primary_of
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, amount_interval, share_interval
+from sasgeo_bench.scoring.metric import MeanMetric, QuantileMetric
+from sasgeo_bench.scoring.metrics import COSTS, means_of, primary_of, quantiles_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, is_unranked, to_frame
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, strata
@@ -107,7 +108,7 @@ class _Group:
     def of(cls, key: GroupKey, frames: Mapping[str, pd.DataFrame], unranked: Collection[str]) -> Self:
         """Return the columns of some matchers' rows; `unranked` matchers are no rivals."""
         first = next(iter(frames.values()))
-        columns = dict.fromkeys(quantile.column for quantile in QUANTILES)
+        columns = dict.fromkeys(quantile.column for quantile in quantiles_of(key.track))
         codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
 
         def stacked(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
@@ -208,7 +209,7 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Means:
-    """Columns of values in [0, 1], shape (N, M), and their means in draws by places and by blocks, shape (D, M)."""
+    """Columns of values, shape (N, M), and their means in draws by places and by blocks, shape (D, M)."""
 
     table: Floats
     drawn: tuple[Floats, Floats]
@@ -219,9 +220,11 @@ class _Means:
         by_place, by_block = (means[:, columns] for means in self.drawn)
         return replace(self, table=self.table[:, columns], drawn=(by_place, by_block))
 
-    def interval(self, column: int, value: float) -> BoardInterval:
-        """Return the intervals of one column's mean."""
+    def interval(self, column: int, value: float, *, is_share: bool = True) -> BoardInterval:
+        """Return the intervals of one column's mean; values of a share lie in [0, 1]."""
         by_place, by_block = (means[:, column] for means in self.drawn)
+        if not is_share:
+            return amount_interval(value, (by_place, by_block))
         return share_interval(value, (by_place, by_block), self.trials)
 
 
@@ -240,11 +243,10 @@ class _Below:
 
 def _thresholds(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[_Below]:
     """Yield quantiles of errors; their intervals invert those of the share below them (Woodruff 1952)."""
-    is_pose = cell.group.key.track == "localization" and any(metric.is_primary for metric in metrics)
-    if not is_pose or cell.stratum not in _WHOLE:
+    if cell.stratum not in _WHOLE or not any(metric.is_primary for metric in metrics):
         return
     for at in range(len(cell.group.names)):
-        for quantile in QUANTILES:
+        for quantile in quantiles_of(cell.group.key.track):
             errors = cell.group.errors[quantile.column][cell.chosen, at]
             value = weighted_quantile(errors, quantile.share)
             is_below, is_equal = errors < value, errors == value
@@ -262,7 +264,8 @@ def _inverse(errors: Floats, share: float) -> float:
 def _ranked(cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, means: _Means) -> Iterator[Row]:
     """Yield the rows of one metric, with ranks for the primary one."""
     names, places, table = cell.group.names, cell.group.places[cell.chosen], means.table
-    found = [means.interval(at, float(table[:, at].mean())) for at in range(len(names))]
+    is_share = metric.bounds == (0.0, 1.0)
+    found = [means.interval(at, float(table[:, at].mean()), is_share=is_share) for at in range(len(names))]
     is_decidable = metric.is_primary and keys[0].places >= LEAST_PLACES
     values = [interval.value for interval in found]
     ranks = _ranks(cell.group, values, means.drawn[0], metric) if is_decidable else {}

@@ -42,6 +42,7 @@ SHUFFLED: Final = "shuffled map"
 TURNED: Final = "turned map"
 TWINS: Final = "identical twins"
 BLIND: Final = "all unknown"
+SEQUENCE: Final = "sequence"  # the track of flights
 SEQUENCE_DIGITS: Final = 18  # of the id of a flight; the id of a view has more
 _FRAME_DIGITS: Final = 6  # at the end of the id of a view
 YAW_SIGMA_DEG: Final = {"known": 5.0, "weak": 20.0, "unknown": None}
@@ -221,10 +222,16 @@ class Query(_Question):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Head(_Question):
-    """A query without its view: all that scoring needs of it. `view_cells` is the side of the view."""
+    """A query without its view: all that scoring needs of it.
+
+    `view_cells` is the side of the view. Views of a flight have `sequence_id`, `frame` and `increment` of their `Step`.
+    """
 
     view_cells: int
     cell_size_m: float
+    sequence_id: str | None = None
+    frame: int | None = None
+    increment: tuple[float, float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,9 +241,10 @@ class Truth:
     Parameters
     ----------
     is_present : bool
-        Whether the place is on the searched map (for retrieval: among the candidates).
+        Whether the place is on the searched map (for retrieval: among the candidates). A view of a flight is absent
+        where its middle lies off the map, and its pose is known all the same: what was flown there counts too.
     pose : Pose, optional
-        Where the view was taken; None if it was not taken in this map.
+        Where the view was taken; None if it was not taken in this place at all.
     candidate : int
         Index of the right candidate; -1 for localization or if it is absent.
     pair_id, role : str

@@ -396,7 +396,10 @@ def read_heads(folder: Path) -> Iterator[Head]:
     for batch in read_batches(folder / QUERIES, HEAD_SCHEMA.names):
         rows = batch.drop_columns(["candidates"]).to_pylist()
         for row, poses in zip(rows, _made(folder / QUERIES, poses_of, batch["candidates"]), strict=True):
-            yield Head(view_cells=row.pop("rows"), candidates=poses, **row)
+            way = row.pop("increment")
+            yield Head(
+                view_cells=row.pop("rows"), candidates=poses, increment=None if way is None else tuple(way), **row
+            )
 
 
 def read_truths(folder: str | Path) -> Iterator[Truth]:

@@ -696,8 +696,11 @@ def test_reference_imagery_that_tells_nothing_or_too_much_is_refused(tmp_path, o
     assert "\n" not in str(error.value)
 
 
-def test_a_suite_of_flights_is_refused(tmp_path):
+def test_a_contrast_on_flights_names_their_track(tmp_path):
     text = TEXT.replace('suites = ["clean"]', 'suites = ["flight-gap"]')
     assert text != TEXT
-    with pytest.raises(ConfigError, match="suite 'flight-gap' is of flights, which no board scores yet: leave it out"):
+    with pytest.raises(ConfigError, match="has track 'localization', and suite 'flight-gap' is of flights, say track"):
         plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+    other = TEXT.replace("[[contrast]]", '[[contrast]]\ntrack = "sequence"', 1)
+    with pytest.raises(ConfigError, match="has track 'sequence', and suite 'clean' has no flights"):
+        plan_pipeline(parse_toml(other, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)

@@ -8,7 +8,8 @@ import pytest
 
 from sasgeo_bench.scoring.decisions import Answers
 from sasgeo_bench.scoring.integrity_metric import augrc, aurc, excess_aurc
-from sasgeo_bench.scoring.metrics import METRICS, QUANTILES, REJECTION, MeanMetric, means_of, primary_of
+from sasgeo_bench.scoring.metric import MeanMetric
+from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of
 from tests.scoring.test_tables import scores
 
 SOME = Answers(confidence=[0.9, 0.8, 0.1, 0.0], is_answered=[1] * 4, is_right=[1, 0, 1, 1], is_present=[1] * 4)
@@ -39,13 +40,15 @@ def test_means_compute_what_they_are_named_after():
 
 
 def test_quantiles_name_their_share():
-    assert {metric.name: metric.share for metric in QUANTILES} == {
+    assert {metric.name: metric.share for metric in quantiles_of("localization")} == {
         "position_median": 0.5,
         "position_p90": 0.9,
         "position_p99": 0.99,
         "yaw_median": 0.5,
         "log_scale_median": 0.5,
     }
+    assert {metric.share for metric in quantiles_of("sequence")} == {0.5}
+    assert quantiles_of("retrieval") == ()
 
 
 def test_rejection_metrics_compute_what_they_are_named_after():

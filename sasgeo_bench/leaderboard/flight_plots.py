@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Figures of flights on a board: error along the way, and how rarely the map may be asked; their tables.
+
+Each figure has a panel for each kind of flight of a suite and a line for each matcher.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+
+from sasgeo_bench.canvas import page, panels
+from sasgeo_bench.errors import counted
+from sasgeo_bench.leaderboard.board_plots import (
+    FAINT,
+    INTERVALS,
+    BoardPage,
+    dodged,
+    draw_line,
+    dress_share,
+    label_outer,
+    line_keys,
+    look_of,
+    of_which,
+    panels_across,
+    those_there,
+    ticks_across,
+)
+from sasgeo_bench.scoring.flights import EVERY_M
+from sasgeo_bench.scoring.score import FIX_M
+from sasgeo_bench.scoring.strata import CONTROL, GROUP
+
+_BIN_M: Final = 250.0
+_LEAST_FLIGHTS: Final = 2  # of a point: one flight is no distribution
+_SHARES: Final = {"half": 0.5, "most": 0.9}
+_LEAST_ERROR_M: Final = 1.0
+_MOST_ERROR_M: Final = 10_000.0
+_METRICS: Final = {f"fix_every_{far_m:g}m": far_m for far_m in EVERY_M}
+DISTANCE_COLUMNS: Final = (*GROUP, "kind", "matcher", "distance_m", "flights", *_SHARES)
+INTERVAL_COLUMNS: Final = (*GROUP, "kind", "matcher", "every_m", "n", "blocks", "value", "lo", "hi")
+
+
+def distance_frame(
+    views: Mapping[str, pd.DataFrame], scores: Mapping[str, pd.DataFrame], shown: Sequence[str]
+) -> pd.DataFrame:
+    """Return the error of the estimate along the way, with the columns `DISTANCE_COLUMNS`.
+
+    `half` and `most` are the errors that 50 % and 90 % of the flights stay below at a distance from the start: of a
+    flight its largest error in each 250 m, infinite without an estimate. A distance that fewer than two flights reach
+    has no row.
+    """
+    parts = []
+    for name in (name for name in shown if name in views):
+        kinds = scores[name].set_index("query_id")["kind"]
+        seen = views[name]
+        bins = (seen["distance_m"] // _BIN_M + 0.5) * _BIN_M
+        mine = seen.assign(kind=seen["sequence_id"].map(kinds), at_m=bins)
+        worst = mine.groupby([*GROUP, "kind", "sequence_id", "at_m"], as_index=False)["error_m"].max()
+        for key, some in worst.groupby([*GROUP, "kind", "at_m"], sort=True):
+            if len(some) >= _LEAST_FLIGHTS:
+                errors_m = some["error_m"].to_numpy(float)
+                found = [np.quantile(errors_m, share, method="inverted_cdf") for share in _SHARES.values()]
+                parts.append((*key[:-1], name, key[-1], len(some), *found))
+    return pd.DataFrame(parts, columns=list(DISTANCE_COLUMNS))
+
+
+def interval_frame(
+    table: pd.DataFrame, kinds: Mapping[tuple[str, ...], Sequence[str]], shown: Sequence[str]
+) -> pd.DataFrame:
+    """Return how much of the way stays within 25 m if the map is asked rarely, with the columns `INTERVAL_COLUMNS`.
+
+    `table` is the leaderboard; `kinds` are the strata of a suite, track and prior group that have a panel.
+    """
+    rows = table[table["metric"].isin(list(_METRICS)) & table["matcher"].isin(list(shown)) & (table["rejector"] == "")]
+    is_kind = [
+        stratum in kinds.get(key, ())
+        for *key_list, stratum in rows[[*GROUP, "stratum"]].itertuples(index=False)
+        for key in [tuple(key_list)]
+    ]
+    some = rows[np.array(is_kind, dtype=bool)]
+    found = some.assign(every_m=some["metric"].map(_METRICS), kind=some["stratum"])
+    return found[[*INTERVAL_COLUMNS]].reset_index(drop=True)
+
+
+def kinds_of(scores: Mapping[str, pd.DataFrame]) -> dict[tuple[str, ...], list[str]]:
+    """Return the strata that have a panel, by suite, track and prior group: the controls, and each kind of stress."""
+    found: dict[tuple[str, ...], list[str]] = {}
+    for frame in scores.values():
+        for key, part in frame.groupby(list(GROUP), sort=True):
+            stress = sorted(set(part.loc[part["role"] == "stress", "kind"]))
+            found[tuple(map(str, key))] = [CONTROL, *stress]
+    return found
+
+
+def draw_distance(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
+    """Draw the error along the way from `distance_frame`."""
+    names, kinds = those_there(rows, shown), list(dict.fromkeys(rows["kind"]))
+    note = (
+        f"Error of the estimate, accepted or not: of a flight the largest in each {_BIN_M:g} m, of the flights the "
+        f"median (line) and the 90th percentile (pale). At the top: no estimate. Dashed: {FIX_M:g} m. A distance that "
+        "fewer than two flights reach is not drawn."
+    )
+    title = f"Error along the way: {of_which(rows.iloc[0])}"
+    for chart, kind, number, across in _panels(path, kinds, names, title, note, "flown from the start (km)"):
+        mine = rows[rows["kind"] == kind]
+        flights = int(mine["flights"].max())
+        chart.set_title(f"{kind}\n{counted(flights, 'flight')} at most")
+        chart.axhline(FIX_M, color="#999999", lw=0.8, ls="--")
+        chart.set_yscale("log")
+        chart.set_ylim(_LEAST_ERROR_M, _MOST_ERROR_M)
+        chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
+        for at, name in enumerate(names):
+            line = mine[mine["matcher"] == name].sort_values("distance_m")
+            look, far_km = look_of(at), line["distance_m"].to_numpy(float) / 1000
+            half, most = (np.clip(line[column].to_numpy(float), _LEAST_ERROR_M, _MOST_ERROR_M) for column in _SHARES)
+            chart.plot(far_km, half, color=look.colour, ls=look.dash, lw=1.4)
+            chart.plot(far_km, most, color=look.colour, ls=look.dash, lw=0.8, alpha=0.45)
+        label_outer(chart, number, across, len(kinds), "error of the estimate (m)")
+        chart.tick_params(labelbottom=True)
+
+
+def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
+    """Draw how rarely the map may be asked from `interval_frame`."""
+    names, kinds = those_there(rows, shown), list(dict.fromkeys(rows["kind"]))
+    note = (
+        f"Share of the flown distance within {FIX_M:g} m if an accepted fix is used once in so many metres at most, "
+        f"and the odometer alone says the rest; nothing is known before the first fix. Dashed: 95 %. {INTERVALS}"
+    ).replace("n: queries of each point.", "")
+    title = f"How rarely the map may be asked: {of_which(rows.iloc[0])}"
+    for chart, kind, number, across in _panels(path, kinds, names, title, note, "flown between two uses of a fix (m)"):
+        mine = rows[rows["kind"] == kind]
+        chart.set_title(f"{kind}\nn {mine['n'].iloc[0]:g} flights, {counted(int(mine['blocks'].iloc[0]), 'block')}")
+        ticks_across(chart, list(EVERY_M), EVERY_M[0] / 1.35, EVERY_M[-1] * 1.35)
+        dress_share(chart)
+        chart.set_ylim(-0.03, 1.04)
+        chart.axhline(0.95, color="#999999", lw=0.8, ls="--")
+        for at, name in enumerate(names):
+            line = mine[mine["matcher"] == name].sort_values("every_m")
+            draw_line(chart, line, dodged(line["every_m"].to_numpy(float), at, len(names), by=0.03), at)
+        label_outer(chart, number, across, len(kinds), f"share of the way\nwithin {FIX_M:g} m")
+
+
+def _panels(
+    path: Path, kinds: Sequence[str], names: Sequence[str], title: str, note: str, below: str
+) -> Iterator[tuple[Axes, str, int, int]]:
+    """Yield the axes of each kind with its number and the number of columns."""
+    down, across = panels_across(len(kinds))
+    about = BoardPage(title=title, note=note, below=below, rows=down, columns=across, keys=line_keys(names))
+    with page(path, about) as charts:
+        for number, chart in panels(charts, len(kinds)):
+            yield chart, kinds[number], number, across

@@ -1,0 +1,383 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores of flights: the error of every view, and one scored row for each flight.
+
+A flight is the unit of all figures: its views are answered one after the other, and the errors of neighbours are alike.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.geometry.pose import wrap_deg
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.tracker import SIDE
+from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.pose import first_pose
+from sasgeo_bench.scoring.score import COLUMNS, FIX_M, MISSING, truths_of
+from sasgeo_bench.tasks.query import Head, Truth, base_of
+
+WITHIN_M: Final = (25.0, 10.0, 50.0)  # the first is the primary one
+EVERY_M: Final = (250.0, 500.0, 1000.0, 2000.0)  # flown between two uses of a fix
+SOON_M: Final = 500.0  # after a gap, or after the drone was carried
+DIVERGED_M: Final = 100.0
+_DIVERGED_FOR_M: Final = 500.0
+_TWO_SIGMA: Final = float(chi2.ppf(math.erf(math.sqrt(2)), 2))  # squared distance within which 95.4 % of a plane lie
+_JUMP_M: Final = 1.0  # more between two views than was flown: the drone was carried
+
+Complexes = NDArray[np.complex128]  # east + i north, metres
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightScore:
+    """What a scored row of a flight has besides `Score`; every view is in every figure.
+
+    Parameters
+    ----------
+    views : int
+        Number of views.
+    length_m : float
+        Flown between the first view and the last.
+    distance_within_10m, distance_within_25m, distance_within_50m : float
+        Share of the flown distance with an estimate so near, accepted or not. A view stands for half the way to either
+        neighbour.
+    fix_every_250m, fix_every_500m, fix_every_1000m, fix_every_2000m : float
+        Share within 25 m if an accepted fix is used once in so many metres at most, and the odometer says the rest; no
+        part before the first fix.
+    accepted, false_accepted : float
+        Share of the views with an accepted fix; and with one beyond 25 m.
+    false_per_km, accepted_per_km : float
+        The same two as counts over kilometres.
+    longest_without_fix_m : float
+        The longest stretch without an accepted fix; the whole flight if there is none.
+    first_fix_m, first_fix_s : float
+        Distance and time to the first accepted fix within 25 m; infinite without one.
+    reacquired_m : float
+        The same distance after a gap, a stretch off the map, or being carried; NaN where the flight has nothing of it.
+    divergences : int
+        Number of stretches of more than 500 m with accepted fixes all beyond 100 m.
+    ate_m : float
+        Root mean square of the position errors of all views, nothing aligned; infinite if a view has no estimate.
+    error_p50_m, error_p95_m : float
+        Quantiles of the position errors of all views.
+    nees : float
+        Mean normalized estimation error squared of the views with a covariance over its 3 degrees of freedom: 1 for an
+        honest covariance, more for an optimistic one. Infinite without a covariance.
+    inside_two_sigma : float
+        Share of the views with a covariance whose true position lies in the ellipse that holds 95.4 %; 0 without one.
+    """
+
+    views: int
+    length_m: float
+    distance_within_25m: float
+    distance_within_10m: float
+    distance_within_50m: float
+    fix_every_250m: float
+    fix_every_500m: float
+    fix_every_1000m: float
+    fix_every_2000m: float
+    accepted: float
+    false_accepted: float
+    false_per_km: float
+    accepted_per_km: float
+    longest_without_fix_m: float
+    first_fix_m: float
+    first_fix_s: float
+    reacquired_m: float
+    divergences: int
+    ate_m: float
+    error_p50_m: float
+    error_p95_m: float
+    nees: float
+    inside_two_sigma: float
+
+
+FLIGHT_COLUMNS: Final = tuple(field.name for field in fields(FlightScore))
+_OF_HEAD: Final = ("query_id", "track", "suite", "suite_version", "part", "region", "prior_group", "view_cells")
+_OF_TRUTH: Final = ("pair_id", "role", "kind", "strength", "strength_unit", "block", "scene", "detector")
+_MEANS: Final = ("unknown_share", "changed_share", "feature_density")
+
+
+class ScoredFlights(NamedTuple):
+    """`flights` has a row for each flight, `views` one for each view (`view_frame`)."""
+
+    flights: pd.DataFrame
+    views: pd.DataFrame
+
+
+def score_flights(
+    heads: Iterable[Head],
+    truths: Iterable[Truth],
+    predictions: Mapping[str, Prediction],
+    *,
+    place_of: Mapping[str, str] | None = None,
+    country_of: Mapping[str, str] | None = None,
+) -> ScoredFlights:
+    """Score the predictions of one task of flights: a row for each flight with the columns of Score and FlightScore.
+
+    Arguments and errors are as of `score.score_task`. Of the columns of `Score` the query id is that of the flight, a
+    flight is answered if one of its fixes was accepted, its errors are the medians over its views, and it is right if
+    its median error is within 25 m. Its status is the first that is not "ok".
+    """
+    asked = sorted(heads, key=lambda head: head.query_id)  # by flight, then by time
+    by_id = truths_of(asked, truths, predictions)
+    views = view_frame(asked, [by_id[head.query_id] for head in asked], predictions, place_of)
+    ends = _ends(views["sequence_id"].tolist())
+    rows = []
+    for first, last in pairwise(ends):
+        part, head = views.iloc[first:last], asked[first]
+        truth = by_id[head.query_id]
+        place = str(part["place"].iloc[0])
+        known = [by_id[name] for name in part["query_id"]]
+        row = {name: getattr(head, name) for name in _OF_HEAD} | {name: getattr(truth, name) for name in _OF_TRUTH}
+        row |= {name: float(np.mean([getattr(one, name) for one in known])) for name in _MEANS}
+        row |= {"place": place, "country": (country_of or {}).get(place, place), "cell_size_m": head.cell_size_m}
+        odd = [status for status in part["status"] if status != "ok"]
+        figures = flight_score(part, [head.increment for head in asked[first:last]])
+        rows.append(
+            row
+            | {"query_id": head.sequence_id, "pool": 0, "alias_index": None, "is_present": True, "ceiling": 1.0}
+            | {"status": odd[0] if odd else "ok", "is_answered": bool(part["is_accepted"].any())}
+            | {"above": 0, "tied": 0, "right": 0, "confidence": math.nan, "log_scale_error": math.nan}
+            | {"position_error_m": figures.error_p50_m, "yaw_error_deg": _quantile(part["yaw_error_deg"], 0.5)}
+            | {"is_right": figures.error_p50_m <= FIX_M, "latency_s": float(part["latency_s"].mean())}
+            | {name: getattr(figures, name) for name in FLIGHT_COLUMNS}
+        )
+    columns = [*COLUMNS, *FLIGHT_COLUMNS]
+    return ScoredFlights(pd.DataFrame(rows, columns=columns), views)
+
+
+def _ends(names: Sequence[str]) -> list[int]:
+    """Return where each run of equal names begins, and the number of names."""
+    return [at for at, name in enumerate(names) if at == 0 or name != names[at - 1]] + [len(names)]
+
+
+VIEW_COLUMNS: Final = (
+    *("query_id", "sequence_id", "frame", "track", "suite", "region", "prior_group", "status"),
+    *("distance_m", "time_s", "is_seen", "is_present", "is_carried", "is_answered", "is_accepted", "latency_s"),
+    *("true_east_m", "true_north_m", "east_m", "north_m", "yaw_deg", "error_m", "yaw_error_deg"),
+    *("nees", "is_inside", "block", "place"),
+)
+
+
+def view_frame(
+    heads: Sequence[Head],
+    truths: Sequence[Truth],
+    predictions: Mapping[str, Prediction],
+    place_of: Mapping[str, str] | None = None,
+) -> pd.DataFrame:
+    """Return a row for each view of flights, in order, with the columns `VIEW_COLUMNS`.
+
+    `truths` are those of `heads`, in the same order. Errors are infinite without an estimate; places, `yaw_deg`, `nees`
+    and `is_inside` are NaN or False without one, or without a covariance. `is_carried` marks the first view after the
+    drone was carried. The estimate of a method that does not say whether it is accepted counts as accepted.
+    """
+    answers = [predictions.get(head.query_id) for head in heads]
+    poses = [first_pose(answer) for answer in answers]
+    nothing = (math.nan,) * SIDE
+    found = np.array([nothing if one is None else (one.easting_m, one.northing_m, one.yaw_deg) for one in poses])
+    true = np.array([_true_pose(truth) for truth in truths])
+    gaps = np.column_stack([(found - true).reshape(-1, SIDE)[:, :2], wrap_deg((found - true).reshape(-1, SIDE)[:, 2])])
+    is_answered = np.array([pose is not None for pose in poses], dtype=bool)
+    nees, in_plane = _normalized(gaps, [None if one is None else one.covariance for one in answers])
+    measured, places = [truth.measured for truth in truths], place_of or {}
+    distance_m = np.array([one.get("distance_m", math.nan) for one in measured])
+    frame = np.array([head.frame or 0 for head in heads])
+    jump_m = np.hypot(*np.diff(true[:, :2], axis=0, prepend=true[:1, :2]).T)
+    table = {
+        **{name: [getattr(head, name) for head in heads] for name in ("query_id", "sequence_id", "track", "suite")},
+        **{name: [getattr(head, name) for head in heads] for name in ("region", "prior_group")},
+        "frame": frame,
+        "status": [MISSING if answer is None else answer.status for answer in answers],
+        "distance_m": distance_m,
+        "time_s": [one.get("time_s", math.nan) for one in measured],
+        "is_seen": [one.get("is_seen", 1.0) > 0 for one in measured],
+        "is_present": [truth.is_present for truth in truths],
+        "is_carried": (frame > 0) & (jump_m > np.diff(distance_m, prepend=distance_m[:1]) + _JUMP_M),
+        "is_answered": is_answered,
+        "is_accepted": is_answered & np.array([one is not None and one.is_accepted is not False for one in answers]),
+        "latency_s": [math.nan if one is None or one.latency_s is None else one.latency_s for one in answers],
+        **dict(zip(("true_east_m", "true_north_m"), true.T, strict=False)),
+        **dict(zip(("east_m", "north_m", "yaw_deg"), found.reshape(-1, SIDE).T, strict=True)),
+        "error_m": np.where(is_answered, np.hypot(gaps[:, 0], gaps[:, 1]), np.inf),
+        "yaw_error_deg": np.where(is_answered, np.abs(gaps[:, 2]), np.inf),
+        "nees": nees,
+        "is_inside": in_plane <= _TWO_SIGMA,
+        "block": [truth.block for truth in truths],
+        "place": [places.get(truth.block, base_of(head.region)) for truth, head in zip(truths, heads, strict=True)],
+    }
+    return pd.DataFrame(table, columns=list(VIEW_COLUMNS))
+
+
+def _true_pose(truth: Truth) -> tuple[float, float, float]:
+    if truth.pose is None:
+        message = f"view {truth.query_id} of a flight has no true pose: make the queries again"
+        raise MetricError(message)
+    return truth.pose.easting_m, truth.pose.northing_m, truth.pose.yaw_deg
+
+
+def _normalized(gaps: Floats, covariances: Sequence[tuple[float, ...] | None]) -> tuple[Floats, Floats]:
+    """Return normalized squared errors over three degrees of freedom, and squared ones of the position alone.
+
+    Both are NaN without a covariance, and where one from a file has no inverse or is not positive.
+    """
+    blank = (math.nan,) * SIDE**2
+    table = np.array([blank if one is None else one for one in covariances], dtype=float).reshape(-1, SIDE, SIDE)
+    nees, in_plane = np.full(len(table), np.nan), np.full(len(table), np.nan)
+    is_given = np.isfinite(table).all(axis=(1, 2)) & np.isfinite(gaps).all(axis=1)
+    is_given[is_given] = np.linalg.eigvalsh(table[is_given])[:, 0] > 0
+    for size, into in ((SIDE, nees), (2, in_plane)):
+        some, part = gaps[is_given][:, :size, None], table[is_given][:, :size, :size]
+        into[is_given] = (some * np.linalg.solve(part, some)).sum(axis=(1, 2))
+    return nees / SIDE, in_plane
+
+
+def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, float] | None]) -> FlightScore:
+    """Return the figures of one flight from the rows of its views and the odometer's increments to them."""
+    column = {name: views[name].to_numpy() for name in VIEW_COLUMNS}
+    distance_m, error_m = column["distance_m"].astype(float), column["error_m"].astype(float)
+    accepted = column["is_accepted"].astype(bool)
+    right = accepted & (error_m <= FIX_M)
+    false = accepted & (error_m > FIX_M)
+    way_m = _ways_m(distance_m)
+    length_m = float(distance_m[-1] - distance_m[0])
+    per_km = 1000.0 / length_m if length_m > 0 else math.nan
+    first_fix_m = _first(distance_m - distance_m[0], right)
+    event = _event(column["is_seen"] & column["is_present"], column["is_carried"])
+    reckoned = _Reckoned.of(views, increments)
+    has_nees = np.isfinite(column["nees"])
+    return FlightScore(
+        views=len(views),
+        length_m=length_m,
+        **{f"distance_within_{near_m:g}m": _share(way_m, error_m <= near_m) for near_m in WITHIN_M},
+        **{f"fix_every_{far_m:g}m": _share(way_m, reckoned.error_m(far_m) <= FIX_M) for far_m in EVERY_M},
+        accepted=float(accepted.mean()),
+        false_accepted=float(false.mean()),
+        false_per_km=float(false.sum()) * per_km,
+        accepted_per_km=float(accepted.sum()) * per_km,
+        longest_without_fix_m=_longest(distance_m, accepted),
+        first_fix_m=first_fix_m,
+        first_fix_s=_first(column["time_s"].astype(float), right),
+        reacquired_m=math.nan
+        if event is None
+        else _first(distance_m[event:] - distance_m[max(event - 1, 0)], right[event:]),
+        divergences=_divergences(distance_m, accepted & (error_m > DIVERGED_M), accepted),
+        ate_m=float(np.sqrt(np.mean(error_m**2))),
+        error_p50_m=_quantile(error_m, 0.5),
+        error_p95_m=_quantile(error_m, 0.95),
+        nees=float(column["nees"][has_nees].mean()) if has_nees.any() else math.inf,
+        inside_two_sigma=float(column["is_inside"][has_nees].mean()) if has_nees.any() else 0.0,
+    )
+
+
+def _ways_m(distance_m: Floats) -> Floats:
+    """Return the way that each view stands for: half of that from the view before and of that to the next.
+
+    Views of a flight that never moved stand for the same.
+
+    >>> _ways_m(np.array([0.0, 10.0, 40.0])).tolist()
+    [5.0, 20.0, 15.0]
+    """
+    if not distance_m[-1] > distance_m[0]:
+        return np.ones(len(distance_m))
+    step_m = np.diff(distance_m)
+    return np.asarray((np.append(0.0, step_m) + np.append(step_m, 0.0)) / 2)
+
+
+def _share(way_m: Floats, mask: Bools) -> float:
+    """Return a share of the way, 1 for all of it to the last digit."""
+    return float((way_m * mask).sum() / way_m.sum())
+
+
+def _quantile(values: ArrayLike, share: float) -> float:
+    """Return the least value that a share of the views does not exceed, which may be infinite."""
+    return float(np.quantile(np.asarray(values, dtype=float), share, method="inverted_cdf"))
+
+
+def _first(at: Floats, is_right: Bools) -> float:
+    """Return the first of some increasing values that is right; infinite without one."""
+    return float(at[np.argmax(is_right)]) if is_right.any() else math.inf
+
+
+def _longest(distance_m: Floats, accepted: Bools) -> float:
+    """Return the longest stretch between accepted fixes, the start and the end.
+
+    >>> _longest(np.array([0.0, 50.0, 100.0, 300.0]), np.array([False, True, True, False]))
+    200.0
+    """
+    known = np.concatenate([distance_m[:1], distance_m[accepted], distance_m[-1:]])
+    return float(np.diff(known).max())
+
+
+def _event(is_sighted: Bools, is_carried: Bools) -> int | None:
+    """Return the first view after the drone was carried, or else after the longest stretch of views without a place.
+
+    Views that show nothing one by one are no gap: the event takes two in a row.
+    """
+    if is_carried.any():
+        return int(np.argmax(is_carried))
+    ends = np.flatnonzero(np.diff(np.concatenate([[True], is_sighted, [True]]).astype(int)))
+    runs = ends.reshape(-1, 2)
+    long = runs[(np.diff(runs, axis=1)[:, 0] > 1) & (runs[:, 1] < len(is_sighted))]
+    return int(long[np.argmax(np.diff(long, axis=1)[:, 0]), 1]) if len(long) else None
+
+
+def _divergences(distance_m: Floats, is_far: Bools, accepted: Bools) -> int:
+    """Count the stretches of more than 500 m whose accepted fixes are all far off; other views do not end one."""
+    claimed = np.flatnonzero(accepted)
+    far, at_m = is_far[claimed], distance_m[claimed]
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(int))).reshape(-1, 2)
+    return sum(bool(at_m[last - 1] - at_m[first] > _DIVERGED_FOR_M) for first, last in ends)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Reckoned:
+    """The way of a flight by its odometer, its accepted fixes, and the truth.
+
+    Places are complex numbers, east + i north. A heading is clockwise, and so turns by exp(-i yaw).
+    """
+
+    distance_m: Floats
+    true: Complexes
+    fixes: Complexes
+    fix_yaw: Floats  # radians
+    accepted: Bools
+    way: Complexes
+    turn: Floats  # radians
+
+    @classmethod
+    def of(cls, views: pd.DataFrame, increments: Sequence[tuple[float, float, float] | None]) -> "_Reckoned":
+        """Add up the increments; a lost one counts as no movement."""
+        steps = np.array([(0.0, 0.0, 0.0) if one is None else one for one in increments], dtype=float)
+        turn = np.cumsum(np.radians(steps[:, 2]))
+        heading = np.concatenate([[0.0], turn[:-1]])
+        column = {name: views[name].to_numpy(float) for name in ("true_east_m", "true_north_m", "east_m", "north_m")}
+        return cls(
+            distance_m=views["distance_m"].to_numpy(float),
+            true=column["true_east_m"] + 1j * column["true_north_m"],
+            fixes=column["east_m"] + 1j * column["north_m"],
+            fix_yaw=np.radians(views["yaw_deg"].to_numpy(float)),
+            accepted=views["is_accepted"].to_numpy(bool),
+            way=np.cumsum((steps[:, 0] + 1j * steps[:, 1]) * np.exp(-1j * heading)),
+            turn=turn,
+        )
+
+    def error_m(self, every_m: float) -> Floats:
+        """Return the error of every view if a fix is used once in some metres at most, and the odometer then."""
+        last = np.full(len(self.way), -1)
+        used_m = -math.inf
+        for at in np.flatnonzero(self.accepted).tolist():
+            if self.distance_m[at] - used_m >= every_m:
+                last[at:], used_m = at, self.distance_m[at]
+        known = last >= 0
+        base = np.maximum(last, 0)
+        turned = np.exp(-1j * (self.fix_yaw[base] - self.turn[base]))
+        reached = self.fixes[base] + (self.way - self.way[base]) * turned
+        return np.where(known, np.abs(reached - self.true), np.inf)

@@ -1,0 +1,236 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scores of flights, against flights whose figures are worked by hand."""
+
+import math
+from dataclasses import replace
+from itertools import accumulate
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import MetricError
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS, score_flights
+from sasgeo_bench.scoring.metrics import means_of, primary_of, quantiles_of
+from sasgeo_bench.scoring.score import COLUMNS, MISSING
+from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.tasks.query import Head, Truth, view_id
+
+STEP_M = 100.0
+SURE = (25.0, 0.0, 0.0, 0.0, 25.0, 0.0, 0.0, 0.0, 4.0)  # 5 m, 5 m and 2 deg
+
+
+def a_flight(count=11, flight="f0", *, steps_m=None, kind="no drift", unseen=(), absent=(), carried_m=None):
+    """Return heads and truths of a flight due east, a view each 100 m; `carried_m` shifts its second half north."""
+    ways = [0.0, *(steps_m or [STEP_M] * (count - 1))]
+    heads, truths = [], []
+    for frame, distance_m in enumerate(accumulate(ways)):
+        north_m = carried_m if carried_m and frame >= count // 2 else 0.0
+        heads.append(
+            Head(
+                query_id=view_id(flight, frame),
+                track="sequence",
+                suite="flight-clean",
+                suite_version=1,
+                part="test",
+                region="town",
+                prior_group="r500-weak-s3",
+                view_cells=192,
+                cell_size_m=1.0,
+                sequence_id=flight,
+                frame=frame,
+                increment=(0.0, ways[frame], 0.0) if frame else None,
+            )
+        )
+        truths.append(
+            Truth(
+                query_id=heads[-1].query_id,
+                is_present=frame not in absent,
+                pose=Pose(easting_m=distance_m, northing_m=north_m, yaw_deg=90.0),
+                candidate=-1,
+                pair_id=f"site of {flight}",
+                role="control",
+                kind=kind,
+                strength=0.0,
+                strength_unit="m",
+                unknown_share=1.0 if frame in unseen else 0.0,
+                changed_share=0.0,
+                feature_density=0.5,
+                alias_index=None,
+                block=f"town/{flight}",
+                scene="town",
+                measured={"distance_m": distance_m, "time_s": distance_m / 10, "is_seen": float(frame not in unseen)},
+            )
+        )
+    return heads, truths
+
+
+def answers(truths, *, off_m=None, accepted=None, covariance=SURE, **changes):
+    """Return predictions that lie `off_m[frame]` north of the truth; None is a view without an estimate."""
+    found = {}
+    for at, truth in enumerate(truths):
+        error_m = 0.0 if off_m is None else off_m[at]
+        pose = None if error_m is None else replace(truth.pose, northing_m=truth.pose.northing_m + error_m)
+        found[truth.query_id] = Prediction(
+            query_id=truth.query_id,
+            candidates=() if pose is None else ((pose, 1.0),),
+            is_accepted=pose is not None and (accepted is None or bool(accepted[at])),
+            covariance=None if pose is None else covariance,
+            latency_s=0.5,
+            **changes,
+        )
+    return found
+
+
+def score_of(heads, truths, predictions):
+    """Return the row of the only flight."""
+    (row,) = score_flights(heads, truths, predictions).flights.to_dict("records")
+    return row
+
+
+def test_a_flight_that_is_followed_exactly_has_the_best_of_every_figure():
+    heads, truths = a_flight()
+    row = score_of(heads, truths, answers(truths))
+    assert (row["query_id"], row["track"], row["status"], row["is_answered"], row["is_right"]) == (
+        *("f0", "sequence", "ok"),
+        *(True, True),
+    )
+    assert (row["views"], row["length_m"], row["latency_s"]) == (11, 1000.0, 0.5)
+    shares = [name for name in FLIGHT_COLUMNS if name.startswith(("distance_within", "fix_every"))]
+    assert [row[name] for name in shares] == [1.0] * 7
+    assert (row["accepted"], row["false_accepted"], row["inside_two_sigma"], row["divergences"]) == (1.0, 0.0, 1.0, 0)
+    assert [row[name] for name in ("first_fix_m", "first_fix_s", "ate_m", "nees", "false_per_km")] == [0.0] * 5
+    assert (row["accepted_per_km"], row["longest_without_fix_m"]) == (11.0, 100.0)
+    assert math.isnan(row["reacquired_m"])
+
+
+def test_a_view_stands_for_half_the_way_to_either_neighbour():
+    heads, truths = a_flight(4, steps_m=[100.0, 300.0, 600.0])
+    row = score_of(heads, truths, answers(truths, off_m=[0.0, 25.0, 25.1, 50.0]))
+    assert row["distance_within_10m"] == pytest.approx(0.05)
+    assert row["distance_within_25m"] == pytest.approx(0.25)  # 50 m of the first view and 200 m of the second
+    assert row["distance_within_50m"] == pytest.approx(1.0)
+    assert (row["error_p50_m"], row["error_p95_m"]) == (25.0, 50.0)
+    assert row["ate_m"] == pytest.approx(math.sqrt((25**2 + 25.1**2 + 50**2) / 4))
+
+
+def test_what_is_not_answered_stays_in_every_denominator():
+    heads, truths = a_flight(5)
+    mine = answers(truths, off_m=[0.0, None, None, None, 0.0])
+    row = score_of(heads, truths, mine)
+    assert row["distance_within_25m"] == pytest.approx(0.25)
+    assert (row["accepted"], row["error_p50_m"], row["ate_m"]) == (0.4, math.inf, math.inf)
+    assert row["longest_without_fix_m"] == 400.0
+    lost = score_of(heads, truths, {})
+    assert (lost["status"], lost["is_answered"], lost["distance_within_25m"]) == (MISSING, False, 0.0)
+    assert (lost["first_fix_m"], lost["nees"], lost["inside_two_sigma"]) == (math.inf, math.inf, 0.0)
+    assert lost["longest_without_fix_m"] == 400.0
+
+
+def test_only_accepted_fixes_can_be_false_or_first():
+    heads, truths = a_flight(11)
+    off_m = [0.0, 30.0, 30.0, 30.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    row = score_of(heads, truths, answers(truths, off_m=off_m, accepted=[0, 1, 1, 0, 0, 1, 0, 0, 0, 0, 1]))
+    assert (row["first_fix_m"], row["first_fix_s"]) == (500.0, 50.0)
+    assert row["false_accepted"] == pytest.approx(2 / 11)
+    assert (row["false_per_km"], row["accepted_per_km"]) == (2.0, 4.0)
+    assert row["longest_without_fix_m"] == 500.0
+
+
+def test_a_divergence_is_a_long_stretch_of_accepted_fixes_that_are_far_off():
+    heads, truths = a_flight(20)
+    far = [0.0] * 5 + [150.0] * 8 + [0.0] * 7
+    assert score_of(heads, truths, answers(truths, off_m=far))["divergences"] == 1
+    # Withheld views between do not end one, and a stretch of 500 m is not more than 500 m.
+    accepted = [at % 2 for at in range(20)]
+    assert score_of(heads, truths, answers(truths, off_m=far, accepted=accepted))["divergences"] == 1
+    short = [0.0] * 5 + [150.0] * 6 + [0.0] * 9
+    assert score_of(heads, truths, answers(truths, off_m=short))["divergences"] == 0
+    assert score_of(heads, truths, answers(truths, off_m=far, accepted=[0] * 20))["divergences"] == 0
+
+
+@pytest.mark.parametrize("how", ["unseen", "absent"])
+def test_reacquisition_begins_where_a_gap_ends(how):
+    heads, truths = a_flight(11, **{how: range(3, 6)})
+    right = [1, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1]
+    row = score_of(heads, truths, answers(truths, accepted=right))
+    assert row["reacquired_m"] == 200.0  # from the last view of the gap to the second after it
+    never = score_of(heads, truths, answers(truths, accepted=[1] * 6 + [0] * 5))
+    assert never["reacquired_m"] == math.inf
+
+
+def test_single_views_that_show_nothing_are_no_gap():
+    heads, truths = a_flight(11, unseen=(3, 5, 7))
+    assert math.isnan(score_of(heads, truths, answers(truths))["reacquired_m"])
+
+
+def test_a_gap_that_never_ends_has_nothing_after_it():
+    heads, truths = a_flight(11, unseen=range(6, 11))
+    assert math.isnan(score_of(heads, truths, answers(truths))["reacquired_m"])
+
+
+def test_being_carried_is_found_and_its_way_does_not_count():
+    heads, truths = a_flight(11, carried_m=2000.0)
+    late = [1] * 5 + [0, 0, 0, 1, 1, 1]
+    row = score_of(heads, truths, answers(truths, accepted=late))
+    assert row["length_m"] == 1000.0
+    assert row["reacquired_m"] == 400.0
+
+
+def test_covariances_are_held_against_errors():
+    heads, truths = a_flight(4)
+    row = score_of(heads, truths, answers(truths, off_m=[5.0, 10.0, 12.0, 20.0]))
+    assert row["nees"] == pytest.approx(np.mean([1.0, 4.0, 5.76, 16.0]) / 3)
+    assert row["inside_two_sigma"] == 0.75  # 2.486 of their standard deviations hold 95.4 % of a plane
+    odd = score_of(heads, truths, answers(truths, covariance=(-1.0, *SURE[1:])))
+    assert (odd["nees"], odd["inside_two_sigma"]) == (math.inf, 0.0)
+
+
+def test_the_odometer_says_the_rest_between_fixes():
+    """An odometer that turns 10 degrees too far at once strays by 17 m in each 100 m."""
+    heads, truths = a_flight(11)
+    heads[1] = replace(heads[1], increment=(0.0, STEP_M, 10.0))
+    row = score_of(heads, truths, answers(truths))
+    assert row["fix_every_250m"] == 1.0
+    assert row["fix_every_2000m"] == pytest.approx(0.25)  # views 0, 1 and 2 are within 25 m
+    first = score_of(heads, truths, answers(truths, accepted=[0] * 10 + [1]))
+    assert first["fix_every_250m"] == pytest.approx(0.05)  # nothing is known before the first fix
+
+
+def test_two_flights_are_two_rows_in_the_order_of_their_ids():
+    parts = [a_flight(5, name) for name in ("f1", "f0")]
+    heads, truths = ([item for part in parts for item in part[at]] for at in (0, 1))
+    found = score_flights(heads, truths, answers(truths), place_of={"town/f0": "here"}, country_of={"here": "LI"})
+    assert list(found.flights.columns) == [*COLUMNS, *FLIGHT_COLUMNS]
+    assert found.flights["query_id"].tolist() == ["f0", "f1"]
+    assert found.flights[["place", "country"]].to_numpy().tolist() == [["here", "LI"], ["town", "town"]]
+    assert found.views["sequence_id"].tolist() == ["f0"] * 5 + ["f1"] * 5
+    assert found.views["place"].tolist() == ["here"] * 5 + ["town"] * 5
+
+
+def test_answers_of_other_queries_and_lost_truths_are_refused():
+    heads, truths = a_flight(3)
+    with pytest.raises(MetricError, match="belongs to no query"):
+        score_flights(heads[:2], truths, answers(truths))
+    with pytest.raises(MetricError, match="has no truth"):
+        score_flights(heads, truths[:2], {})
+    with pytest.raises(MetricError, match="has no true pose"):
+        score_flights(heads, [replace(truths[0], pose=None), *truths[1:]], {})
+
+
+def test_a_board_of_flights_has_every_figure_of_their_track():
+    parts = [a_flight(5, f"f{at}", unseen=(1, 2)) for at in range(4)]
+    heads, truths = ([item for part in parts for item in part[at]] for at in (0, 1))
+    good = score_flights(heads, truths, answers(truths)).flights
+    bad = score_flights(heads, truths, {}).flights
+    table = leaderboard({"good": good, "bad": bad}, draws=100)
+    whole = table[table["stratum"] == "all"].set_index(["matcher", "metric"])
+    expected = {item.name for item in (*means_of("sequence"), *quantiles_of("sequence"))}
+    assert set(table["metric"]) == expected
+    first = primary_of("sequence").name
+    assert (whole.loc[("good", first), "value"], whole.loc[("bad", first), "value"]) == (1.0, 0.0)
+    assert whole.loc[("good", first), "n"] == 4
+    assert whole.loc[("good", "reacquired_500m"), "value"] == 1.0
+    assert whole.loc[("bad", "first_fix"), "value"] == math.inf
+    assert math.isnan(whole.loc[("good", "accepted_per_km"), "lo"])  # four flights that are alike

@@ -50,9 +50,10 @@ LOOPBACK = ("127.", "localhost", "::1")
 
 
 def pytest_collection_finish() -> None:
-    """Leave out of garbage collection what is there for good: thousands of tests, and the modules they import."""
+    """Collect garbage seldom, and never what is there for good: thousands of tests, and the modules they import."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(10_000, 10, 50)  # tables and figures make many objects that die without it
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest selects by markers
@@ -222,6 +223,15 @@ def without_drawings() -> Iterator[None]:
         for maker in (pipeline, archive):
             for name in ("figures_extra", "pictures_extra"):
                 patch.setattr(maker, name, lambda *_, **__: Extra())
+        yield
+
+
+@pytest.fixture(scope="module")
+def without_pictures() -> Iterator[None]:
+    """Boards of pipelines and of the program have no pictures: for tests that are about rows and figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        for maker in (pipeline, archive):
+            patch.setattr(maker, "pictures_extra", lambda *_, **__: Extra())
         yield
 
 

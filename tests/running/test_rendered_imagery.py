@@ -57,26 +57,26 @@ def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(dra
     folder = plain.parents[2] / "regions" / TOWN
     ask(plain, "oracle_pose")
     bare = about(plain, "oracle_pose")["map_bytes"]
-    (count,) = ask(seen, "hog_colour").values()
-    assert set(about(seen, "hog_colour")) == set(about(plain, "oracle_pose"))
+    (count,) = ask(seen, "orb_vlad").values()
+    assert set(about(seen, "orb_vlad")) == set(about(plain, "oracle_pose"))
 
     render_imagery(folder, folder, LOOK, tell=quiet)
     assert not ask(plain, "oracle_pose")
     assert ask(plain.parents[1] / "clean" / TOWN, "prior_centre")
     assert about(plain, "prior_centre")["map_bytes"] < bare + 5_000  # region.json says a little more
-    assert ask(seen, "hog_colour") == {"ok": count}
-    assert not ask(seen, "hog_colour")
-    first = about(seen, "hog_colour")
+    assert ask(seen, "orb_vlad") == {"ok": count}
+    assert not ask(seen, "orb_vlad")
+    first = about(seen, "orb_vlad")
     assert first["map_bytes"] > bare + 50_000
-    assert first["rendered_imagery"] == plan_of(seen, "hog_colour").parts[0].imagery
-    assert not list(validate(plan_of(seen, "hog_colour").parts[0].folder, [seen]))
+    assert first["rendered_imagery"] == plan_of(seen, "orb_vlad").parts[0].imagery
+    assert not list(validate(plan_of(seen, "orb_vlad").parts[0].folder, [seen]))
 
     render_imagery(folder, folder, replace(LOOK, seed=1), tell=quiet)
-    assert plan_of(seen, "hog_colour").parts[0].aside == 2 * count
-    assert ask(seen, "hog_colour") == {"ok": count}
+    assert plan_of(seen, "orb_vlad").parts[0].aside == 2 * count
+    assert ask(seen, "orb_vlad") == {"ok": count}
     assert not ask(plain, "oracle_pose")
     render_imagery(folder, folder, LOOK, tell=quiet)
-    assert not ask(seen, "hog_colour")  # the same imagery again: its answers count again
+    assert not ask(seen, "orb_vlad")  # the same imagery again: its answers count again
 
 
 def test_a_damaged_hash_of_imagery_is_refused():

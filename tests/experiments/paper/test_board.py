@@ -16,7 +16,7 @@ from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from tests.threaded import threaded
 
-pytestmark = pytest.mark.usefixtures("in_threads", "few_figures")
+pytestmark = pytest.mark.usefixtures("in_threads", "few_figures", "without_pictures")
 
 TEXT = """
 id = "few"

@@ -190,11 +190,11 @@ class Region:
 
     `layers` is uint8 of shape (C, rows, cols), PRESENT, ABSENT or OUTSIDE, bands in the order of `classes`, read-only;
     `coverage` is the mapped area in the region's CRS. `features` and `graph` of a stored region are read when they are
-    first asked for. `imagery` reads windows of the aerial imagery; None if there is none.
+    first asked for, and so may `layers` be. `imagery` reads windows of the aerial imagery; None if there is none.
     """
 
     manifest: Manifest
-    layers: NDArray[np.uint8]
+    layers: Late[NDArray[np.uint8]] = Late()
     features: Late["gpd.GeoDataFrame"] = Late()
     graph: Late[MapGraph] = Late()
     coverage: shapely.Geometry

@@ -23,7 +23,9 @@ from sasgeo_bench.texts import json_text
 
 if TYPE_CHECKING:
     import geopandas as gpd
+    import numpy as np
     import pandas as pd
+    from numpy.typing import NDArray
     from pyproj import CRS
 
 Table = TypeVar("Table", bound="pd.DataFrame")
@@ -93,11 +95,17 @@ def read_manifest(folder: Path) -> Manifest:
     return manifest
 
 
-def read_region(path: str | Path, *, around: Callable[[], AbstractContextManager[object]] = nullcontext) -> Region:
+def read_region(
+    path: str | Path,
+    *,
+    around: Callable[[], AbstractContextManager[object]] = nullcontext,
+    with_layers: bool = True,
+) -> Region:
     """Read a region: its layers now, its features and graph when they are first used.
 
     All files are checked against their hashes now. `around` gives a context that is entered while features or graph
-    are read. Raise `StoreError` if a file is missing, changed or unreadable.
+    are read. Without `with_layers`, these are read when they are first used, too: a country's take a gigabyte. Raise
+    `StoreError` if a file is missing, changed or unreadable.
     """
     from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
 
@@ -105,6 +113,11 @@ def read_region(path: str | Path, *, around: Callable[[], AbstractContextManager
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])
+
+    def layers() -> "NDArray[np.uint8]":
+        """Read the layers when they are first used."""
+        with around():
+            return read_layers(folder / LAYERS)
 
     def features() -> "gpd.GeoDataFrame":
         """Read the features when they are first used."""
@@ -118,7 +131,7 @@ def read_region(path: str | Path, *, around: Callable[[], AbstractContextManager
 
     return Region(
         manifest=manifest,
-        layers=read_layers(folder / LAYERS),
+        layers=read_layers(folder / LAYERS) if with_layers else layers,
         features=features,
         graph=graph,
         coverage=shapely.from_wkt(manifest.coverage.wkt),

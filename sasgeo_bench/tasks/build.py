@@ -20,6 +20,7 @@ from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.progress import Tell, spread
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.layers import read_bits
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
@@ -198,12 +199,13 @@ def _view_reach_m(request: Request, suite: Suite) -> float:
 
 def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Region]:
     """Build missing regions and read what the suite draws from."""
-    base = _built(request, request.region, None, tell)
+    folder = _built(request, request.region, None, tell)
+    base = region_files.read_region(folder, with_layers=False)
     blocks = request.split.blocks_in(request.region.id)
     if not blocks:
         message = f"split {request.split.spec.id!r} does not speak of region {request.region.id!r}"
         raise ConfigError(message)
-    state = State.of(base)
+    state = State.of(base, bits=read_bits(folder / region_files.LAYERS))
     needs = suite.card.needs
     others: tuple[State, ...] = ()
     elsewhere: State | None = None
@@ -211,13 +213,11 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
     if "degraded map" in needs and imagery is not None:
         others = (degraded_map(request, suite, base),)
     if "older maps" in needs:
-        others = tuple(
-            State.of(_built(request, request.region, date, tell), name=f"{request.region.id}@{date.isoformat()}")
-            for date in aged_dates(request.region)
-        )
+        folders = [_built(request, request.region, date, tell) for date in aged_dates(request.region)]
+        others = tuple(map(State.read, folders))
     if "another region" in needs and request.elsewhere is not None:
         # A view that shows more than the region's map knows of would give away that it is of another place.
-        elsewhere = State.of(_built(request, request.elsewhere, None, tell)).of_classes(base.classes)
+        elsewhere = State.read(_built(request, request.elsewhere, None, tell)).of_classes(base.classes)
     scene = Scene(
         map=state,
         world=state,
@@ -249,12 +249,12 @@ def _ageing(spec: RegionFile) -> Ageing:
     return ageing_of(pool_rates(book, exclude=[place] if place else []), place=place or spec.id)
 
 
-def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell) -> Region:
-    """Read a region; build it first if it is missing or its inputs have changed."""
+def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell) -> Path:
+    """Return the folder of a region, which is built if it is missing or its inputs have changed."""
     plan = plan_build(spec, out=request.out, date=date, extract_folders=request.extract_folders)
     if not plan.is_current:
         build_region(plan, tell=tell)
-    return region_files.read_region(plan.folder)
+    return plan.folder
 
 
 def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:

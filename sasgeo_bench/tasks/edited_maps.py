@@ -8,7 +8,6 @@ from dataclasses import replace
 import geopandas as gpd
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_edited, plan_build
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.graph import build_graph
@@ -31,7 +30,7 @@ def degraded_map(request: Request, suite: Suite, base: Region) -> State:
     features = degrade(base.features, base.grid, rng)
     note = f"degraded: {DROPPED:.0%} of the buildings dropped, the rest {WARP_M:g} m off, for suite {suite.card.name}"
     folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
-    return State.of(region_files.read_region(folder), name=folder.name)
+    return State.read(folder)
 
 
 def edit_maps(
@@ -69,7 +68,7 @@ def edit_maps(
     features = paste(base.features, edit.map_pastes)
     note = f"edited: {len(edit.map_pastes)} parts pasted for suite {suite.card.name}"
     folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
-    edited = State.of(region_files.read_region(folder))
+    edited = State.read(folder)
     world = edited if edit.world_pastes is None else world
     return replace(drawer, scene=replace(scene, map=edited, world=world, twins=edit.twins)), edit.sites
 
@@ -90,7 +89,7 @@ def changed_maps(request: Request, base: Region, flights: Mapping[int, Flight]) 
             note=f"edited: {len(changes)} parts changed for suite {request.suite}",
             coverage=None if coverage is base.coverage else coverage,
         )
-        found.append(State.of(region_files.read_region(folder), name=folder.name))
+        found.append(State.read(folder))
     return tuple(found)
 
 

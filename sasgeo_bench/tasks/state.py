@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -14,8 +15,10 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
-from sasgeo_bench.regions.region import MapGraph, Region
+from sasgeo_bench.regions.layers import read_bits
+from sasgeo_bench.regions.region import Late, MapGraph, Region
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -25,30 +28,42 @@ DRAWN_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "bu
 
 @dataclass(frozen=True, kw_only=True)
 class State:
-    """One dated state of a place: its layers in bits, its features and its graph, on one lattice."""
+    """One dated state of a place: its layers in bits, its features and its graph, on one lattice.
+
+    Features and graph of a stored region are read when they are first asked for.
+    """
 
     region: str
     date: dt.date
     grid: Grid
     classes: tuple[str, ...]
     bits: LayerBits
-    features: "gpd.GeoDataFrame"
-    graph: MapGraph
+    features: Late["gpd.GeoDataFrame"] = Late()  # noqa: RUF009 - no default: a field that may be a function
+    graph: Late[MapGraph] = Late()  # noqa: RUF009
     coverage: shapely.Geometry
 
     @classmethod
-    def of(cls, region: Region, name: str | None = None) -> "State":
-        """Return the state of a region; `name` is its folder if that differs from its id."""
+    def of(cls, region: Region, name: str | None = None, *, bits: LayerBits | None = None) -> "State":
+        """Return the state of a region; `name` is its folder if that differs from its id.
+
+        `bits` are those of its layers, where they have been read: the layers then need not be.
+        """
         return cls(
             region=name or region.manifest.id,
             date=region.manifest.extract.date,
             grid=region.grid,
             classes=region.classes,
-            bits=LayerBits.of(region.layers),
-            features=region.features,
-            graph=region.graph,
+            bits=LayerBits.of(region.layers) if bits is None else bits,
+            features=lambda: region.features,
+            graph=lambda: region.graph,
             coverage=region.coverage,
         )
+
+    @classmethod
+    def read(cls, folder: Path) -> "State":
+        """Return the state of a stored region, named by its folder."""
+        region = region_files.read_region(folder, with_layers=False)
+        return cls.of(region, name=folder.name, bits=read_bits(folder / region_files.LAYERS))
 
     def view(self, pose: Pose, *, size_cells: int, cell_size_m: float) -> Evidence:
         """Return what a perfect detector would see from a pose."""

@@ -21,7 +21,8 @@ from sasgeo_bench.osm.features import DTYPES, fingerprint, make_features
 from sasgeo_bench.osm.read import Reading
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.build import build_made, build_region, plan_build
-from sasgeo_bench.regions.layers import OUTSIDE
+from sasgeo_bench.regions.evidence import LayerBits
+from sasgeo_bench.regions.layers import OUTSIDE, read_bits
 from sasgeo_bench.regions.region_files import differing_files, read_manifest, read_region
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
@@ -63,6 +64,30 @@ def test_what_lies_beyond_the_town_is_unknown_not_absent(tmp_path):
     assert 0.18 < outside.mean() < 0.24  # the town is 2048 m wide, the region 2304 m
     assert abs(1 - outside.mean() - manifest.coverage.share) < 0.002
     assert ((region.layers == OUTSIDE).any(axis=0) == outside).all()
+
+
+def test_layers_that_are_read_as_bits_hold_the_same_cells_and_a_damaged_file_is_named(tmp_path):
+    """The side is no multiple of the stripes that are read."""
+    plan, _ = built(tmp_path, small(size_m=(60.0, 1100.0)))
+    region, path = read_region(plan.folder), plan.folder / "layers.tif"
+    bits = read_bits(path)
+    np.testing.assert_array_equal(bits.bits, LayerBits.of(region.layers).bits)
+    assert (bits.count, bits.bits.shape) == (len(region.classes), region.grid.shape)
+    assert not bits.bits.flags.writeable
+    path.write_bytes(path.read_bytes()[:2000])
+    with pytest.raises(StoreError, match=r"layers\.tif cannot be read"):
+        read_bits(path)
+
+
+def test_layers_may_be_read_when_they_are_first_used_or_never(tmp_path):
+    plan, _ = built(tmp_path, small())
+    whole, late, never = (read_region(plan.folder, with_layers=now) for now in (True, False, False))
+    np.testing.assert_array_equal(late.layers, whole.layers)
+    (plan.folder / "layers.tif").unlink()
+    np.testing.assert_array_equal(late.layer("building"), whole.layer("building"))
+    assert len(never.features) == len(whole.features)
+    with pytest.raises(StoreError, match="build the region again"):
+        never.layers.sum()
 
 
 def test_every_file_carries_the_attribution(tmp_path):

@@ -3,8 +3,9 @@
 
     python benchmarks/fit_particle_filters.py --out out/particle-filters [--write]
 
-draws six towns from seeds that no region of ours has, flies over them (suite `flight-clean`), and fits the embedding of
-`zhou_smc`. `--write` replaces the file of the baselines; its hash belongs into the tracker.
+draws six towns from a seed that no region of ours has, flies over them (suite `flight-clean`), and fits the embedding
+of `zhou_smc`. `--write` replaces the file of the baselines; its hash belongs into the tracker. `--floors` flies
+`ouyang_cfbvm_pf` with several floors of its likelihood instead.
 """
 
 import argparse
@@ -16,12 +17,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from sasgeo_baselines.trackers import polar, zhou_smc
+from sasgeo_baselines.trackers.ouyang_cfbvm_pf import OuyangCfbvmPf
+from sasgeo_baselines.trackers.particles import NEAR_M
 
 import sasgeo_bench as sgb
 
 MORPHOLOGIES = ("agricultural", "grid", "industrial", "old_town", "riverside", "suburb")
 SEED, SIZE_M, FLIGHTS = 4711, 2048.0, 4
 KINDS = ("no drift", "no drift again")  # the other variants of a flight show the same views
+DRIFTING = "F1 vo-mono-survey"
+FLOORS = (1.0, 0.3, 0.1, 0.03, 0.01)
 PRINCIPAL = 96  # components kept before the canonical correlation
 RIDGE = 0.05  # of the mean variance of these components
 
@@ -89,12 +94,12 @@ def draw_towns(out: Path) -> list[Town]:
     return [Town(region=sgb.read_region(out / "regions" / name), views=tuple(read_views(out, name))) for name in names]
 
 
-def read_views(out: Path, name: str) -> Iterator[View]:
+def read_views(out: Path, name: str, *, kinds: tuple[str, ...] = KINDS) -> Iterator[View]:
     """Yield the views of a town with their poses, in the order of flights."""
     truths = {truth.query_id: truth for truth in sgb.read_truths(out / "truth" / "flight-clean" / name)}
     for query in sgb.read_queries(out / "tasks" / "flight-clean" / name):
         truth = truths[query.query_id]
-        if truth.kind in KINDS and truth.pose is not None:
+        if truth.kind in kinds and truth.pose is not None:
             yield View(query=query, pose=truth.pose)
 
 
@@ -159,13 +164,37 @@ def write_embedding(embedding: zhou_smc.Embedding, path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def try_floors(out: Path, towns: list[Town]) -> None:
+    """Fly the tracker of Ouyang over the towns with several floors; print what lies within 25 m, and what is wrong."""
+    for floor in FLOORS:
+        tracker, far_m, accepted = OuyangCfbvmPf(floor=floor), [], []
+        for town in towns:
+            tracker.prepare(town.region, None)
+            for view in read_views(out, town.region.manifest.id, kinds=(DRIFTING,)):
+                if view.query.step is not None and view.query.step.frame == 0:
+                    tracker.start(view.query.prior)
+                fix = tracker.step(view.query)
+                pose = view.pose if fix.pose is None else fix.pose
+                far_m.append(np.hypot(pose.easting_m - view.pose.easting_m, pose.northing_m - view.pose.northing_m))
+                accepted.append(fix.is_accepted)
+        is_far, is_accepted = np.array(far_m) > NEAR_M, np.array(accepted)
+        print(
+            f"floor {floor:g}: {len(is_far)} views, within {NEAR_M:g} m {1 - is_far.mean():.2f}, accepted "
+            f"{is_accepted.mean():.2f}, of these wrong {is_far[is_accepted].mean():.2f}"
+        )
+
+
 def main() -> None:
     """Fit, and say what was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/particle-filters"), help="folder of the towns")
     parser.add_argument("--write", action="store_true", help="replace the file of the baselines")
+    parser.add_argument("--floors", action="store_true", help="try floors of ouyang_cfbvm_pf, and fit nothing")
     options = parser.parse_args()
     towns = draw_towns(options.out)
+    if options.floors:
+        try_floors(options.out, towns)
+        return
     path = zhou_smc.EMBEDDING if options.write else options.out / zhou_smc.EMBEDDING.name
     print(f"{path}: SHA-256 {write_embedding(fit_embedding(towns), path)}")
 

@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from sasgeo_baselines.trackers import polar
+from sasgeo_baselines.trackers.ouyang_cfbvm_pf import OuyangCfbvmPf
 from sasgeo_baselines.trackers.particles import Particles
 from sasgeo_baselines.trackers.swapf import DistanceMaps, SwaPf
 from sasgeo_baselines.trackers.zhou_smc import EMBEDDING, Embedding, Table, ZhouSmc
@@ -17,7 +18,7 @@ from sasgeo_bench.matching.tracker import check_fix
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.query import Step
 
-FILTERS = {"swapf": SwaPf, "zhou_smc": ZhouSmc}
+FILTERS = {"swapf": SwaPf, "zhou_smc": ZhouSmc, "ouyang_cfbvm_pf": OuyangCfbvmPf}
 SLOW = {"zhou_smc"}  # sure of its place after more views than are flown here
 COUNT = 4000  # particles: enough on this map
 VIEW, STEP_M, VIEWS = 128, 30.0, 12

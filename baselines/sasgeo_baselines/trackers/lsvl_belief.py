@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`lsvl_belief`: a belief on a grid, weighed by a fitted ratio of densities of the distance between descriptors."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+import sasgeo_bench as sgb
+from sasgeo_baselines.trackers.belief import Belief, Floats
+from sasgeo_baselines.trackers.grid_filter import LEAST, GridFilter, pooled_logs
+from sasgeo_baselines.trackers.lsvl_descriptors import CELL_M, SIDE, Described, Parts, Shares
+
+VIEW_M: Final = 192.0  # views that are expected; the map is described for others when the first one comes
+NEAR_M, NEAR_DEG = CELL_M / 2, 5.0  # of a match: half a cell, and half a step of heading
+WRONG: Final = 20  # other poses for each view
+BINS: Final = 24
+MOST: Final = 0.48  # distance of the last bin
+LEAST_PAIRS: Final = 50  # views below which a ratio is not fitted
+# Of `python benchmarks/fit_grid_trackers.py`, which fits them to made-up towns that are in no split.
+TEMPER: Final = 1.0
+DOUBT: Final = 1e-2
+TAUGHT: Final = """{
+"distance": [0.01, 0.03, 0.05, 0.07, 0.09, 0.11, 0.13, 0.15, 0.17, 0.19, 0.21, 0.23, 0.25, 0.27, 0.29, 0.31, 0.33, 0.35,
+0.37, 0.39, 0.41, 0.43, 0.45, 0.47],
+"log": [3.099, 3.099, 3.099, 2.741, 1.348, 0.011, -1.234, -1.246, -1.246, -1.246, -2.419, -2.419, -2.419, -2.419,
+-2.419, -2.419, -2.419, -2.419, -2.419, -2.419, -2.419, -2.419, -2.419, -2.419]
+}"""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ratio:
+    """Logarithm of p(distance | match) / p(distance | other place), linear between distances.
+
+    Both have shape (N,); distances ascend, and the ratio falls with them.
+    """
+
+    distance: NDArray[np.float64]
+    log: NDArray[np.float64]
+
+    @classmethod
+    def fitted(cls, right: NDArray[np.float64], wrong: NDArray[np.float64]) -> Self:
+        """Fit the ratio of two histograms, each with one count more in every bin, made to fall with the distance.
+
+        >>> rng = np.random.default_rng(0)
+        >>> ratio = Ratio.fitted(rng.normal(0.1, 0.03, 500), rng.normal(0.2, 0.03, 5000))
+        >>> ratio.at(np.array([0.1, 0.15, 0.2, np.nan])).round().tolist()
+        [5.0, 0.0, -4.0, 0.0]
+        """
+        edges = np.linspace(0.0, MOST, BINS + 1)
+        counts = [np.histogram(np.clip(some, 0, MOST), edges)[0] + 1.0 for some in (right, wrong)]
+        logs = np.log(counts[0] / counts[0].sum()) - np.log(counts[1] / counts[1].sum())
+        return cls(distance=(edges[:-1] + edges[1:]) / 2, log=_falling(logs, counts[0] + counts[1]))
+
+    def to_text(self) -> str:
+        """Return the ratio as JSON."""
+        return json.dumps({"distance": self.distance.round(4).tolist(), "log": self.log.round(3).tolist()})
+
+    @classmethod
+    def of(cls, text: str) -> Self:
+        """Read what `to_text` wrote."""
+        found = json.loads(text)
+        return cls(distance=np.array(found["distance"]), log=np.array(found["log"]))
+
+    def at(self, distances: Floats) -> Floats:
+        """Return the logarithm at distances; 0 where the distance is unknown (NaN)."""
+        return np.nan_to_num(np.interp(distances, self.distance, self.log), nan=0.0).astype(np.float32)
+
+
+def _falling(logs: NDArray[np.float64], weights: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the nearest sequence that does not rise: neighbours that rise are pooled."""
+    blocks: list[list[float]] = []
+    for log, weight in zip(logs.tolist(), weights.tolist(), strict=True):
+        blocks.append([log, weight, 1])
+        while len(blocks) > 1 and blocks[-2][0] < blocks[-1][0]:
+            value, mass, count = blocks.pop()
+            before = blocks[-1]
+            before[0] = (before[0] * before[1] + value * mass) / (before[1] + mass)
+            before[1] += mass
+            before[2] += count
+    return np.concatenate([np.full(int(count), value) for value, _, count in blocks])
+
+
+class LsvlBelief(GridFilter):
+    """Kinnari's belief on a grid, with descriptors of layers in place of learned ones."""
+
+    card = sgb.MatcherCard(
+        name="lsvl_belief",
+        version="1",
+        title="Belief by descriptors on a grid, with a fitted likelihood",
+        source=(
+            "LSVL (Kinnari, Renzulli, Verdoja and Kyrki, arXiv 2212.03581): descriptors of a grid over the map, a "
+            "likelihood fitted to distances of matches and of others, a belief over place and heading"
+        ),
+        ours=(
+            "The descriptor: square roots of the shares of the classes in 4 x 4 parts of the view, of the map in discs "
+            "as large as a part around cells of 16 m, at 36 headings (theirs is learned of pictures); the distance, "
+            "root mean square over parts and classes known on both sides; the ratio of two histograms of 24 bins, "
+            f"made to fall; a temper of {TEMPER:g} for views that share ground; a share of {DOUBT:g} of views that say "
+            "nothing; diffusion by the covariance of each increment, 1 km and 90 degrees where the odometer lost its "
+            f"way; an estimate is accepted if {LEAST:g} of the belief lies within 25 m"
+        ),
+        licence="Apache-2.0",
+        tracks=("sequence",),
+        trained_on=("four made-up towns that are in no split (benchmarks/fit_grid_trackers.py)",),
+        limits=(
+            "Scale 1 alone; errors of neighbouring increments count as independent; nothing finds a drone again that "
+            "was carried where the belief does not reach; ages of maps are not known to it"
+        ),
+    )
+    temper = TEMPER
+    doubt = DOUBT
+
+    def learn(self, training: sgb.Training) -> str:
+        """Fit the ratio to views of training places; without enough of them, return the one that ships."""
+        right, wrong = distances(training)
+        return Ratio.fitted(right, wrong).to_text() if len(right) >= LEAST_PAIRS else TAUGHT
+
+    def read(self, region: sgb.Region, learned: str | None) -> sgb.Grid:
+        """Describe a map."""
+        self._ratio = Ratio.of(TAUGHT if learned is None else learned)
+        self._shares = Shares.of(region)
+        self._described = self._shares.described(VIEW_M / SIDE)
+        return self._shares.grid
+
+    def logs(self, query: sgb.Query, belief: Belief) -> Floats:
+        """Return the fitted ratio at the distance between the descriptors of the view and of each place."""
+        part_m = max(query.evidence.size_m) / SIDE
+        if not math.isclose(part_m, self._described.part_m):
+            self._described = self._shares.described(part_m)
+        view = Parts.of(query.evidence, self._described.classes)
+        top, left, bottom, right = belief.box
+        cells = self._described.grid.window(top, left, bottom - top, right - left)
+        compared = self._described.compared(view, cells)
+        found = np.empty((len(belief.asked), *belief.shape), dtype=np.float32)
+        for into, yaw_deg in zip(found, belief.yaws_deg[belief.asked].tolist(), strict=True):
+            logs = np.float32(self.temper) * self._ratio.at(compared.distances(yaw_deg))
+            into[:] = pooled_logs(logs[None], belief.factor)[0]
+        return found
+
+
+def distances(training: sgb.Training) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return distances of descriptors at right poses and at others, of all views of known place.
+
+    Right ones are within half a cell and half a step of heading, others anywhere on the same map, farther away than a
+    view is wide.
+    """
+    right, wrong = [], []
+    described: dict[str, Described] = {}  # of one map at a time
+    for query, truth in training.pairs:
+        if truth.pose is None or sgb.is_blind(query):
+            continue
+        part_m = max(query.evidence.size_m) / SIDE
+        found = described.get(query.region)
+        if found is None or not math.isclose(found.part_m, part_m):
+            found = Shares.of(training.regions[query.region]).described(part_m)
+            described = {query.region: found}
+        view = Parts.of(query.evidence, found.classes)
+        rng = np.random.default_rng(list(query.query_id.encode()))
+        right.append(_distance(found, view, near(truth.pose, rng=rng)))
+        apart_m = max(query.evidence.size_m)
+        wrong += [_distance(found, view, pose) for pose in others(found.grid, truth.pose, apart_m=apart_m, rng=rng)]
+    kept = [np.array(some, dtype=np.float64) for some in (right, wrong)]
+    return kept[0][np.isfinite(kept[0])], kept[1][np.isfinite(kept[1])]
+
+
+def near(pose: sgb.Pose, *, rng: np.random.Generator) -> sgb.Pose:
+    """Return a pose within half a cell and half a step of heading of another."""
+    east_m, north_m, turn_deg = rng.uniform(-1, 1, 3) * (NEAR_M, NEAR_M, NEAR_DEG)
+    return sgb.Pose(
+        easting_m=pose.easting_m + east_m, northing_m=pose.northing_m + north_m, yaw_deg=pose.yaw_deg + turn_deg
+    )
+
+
+def others(grid: sgb.Grid, pose: sgb.Pose, *, apart_m: float, rng: np.random.Generator) -> Iterator[sgb.Pose]:
+    """Yield up to `WRONG` poses anywhere on a map, but for those near another."""
+    west_m, south_m, east_m, north_m = grid.bounds_m
+    for _ in range(WRONG):
+        east, north, yaw_deg = rng.uniform((west_m, south_m, 0.0), (east_m, north_m, 360.0)).tolist()
+        if math.dist((east, north), (pose.easting_m, pose.northing_m)) > apart_m:
+            yield sgb.Pose(easting_m=east, northing_m=north, yaw_deg=yaw_deg)
+
+
+def _distance(described: Described, view: Parts, pose: sgb.Pose) -> float:
+    """Return the distance at the cell around a pose."""
+    row, col = described.grid.to_cells(np.array([(pose.easting_m, pose.northing_m)]))[0].tolist()
+    return float(described.compared(view, described.grid.window(row, col, 1, 1)).distances(pose.yaw_deg)[0, 0])

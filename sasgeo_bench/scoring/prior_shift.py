@@ -10,7 +10,6 @@ from typing import Final
 
 import numpy as np
 from scipy import special
-from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]
 
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.decisions import Answers, presence_weights
@@ -42,6 +41,9 @@ def at_share(calibration: Answers, present_share: float, p_right: Floats) -> Flo
     >>> at_share(known, 0.9, np.array([0.5])).round(1).tolist()
     [0.9]
     """
+    # Slow to import, and most processes judge no rejector.
+    from sklearn.linear_model import LogisticRegression  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415
+
     given = calibration.is_answered & ~np.isnan(calibration.confidence)
     right, present = calibration.is_right[given], calibration.is_present[given]
     if right.all() or not right.any() or present.all():

@@ -67,7 +67,10 @@ def read_field(
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
-    known = _share(np.asarray((region.layers <= PRESENT).all(axis=0)), around, grid) > FULL // 2
+    is_known = np.ones(region.grid.shape, dtype=bool)
+    for layer in region.layers:  # one by one: all at once would double the memory of a country
+        is_known &= layer <= PRESENT
+    known = _share(is_known, around, grid) > FULL // 2
     stamped = None if trust is None else strata(region)
     layers = np.zeros((len(region.classes), *grid.shape), dtype=np.uint8)
     for at, (layer, into) in enumerate(zip(region.layers, layers, strict=True)):

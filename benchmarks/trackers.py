@@ -5,9 +5,9 @@
 
 follows the flights of each folder of tasks, whose truths lie beside it (`make-queries`), in this process, and prints a
 row for each tracker, role and kind of view: views, flights, shares of views within 25 m, of accepted views and of these
-beyond 25 m, median normalised squared error of place and heading (2.37 for honest covariances), and time of a step. For
-each tracker and map: time to prepare, and the growth of resident memory beyond the map itself, at most. It is no
-leaderboard: nothing is shut in, and a crash ends it.
+beyond 25 m, median normalised squared error of place and heading (2.37 for honest covariances), and processor time of a
+step. For each tracker and map: processor time to prepare, and the growth of resident memory beyond the map itself, at
+most. It is no leaderboard: nothing is shut in, and a crash ends it.
 """
 
 import argparse
@@ -57,9 +57,9 @@ def follow(tracker: sgb.Tracker, flight: Flight) -> list[Row]:
     tracker.start(flight[0][0].prior)
     rows = []
     for query, truth in flight:
-        start = time.perf_counter()
+        start = time.process_time()
         fix = tracker.step(query)
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         if truth.pose is not None:
             rows.append(judged(fix, truth.pose, seconds))
     return rows
@@ -110,9 +110,9 @@ def main() -> None:
             tracker, before_mb = sgb.load_tracker(name), memory_mb("VmRSS")
             if REFS.exists():
                 REFS.write_text("5")  # forgets the most that was resident until now
-            start = time.perf_counter()
+            start = time.process_time()
             tracker.prepare(region, None)
-            prepare_s, prepared_mb = time.perf_counter() - start, memory_mb("VmHWM") - before_mb
+            prepare_s, prepared_mb = time.process_time() - start, memory_mb("VmHWM") - before_mb
             by_kind: dict[str, list[list[Row]]] = defaultdict(list)
             if REFS.exists():
                 REFS.write_text("5")

@@ -22,7 +22,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Query, Step
 from sasgeo_bench.texts import MOST_DIAGNOSTICS
 
-_VERSION: Final = 1
+_VERSION: Final = 2
 _ANY_DEG: Final = 90.0  # standard deviation of a heading of which nothing is left
 _NO_MORE_M: Final = 1e5  # standard deviation of a place, at most
 _SHARE: Final = 1e-9  # of its trace, which the least eigenvalue of a covariance exceeds
@@ -50,8 +50,11 @@ class FollowPlan:
         The searched disc holds so many standard deviations of the belief, and has at least that radius; at most that of
         the prior of the flight, or the whole map without one.
     patience, widen : int, float
-        After more than `patience` views without an answer that is taken up, the standard deviations of the belief grow
-        by the factor `widen` at each view, until they are those of the start.
+        After more than `patience` answers that do not fit, the belief counts as lost: its standard deviations grow by
+        the factor `widen` at each view, that of the place until it is the start's, that of the heading until it may be
+        any. Views without an answer do not count.
+    lost_radius_m : float
+        While the belief is lost, the disc may have this radius if the start's is less.
     top_k : int
         Poses asked of the matcher; the first counts.
     """
@@ -64,12 +67,13 @@ class FollowPlan:
     least_radius_m: float = 50.0
     patience: int = 8
     widen: float = 1.3
+    lost_radius_m: float = 0.0
     top_k: int = 5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Belief:
-    """Estimate of a pose, its covariance (east, north, yaw; m2, m deg, deg2), and views since it was last corrected."""
+    """Estimate of a pose, its covariance (east, north, yaw; m2, m deg, deg2), and answers since that did not fit."""
 
     pose: Pose
     covariance: Covariance
@@ -195,7 +199,7 @@ class Follower:
         is_sure = found.confidence is None or found.confidence >= self.plan.least_confidence
         if found.poses and is_sure and belief.distance(found.poses[0], covariance) <= self.plan.gate:
             return Belief(pose=found.poses[0], covariance=covariance), True
-        return replace(belief, idle=belief.idle + 1), False
+        return replace(belief, idle=belief.idle + bool(found.poses)), False
 
     def covariance_of(self, found: Match, query: Query) -> Covariance:
         """Return the covariance of the first pose of an answer: the same for all, unless you know better."""
@@ -206,7 +210,8 @@ class Follower:
         """Return a belief as the prior of a single view, with the scale of the view's own."""
         needs, grid = self.matcher.card.needs, self._grid
         whole_m = math.inf if grid is None else math.dist(grid.bounds_m[:2], grid.bounds_m[2:]) / 2
-        radius_m = min(max(self.plan.sigmas * belief.spreads_m[1], self.plan.least_radius_m), self._limit_m)
+        most_m = max(self._limit_m, self.plan.lost_radius_m if self._is_lost(belief) else 0.0)
+        radius_m = min(max(self.plan.sigmas * belief.spreads_m[1], self.plan.least_radius_m), most_m)
         center_m: tuple[float, float] | None = (belief.pose.easting_m, belief.pose.northing_m)
         if radius_m >= whole_m and grid is not None:
             center_m, radius_m = middle_m(replace(given, center_m=None, radius_m=None), grid), whole_m
@@ -220,12 +225,16 @@ class Follower:
             scale_sigma=given.scale_sigma,
         )
 
+    def _is_lost(self, belief: Belief) -> bool:
+        return belief.idle > self.plan.patience
+
     def _widened(self, belief: Belief) -> Belief:
-        """Let a belief grow that nothing has corrected for long, up to the start's."""
-        if belief.idle <= self.plan.patience or self._first is None:
+        """Let a lost belief grow, at most to the start's, or to what may be searched then; its heading to any."""
+        if not self._is_lost(belief) or self._first is None:
             return belief
-        place_m2 = _grown(belief.spreads_m[0], self._first.spreads_m[0], self.plan.widen)
-        yaw_deg2 = _grown(belief.yaw_sigma_deg, self._first.yaw_sigma_deg, self.plan.widen)
+        most_m = max(self._first.spreads_m[0], self.plan.lost_radius_m / 2)
+        place_m2 = _grown(belief.spreads_m[0], most_m, self.plan.widen)
+        yaw_deg2 = _grown(belief.yaw_sigma_deg, reckoning.ANY_YAW_DEG, self.plan.widen)
         return replace(belief, covariance=belief.covariance + np.diag([place_m2, place_m2, yaw_deg2]))
 
 

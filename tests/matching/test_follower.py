@@ -115,9 +115,17 @@ def test_a_belief_that_nothing_corrects_widens_until_the_start_and_finds_the_dro
     assert radii[1] == 50.0
     assert sorted(radii[1 : found + 1]) == radii[1 : found + 1]
     assert radii[-1] == 50.0
-    _, asked = follow([at(1000.0, 1000.0), *[WITHHELD] * 60])
-    assert max(query.prior.radius_m for query in asked) == 500.0
-    assert asked[-1].prior.yaw_sigma_deg < 30.0
+    _, asked = follow([at(1000.0, 1000.0), *[at(0.0, 0.0)] * 30], patience=3)
+    assert asked[-1].prior.radius_m == 500.0
+    assert asked[-1].prior.yaw_deg is None
+    _, asked = follow([at(1000.0, 1000.0), *[at(0.0, 0.0)] * 30], patience=3, lost_radius_m=900.0)
+    assert asked[-1].prior.radius_m == 900.0
+
+
+def test_views_without_an_answer_widen_nothing_beyond_the_odometry():
+    _, asked = follow([at(1000.0, 1000.0), *[WITHHELD] * 20], patience=3)
+    assert asked[-1].prior.radius_m < 300.0
+    assert asked[-1].prior.yaw_sigma_deg < 6.0
 
 
 def test_without_a_place_the_whole_map_is_searched_and_a_matcher_that_needs_one_gets_it():

@@ -4,8 +4,8 @@
     python benchmarks/fit_particle_filters.py --out out/particle-filters [--write]
 
 draws six towns from a seed that no region of ours has, flies over them (suite `flight-clean`), and fits the embedding
-of `zhou_smc`. `--write` replaces the file of the baselines; its hash belongs into the tracker. `--floors` flies
-`ouyang_cfbvm_pf` with several floors of its likelihood instead.
+of `zhou_smc` and the ratio of `kinnari_mcl`. `--write` replaces the file of the embedding, whose hash belongs into the
+tracker. `--floors` flies `ouyang_cfbvm_pf` with several floors of its likelihood instead.
 """
 
 import argparse
@@ -16,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sasgeo_baselines.trackers import polar, zhou_smc
+from sasgeo_baselines.trackers import kinnari_mcl, polar, zhou_smc
 from sasgeo_baselines.trackers.ouyang_cfbvm_pf import OuyangCfbvmPf
-from sasgeo_baselines.trackers.particles import NEAR_M
+from sasgeo_baselines.trackers.particles import NEAR_M, Particles
+from sklearn.linear_model import LogisticRegression
 
 import sasgeo_bench as sgb
 
@@ -26,6 +27,9 @@ MORPHOLOGIES = ("agricultural", "grid", "industrial", "old_town", "riverside", "
 SEED, SIZE_M, FLIGHTS = 4711, 2048.0, 4
 KINDS = ("no drift", "no drift again")  # the other variants of a flight show the same views
 DRIFTING = "F1 vo-mono-survey"
+EVERY = 3  # views for the ratio of kinnari_mcl: neighbours are alike
+RIGHTS, RIGHT_M, RIGHT_DEG = 20, 8.0, 2.0  # particles about the truth
+WRONGS, WRONGS_M, WRONG_DEG, APART_M = 40, (60.0, 500.0), 20.0, 16.0
 FLOORS = (1.0, 0.3, 0.1, 0.03, 0.01)
 PRINCIPAL = 96  # components kept before the canonical correlation
 RIDGE = 0.05  # of the mean variance of these components
@@ -164,6 +168,40 @@ def write_embedding(embedding: zhou_smc.Embedding, path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
+def fit_ratio(towns: list[Town], *, rng: np.random.Generator) -> Floats:
+    """Fit the log-likelihood ratio of `kinnari_mcl`: particles about the truth against others of a disc around it."""
+    rows, labels = [], []
+    for town in towns:
+        mosaic = kinnari_mcl.Mosaic.of(town.region)
+        for view in town.views[::EVERY]:
+            near = around(view.pose, reach_m=RIGHT_M, yaw_deg=RIGHT_DEG, count=RIGHTS, rng=rng)
+            chosen = [(near, 1)]
+            for reach_m in WRONGS_M:
+                far = around(view.pose, reach_m=reach_m, yaw_deg=WRONG_DEG, count=WRONGS, rng=rng)
+                is_far = sgb.offsets_m(far.place_m, (view.pose.easting_m, view.pose.northing_m)) > APART_M
+                chosen.append((far.within(is_far), 0))
+            template = kinnari_mcl.Template.of(view.query.evidence)
+            for particles, label in chosen:
+                rows.append(kinnari_mcl.features(kinnari_mcl.surfaces(template, mosaic, particles)))
+                labels += [label] * len(particles)
+    fitted = LogisticRegression(class_weight="balanced", fit_intercept=False, C=1e3).fit(np.concatenate(rows), labels)
+    print(f"{len(labels)} places; ratio {fitted.coef_[0].round(2).tolist()}")
+    return np.asarray(fitted.coef_[0])
+
+
+def around(pose: sgb.Pose, *, reach_m: float, yaw_deg: float, count: int, rng: np.random.Generator) -> Particles:
+    """Draw particles evenly over a disc around a pose, with normal headings."""
+    prior = sgb.Prior(
+        center_m=(pose.easting_m, pose.northing_m),
+        radius_m=reach_m,
+        yaw_deg=pose.yaw_deg,
+        yaw_sigma_deg=yaw_deg,
+        scale_sigma=0.03,
+    )
+    grid = sgb.Grid.around(*prior.center_m, size_m=(1.0, 1.0), cell_size_m=1.0, epsg=32632)
+    return Particles.drawn(prior, grid, count=count, rng=rng)
+
+
 def try_floors(out: Path, towns: list[Town]) -> None:
     """Fly the tracker of Ouyang over the towns with several floors; print what lies within 25 m, and what is wrong."""
     for floor in FLOORS:
@@ -195,6 +233,7 @@ def main() -> None:
     if options.floors:
         try_floors(options.out, towns)
         return
+    fit_ratio(towns, rng=np.random.default_rng(SEED))
     path = zhou_smc.EMBEDDING if options.write else options.out / zhou_smc.EMBEDDING.name
     print(f"{path}: SHA-256 {write_embedding(fit_embedding(towns), path)}")
 

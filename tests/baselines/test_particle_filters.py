@@ -6,7 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from sasgeo_baselines.trackers import polar
+from sasgeo_baselines.trackers import kinnari_mcl, polar
+from sasgeo_baselines.trackers.kinnari_mcl import SHIFTS, KinnariMcl, Mosaic, Template, surfaces
 from sasgeo_baselines.trackers.ouyang_cfbvm_pf import OuyangCfbvmPf
 from sasgeo_baselines.trackers.particles import Particles
 from sasgeo_baselines.trackers.swapf import DistanceMaps, SwaPf
@@ -18,7 +19,7 @@ from sasgeo_bench.matching.tracker import check_fix
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.query import Step
 
-FILTERS = {"swapf": SwaPf, "zhou_smc": ZhouSmc, "ouyang_cfbvm_pf": OuyangCfbvmPf}
+FILTERS = {"kinnari_mcl": KinnariMcl, "ouyang_cfbvm_pf": OuyangCfbvmPf, "swapf": SwaPf, "zhou_smc": ZhouSmc}
 SLOW = {"zhou_smc"}  # sure of its place after more views than are flown here
 COUNT = 4000  # particles: enough on this map
 VIEW, STEP_M, VIEWS = 128, 30.0, 12
@@ -192,3 +193,36 @@ def test_another_embedding_is_refused(tmp_path):
     path.write_bytes(EMBEDDING.read_bytes() + b" ")
     with pytest.raises(ValueError, match="install sasgeo-baselines again"):
         Embedding.read(path)
+
+
+def test_a_correlation_surface_is_that_of_squares_read_one_by_one(made, region):
+    pose = Pose(easting_m=1300.0, northing_m=8700.0, yaw_deg=30.0)
+    seen = made.view_of(region, pose, size_cells=192)
+    cells = seen.cells.copy()
+    cells[:, :60] = UNKNOWN
+    template, mosaic = Template.of(seen.replace(cells)), Mosaic.of(region)
+    there = particles_at(pose)
+    found = surfaces(template, mosaic, there)[0].reshape(5, 5)
+    known, grey = template.known.reshape(16, 16) > 0, template.share.reshape(-1, 16, 16)
+    assert known.sum() == 16 * 11
+    around = mosaic.around(there, 16 + 2 * SHIFTS)[0].reshape(-1, 20, 20)
+    for down, right in ((0, 0), (2, 2), (1, 4)):
+        pairs = [(a[known], b[down : down + 16, right : right + 16][known]) for a, b in zip(grey, around, strict=True)]
+        first, second = (np.concatenate([pair[side] - pair[side].mean() for pair in pairs]) for side in (0, 1))
+        expected = first @ second / np.sqrt((first @ first) * (second @ second))
+        assert found[down, right] == pytest.approx(expected, abs=1e-4)
+    assert found.argmax() == 12
+    assert found[2, 2] > 0.9
+
+
+def test_a_view_without_contrast_correlates_with_nothing(made, region):
+    seen = made.view_of(region, Pose(easting_m=1300.0, northing_m=8700.0, yaw_deg=0.0), size_cells=192)
+    even = Template.of(seen.replace(np.zeros_like(seen.cells)))
+    assert np.abs(surfaces(even, Mosaic.of(region), particles_at(START))).max() < 1e-3
+    assert kinnari_mcl.RATIO[1:].min() > 0
+
+
+def particles_at(pose):
+    """One particle."""
+    place_m = np.array([[pose.easting_m, pose.northing_m]])
+    return Particles(place_m=place_m, yaw_deg=np.array([pose.yaw_deg]), scale=np.ones(1), weight=np.ones(1))

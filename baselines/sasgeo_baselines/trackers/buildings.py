@@ -59,7 +59,8 @@ class Buildings:
         number = np.cumsum(is_kept) - 1
         rows, cols = np.nonzero(is_kept[labels])
         label = number[labels[rows, cols]]
-        rim_m = np.bincount(label, weights=_rim(present)[rows, cols] * cell_m, minlength=int(is_kept.sum()))
+        rims_m = np.bincount(label, weights=_rim(present)[rows, cols] * cell_m, minlength=int(is_kept.sum()))
+        rim_m = rims_m.astype(np.float64)
         return cls._measured(label, np.stack([cols + 0.5, -rows - 0.5]) * cell_m, rim_m, cell_m)
 
     @classmethod

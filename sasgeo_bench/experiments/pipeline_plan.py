@@ -29,7 +29,7 @@ from sasgeo_bench.tasks.build import is_of_region, look_of, made_tasks, why_to_d
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import BY, CONTROLS, SEQUENCE, PriorGroup, base_of
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES, PICTURE_SUITES, find_suite
+from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES, PICTURED, find_suite
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
@@ -309,18 +309,22 @@ def _check_pictures(spec: PipelineFile) -> None:
 def _check_flights(spec: PipelineFile) -> None:
     """Refuse contrasts on a track that their suites do not have: they would count nothing."""
     for item in spec.contrast:
-        odd = next((name for name in item.suites if (name in FLIGHT_SUITES) != (item.track == SEQUENCE)), None)
+        odd = next((name for name in item.suites if _is_of_flights(name) != (item.track == SEQUENCE)), None)
         if odd is not None:
-            what = f"is of flights, say track = {SEQUENCE!r}" if odd in FLIGHT_SUITES else "has no flights"
+            what = f"is of flights, say track = {SEQUENCE!r}" if _is_of_flights(odd) else "has no flights"
             message = f"contrast {item.name!r} has track {item.track!r}, and suite {odd!r} {what}"
             raise ConfigError(message)
+
+
+def _is_of_flights(name: str) -> bool:
+    return name.split(BY, maxsplit=1)[0] in FLIGHT_SUITES
 
 
 def _check_look(spec: PipelineFile, requests: Sequence[Request]) -> None:
     """Refuse reference imagery in a family of looks that a query has, too, and imagery that no suite looks at."""
     if spec.reference_imagery is None:
         return
-    pictured = [item for item in requests if item.suite in PICTURE_SUITES]
+    pictured = [item for item in requests if item.suite in PICTURED]
     if not pictured:
         message = f"pipeline {spec.id!r} has reference_imagery, and draws no suite of pictures: leave it out"
         raise ConfigError(message)
@@ -451,7 +455,7 @@ def _is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
 
     Nobody is asked on a train place of a hold-out.
     """
-    if suite in PICTURE_SUITES:  # asked with the evidence that a segmenter makes
+    if suite in PICTURED:  # asked with the evidence that a segmenter makes
         return False
     if suite in {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}:
         return True

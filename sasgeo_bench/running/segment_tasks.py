@@ -28,7 +28,7 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import FrameLabels, read_labels
-from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of
+from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of, view_id
 from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
 from sasgeo_bench.tasks.split import HALVES, Split
 
@@ -372,11 +372,21 @@ def _with_evidence(
         size_cells, cell_size_m = evidence.shape[0], evidence.cell_size_m
         found = evidence_of(query.frames, seen, size_cells=size_cells, cell_size_m=cell_size_m)
         evidence = _for_classes(found, evidence)
-    query_id = hashlib.sha256(f"{query.query_id}/{segmenter}".encode()).hexdigest()[: len(query.query_id)]
+    asked = _renamed(query, segmenter)
     return (
-        replace(query, query_id=query_id, suite=suite, evidence=evidence),
-        replace(truth, query_id=query_id, unknown_share=evidence.unknown_share),
+        replace(asked, suite=suite, evidence=evidence),
+        replace(truth, query_id=asked.query_id, unknown_share=evidence.unknown_share),
     )
+
+
+def _renamed(query: Query, segmenter: str) -> Query:
+    """Return a query with an id that follows from its own and the segmenter; views of a flight keep their order."""
+    step = query.step
+    old = query.query_id if step is None else step.sequence_id
+    new = hashlib.sha256(f"{old}/{segmenter}".encode()).hexdigest()[: len(old)]
+    if step is None:
+        return replace(query, query_id=new)
+    return replace(query, query_id=view_id(new, step.frame), step=replace(step, sequence_id=new))
 
 
 def _for_classes(found: Evidence | None, empty: Evidence) -> Evidence:

@@ -21,7 +21,7 @@ from sasgeo_bench.tasks.sampling import drawn_share
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Site
 from sasgeo_bench.tasks.suites.flight_plots import ChangedMapSuite, Plot, ground_of
-from sasgeo_bench.tasks.suites.flights import EXTENT, HEIGHT_M, LENGTHS_M, LOITER_M, SPACING_M, UNEVEN, FlightSuite
+from sasgeo_bench.tasks.suites.flights import EXTENT, HEIGHT_M, LENGTHS_M, LOITER_M, UNEVEN, FlightSuite
 
 Floats = NDArray[np.float64]
 
@@ -105,9 +105,10 @@ class Airspace:
         seeds, sigmas = self.seeds_of(index), (-_SCALE_CUT, _SCALE_CUT)
         extent_m = math.sqrt(flight_area(self.region, self.suite.clear_m(self.scene)).area)
         scale = 1.0 + self.group.scale_sigma * float(np.clip(seeds.rng("scale").standard_normal(), *sigmas))
-        spacing_m = float(seeds.rng("spacing").uniform(*SPACING_M))
+        spacing_m = float(seeds.rng("spacing").uniform(*self.suite.every_m))
         kinds = [KINDS[(index + turn) % len(KINDS)] for turn in range(len(KINDS))]
-        for length_m in (length_m for length_m in LENGTHS_M if length_m <= EXTENT * extent_m):
+        longest_m = min(EXTENT * extent_m, self.suite.longest_m)
+        for length_m in (length_m for length_m in LENGTHS_M if length_m <= longest_m):
             for kind in kinds:
                 for attempt in range(_TRIES):
                     rng = seeds.rng("path", kind, f"{length_m:g}", attempt)

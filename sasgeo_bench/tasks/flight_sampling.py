@@ -101,9 +101,22 @@ class FlightDrawer:
         return None
 
     def drawn(self, jobs: Sequence[Job]) -> Iterator[tuple[Query, Truth]]:
-        """Yield the views of flights in order, each with its truth."""
+        """Yield the views of flights in order, each with its truth.
+
+        Pictures are drawn place by place, since a place is painted once.
+        """
+        if not self.suite.is_pictured:
+            for job in jobs:
+                yield from self._flown(job)
+            return
+        found: dict[str, list[tuple[Query, Truth]]] = {job.query_id: [] for job in jobs}
+        for site in dict.fromkeys(job.site.index for job in jobs):
+            own = [job for job in jobs if job.site.index == site]
+            for pairs in zip(*map(self._flown, own), strict=True):
+                for job, pair in zip(own, pairs, strict=True):
+                    found[job.query_id].append(pair)
         for job in jobs:
-            yield from self._flown(job)
+            yield from found[job.query_id]
 
     def _flown(self, job: Job) -> Iterator[tuple[Query, Truth]]:
         mission, flight = self.suite.mission(job.variant), self.flights[job.site.index]
@@ -150,7 +163,7 @@ class FlightDrawer:
         seeds = self._seeds(job.site)
         of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
         site = replace(job.site, pose=pose, density=drawn_share(scene.map, pose, variant))
-        draft = self.suite.draw(Shot(scene=scene, site=site, variant=variant, seeds=of_view))
+        draft = self.suite.draw(Shot(scene=scene, site=site, variant=variant, seeds=of_view, flight_seeds=seeds))
         evidence = draft.evidence
         if not measured["is_seen"]:
             evidence = evidence.replace(np.full_like(evidence.cells, UNKNOWN))
@@ -174,6 +187,7 @@ class FlightDrawer:
             season=draft.season,
             prior=prior,
             prior_group=group.name,
+            frames=draft.frames,
             step=step,
         )
         return query, self._truth(job, query, site, replace(draft, measured=draft.measured | measured))
@@ -204,6 +218,7 @@ class FlightDrawer:
             scene=",".join(self.scene.scenes),
             measured=draft.measured | ({UNANSWERABLE: 1.0} if is_blank else {}),
             detector=variant.detector,
+            labels=draft.labels,
         )
 
 

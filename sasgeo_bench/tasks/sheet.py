@@ -204,6 +204,15 @@ def rival_text(truth: Truth) -> str:
     return f"{away}; a plain search lists {both.get((is_rival, is_truth), 'neither')}"
 
 
+def _known_text(query: Query) -> str:
+    """Return what a query tells besides its view: its place in a flight, or its priors, candidates and vectors."""
+    if query.step is not None:
+        known = f", priors {query.prior_group}" if query.step.frame == 0 else ""
+        return f"view {query.step.frame} of flight {query.step.sequence_id}{known}"
+    vectors = f", {len(query.vectors)} vectors" if query.vectors is not None else ""
+    return f"priors {query.prior_group}; {len(query.candidates)} candidates{vectors}"
+
+
 def _text(panel: Panel) -> tuple[str, ...]:
     query, truth = panel.query, panel.truth
     rows, cols = query.evidence.shape
@@ -213,8 +222,7 @@ def _text(panel: Panel) -> tuple[str, ...]:
         f"{truth.role}: {truth.kind}" + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
         strength_text(truth),
         f"{query.track}, {rows} x {cols} cells of {query.evidence.cell_size_m:g} m",
-        f"priors {query.prior_group}; {len(query.candidates)} candidates"
-        + (f", {len(query.vectors)} vectors" if query.vectors is not None else ""),
+        _known_text(query),
         "present" if truth.is_present else "ABSENT",
         f"unknown {truth.unknown_share:.2f}, changed {truth.changed_share:.2f}{alias}",
         rival_text(truth),

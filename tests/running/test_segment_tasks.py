@@ -14,7 +14,9 @@ from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.prediction_files import read_predictions
 from sasgeo_bench.running.recalibration import recalibrated, shares_within
+from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.segment_tasks import FOLDER, SegmentTasks, segment_tasks
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.sensing.segmentation import Segmentation
@@ -22,6 +24,7 @@ from sasgeo_bench.sensing.tiny_images import tiny_images
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks, put_task
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
+from sasgeo_bench.tasks.query import Step, view_id
 from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -98,6 +101,43 @@ def test_the_oracles_evidence_is_what_the_labels_show_under_new_ids_with_the_tru
         assert truth.unknown_share == pytest.approx(query.evidence.unknown_share)
         assert len(query.frames) == 1
     assert not list(Path("out/truth/aerial+oracle_segmenter").rglob("labels.parquet"))
+
+
+def in_flight(query, truth, at):
+    """A query and its truth as one of two views of one of two flights; those of the second come first."""
+    sequence, frame = ("0f" * 9, "0e" * 9)[at // 2], at % 2
+    way = {"increment": (0.0, 50.0, 0.0), "covariance": tuple(np.eye(3).ravel().tolist())} if frame else {}
+    step = Step(sequence_id=sequence, frame=frame, **way)
+    prior = replace(query.prior, center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None)
+    query_id = view_id(sequence, frame)
+    known = query.prior if frame == 0 else prior
+    own = replace(
+        query, query_id=query_id, track="sequence", suite="flight-image", candidates=(), step=step, prior=known
+    )
+    return own, replace(truth, query_id=query_id, candidate=-1)
+
+
+@pytest.mark.usefixtures("in_threads")
+def test_views_of_a_flight_stay_in_order_and_a_tracker_follows_them(pictured):
+    about = task_files.read_task(pictured[0])
+    truth = Path("out/truth/aerial") / pictured[0].name
+    both = zip(task_files.read_queries(pictured[0]), task_files.read_truths(truth), strict=True)
+    pairs = [in_flight(*with_pictures(*pair, at), at) for at, pair in enumerate(both)]
+    own = {name: about[name] for name in ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites", "region")}
+    pairs = sorted(pairs, key=lambda pair: pair[0].query_id)
+    task = put_task(pairs, own | {"suite": "flight-image"}, {"seed": 4}, out=Path("out"), tell=silent)
+    (made,) = of_oracle([task.folder])
+    queries = list(task_files.read_queries(made))
+    assert [query.step.frame for query in queries] == [0, 1, 0, 1]
+    assert [query.query_id for query in queries] == [
+        view_id(query.step.sequence_id, query.step.frame) for query in queries
+    ]
+    assert not {query.query_id for query in queries} & {query.query_id for query, _ in pairs}
+    assert {query.step.increment for query in queries if query.step.frame} == {(0.0, 50.0, 0.0)}
+    assert all((query.evidence.layer("building") == PRESENT).any() for query in queries)
+    plan = plan_run(RunRequest(spec="dead_reckoning", tasks=(made,), out=Path("out"), limits=PATIENT))
+    run(plan, tell=silent)
+    assert [item.status for item in read_predictions(plan.parts[0].folder)] == ["ok"] * 4
 
 
 def test_what_is_up_to_date_stays_and_other_pictures_are_segmented_again(pictured):

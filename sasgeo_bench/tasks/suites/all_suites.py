@@ -16,6 +16,7 @@ from sasgeo_bench.tasks.suites import (
     flight_alias,
     flight_clean,
     flight_gap,
+    flight_image,
     flight_kidnap,
     flight_off_map,
     flight_overconfident,
@@ -88,6 +89,7 @@ FLIGHT_SUITES: Final[dict[str, FlightSuite]] = {
         flight_overconfident.SUITE,
         flight_alias.SUITE,
         flight_off_map.SUITE,
+        flight_image.SUITE,
     )
 }
 # With the controls, which every board draws in addition to its experiment.
@@ -97,6 +99,8 @@ EVERY_SUITE: Final[dict[str, Suite]] = {
     **FLIGHT_SUITES,
     board_controls.SUITE.card.name: board_controls.SUITE,
 }
+# Suites of pictures, flights among them.
+PICTURED: Final = frozenset(name for name, suite in EVERY_SUITE.items() if suite.is_pictured)
 
 
 def find_suite(name: str) -> Suite:

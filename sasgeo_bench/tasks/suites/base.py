@@ -342,12 +342,16 @@ class Seeds:
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """One view to draw: a variant at a site of a scene, and the seeds of the site."""
+    """One view to draw: a variant at a site of a scene, and the seeds of the site.
+
+    For a view of a flight `seeds` are those of the view, and `flight_seeds` those of what lasts for the whole flight.
+    """
 
     scene: Scene
     site: Site
     variant: Variant
     seeds: Seeds
+    flight_seeds: Seeds | None = None
 
     def rng(self, *purpose: object) -> np.random.Generator:
         """Return the generator of a purpose for this size of view."""

@@ -59,9 +59,14 @@ class Mission:
 
 @dataclass(frozen=True, kw_only=True)
 class FlightSuite(Suite):
-    """A suite of flights: all variants at a site fly the same way, and `mission` says what happens on it."""
+    """A suite of flights: all variants at a site fly the same way, and `mission` says what happens on it.
+
+    `every_m` are the bounds of a flight's mean spacing of views, and `longest_m` of its length.
+    """
 
     mission: Callable[[Variant], Mission]
+    every_m: tuple[float, float] = SPACING_M
+    longest_m: float = max(LENGTHS_M)
 
     def draw(self, shot: Shot) -> Draft:
         """Perceive one view."""

@@ -4,6 +4,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -115,16 +116,16 @@ class PictureSuite(Suite):
         if shot.variant.detector in PERCEIVED:
             return Draft(evidence=shot.perceived())
         variant, flight = shot.variant, self.flight(shot.variant)
-        conditions = flight.conditions(draw_conditions(shot.seeds.rng("conditions"), season="summer"))
+        of_weather = (shot.flight_seeds or shot.seeds).rng("conditions")
+        conditions = flight.conditions(draw_conditions(of_weather, season="summer"))
         painted = _painted(shot, flight)
         stands = stands_of(shot, flight)
         rng = shot.rng("sensor", variant.name)
         pictures = [render(painted, stand.true, conditions, rng) for stand in stands]
         found = [labels(painted, stand.true, season=conditions.season) for stand in stands]
         state = shot.scene.world
-        cells = np.full((len(state.classes), variant.view_cells, variant.view_cells), UNKNOWN, dtype=np.uint8)
         return Draft(
-            evidence=Evidence(classes=state.classes, cells=cells, cell_size_m=variant.cell_size_m),
+            evidence=_unseen(state.classes, variant.view_cells, variant.cell_size_m),
             frames=tuple(
                 Frame(
                     picture=encode_webp(picture),
@@ -147,6 +148,13 @@ class PictureSuite(Suite):
                 "building_share": round(_share_of(found[-1], state.classes, "building"), 4),
             },
         )
+
+
+@cache
+def _unseen(classes: tuple[str, ...], size_cells: int, cell_size_m: float) -> Evidence:
+    """Return evidence that is all unknown, the same for all views: many are in memory at once."""
+    cells = np.full((len(classes), size_cells, size_cells), UNKNOWN, dtype=np.uint8)
+    return Evidence(classes=classes, cells=cells, cell_size_m=cell_size_m)
 
 
 def _share_of(found: NDArray[np.uint8], classes: tuple[str, ...], name: str) -> float:
@@ -200,7 +208,7 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
     reach_m = _reach_m(flight, variant)
     pixel_m = flight.height_m / LENS.focal_px[0]
     cell_m = min(max(pixel_m * _CELL_PX, _FINEST_M), _COARSEST_M)
-    key = (site.index, family, flight.relief, flight.height_m, reach_m, round(cell_m, 3))
+    key = (site.en_m, family, flight.relief, flight.height_m, reach_m, round(cell_m, 3))
     if key not in scene.painted:
         while len(scene.painted) >= _KEPT:
             scene.painted.pop(next(iter(scene.painted)))

@@ -17,7 +17,7 @@ from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.tasks.flight_choice import Airspace, Flight
+from sasgeo_bench.tasks.flight_choice import Airspace, Flight, rows
 from sasgeo_bench.tasks.flight_sampling import FlightDrawer
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
 from sasgeo_bench.tasks.query import Query, Truth
@@ -25,6 +25,7 @@ from sasgeo_bench.tasks.split import blocks_of, find_split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, Variant
+from sasgeo_bench.tasks.suites.flight_image import FlightImageSuite
 from sasgeo_bench.tasks.suites.flight_plots import changed, changes_of
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
@@ -49,11 +50,12 @@ TOWN_OF = {
     "flight-real-age": "town-suburb",
     **dict.fromkeys(("flight-clean", "flight-start", "flight-gap", "flight-kidnap"), "town-grid"),
     "flight-overconfident": "town-grid",
-    **dict.fromkeys(("flight-off-map", "flight-alias"), "town-suburb"),
+    **dict.fromkeys(("flight-off-map", "flight-alias", "flight-image"), "town-suburb"),
 }
 # One overpass, little room for wide views; the others get as many as are asked for.
 SITES = {"grade-separation": 1, "no-priors": 3}
 MOST_SITES = 4
+PICTURES = 3  # of a flight: its first views
 MAIN_REACH_M = 144.0  # half a diagonal of a view of 192 m at its largest scale
 
 TownOf = Callable[..., Region]
@@ -187,6 +189,12 @@ def carried(scene, edited) -> Callable[[str], Carried]:
     return of_suite
 
 
+def _low(suite: FlightImageSuite) -> FlightImageSuite:
+    """A suite of small pictures from low above, which are painted at once."""
+    views = tuple(replace(item, view_cells=48) for item in suite.variants)
+    return replace(suite, variants=views, flight=lambda item: replace(suite.flight(item), height_m=40.0))
+
+
 @dataclass(frozen=True, kw_only=True)
 class Flown:
     """A suite's flights at one site: where they may go, the control's path, and the views of each variant in order."""
@@ -216,11 +224,15 @@ def flown(scene, town, edited) -> Callable[[str], Flown]:
         over = scene(where, name)
         assert suite.lack(over) is None
         suite = replace(suite, variants=suite.usable(over))
+        if suite.is_pictured:
+            suite = _low(suite)
         seeds = Seeds(root=1, names=(over.map.region, name))
         airspace = Airspace(
             region=town(where), scene=over, suite=suite, split=split, seeds=seeds, group=suite.card.group
         )
         flights = airspace.choose(count=1, may_be_fewer=False)
+        if suite.is_pictured:
+            flights = {0: replace(flights[0], views=rows(flights[0].views, slice(0, PICTURES)))}
         if flights[0].plot is not None:
             parts = [
                 changed(over.map.features, over.map.coverage, changes_of([(0, flights[0].plot)], at)) for at in (0, 1)

@@ -37,7 +37,7 @@ LATTICE: Final = 28  # cells a side at which the square is sampled: 4.8 m apart 
 PX_M: Final = 0.34  # 400 px for the inner square of a view of 192 m
 _STEPS: Final = 250.0  # of a stored distance: uint8 holds TRUNCATION as so many
 _MOST_CELLS: Final = 32_000_000  # of a stored map of one label: larger maps are read in coarser cells
-_STRIP: Final = 2048  # rows of a map whose distances are measured at once
+_STRIP: Final = 512  # rows of a map whose distances are measured at once
 _BLOCK: Final = 1000  # particles weighed at once: what they read fits into the cache
 
 

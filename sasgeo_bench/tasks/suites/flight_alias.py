@@ -14,13 +14,13 @@ from sasgeo_bench.tasks.query import RADII_M, PriorGroup
 from sasgeo_bench.tasks.suites.base import Scene, SuiteCard, Variant
 from sasgeo_bench.tasks.suites.flight_off_map import lengths_within
 from sasgeo_bench.tasks.suites.flight_plots import (
-    MOST_SHARE,
     STRETCHES_M,
     ChangedMapSuite,
     Floats,
     Ground,
     MapChange,
     Plot,
+    stretches_m,
 )
 from sasgeo_bench.tasks.suites.flights import SEQUENCE, START, Mission
 from sasgeo_bench.tasks.suites.twins import RIVAL_M
@@ -51,9 +51,7 @@ class FlightAliasSuite(ChangedMapSuite):
         place_m, flown_m = views.position_m[:, :2], views.distance_m
         if not ground.admits(place_m):
             return None
-        for stretch_m in STRETCHES_M:
-            if stretch_m > MOST_SHARE * flown_m[-1]:
-                continue
+        for stretch_m in stretches_m(float(flown_m[-1])):
             hull = shapely.MultiPoint(place_m[flown_m <= stretch_m]).convex_hull.buffer(_ON_PATH_M)
             area = hull.buffer(ground.reach_m + _RIM_M)
             is_left = lengths_within(hull, place_m, flown_m).sum() <= _MOST_INSIDE * stretch_m
@@ -121,7 +119,7 @@ SUITE: Final = FlightAliasSuite(
         "fits, a second time, up to 800 m away and within the disc of the start: no view there tells which it is, and "
         "no turn. Only the way out does.",
         separates="Trackers that keep two hypotheses until one is right, and say so, from those that pick one.",
-        falsifier="The second time the ground is as in a mirror: as much of the map is changed, and no view fits.",
+        falsifier="The second time the ground is as in a mirror: as much of the map is changed, and it does not fit.",
         strength_unit="m of the flight that the map shows twice, about: is_copied says which views",
         group=START,
         tracks=SEQUENCE,

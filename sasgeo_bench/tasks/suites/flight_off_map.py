@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.tasks.suites.base import SuiteCard, Variant
 from sasgeo_bench.tasks.suites.flight_plots import (
-    MOST_SHARE,
     STRETCHES_M,
     ChangedMapSuite,
     Floats,
     Ground,
     MapChange,
     Plot,
+    stretches_m,
 )
 from sasgeo_bench.tasks.suites.flights import SEQUENCE, START, Mission
 
@@ -27,7 +27,7 @@ _WITHIN: Final = (0.9, 1.2)  # of what is asked for, that the longest stretch me
 _MOST_TIMES: Final = 1.3  # the longest stretch, that all together measure: a flight passes through its hole once
 _MIDDLE: Final = (0.2, 0.8)  # of a flight, where it may be off the map
 _HOLES: Final = 40  # tried for each length
-_RADII: Final = np.linspace(0.3, 0.8, 11)  # of the hole, in lengths of the stretch: half, where it is straight
+_RADII: Final = np.linspace(0.4, 0.8, 9)  # of the hole, in lengths of the stretch: half, where it is straight
 _ASIDE: Final = 0.6  # of its radius, by which the middle of the hole may lie off the path
 _ELSEWHERE: Final = 400  # places tried for the hole of the falsifier
 _ARC_SEGMENTS: Final = 16
@@ -41,9 +41,7 @@ class FlightOffMapSuite(ChangedMapSuite):
         place_m, flown_m = views.position_m[:, :2], views.distance_m
         if not ground.admits(place_m):
             return None
-        for stretch_m in STRETCHES_M:
-            if stretch_m > MOST_SHARE * flown_m[-1]:
-                continue
+        for stretch_m in stretches_m(float(flown_m[-1])):
             hole = _hole(place_m, flown_m, stretch_m, ground, rng)
             other = None if hole is None else _elsewhere(hole, place_m, ground, rng)
             if hole is None or other is None:

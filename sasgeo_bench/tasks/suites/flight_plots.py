@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 STRETCHES_M: Final = (1000.0, 500.0, 250.0)  # of a flight, the longest that fits
-MOST_SHARE: Final = 1 / 3  # of a flight that such a stretch takes
+SHARES: Final = (0.1, 1 / 3)  # of a flight that such a stretch takes
 MAPS: Final = 2
 
 
@@ -119,6 +119,16 @@ def ground_of(scene: Scene, before: Iterable[tuple[Trajectory, Plot]]) -> Ground
         seen_m=np.concatenate([np.zeros((0, 2)), *(views.position_m[:, :2] for views, _ in flights)]),
         changed=tuple(area for _, plot in flights for area in plot.areas),
     )
+
+
+def stretches_m(length_m: float) -> tuple[float, ...]:
+    """Return the stretches that suit a flight of a length, the longest first.
+
+    >>> stretches_m(1950.0), stretches_m(9800.0)
+    ((500.0, 250.0), (1000.0,))
+    """
+    least, most = SHARES
+    return tuple(item for item in STRETCHES_M if least * length_m <= item <= most * length_m)
 
 
 def changes_of(plots: Sequence[tuple[int, Plot]], number: int) -> list[MapChange]:

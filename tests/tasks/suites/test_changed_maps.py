@@ -15,7 +15,7 @@ from sasgeo_bench.tasks.build import check_task, make_tasks
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.flight_off_map import LOST, OFF_MAP, lengths_within
-from sasgeo_bench.tasks.suites.flight_plots import MOST_SHARE, Ground, MapChange, Plot
+from sasgeo_bench.tasks.suites.flight_plots import SHARES, Ground, MapChange, Plot
 from sasgeo_bench.tasks.suites.twins import RIVAL_M
 from sasgeo_bench.tasks.task_files import read_truths
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -75,7 +75,7 @@ def test_a_flight_leaves_the_map_once_in_its_middle_and_comes_back(flown):
         assert bool(state.known[row, col]) == is_on
     (off_m,) = {truth.measured[OFF_MAP] for _, truth in stress}
     assert off_m == pytest.approx(stress[0][1].strength, rel=0.35)
-    assert off_m <= MOST_SHARE * made.flight.length_m
+    assert off_m <= SHARES[1] * made.flight.length_m
     assert {truth.measured[OFF_MAP] for _, truth in (*control, *falsifier)} == {0.0}
 
 
@@ -226,7 +226,7 @@ def test_changed_maps_are_regions_of_their_own_and_their_tasks_hold_together(own
 
 def test_where_nothing_can_be_changed_the_request_gets_one_line_and_writes_no_map(own_town, monkeypatch):
     monkeypatch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
-    monkeypatch.setattr("sasgeo_bench.tasks.suites.flight_off_map.STRETCHES_M", ())
+    monkeypatch.setattr("sasgeo_bench.tasks.suites.flight_plots.STRETCHES_M", ())
     wanted = Wanted(suites=("flight-off-map",), regions=(TOWN,), split="crossfit", count=1, seed=0, out=own_town)
     (request,) = plan_requests(wanted, tell=lambda _: None)
     with pytest.raises(ConfigError, match="town-suburb has room for 0 of 1 flights of suite 'flight-off-map'"):

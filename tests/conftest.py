@@ -20,6 +20,7 @@ from hypothesis import HealthCheck, settings
 
 from sasgeo_bench import cli, progress
 from sasgeo_bench.experiments import pipeline, pipeline_plan
+from sasgeo_bench.leaderboard import board_pictures
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.publishing import archive
@@ -237,7 +238,10 @@ def without_pictures() -> Iterator[None]:
 
 @pytest.fixture(scope="module")
 def few_figures() -> Iterator[None]:
-    """Boards of pipelines and of the program have two of their figures: all are drawn where the test is about them."""
+    """Boards of pipelines and of the program have two of their figures, and pictures of two of their cases.
+
+    All are drawn where the test is about them.
+    """
 
     def few(*about: Any, **more: Any) -> Extra:
         extra = figures_extra(*about, **more)
@@ -246,6 +250,7 @@ def few_figures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for maker in (pipeline, archive):
             patch.setattr(maker, "figures_extra", few)
+        patch.setattr(board_pictures, "MOST_CASES", 2)
         yield
 
 

@@ -70,6 +70,9 @@ from .running.testing import check_matcher as check_matcher
 from .running.testing import tiny_place as tiny_place
 from .sasgeo.by_hand import map_by_hand as map_by_hand
 from .sasgeo.by_hand import view_by_hand as view_by_hand
+from .running.tracker_testing import TinyFlights as TinyFlights
+from .running.tracker_testing import check_tracker as check_tracker
+from .running.tracker_testing import tiny_flights as tiny_flights
 from .search.chart import Chart as Chart
 from .search.chart import block_max as block_max
 from .search.chart import fade as fade

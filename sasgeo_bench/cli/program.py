@@ -70,6 +70,8 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Flights": {
         "measure-drift": "flights",
         "list-trackers": "listing",
+        "new-tracker": "trackers",
+        "check-tracker": "trackers",
     },
     "Datasets of others": {
         "import-dataset": "importing",

@@ -27,7 +27,7 @@ YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are n
 # The runner's own controls, which are given the truth: no plugin can have their names.
 ORACLE: Final = "oracle_pose"
 ORACLE_SEGMENTER: Final = "oracle_segmenter"
-_RESERVED: Final = {MATCHERS: ORACLE, SEGMENTERS: ORACLE_SEGMENTER}
+_RESERVED: Final = {MATCHERS: ORACLE, TRACKERS: ORACLE, SEGMENTERS: ORACLE_SEGMENTER}
 KINDS: Final = {MATCHERS: "matcher", TRACKERS: "tracker", REJECTORS: "rejector", SEGMENTERS: "segmenter"}
 
 

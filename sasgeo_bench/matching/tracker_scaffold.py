@@ -1,0 +1,172 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Files of a new package with a tracker: complete, small, and passing the conformance kit."""
+
+from typing import Final
+
+from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.matching.plugins import MATCHERS, TRACKERS, shipped_names
+from sasgeo_bench.matching.scaffold import filled, imported_names, words_of
+
+_PYPROJECT: Final = """\
+[build-system]
+requires = ["hatchling>=1.27"]
+build-backend = "hatchling.build"
+
+[project]
+name = "{distribution}"
+version = "0.1.0"
+description = "A tracker for sasgeo-bench"
+requires-python = ">=3.11"
+dependencies = ["numpy>=2", "sasgeo-bench>=0.1"]
+
+[project.entry-points."sasgeo_bench.trackers"]
+{name} = "{module}.tracker:{cls}"
+
+[tool.hatch.build.targets.wheel]
+packages = ["src/{module}"]
+"""
+
+_TRACKER: Final = '''\
+"""The tracker {name}: here is where your method goes."""
+
+from dataclasses import replace
+
+import numpy as np
+from sasgeo_bench import Fix, MatcherCard, Pose, Prior, Query, Region, advance, load_matcher, start_of, wrap_deg
+
+FOUND = np.diag([5.0, 5.0, 3.0]) ** 2  # covariance of a pose that the search finds: m2, m2, deg2
+GATE = 3.4  # largest Mahalanobis distance of a pose that is taken: 99 of 100 right ones are nearer
+NEAR_M = 25.0  # an estimate is accepted while 95 % of its belief lies within
+LEAST_M = 80.0  # radius that is searched at least
+STREAK = 3  # poses taken in a row before the first estimate is accepted
+PATIENCE = 5  # poses refused in a row before no more is believed than at the start
+
+
+class {cls}:
+    """Odometry corrected by a search, in a Kalman filter. A place to start from, no method to win with."""
+
+    card = MatcherCard(
+        name="{name}",
+        version="0.1.0",
+        title="{title}",
+        source="original",
+        ours="all of it",
+        licence="MIT",
+        tracks=("sequence",),
+        limits="one hypothesis at a time: where a map repeats itself it may follow the wrong copy",
+    )
+
+    def __init__(self) -> None:
+        self.matcher = load_matcher("fft_vote")  # a search that ships; put your own here
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Index the map; called once for each one."""
+        self.matcher.prepare(region, learned)
+        self.grid = region.grid
+
+    def start(self, prior: Prior) -> None:
+        """Begin a flight with what is known of its first view; forget the one before."""
+        self.pose, self.covariance = start_of(prior, self.grid)
+        self.begun = self.covariance
+        west_m, south_m, east_m, north_m = self.grid.bounds_m
+        self.most_m = prior.radius_m or np.hypot(east_m - west_m, north_m - south_m) / 2
+        self.taken = self.refused = 0
+
+    def step(self, query: Query) -> Fix:
+        """Add the odometry up, search around the estimate, and correct it by what is found."""
+        self.pose, self.covariance = advance(self.pose, self.covariance, query.step)
+        asked = replace(query, track="localization", prior=self.prior(query), step=None)
+        found = self.matcher.match(asked, top_k=1)
+        if found.poses:
+            self.correct(found.poses[0])
+        spread_m = np.sqrt(5.99 * np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
+        is_accepted = bool(self.taken >= STREAK and spread_m <= NEAR_M)
+        return Fix(pose=self.pose, covariance=self.covariance, is_accepted=is_accepted)
+
+    def prior(self, query: Query) -> Prior:
+        """Three standard deviations of the belief, as the prior of a single view."""
+        radius_m = 3 * np.sqrt(np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
+        return Prior(
+            center_m=(self.pose.easting_m, self.pose.northing_m),
+            radius_m=float(np.clip(radius_m, LEAST_M, max(LEAST_M, self.most_m))),
+            yaw_deg=self.pose.yaw_deg,
+            yaw_sigma_deg=float(np.sqrt(self.covariance[2, 2])),
+            scale_sigma=query.prior.scale_sigma,
+        )
+
+    def correct(self, found: Pose) -> None:
+        """Take a pose that fits the belief; after many that do not, believe no more than at the start."""
+        gap = np.array(
+            [
+                found.easting_m - self.pose.easting_m,
+                found.northing_m - self.pose.northing_m,
+                float(wrap_deg(found.yaw_deg - self.pose.yaw_deg)),
+            ]
+        )
+        joint = self.covariance + FOUND
+        if gap @ np.linalg.solve(joint, gap) > GATE**2:
+            self.taken, self.refused = 0, self.refused + 1
+            if self.refused > PATIENCE:
+                self.covariance, self.refused = self.begun, 0
+            return
+        gain = self.covariance @ np.linalg.inv(joint)
+        east_m, north_m, turn_deg = (gain @ gap).tolist()
+        self.pose = Pose(
+            easting_m=self.pose.easting_m + east_m,
+            northing_m=self.pose.northing_m + north_m,
+            yaw_deg=self.pose.yaw_deg + turn_deg,
+            scale=found.scale,
+        )
+        left = np.eye(3) - gain
+        self.covariance = left @ self.covariance @ left.T + gain @ FOUND @ gain.T
+        self.taken, self.refused = self.taken + 1, 0
+'''
+
+_TEST: Final = '''\
+"""The tracker keeps to what every tracker keeps to."""
+
+from sasgeo_bench import check_tracker
+
+
+def test_it_conforms():
+    faults = [check for check in check_tracker("{module}.tracker:{cls}") if check.outcome == "fail"]
+    assert not faults, faults
+'''
+
+_README: Final = """\
+# {title}
+
+A tracker for sasgeo-bench.
+
+```bash
+pip install -e .
+sasgeo-bench check-tracker {name}
+sasgeo-bench make-queries --suite flight-clean --regions town-grid --n 1 --up-to
+sasgeo-bench run --matcher {name} --tasks out/tasks/flight-clean/town-grid
+```
+
+Say in the card (`src/{module}/tracker.py`) where the method comes from and what of it is yours; raise its version
+whenever answers change.
+"""
+
+
+def tracker_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a tracker, by its path.
+
+    `name` is that of the tracker; raise `ConfigError` if it is not allowed, or taken.
+
+    >>> sorted(tracker_files("my-tracker"))[-2:]
+    ['src/my_tracker/tracker.py', 'tests/test_conforms.py']
+    """
+    words = words_of(name, group=TRACKERS, imported=imported_names(_TRACKER))
+    if name in shipped_names(MATCHERS):
+        message = f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another"
+        raise ConfigError(message)
+    files = {
+        "pyproject.toml": _PYPROJECT,
+        "README.md": _README,
+        "src/{module}/__init__.py": '"""The package of the tracker {name}."""\n',
+        "src/{module}/tracker.py": _TRACKER,
+        "tests/test_conforms.py": _TEST,
+    }
+    return filled(files, words)

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The conformance kit of trackers: the rules that each keeps, checked on a short flight under the limits of a run."""
+
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from sasgeo_bench.errors import counted
+from sasgeo_bench.geometry.pose import Prior
+from sasgeo_bench.matching.matcher import MatcherCard, is_followed, lacks
+from sasgeo_bench.matching.plugins import MATCHERS, TRACKERS
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import read_region
+from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.running.checks import Check, check_of, kept_check, listing_of, loaded_check, refusal_of
+from sasgeo_bench.running.replies import Reply
+from sasgeo_bench.running.worker import Limits, Reach, Worker
+from sasgeo_bench.tasks import task_files, task_rows
+from sasgeo_bench.tasks.build import make_tasks
+from sasgeo_bench.tasks.query import Query, Step, Truth
+from sasgeo_bench.tasks.suites.base import Choice
+from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+TOWN: Final = "town-riverside"  # the smallest over which views tell where they are
+TOP_K: Final = 10
+_SUITE, _KIND = "flight-clean", "F1 vo-mono-survey"
+_VIEWS: Final = 12  # of a flight that are asked
+_CUT: Final = 6  # of them, where the flight is cut short
+_ODD: Final = slice(5, 8)  # views that are changed: once a tracker may know its place, and some are left
+_OFF_M: Final = 5000.0  # flown in one step, off the map
+_NEAR_M: Final = 25.0
+_QUICK_S: Final = 5.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TinyFlights:
+    """Short flights over a synthetic town, made by `tiny_flights`.
+
+    `folder` holds regions/, tasks/ and truth/, as `make-queries` writes them. Each flight is its views in order, and
+    `truths` gives the truth of a view by its query id.
+    """
+
+    folder: Path
+    region: Region
+    flights: tuple[tuple[Query, ...], ...]
+    truths: dict[str, Truth]
+
+    @property
+    def map_folder(self) -> Path:
+        """Return the folder of the map."""
+        return self.folder / "regions" / self.region.manifest.id
+
+
+def tiny_flights(path: str | Path) -> TinyFlights:
+    """Make short flights to try a tracker on, in some seconds, the same on every machine; nothing is downloaded.
+
+    The first has an odometer that drifts, the others one that does not. Map, queries and truths go to the folder
+    `path`, in place of earlier ones. Raise `StoreError` if it cannot be written.
+
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     made = tiny_flights(folder)
+    >>> len(made.flights), made.flights[0][1].step.frame, made.flights[0][1].track
+    (3, 1, 'sequence')
+    """
+    folder = Path(path)
+    build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent, with_preview=False)
+    wanted = Wanted(
+        suites=(_SUITE,),
+        regions=(TOWN,),
+        split="crossfit",
+        count=1,
+        seed=1,
+        out=folder,
+        may_be_fewer=True,
+        choice=Choice(kinds=(_KIND,)),
+    )
+    queries: list[Query] = []
+    truths: dict[str, Truth] = {}
+    for request in plan_requests(wanted, tell=_silent):
+        for made in make_tasks(request, tell=_silent):
+            queries += task_files.read_queries(made.folder)
+            found = task_files.read_truths(folder / "truth" / made.folder.relative_to(folder / "tasks"))
+            truths |= {truth.query_id: truth for truth in found}
+    flights = [tuple(views) for _, views in groupby(queries, key=lambda query: query.step and query.step.sequence_id)]
+    flights.sort(key=lambda views: (truths[views[0].query_id].kind != _KIND, views[0].query_id))
+    return TinyFlights(
+        folder=folder, region=read_region(folder / "regions" / TOWN), flights=tuple(flights), truths=truths
+    )
+
+
+def _silent(line: str) -> None:
+    del line
+
+
+def check_tracker(
+    spec: str, *, limits: Limits | None = None, made: TinyFlights | None = None, is_shut_in: bool = True
+) -> Iterator[Check]:
+    """Try a tracker, given by name or module:Class, on short flights; yield a row for each rule.
+
+    A matcher of single views is tried as it follows flights (`Follower`). `made` can be shared by several trackers.
+    Without `is_shut_in`, trusted code runs without isolation, as in `run --trusted`.
+    """
+    with ExitStack() as stack:
+        if made is None:
+            made = tiny_flights(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sasgeo-check-"))))
+        readable, hidden = made.map_folder.resolve(), (made.folder / "truth").resolve()
+        reach = Reach(readable=[readable], hidden=[hidden, (made.folder / "tasks").resolve()], is_shut_in=is_shut_in)
+        worker = stack.enter_context(Worker(spec=spec, reach=reach, limits=limits or Limits()))
+        before = listing_of(made.folder)
+        loaded = worker.load()
+        group = MATCHERS if loaded.card is not None and is_followed(loaded.card) else TRACKERS
+        yield (first := loaded_check(spec, loaded, loaded.card, group=group))
+        if loaded.card is None or first.outcome == "fail":
+            return
+        ready = worker.prepare(made.map_folder)
+        seconds = f"{ready.seconds:.2f} s" if ready.seconds is not None else ready.message
+        yield Check(name="prepares a map", outcome="pass" if ready.status == "ok" else "fail", found=seconds)
+        kit = _Kit(worker=worker, card=loaded.card, made=made)
+        if ready.status == "ok":
+            yield from kit.checks()
+        limited = worker.isolation.get("files_changed", "")
+        yield kept_check(kit.refused or refusal_of(ready), before, listing_of(made.folder), limited)
+
+
+@dataclass(kw_only=True)
+class _Kit:
+    worker: Worker
+    card: MatcherCard
+    made: TinyFlights
+    refused: str = ""
+
+    def checks(self) -> Iterator[Check]:
+        """Run every check in turn; nothing more where an ordinary flight is not followed."""
+        views, other = (flight[:_VIEWS] for flight in self.made.flights[:2])
+        lack = lacks(self.card, views[0])
+        if lack is not None:
+            yield Check(name="follows a flight", outcome="not applicable", found=f"the flights here have {lack}")
+            return
+        first = self._fly(views)
+        yield check_of("follows a flight", _fault(first, views), self._told(first))
+        if _fault(first, views) is not None:
+            return
+        yield _covariances(first)
+        yield self._again("the same answers twice", first, views)
+        self._fly(other)
+        yield self._again("forgets the flight before", first, views)
+        self.worker.end()
+        yield self._again("the same answers to a flight that is cut short, in a fresh process", first, views[:_CUT])
+        for name, changed in odd_flights(views).items():
+            yield check_of(name, _fault(self._fly(changed), changed), counted(len(changed), "view"))
+        yield self._unseen(views)
+        yield self._cost(first)
+
+    def _fly(self, views: Sequence[Query]) -> list[Reply]:
+        """Ask the views of a flight in order; stop at the first without an answer."""
+        replies = []
+        for query in views:
+            replies.append(self.worker.match(task_rows.query_bytes(query), top_k=TOP_K))
+            self.refused = self.refused or refusal_of(replies[-1])
+            if replies[-1].status != "ok":
+                break
+        return replies
+
+    def _again(self, name: str, first: Sequence[Reply], views: Sequence[Query]) -> Check:
+        """Fly again and compare."""
+        for frame, (before, now) in enumerate(zip(first, self._fly(views), strict=False)):
+            if now.status != "ok":
+                return Check(name=name, outcome="fail", found=f"view {frame}: {now.status}: {now.message}")
+            if (before.match, before.is_accepted, before.covariance) != (now.match, now.is_accepted, now.covariance):
+                return Check(name=name, outcome="fail", found=f"view {frame} has another answer")
+        return Check(name=name, outcome="pass", found=counted(len(views), "view"))
+
+    def _unseen(self, views: Sequence[Query]) -> Check:
+        """Check that nothing is accepted where no view shows anything: the start is known to some 500 m alone."""
+        blind = [replace(query, evidence=_unknown(query)) for query in views]
+        replies = self._fly(blind)
+        accepted = sum(bool(reply.is_accepted) for reply in replies)
+        fault = f"{accepted} of {counted(len(blind), 'view')} accepted: odometry alone does not tell the place"
+        return check_of(
+            "accepts nothing where nothing is seen",
+            _fault(replies, blind) or (fault if accepted else None),
+            counted(len(blind), "view"),
+        )
+
+    def _told(self, replies: Sequence[Reply]) -> str:
+        """Describe how near the estimates are, and how many were accepted."""
+        near, accepted, wrong = 0, 0, 0
+        for query, reply in zip(self.made.flights[0], replies, strict=False):
+            truth, poses = self.made.truths[query.query_id].pose, reply.match.poses if reply.match else ()
+            is_near = bool(
+                truth
+                and poses
+                and np.hypot(poses[0].easting_m - truth.easting_m, poses[0].northing_m - truth.northing_m) <= _NEAR_M
+            )
+            near, accepted = near + is_near, accepted + bool(reply.is_accepted)
+            wrong += bool(reply.is_accepted) and not is_near
+        views = counted(len(replies), "view")
+        return f"{views}: {near} within {_NEAR_M:g} m, {accepted} accepted, {wrong} of these farther away"
+
+    def _cost(self, replies: Sequence[Reply]) -> Check:
+        seconds = [reply.seconds or 0.0 for reply in replies]
+        found = (
+            f"{np.median(seconds):.3f} s a step (median), {max(seconds):.3f} s at most, "
+            f"{self.worker.peak_bytes / 1e6:.0f} MB at most"
+        )
+        return check_of("time and memory", None if np.mean(seconds) < _QUICK_S else f"{found}: too slow", found)
+
+
+def odd_flights(views: Sequence[Query]) -> dict[str, tuple[Query, ...]]:
+    """Return flights that a tracker must bear, by the name of the check, each a change of a flight."""
+    prior = views[0].prior
+    nowhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=prior.scale_sigma)
+    chosen = range(len(views))[_ODD]
+    return {
+        "bears views that show nothing": tuple(
+            replace(query, evidence=_unknown(query)) if at in chosen else query for at, query in enumerate(views)
+        ),
+        "bears steps that the odometer lost": tuple(
+            replace(query, step=_stepped(query, None)) if at in chosen else query for at, query in enumerate(views)
+        ),
+        "bears an odometer without errors": tuple(
+            replace(query, step=_stepped(query, query.step.increment if query.step else None, sigma=0.0))
+            for query in views
+        ),
+        "bears a flight off the map": tuple(
+            replace(query, step=_stepped(query, (0.0, _OFF_M, 0.0))) if at == chosen[0] else query
+            for at, query in enumerate(views)
+        ),
+        "bears a prior without a place": (replace(views[0], prior=nowhere), *views[1:]),
+        "bears a flight of one view": tuple(views[:1]),
+    }
+
+
+def _unknown(query: Query) -> Evidence:
+    """Return the evidence of a view without anything that is seen."""
+    return query.evidence.replace(np.full_like(query.evidence.cells, UNKNOWN))
+
+
+def _stepped(query: Query, increment: tuple[float, float, float] | None, *, sigma: float = 1.0) -> Step:
+    """Return the step of a view with another increment, of the given standard deviations; the first view has none."""
+    step = query.step or Step(sequence_id=query.query_id, frame=0)
+    told = None if step.frame == 0 else increment
+    covariance = None if told is None else tuple((sigma**2 * np.eye(3)).ravel().tolist())
+    return replace(step, increment=told, covariance=covariance)
+
+
+def _fault(replies: Sequence[Reply], views: Sequence[Query]) -> str | None:
+    """Return where and why a flight ended before its last view."""
+    if replies and replies[-1].status != "ok":
+        return f"view {len(replies) - 1} of {len(views)}: {replies[-1].status}: {replies[-1].message}"
+    return None
+
+
+def _covariances(replies: Sequence[Reply]) -> Check:
+    """Check that every estimate has a covariance, or none has; the door has checked that each is one."""
+    name = "a covariance for every estimate"
+    posed = [reply for reply in replies if reply.match is not None and reply.match.poses]
+    given = [reply for reply in posed if reply.covariance is not None]
+    if not given:
+        return Check(name=name, outcome="not applicable", found="none is given: figures of honesty will be empty")
+    fault = f"{len(posed) - len(given)} of {len(posed)} estimates have none" if len(given) < len(posed) else None
+    return check_of(name, fault, f"{counted(len(given), 'estimate')}, symmetric and positive definite")

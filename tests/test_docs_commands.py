@@ -51,6 +51,7 @@ ONLY_PARSED = {
     r"--extracts|--extract ": "needs extracts",
     r"--imagery|zanzibar": "needs aerial pictures; tests/regions/test_imagery.py makes some",
     r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",
+    r"(check-tracker|--matcher|runs/) ?my-tracker": "half a minute; tests/running/test_tracker_testing.py flies it",
     r"--segmenter my-segmenter": "needs tasks of pictures; tests/running/test_segment_tasks.py makes some",
     r"--suite aerial|/aerial": "minutes of painting; tests/tasks/suites/test_pictures.py takes small ones",
     r"--dask": "needs a scheduler; tests/running does it",
@@ -66,7 +67,7 @@ ONLY_PARSED = {
 }
 # Commands of other programs that are not run, each with its reason.
 OTHERS = {
-    r"^pip install -e my-(matcher|segmenter)$": "done by hand: an installation needs the package registry",
+    r"^pip install -e my-(matcher|segmenter|tracker)$": "done by hand: an installation needs the package registry",
     r"^sha256sum ": "a program of the system",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",
     r"^python benchmarks/segmenters\.py ": "minutes; tests/scoring/test_segmenter_program.py makes a small board",

@@ -22,7 +22,7 @@ from sasgeo_bench.sasgeo.joint import columns
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.raster import RasterView, burnt, doubted, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, doubted, likeness_by_hand, read_field
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
@@ -195,8 +195,8 @@ class Reader:
     rarity: Rarity | None
 
     @classmethod
-    def of(cls, region: Region, model: ScorerModel, switches: Switches) -> Self:
-        """Prepare a map."""
+    def of(cls, region: Region, model: ScorerModel, switches: Switches, *, search_cell_m: float = CELL_M) -> Self:
+        """Prepare a map; it is searched in cells of about `search_cell_m`."""
         model = model.of_classes(region.classes)
         near = model.likeness if switches.learns else likeness_by_hand(region.classes)
         cell_m = region.grid.cell_size_m
@@ -205,7 +205,9 @@ class Reader:
             region=region,
             model=model,
             switches=switches,
-            field=read_field(region, near, trust=model.trust if switches.is_stamped else None),
+            field=read_field(
+                region, near, trust=model.trust if switches.is_stamped else None, cell_size_m=search_cell_m
+            ),
             graph=MappedGraph.of(region) if switches.has_graph else None,
             rarity=Rarity.of(region.layers, region.classes, cell_size_m=cell_m) if is_rare else None,
         )

@@ -4,7 +4,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, TypeVar
+from typing import Final, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -77,6 +77,16 @@ class Field:
             raise ShapeError(message)
         self.layers.flags.writeable = False
         self.known.flags.writeable = False
+
+    def cut(self, box: tuple[int, int, int, int], margin: int) -> Self:
+        """Return the part under a box, top, left, bottom and right in cells, with a margin; cells are shared."""
+        top, left = max(0, box[0] - margin), max(0, box[1] - margin)
+        bottom, right = min(self.grid.rows, box[2] + margin), min(self.grid.cols, box[3] + margin)
+        return type(self)(
+            grid=self.grid.window(top, left, bottom - top, right - left),
+            layers=self.layers[:, top:bottom, left:right],
+            known=self.known[top:bottom, left:right],
+        )
 
     def level(self, factor: int) -> Level:
         """Return the map in cells of `factor` of its own a side; each level is made once."""

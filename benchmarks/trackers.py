@@ -6,13 +6,14 @@
 follows the flights of each folder of tasks, whose truths lie beside it (`make-queries`), in this process, and prints a
 row for each tracker, role and kind of view: views, flights, shares of views within 25 m, of accepted views and of these
 beyond 25 m, median normalised squared error of place and heading (2.37 for honest covariances), and processor time of a
-step. For each tracker and map: processor time to prepare, and the growth of resident memory beyond the map itself, at
-most. It is no leaderboard: nothing is shut in, and a crash ends it.
+step. For each tracker and map it prints the processor time to prepare. `--memory` prints what Python and NumPy allocate
+beyond the map itself, at most, and slows the rest down. It is no leaderboard: nothing is shut in, and a crash ends it.
 """
 
 import argparse
 import math
 import time
+import tracemalloc
 from collections import defaultdict
 from pathlib import Path
 from typing import NamedTuple
@@ -22,7 +23,7 @@ import numpy as np
 import sasgeo_bench as sgb
 
 NEAR_M = 25.0
-STATUS, REFS = Path("/proc/self/status"), Path("/proc/self/clear_refs")
+MB = 1e6
 
 Flight = list[tuple[sgb.Query, sgb.Truth]]
 
@@ -34,12 +35,6 @@ class Row(NamedTuple):
     is_accepted: bool
     error: float
     seconds: float
-
-
-def memory_mb(name: str) -> float:
-    """Return a field of the memory of this process: VmRSS now, VmHWM at most; NaN where the system has none."""
-    lines = STATUS.read_text().splitlines() if STATUS.exists() else []
-    return next((int(line.split()[1]) / 1000 for line in lines if line.startswith(name)), math.nan)
 
 
 def read_flights(tasks: Path, *, views: int) -> list[Flight]:
@@ -81,6 +76,15 @@ def judged(fix: sgb.Fix, pose: sgb.Pose, seconds: float) -> Row:
     return Row(is_near=is_near, is_accepted=bool(fix.is_accepted), error=error, seconds=seconds)
 
 
+def allocated(*, is_measured: bool) -> str:
+    """Return what is allocated now and was at most since the last call, if it is measured."""
+    if not is_measured:
+        return ""
+    now, most = tracemalloc.get_traced_memory()
+    tracemalloc.reset_peak()
+    return f"; {now / MB:.0f} MB are allocated, {most / MB:.0f} MB were at most"
+
+
 def row_of(name: str, flown: list[list[Row]]) -> str:
     """Return a line for the flights of a kind."""
     near, accepted, errors, seconds = np.array([row for rows in flown for row in rows], dtype=float).T
@@ -99,6 +103,7 @@ def main() -> None:
     parser.add_argument("tasks", type=Path, nargs="+", help="folders made by make-queries: OUT/tasks/<suite>/<region>")
     parser.add_argument("--tracker", action="append", required=True, help="a name from list-trackers")
     parser.add_argument("--views", type=int, default=1_000_000, help="first views of each flight")
+    parser.add_argument("--memory", action="store_true", help="measure memory too")
     parser.add_argument("--role", action="append", help="control, stress, falsifier; default: all")
     options = parser.parse_args()
     head = ("views", "fl.", "<=25 m", "accept", "false", "NEES", "p50 ms", "p95", "max")
@@ -107,15 +112,16 @@ def main() -> None:
         region = sgb.read_region(tasks.parents[2] / "regions" / flights[0][0][0].region)
         print(f"\n{tasks.parent.name} on {tasks.name}".ljust(66), " ".join(f"{word:>6s}" for word in head))
         for name in options.tracker:
-            tracker, before_mb = sgb.load_tracker(name), memory_mb("VmRSS")
-            if REFS.exists():
-                REFS.write_text("5")  # forgets the most that was resident until now
+            if options.memory:
+                tracemalloc.start()
+            tracker = sgb.load_tracker(name)
             start = time.process_time()
             tracker.prepare(region, None)
-            prepare_s, prepared_mb = time.process_time() - start, memory_mb("VmHWM") - before_mb
+            print(
+                f"{name}: prepared in {time.process_time() - start:.1f} s{allocated(is_measured=options.memory)}",
+                flush=True,
+            )
             by_kind: dict[str, list[list[Row]]] = defaultdict(list)
-            if REFS.exists():
-                REFS.write_text("5")
             for flight in flights:
                 truth = flight[0][1]
                 if not options.role or truth.role in options.role:
@@ -124,8 +130,9 @@ def main() -> None:
                 print(row_of(f"{name}: {kind}", flown), flush=True)
             if len(by_kind) > 1:
                 print(row_of(f"{name}: all", [rows for flown in by_kind.values() for rows in flown]))
-            flying_mb = memory_mb("VmHWM") - before_mb
-            print(f"{name}: prepared in {prepare_s:.1f} s and {prepared_mb:.0f} MB, flies in {flying_mb:.0f} MB")
+            if options.memory:
+                print(f"{name}: flew{allocated(is_measured=options.memory)}")
+                tracemalloc.stop()
 
 
 if __name__ == "__main__":

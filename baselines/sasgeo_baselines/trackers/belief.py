@@ -125,10 +125,9 @@ class Belief:
         """Multiply by a likelihood of which `logs` are the logarithms at the headings in `asked`, up to a constant.
 
         With probability `doubt` a view says nothing, whatever it shows: it never makes a place less likely than that
-        share of the likeliest one.
+        share of the likeliest one. So one view, however sure, excludes nothing.
         """
-        likelihood = np.full(len(self.mass), doubt, dtype=np.float32)[:, None, None]
-        found = self.mass * likelihood
+        found = np.float32(doubt) * self.mass
         found[self.asked] += self.mass[self.asked] * np.exp(logs - logs.max()) * np.float32(1 - doubt)
         return replace(self, mass=found).normalised()
 

@@ -33,9 +33,8 @@ _FINE: Final = 4  # points a side of a cell, for its share in each sector
 _PRESENT: Final = 0.25  # occupancy from which a cell counts for distances
 _LEAST_KNOWN: Final = 0.25  # of a sector; else it is unknown
 
-Planes = NDArray[
-    np.float32
-]  # (len(GROUPS) * (1 + len(DISTANCES_M)), rows, cols): occupancies, then nearness by distance
+# Of shape (len(GROUPS) * (1 + len(DISTANCES_M)), rows, cols): occupancies, then nearness by distance.
+Planes = NDArray[np.float32]
 
 
 @cache

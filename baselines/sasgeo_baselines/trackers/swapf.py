@@ -187,8 +187,9 @@ class SwaPf(ParticleFilter):
         tracks=("sequence",),
         limits=(
             "Classes weigh alike, water counts as other, and a mapped thing that is not seen costs only what stands in "
-            "its place; once it follows a wrong place it stays there; with a known start a tenth of the spread is hard "
-            "to reach, so that fixes within 25 m count as converged too (ours)"
+            "its place; it gathers within 20 views whatever they show, and on a large map may accept a wrong place, "
+            "where it stays; with a known start a tenth of the spread is hard to reach, so that a spread below 25 m "
+            "counts as converged too (ours)"
         ),
     )
     count = 20_000

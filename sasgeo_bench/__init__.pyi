@@ -13,6 +13,8 @@ from .geometry.pose import Prior as Prior
 from .geometry.pose import inverse as inverse
 from .geometry.pose import rotation as rotation
 from .geometry.pose import wrap_deg as wrap_deg
+from .matching.belief_fix import fix_of as fix_of
+from .matching.belief_fix import followed as followed
 from .matching.controls.blind import at_place as at_place
 from .matching.controls.blind import is_blind as is_blind
 from .matching.controls.blind import middle_m as middle_m
@@ -68,11 +70,16 @@ from .running.segmenter_testing import check_segmenter as check_segmenter
 from .running.testing import TinyPlace as TinyPlace
 from .running.testing import check_matcher as check_matcher
 from .running.testing import tiny_place as tiny_place
-from .sasgeo.by_hand import map_by_hand as map_by_hand
-from .sasgeo.by_hand import view_by_hand as view_by_hand
 from .running.tracker_testing import TinyFlights as TinyFlights
 from .running.tracker_testing import check_tracker as check_tracker
 from .running.tracker_testing import tiny_flights as tiny_flights
+from .sasgeo.by_hand import map_by_hand as map_by_hand
+from .sasgeo.by_hand import view_by_hand as view_by_hand
+from .search.belief import GridBelief as GridBelief
+from .search.belief import prepare_levels as prepare_levels
+from .search.belief import window_overlap as window_overlap
+from .search.belief_scores import pooled_logs as pooled_logs
+from .search.belief_scores import surface_logs as surface_logs
 from .search.chart import Chart as Chart
 from .search.chart import block_max as block_max
 from .search.chart import fade as fade

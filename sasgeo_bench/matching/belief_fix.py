@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.matching.tracker import Fix
-from sasgeo_bench.search.belief import Belief, Floats
+from sasgeo_bench.search.belief import Floats, GridBelief
 from sasgeo_bench.search.belief_motion import moved
 from sasgeo_bench.tasks.query import Step
 
@@ -21,7 +21,7 @@ _ROUNDS: Final = 3  # of moving to the mean of what is near
 _EVEN: Final = 1 / 12  # variance of an even spread over a unit
 
 
-def followed(belief: Belief, step: Step, *, diffuses: bool = True) -> Belief:
+def followed(belief: GridBelief, step: Step, *, diffuses: bool = True) -> GridBelief:
     """Return the belief at the next view; `diffuses` spreads it by the covariance of the increment.
 
     Where the odometer lost its way the belief stays, and spreads by 1 km and 90 degrees.
@@ -32,7 +32,7 @@ def followed(belief: Belief, step: Step, *, diffuses: bool = True) -> Belief:
     return moved(belief, step.increment, covariance, diffuses=diffuses)
 
 
-def fix_of(belief: Belief, *, least: float) -> Fix:
+def fix_of(belief: GridBelief, *, least: float) -> Fix:
     """Return the place with the most mass around it, accepted if that is at least `least`."""
     plane = belief.mass.sum(axis=0)
     around = _around(plane, belief.grid.cell_size_m)
@@ -61,7 +61,7 @@ def _around(plane: Floats, cell_m: float) -> Floats:
     return np.asarray(cv2.filter2D(plane, -1, disc, borderType=cv2.BORDER_CONSTANT))
 
 
-def _peaks(around: Floats, belief: Belief) -> list[tuple[float, float]]:
+def _peaks(around: Floats, belief: GridBelief) -> list[tuple[float, float]]:
     """Return places with the most mass around, metres, best first: `MODES` + 1 at most, each apart from the others."""
     left = around.copy()
     found: list[tuple[float, float]] = []
@@ -77,7 +77,7 @@ def _peaks(around: Floats, belief: Belief) -> list[tuple[float, float]]:
     return found
 
 
-def _refined(belief: Belief, plane: Floats, place_m: tuple[float, float]) -> tuple[Pose, float]:
+def _refined(belief: GridBelief, plane: Floats, place_m: tuple[float, float]) -> tuple[Pose, float]:
     """Return the mean pose of the mass near a place, and how much mass lies near it."""
     at_m = np.array(place_m)
     flat = plane.reshape(-1)
@@ -94,7 +94,7 @@ def _refined(belief: Belief, plane: Floats, place_m: tuple[float, float]) -> tup
     return pose, float(min(1.0, of_yaw.sum()))
 
 
-def _covariance(belief: Belief, plane: Floats, pose: Pose) -> NDArray[np.float64]:
+def _covariance(belief: GridBelief, plane: Floats, pose: Pose) -> NDArray[np.float64]:
     """Return the second moments of the belief about a pose: m2, m deg, deg2."""
     away_m = belief.places_m - (pose.easting_m, pose.northing_m)
     turn_deg = np.asarray(wrap_deg(belief.yaws_deg - pose.yaw_deg))

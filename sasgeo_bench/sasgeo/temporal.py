@@ -26,7 +26,7 @@ from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.learning import learn
 from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
-from sasgeo_bench.search.belief import Belief, Floats
+from sasgeo_bench.search.belief import Floats, GridBelief
 from sasgeo_bench.search.belief_scores import known_on, surface_logs
 from sasgeo_bench.search.dense import LevelView
 from sasgeo_bench.search.field import FULL, Field, Template
@@ -143,7 +143,7 @@ class FlightScale:
 class _Rival:
     """Another belief, begun evenly around where the tracker thinks it is, and its lead in evidence, nats."""
 
-    belief: Belief
+    belief: GridBelief
     lead_nats: float = 0.0
     views: int = 0
 
@@ -157,7 +157,7 @@ class SasgeoTrack:
 
     def __init__(self) -> None:
         self._reader: Reader | None = None
-        self._belief: Belief | None = None
+        self._belief: GridBelief | None = None
 
     def learn(self, training: Training) -> str:
         """Fit the model of the scorer to views of known place."""
@@ -177,7 +177,7 @@ class SasgeoTrack:
 
     def start(self, prior: Prior) -> None:
         """Begin with an even belief over the prior."""
-        self._belief = Belief.of(prior, self._map.field.grid)
+        self._belief = GridBelief.of(prior, self._map.field.grid)
         self._scale = FlightScale.of(prior)
         self._new_m = math.inf  # flown since the last view that showed something
         self._doubts = 0
@@ -213,13 +213,13 @@ class SasgeoTrack:
             return _USUAL_M
         return math.inf if step.increment is None else math.hypot(*step.increment[:2])
 
-    def _moved(self, belief: Belief, step: Step) -> Belief:
+    def _moved(self, belief: GridBelief, step: Step) -> GridBelief:
         if self.over_time.has_odometry or step.frame == 0:
             return followed(belief, step)
         blind = replace(step, increment=(0.0, 0.0, 0.0), covariance=tuple(_NO_ODOMETER.tolist()))
         return followed(belief, blind)
 
-    def _seen(self, belief: Belief, query: Query) -> Belief:
+    def _seen(self, belief: GridBelief, query: Query) -> GridBelief:
         """Weigh the belief by a view, learn the flight's scale, and mind whether the view fits better elsewhere."""
         template = self._map.read(query).template
         weight = FRESH * min(1.0, self._new_m / template.side_m)  # ground seen before says nothing new of the map
@@ -241,7 +241,9 @@ class SasgeoTrack:
         lead_nats = -_evidence(belief, logs)
         return self._held(weighed, fix.pose, lead_nats, lambda other: scored.on(other, elsewhere=average))
 
-    def _held(self, weighed: Belief, pose: Pose, lead_nats: float, logs_on: Callable[[Belief], Floats]) -> Belief:
+    def _held(
+        self, weighed: GridBelief, pose: Pose, lead_nats: float, logs_on: Callable[[GridBelief], Floats]
+    ) -> GridBelief:
         """Follow a rival where views fit better elsewhere, and return the belief that has more evidence.
 
         `lead_nats` is minus the evidence of this view for the tracker's own belief.
@@ -257,7 +259,7 @@ class SasgeoTrack:
                 yaw_sigma_deg=None,
                 scale_sigma=0.0,
             )
-            rival = _Rival(belief=Belief.of(near, self._map.field.grid))
+            rival = _Rival(belief=GridBelief.of(near, self._map.field.grid))
         theirs = logs_on(rival.belief)
         lead_nats += rival.lead_nats + _evidence(rival.belief, theirs)
         found = rival.belief.weighed(theirs, doubt=NONE).fitted()
@@ -281,7 +283,7 @@ class _Scored:
     scale: float
     weight: float
 
-    def on(self, belief: Belief, *, elsewhere: float) -> Floats:
+    def on(self, belief: GridBelief, *, elsewhere: float) -> Floats:
         """Return the scores at the headings in `belief.asked` and each cell of its window.
 
         Of a cell that the map does not know nothing is known: there a view scores `elsewhere`.
@@ -332,13 +334,13 @@ def _off(step: Step, before: Pose, after: Pose) -> float:
     return math.sqrt(increment_cost(step, before, after))
 
 
-def _evidence(belief: Belief, logs: Floats) -> float:
+def _evidence(belief: GridBelief, logs: Floats) -> float:
     """Return the logarithm of the likelihood of a view that a belief expects."""
     top = float(logs.max())
     return top + math.log(max(float((belief.mass[belief.asked] * np.exp(logs - top)).sum(dtype=np.float64)), 1e-30))
 
 
-def _middle_m(belief: Belief) -> tuple[float, float]:
+def _middle_m(belief: GridBelief) -> tuple[float, float]:
     """Return the mean place of a belief."""
     plane = belief.mass.sum(axis=0, dtype=np.float64).ravel()
     east_m, north_m = (plane @ belief.places_m / plane.sum()).tolist()

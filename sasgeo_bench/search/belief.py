@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Prior, wrap_deg
+from sasgeo_bench.search.field import Field
 
 Floats = NDArray[np.float32]
 Box = tuple[int, int, int, int]  # top, left, bottom, right in cells of the map
@@ -32,7 +33,7 @@ _CIRCLE_DEG: Final = 360.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Belief:
+class GridBelief:
     """Probability of each heading and cell of a window.
 
     Parameters
@@ -126,10 +127,9 @@ class Belief:
         """Multiply by a likelihood of which `logs` are the logarithms at the headings in `asked`, up to a constant.
 
         With probability `doubt` a view says nothing, whatever it shows: it never makes a place less likely than that
-        share of the likeliest one.
+        share of the likeliest one. So one view, however sure, excludes nothing.
         """
-        likelihood = np.full(len(self.mass), doubt, dtype=np.float32)[:, None, None]
-        found = self.mass * likelihood
+        found = np.float32(doubt) * self.mass
         found[self.asked] += self.mass[self.asked] * np.exp(logs - logs.max()) * np.float32(1 - doubt)
         return replace(self, mass=found).normalised()
 
@@ -156,7 +156,7 @@ class Belief:
         """Return the belief on another window, widened to whole units and cut at some way beyond the map."""
         found = self.blank(self.mapped, self.factor, clipped(box, self.mapped, beyond_m=BEYOND_M))
         down, right = (self.row - found.row) // self.factor, (self.col - found.col) // self.factor
-        into, part = overlap(found.shape, self.shape, down, right)
+        into, part = window_overlap(found.shape, self.shape, down, right)
         found.mass[(slice(None), *into)] = self.mass[(slice(None), *part)]
         return found.normalised()
 
@@ -208,10 +208,10 @@ def clipped(box: Box, mapped: Grid, *, beyond_m: float = 0.0) -> Box:
     return (*first.tolist(), *last.tolist())
 
 
-def overlap(into: tuple[int, int], part: tuple[int, int], down: int, right: int) -> tuple[Slices, Slices]:
+def window_overlap(into: tuple[int, int], part: tuple[int, int], down: int, right: int) -> tuple[Slices, Slices]:
     """Return the common cells of two windows, in each of them; the second begins `down` and `right` of the first.
 
-    >>> overlap((4, 4), (3, 3), 2, -1)
+    >>> window_overlap((4, 4), (3, 3), 2, -1)
     ((slice(2, 4, None), slice(0, 2, None)), (slice(0, 2, None), slice(1, 3, None)))
     """
     sides = []
@@ -235,3 +235,10 @@ def _about(yaws_deg: NDArray[np.float64], yaw_deg: float | None, sigma_deg: floa
     away_deg = np.abs(wrap_deg(yaws_deg - yaw_deg))
     chance = np.exp(-(away_deg**2) / (2 * (sigma_deg**2 + step_deg**2 / 12)))
     return np.asarray(chance / chance.sum(), dtype=np.float32)
+
+
+def prepare_levels(field: Field) -> Field:
+    """Return a map with the larger cells that beliefs on it may have, made now instead of during a flight."""
+    for factor in sizes_of(field.grid)[1:]:
+        field.level(factor)
+    return field

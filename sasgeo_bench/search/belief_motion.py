@@ -10,7 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import rotation
-from sasgeo_bench.search.belief import BEYOND_M, MOST, Belief, Box, Floats, clipped, overlap, sizes_of, values
+from sasgeo_bench.search.belief import (
+    BEYOND_M,
+    MOST,
+    Box,
+    Floats,
+    GridBelief,
+    clipped,
+    sizes_of,
+    values,
+    window_overlap,
+)
 
 LOST: Final = np.diag([1000.0**2, 1000.0**2, 90.0**2])  # m2, m2, deg2: where the odometer lost its way
 _SIGMAS: Final = 3.5  # of a spread that a window holds
@@ -22,13 +32,17 @@ Matrix = NDArray[np.float64]
 
 
 def moved(
-    belief: Belief, increment: tuple[float, float, float] | None, covariance: Matrix | None, *, diffuses: bool = True
-) -> Belief:
+    belief: GridBelief,
+    increment: tuple[float, float, float] | None,
+    covariance: Matrix | None,
+    *,
+    diffuses: bool = True,
+) -> GridBelief:
     """Return a belief after a step of the drone.
 
     Parameters
     ----------
-    belief : Belief
+    belief : GridBelief
         Before the step.
     increment : tuple of float, optional
         Right and up, metres, and the turn, degrees clockwise, in the axes of the pose before. Without one the belief
@@ -50,14 +64,14 @@ def moved(
     return _spread(shifted, covariance).normalised()
 
 
-def _around(belief: Belief, reach_m: float) -> Box:
+def _around(belief: GridBelief, reach_m: float) -> Box:
     """Return the window of a belief with a margin."""
     reach = math.ceil(reach_m / belief.mapped.cell_size_m)
     top, left, bottom, right = belief.box
     return clipped((top - reach, left - reach, bottom + reach, right + reach), belief.mapped, beyond_m=BEYOND_M)
 
 
-def _moved(belief: Belief, increment: tuple[float, float, float], *, spread_m: float) -> Belief:
+def _moved(belief: GridBelief, increment: tuple[float, float, float], *, spread_m: float) -> GridBelief:
     """Move every cell and heading by an increment in its own axes, linear between cells and headings.
 
     The new window has a margin for what spreads from it afterwards.
@@ -92,11 +106,11 @@ def _add(into: Floats, part: Floats, down: float, right: float) -> None:
     for at_row, high in ((row, 1 - by_row), (row + 1, by_row)):
         for at_col, wide in ((col, 1 - by_col), (col + 1, by_col)):
             if high * wide > 0:
-                to, cut = overlap((into.shape[0], into.shape[1]), (part.shape[0], part.shape[1]), at_row, at_col)
+                to, cut = window_overlap((into.shape[0], into.shape[1]), (part.shape[0], part.shape[1]), at_row, at_col)
                 into[to] += np.float32(high * wide) * part[cut]
 
 
-def _spread(belief: Belief, covariance: Matrix) -> Belief:
+def _spread(belief: GridBelief, covariance: Matrix) -> GridBelief:
     """Diffuse a belief by the covariance of an increment, in the axes of each heading.
 
     Errors of place and heading count as independent.

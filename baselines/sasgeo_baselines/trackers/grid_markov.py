@@ -4,8 +4,7 @@
 from typing import Final
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.trackers.belief import Belief, Floats
-from sasgeo_baselines.trackers.grid_filter import LEAST, GridFilter, prepared, surface_logs
+from sasgeo_baselines.trackers.grid_filter import LEAST, Floats, GridFilter
 
 CELL_M: Final = 4.0  # of the map, and the finest of the belief
 # Of `python benchmarks/fit_grid_trackers.py`, on made-up towns that are in no split: of the settings with the most
@@ -49,14 +48,14 @@ class GridMarkov(GridFilter):
     def read(self, region: sgb.Region, learned: str | None) -> sgb.Grid:
         """Read a map by hand-set rates."""
         del learned
-        self._field = prepared(sgb.map_by_hand(region, cell_size_m=CELL_M))
+        self._field = sgb.prepare_levels(sgb.map_by_hand(region, cell_size_m=CELL_M))
         self._classes, self._map_date = region.classes, region.manifest.extract.date
         return self._field.grid
 
-    def logs(self, query: sgb.Query, belief: Belief) -> Floats:
+    def logs(self, query: sgb.Query, belief: sgb.GridBelief) -> Floats:
         """Return tempered sums of log-likelihood ratios over classes and cells."""
         template = sgb.view_by_hand(query, self._classes, map_date=self._map_date)
-        return surface_logs(self._field, template, belief, temper=self.temper)
+        return sgb.surface_logs(self._field, template, belief, temper=self.temper)
 
 
 class GridMarkovStill(GridMarkov):

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.trackers.belief import Belief, Floats
-from sasgeo_baselines.trackers.grid_filter import LEAST, GridFilter, pooled_logs
+from sasgeo_baselines.trackers.grid_filter import LEAST, Floats, GridFilter
 from sasgeo_baselines.trackers.lsvl_descriptors import CELL_M, SIDE, Described, Parts, Shares
 
 VIEW_M: Final = 192.0  # views that are expected; the map is described for others when the first one comes
@@ -92,7 +91,7 @@ class LsvlBelief(GridFilter):
     card = sgb.MatcherCard(
         name="lsvl_belief",
         version="1",
-        title="Belief by descriptors on a grid, with a fitted likelihood",
+        title="sgb.GridBelief by descriptors on a grid, with a fitted likelihood",
         source=(
             "LSVL (Kinnari, Renzulli, Verdoja and Kyrki, arXiv 2212.03581): descriptors of a grid over the map, a "
             "likelihood fitted to distances of matches and of others, a belief over place and heading"
@@ -128,7 +127,7 @@ class LsvlBelief(GridFilter):
         self._described = self._shares.described(VIEW_M / SIDE)
         return self._shares.grid
 
-    def logs(self, query: sgb.Query, belief: Belief) -> Floats:
+    def logs(self, query: sgb.Query, belief: sgb.GridBelief) -> Floats:
         """Return the fitted ratio at the distance between the descriptors of the view and of each place."""
         part_m = max(query.evidence.size_m) / SIDE
         if not math.isclose(part_m, self._described.part_m):
@@ -140,7 +139,7 @@ class LsvlBelief(GridFilter):
         found = np.empty((len(belief.asked), *belief.shape), dtype=np.float32)
         for into, yaw_deg in zip(found, belief.yaws_deg[belief.asked].tolist(), strict=True):
             logs = np.float32(self.temper) * self._ratio.at(compared.distances(yaw_deg))
-            into[:] = pooled_logs(logs[None], belief.factor)[0]
+            into[:] = sgb.pooled_logs(logs[None], belief.factor)[0]
         return found
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.trackers.belief import Floats, overlap
+from sasgeo_baselines.trackers.grid_filter import Floats
 
 CELL_M: Final = 16.0  # of the map
 SIDE: Final = 4  # parts of a view along each of its sides
@@ -109,7 +109,7 @@ class Described:
         reach = math.ceil(float(np.hypot(*view.places_m.T).max()) / self.grid.cell_size_m) + 1
         wide = cells.window(-reach, -reach, cells.rows + 2 * reach, cells.cols + 2 * reach)
         corner = self.grid.to_uv(np.array([(wide.west_m, wide.north_m)]))[0]
-        into, part = overlap(wide.shape, self.grid.shape, -round(float(corner[1])), -round(float(corner[0])))
+        into, part = sgb.window_overlap(wide.shape, self.grid.shape, -round(float(corner[1])), -round(float(corner[0])))
         roots, known = self.roots[(slice(None), *part)], self.known[part]
         sums = np.zeros((len(view.roots), *wide.shape), dtype=np.float32)
         counts = np.zeros_like(sums)

@@ -6,13 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sasgeo_baselines.trackers.belief import COARSEST_M, MOST, Belief, yaw_count
-from sasgeo_baselines.trackers.motion import followed
-from sasgeo_baselines.trackers.summary import fix_of
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
+from sasgeo_bench.matching.belief_fix import fix_of, followed
 from sasgeo_bench.matching.tracker import check_fix
+from sasgeo_bench.search.belief import COARSEST_M, MOST, GridBelief, yaw_count
 from sasgeo_bench.tasks.query import Step
 
 MAPPED = Grid(epsg=32632, west_m=1000.0, north_m=9000.0, cell_size_m=4.0, rows=400, cols=500)
@@ -22,7 +21,7 @@ START = Pose(easting_m=1800.0, northing_m=8300.0, yaw_deg=90.0)
 def believed(*poses, factor=1, reach=64):
     """A belief with the same mass at each of some poses."""
     row, col = MAPPED.to_cells(np.array([(START.easting_m, START.northing_m)]))[0] // 8 * 8
-    found = Belief.blank(MAPPED, factor, (row - reach, col - reach, row + reach, col + reach))
+    found = GridBelief.blank(MAPPED, factor, (row - reach, col - reach, row + reach, col + reach))
     for pose in poses:
         at = found.grid.to_cells(np.array([(pose.easting_m, pose.northing_m)]))[0]
         found.mass[(round(pose.yaw_deg / found.yaw_step_deg), *at)] += 1 / len(poses)
@@ -118,7 +117,7 @@ def test_cells_of_another_size_keep_mass_and_means(factor):
 
 
 def test_a_window_follows_the_belief_and_its_cells_its_size():
-    wide = Belief.of(Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0), MAPPED)
+    wide = GridBelief.of(Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0), MAPPED)
     assert wide.mass.size <= MOST or wide.grid.cell_size_m == COARSEST_M
     assert wide.grid.bounds_m == (1000.0, 7400.0, 3016.0, 9000.0)  # whole squares of 32 m
     logs = np.full((len(wide.asked), *wide.shape), -40.0, dtype=np.float32)
@@ -132,11 +131,11 @@ def test_a_window_follows_the_belief_and_its_cells_its_size():
 
 def test_an_even_prior_covers_its_disc_and_its_headings():
     prior = Prior(center_m=(1800.0, 8300.0), radius_m=200.0, yaw_deg=350.0, yaw_sigma_deg=20.0, scale_sigma=0.03)
-    belief = Belief.of(prior, MAPPED)
+    belief = GridBelief.of(prior, MAPPED)
     _, variances, _ = moments(belief)
     assert variances[:2] == pytest.approx([200.0**2 / 4] * 2, rel=0.02)
     assert belief.mass.sum(axis=(1, 2)).argmax() * belief.yaw_step_deg == 350.0
-    beyond = Belief.of(replace(prior, center_m=(0.0, 0.0)), MAPPED)
+    beyond = GridBelief.of(replace(prior, center_m=(0.0, 0.0)), MAPPED)
     assert beyond.mass.sum() == pytest.approx(1.0, abs=1e-4)
 
 

@@ -228,6 +228,7 @@ class PicturesRecord(_Record):
     regions: list[_Picture] = []
     suites: list[_Picture] = []
     strips: list[_Strip] = []
+    flights: list[_Picture] = []
     cases: list[_Case] = []
 
 

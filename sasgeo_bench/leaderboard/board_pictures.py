@@ -23,6 +23,7 @@ from sasgeo_bench.leaderboard.cases import (
     sample_cases,
     words_of,
 )
+from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels, shown_flight
 from sasgeo_bench.leaderboard.plot_tables import shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
@@ -45,7 +46,9 @@ CASE_BYTES: Final = 31_000
 MOST_BYTES: Final = 3_000_000  # of all pictures of a board
 STRIP_BYTES: Final = 160_000
 STRIP_ROWS: Final = 4
-KINDS: Final = ("regions", "suites", "strips", "cases")
+FLIGHT_BYTES: Final = 220_000
+KINDS: Final = ("regions", "suites", "strips", "flights", "cases")
+_SOMETIMES: Final = ("strips", "flights")  # kinds that are not named where there are none
 _THUMB_CELLS: Final = 1100  # a level of the layers that is not much finer than a thumbnail
 _SHEET_DPI: Final = 72
 _EACH: Final = 4  # cases of one class and matcher
@@ -104,10 +107,13 @@ def pictures_extra(
     _add_suites(found, asked, board, root)
     if has_cases:
         _add_strips(found, board, asked, root)
+        _add_flights(found, board, asked, root)
         _add_cases(found, board, contrasts, asked, root)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
-    listed = ", ".join(f"{len(rows)} of {kind}" for kind, rows in found.listed.items() if rows or kind != "strips")
+    listed = ", ".join(
+        f"{len(rows)} of {kind}" for kind, rows in found.listed.items() if rows or kind not in _SOMETIMES
+    )
     tell(f"pictures: {listed}, {sum(map(len, found.files.values())) / 1e6:.2f} MB")
     return Extra(pictures=_with_list(found.files, found.listed) if found.files else {})
 
@@ -224,6 +230,29 @@ def _strip(
     own = [cases[query_id] for query_id in strip.query_ids if query_id in cases]
     rows = [read_picture(case, root, about[case.query.suite, case.query.region]) for case in own]
     return fitted(strip_pixels(strip, rows, title=title), STRIP_BYTES)
+
+
+def _add_flights(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
+    """Add for each suite of flights the flight on which trackers differ most, a map for each of them."""
+    about = {(str(item["suite"]), str(item["region"])): item for item in asked if "sequence" in item["counts"]}
+    names = [name for name in shown_matchers(board.table, ()) if name in board.views]
+    for suite in sorted({suite for suite, _ in about}):
+        regions = [region for one, region in about if one == suite]
+        chosen = shown_flight({name: board.scores[name] for name in names}, suite, regions)
+        if chosen is None:
+            continue
+        region, flight = chosen
+        views = {name: board.views[name] for name in names}
+        found.add(
+            "flights",
+            suite,
+            partial(_flight_map, about[suite, region], flight, views, root),
+            {"suite": suite, "alt": f"A flight of {suite} on {region}, with the estimates of {', '.join(names)}"},
+        )
+
+
+def _flight_map(about: Mapping[str, Any], flight: str, views: Mapping[str, pd.DataFrame], root: Path) -> bytes:
+    return fitted(flight_map_pixels(about, flight, views, root=root), FLIGHT_BYTES)
 
 
 def _add_cases(

@@ -38,6 +38,7 @@ _LEAST_FLIGHTS: Final = 2  # of a point: one flight is no distribution
 _SHARES: Final = {"half": 0.5, "most": 0.9}
 _LEAST_ERROR_M: Final = 1.0
 _MOST_ERROR_M: Final = 10_000.0
+_ERROR_TICKS_M: Final = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
 _METRICS: Final = {f"fix_every_{far_m:g}m": far_m for far_m in EVERY_M}
 DISTANCE_COLUMNS: Final = (*GROUP, "kind", "matcher", "distance_m", "flights", *_SHARES)
 INTERVAL_COLUMNS: Final = (*GROUP, "kind", "matcher", "every_m", "n", "blocks", "value", "lo", "hi")
@@ -111,6 +112,8 @@ def draw_distance(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
         chart.axhline(FIX_M, color="#999999", lw=0.8, ls="--")
         chart.set_yscale("log")
         chart.set_ylim(_LEAST_ERROR_M, _MOST_ERROR_M)
+        chart.yaxis.set_ticks(_ERROR_TICKS_M, [f"{tick:g}" for tick in _ERROR_TICKS_M])
+        chart.yaxis.set_ticks([], minor=True)
         chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
         for at, name in enumerate(names):
             line = mine[mine["matcher"] == name].sort_values("distance_m")

@@ -223,7 +223,7 @@ def _pictures(record: Mapping[str, Any]) -> Pictures:
 
     of_kind = {
         kind: tuple(Picture(of=str(item.get(what, "")), **plain(item, "file", "alt")) for item in record.get(kind, ()))
-        for kind, what in (("regions", "region"), ("suites", "suite"), ("strips", "suite"))
+        for kind, what in (("regions", "region"), ("suites", "suite"), ("strips", "suite"), ("flights", "suite"))
     }
     cases = tuple(
         Case(

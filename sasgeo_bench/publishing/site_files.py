@@ -224,7 +224,7 @@ def _read_downloads(folder: Path) -> Iterator[Download]:
 
 
 def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """Read regions, suites, strips and cases of `pictures.json`, and check each file against the folder."""
+    """Read regions, suites, strips, flights and cases of `pictures.json`, and check each file against the folder."""
     path = folder / f"{PICTURES}.json"
     if not path.is_file():
         return {}

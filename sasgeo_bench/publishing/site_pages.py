@@ -40,6 +40,8 @@ KINDS: Final = {  # of figures, by how their names begin, in the order they are 
     "stress": "Success under stress",
     "age": "Success against the age of the map",
     "strength": "Success against strength",
+    "distance": "Error along the way",
+    "interval": "How rarely the map may be asked",
     "risk": "Risk against coverage",
     "reliability": "Reliability",
     "stanford": "Protection levels against errors",
@@ -96,7 +98,11 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
             table for key in keys for table in (suite_table(book, key, book.matchers[key]), *strata_tables(book, key))
         ),
         figures=tuple(item for item in source.figures if item.file.startswith(starts)),
-        pictures=tuple(item for item in (*source.pictures.suites, *source.pictures.strips) if item.of == name),
+        pictures=tuple(
+            item
+            for item in (*source.pictures.suites, *source.pictures.strips, *source.pictures.flights)
+            if item.of == name
+        ),
         regions=tuple(sorted({base_of(region) for region in tasks})),
     )
 

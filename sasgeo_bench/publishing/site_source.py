@@ -98,6 +98,7 @@ class Pictures:
     regions: tuple[Picture, ...] = ()
     suites: tuple[Picture, ...] = ()
     strips: tuple[Picture, ...] = ()
+    flights: tuple[Picture, ...] = ()
     cases: tuple[Case, ...] = ()
 
 

@@ -223,19 +223,20 @@ def write_flight_sheet(
         rows=1 + max((row for row, _ in places), default=0),
         columns=across,
         panel_inches=(inches, inches),
-        keys=_keys(shown),
+        keys=flight_keys(shown),
     )
     with page(path, sheet) as charts:
         for _ in panels(charts, 0):
             pass
-        grounds: dict[str, _Ground] = {}
+        grounds: dict[str, Ground] = {}
         for (row, column), panel in zip(places, shown, strict=True):
             charts[row][column].set_visible(True)
             site = panel.truth.pair_id
             if site not in grounds:
-                bounds_m = _bounds_m([other for other in shown if other.truth.pair_id == site])
-                grounds = {site: _Ground.of(region_folder, manifest, bounds_m)}
-            _draw(charts[row][column], panel, grounds[site])
+                bounds_m = bounds_of_m([other for other in shown if other.truth.pair_id == site])
+                grounds = {site: Ground.of(region_folder, manifest, bounds_m)}
+            draw_flight(charts[row][column], panel, grounds[site])
+            charts[row][column].set_title("\n".join(_words(panel)))
 
 
 def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
@@ -257,7 +258,7 @@ def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
         begin += lines
 
 
-def _bounds_m(shown: Sequence[FlightPanel]) -> tuple[float, float, float, float]:
+def bounds_of_m(shown: Sequence[FlightPanel]) -> tuple[float, float, float, float]:
     """Return the square that the panels of a site show: west, east, south, north."""
     true = np.concatenate([panel.place_m for panel in shown] + [panel.copy_m[panel.is_copied] for panel in shown])
     low, high = true.min(axis=0), true.max(axis=0)
@@ -270,8 +271,8 @@ def _bounds_m(shown: Sequence[FlightPanel]) -> tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class _Ground:
-    """The pale map under the panels of a site, west, east, south and north of it, and of the panels."""
+class Ground:
+    """The pale map under the panels of a site: west, east, south and north of it, and of the panels."""
 
     picture: Floats
     extent_m: tuple[float, float, float, float]
@@ -294,8 +295,8 @@ class _Ground:
         return cls(picture=picture, extent_m=extent_m, bounds_m=bounds_m)
 
 
-def _draw(chart: Axes, panel: FlightPanel, ground: _Ground) -> None:
-    """Draw one flight over its map."""
+def draw_flight(chart: Axes, panel: FlightPanel, ground: Ground) -> None:
+    """Draw one flight over its map: the true path and views, and where the odometer alone would lead."""
     chart.imshow(ground.picture, extent=ground.extent_m, interpolation="antialiased")
     if panel.prior_m is not None:
         chart.add_patch(Circle(panel.prior_m[:2], panel.prior_m[2], fill=False, ec=PRIOR, lw=1.2, ls=(0, (4, 2))))
@@ -320,7 +321,6 @@ def _draw(chart: Axes, panel: FlightPanel, ground: _Ground) -> None:
     chart.set(xlim=ground.bounds_m[:2], ylim=ground.bounds_m[2:], aspect="equal", facecolor="#e8e8e8")
     without_ticks(chart)
     _draw_bar(chart, ground.bounds_m)
-    chart.set_title("\n".join(_words(panel)))
 
 
 def _draw_bar(chart: Axes, bounds_m: tuple[float, float, float, float]) -> None:
@@ -360,7 +360,7 @@ def _words(panel: FlightPanel) -> tuple[str, ...]:
     )
 
 
-def _keys(shown: Sequence[FlightPanel]) -> list[Artist]:
+def flight_keys(shown: Sequence[FlightPanel]) -> list[Artist]:
     """Return the handles of the legend, of what is drawn."""
     kinds: list[tuple[bool, str, dict[str, Any]]] = [
         (True, "true path and views", {"color": TRUE, "lw": 1.2, "marker": ".", "ms": 5}),

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps of a flight, one for each tracker: the true path, the estimates, and which of them were accepted."""
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from numpy.typing import NDArray
+
+from sasgeo_bench.canvas import Page, page, panels
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.regions import region_files
+from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.scoring.score import FIX_M
+from sasgeo_bench.tasks.flight_sheet import Ground, bounds_of_m, draw_flight, flight_keys, flight_panels
+
+MOST_TRACKERS: Final = 6
+_ACROSS: Final = 3
+_INCHES: Final = 3.4
+_RIGHT, _FALSE, _WITHHELD = "#00897b", "#d50000", "#5c6bc0"
+_KEYS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
+    (f"accepted, within {FIX_M:g} m", {"color": "none", "marker": "o", "mfc": _RIGHT, "mec": "white", "ms": 6}),
+    (f"accepted, beyond {FIX_M:g} m", {"color": "none", "marker": "X", "mfc": _FALSE, "mec": "white", "ms": 7}),
+    ("estimate that was not accepted", {"color": _WITHHELD, "lw": 1.0, "marker": ".", "ms": 5}),
+)
+
+
+def shown_flight(scores: Mapping[str, pd.DataFrame], suite: str, regions: Sequence[str]) -> tuple[str, str] | None:
+    """Return region and id of the flight of a suite that a board shows: the one on which its trackers differ most.
+
+    Stressed flights come first; of those that differ as much the first by id. None if there is no flight.
+    """
+    parts = [frame[(frame["suite"] == suite) & frame["region"].isin(list(regions))] for frame in scores.values()]
+    rows = pd.concat([part for part in parts if len(part)] or [pd.DataFrame()])
+    if rows.empty:
+        return None
+    is_stress = rows["role"] == "stress"
+    some = rows[is_stress] if is_stress.any() else rows
+    spread = some.groupby(["region", "query_id"])["distance_within_25m"].agg(lambda values: values.max() - values.min())
+    at = int(spread.sort_index().to_numpy().argmax())
+    region, flight = spread.sort_index().index.to_list()[at]
+    return str(region), str(flight)
+
+
+def flight_map_pixels(
+    about: Mapping[str, Any], flight: str, views: Mapping[str, pd.DataFrame], *, root: Path
+) -> NDArray[np.uint8]:
+    """Draw a flight with the estimates of at most `MOST_TRACKERS` trackers; pixels have blue first.
+
+    Parameters
+    ----------
+    about : mapping
+        Content of `task.json`.
+    flight : str
+        Id of the flight.
+    views : mapping of str to DataFrame
+        Rows of `scoring.flights.view_frame` by tracker, in the order in which they are drawn.
+    root : Path
+        Holds tasks/, truth/ and regions/.
+    """
+    suite, region = str(about["suite"]), str(about["region"])
+    (panel,) = flight_panels(root / "tasks" / suite / region, root / "truth" / suite / region, flight=flight)
+    folder = root / "regions" / region
+    ground = Ground.of(folder, region_files.read_manifest(folder), bounds_of_m([panel]))
+    mine = {name: frame[frame["sequence_id"] == flight] for name, frame in views.items()}
+    names = [name for name, frame in mine.items() if len(frame)][:MOST_TRACKERS]
+    truth = panel.truth
+    across = min(_ACROSS, len(names))
+    sheet = Page(
+        title=f"{about['title']}: {region}",
+        facts=f"One flight, {truth.role}: {truth.kind}. {about['what']}",
+        note="North is up. The flight is the one of the suite on which these trackers differ most.",
+        data=ATTRIBUTION,
+        rows=-(-len(names) // across),
+        columns=across,
+        panel_inches=(_INCHES, _INCHES),
+        keys=[*flight_keys([panel]), *(Line2D([], [], label=label, **style) for label, style in _KEYS)],
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "flight.png"
+        with page(path, sheet) as charts:
+            for number, chart in panels(charts, len(names)):
+                draw_flight(chart, panel, ground)
+                _draw_estimates(chart, mine[names[number]])
+                chart.set_title(f"{names[number]}\n{_facts(mine[names[number]])}")
+        pixels = cv2.imread(str(path))
+    if pixels is None:
+        message = f"the map of flight {flight} cannot be drawn: free some space where temporary files lie"
+        raise StoreError(message)
+    return np.asarray(pixels, dtype=np.uint8)
+
+
+def _draw_estimates(chart: Axes, views: pd.DataFrame) -> None:
+    place_m = views[["east_m", "north_m"]].to_numpy(float)
+    accepted, is_near = views["is_accepted"].to_numpy(bool), views["error_m"].to_numpy(float) <= FIX_M
+    chart.plot(*place_m.T, color=_WITHHELD, lw=0.9, marker=".", ms=3, zorder=7)
+    chart.plot(*place_m[accepted & is_near].T, "o", ms=4.2, mfc=_RIGHT, mec="white", mew=0.4, zorder=8)
+    chart.plot(*place_m[accepted & ~is_near].T, "X", ms=6.0, mfc=_FALSE, mec="white", mew=0.5, zorder=9)
+
+
+def _facts(views: pd.DataFrame) -> str:
+    """Return how many views of a flight have a near estimate, an accepted fix, and a false one."""
+    accepted, is_near = views["is_accepted"].to_numpy(bool), views["error_m"].to_numpy(float) <= FIX_M
+    counts = (
+        f"{is_near.sum()} within {FIX_M:g} m, {accepted.sum()} accepted, {(accepted & ~is_near).sum()} of them false"
+    )
+    return f"of {len(views)} views {counts}"

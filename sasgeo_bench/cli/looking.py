@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
+import pandas as pd
 import typer
 from rich.table import Table
 
@@ -15,6 +16,7 @@ from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board, read_scores
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
+from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels
 from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
 from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -151,7 +153,12 @@ def _best_run(board: Path, out: Path) -> Path:
 
 
 def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | None) -> None:
-    """Count the failures of a run by class, with some to look at; or draw one query and its answer, or a strip."""
+    """Count the failures of a run by class, with some to look at; or draw one query and its answer, or a strip.
+
+    Of flights print what each is scored, and draw the map of one.
+    """
+    if cases.flights and strip is None and _inspect_flights(cases, out, query):
+        return
     if strip is not None:
         name = cases.entry.name.replace(" ", "-")
         suites = ", ".join(sorted({suite for suite, _ in pictured_tasks(cases)}))
@@ -165,6 +172,8 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | Non
         write_png(path, case_pixels(picture))
         say(f"picture: {path}")
         return
+    if not len(cases.scores):
+        return
     found = cases.failures()
     counts = count_cases(found)
     some = sample_cases(found, each=SOME_CASES)
@@ -175,6 +184,40 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | Non
     stressed, total = int((cases.scores["role"] == STRESS).sum()), len(cases.scores)
     only = f", {stressed} of them under stress: boards count these first, and controls separately" if stressed else ""
     say(f"{cases.entry.name}: {counted(len(found), 'failure')} in {counted(total, 'query', 'queries')}{only}")
+    print_table(table)
+
+
+def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
+    """Print the figures of the flights of a run, and draw a map of the one named, or of the worst.
+
+    Return True if `query` names one of them.
+    """
+    frames = [found.flights for found in cases.flights.values()]
+    flights = pd.concat(frames, ignore_index=True).sort_values("distance_within_25m", kind="stable")
+    named = flights if query is None else flights[flights["query_id"].str.startswith(query)]
+    if named.empty:
+        return False
+    if query is None:
+        _print_flights(cases.entry.name, flights)
+    row = named.iloc[0]
+    key = (str(row["suite"]), str(row["region"]))
+    about = read_task(cases.root / "tasks" / key[0] / key[1])
+    views = {cases.entry.name: cases.flights[key].views}
+    path = out / "sheets" / f"{cases.entry.name.replace(' ', '-')}-{row['query_id']}.png"
+    write_png(path, flight_map_pixels(about, str(row["query_id"]), views, root=cases.root))
+    say(f"map of {'the worst flight' if query is None else 'the flight'}: {path}")
+    return query is not None
+
+
+def _print_flights(name: str, flights: pd.DataFrame) -> None:
+    """Print a line for each flight, the worst first."""
+    shown = {"flight": "query_id", "suite": "suite", "region": "region", "kind": "kind"}
+    figures = ("distance_within_25m", "accepted", "false_accepted", "error_p95_m", "first_fix_m")
+    table = Table(*shown, *figures, box=None, pad_edge=False)
+    for row in flights.to_dict("records"):
+        texts = [str(row["query_id"])[:SHOWN_LETTERS], *(str(row[column]) for column in list(shown.values())[1:])]
+        table.add_row(*texts, *(f"{row[figure]:.3g}" for figure in figures))
+    say(f"{name}: {counted(len(flights), 'flight')}, the worst first (--query draws one)")
     print_table(table)
 
 

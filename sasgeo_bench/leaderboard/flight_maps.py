@@ -75,7 +75,7 @@ def flight_map_pixels(
     sheet = Page(
         title=f"{about['title']}: {region}",
         facts=f"One flight, {truth.role}: {truth.kind}. {about['what']}",
-        note="North is up. The flight is the one of the suite on which these trackers differ most.",
+        note="North is up." + (" Trackers differ most on this flight of the suite." if len(names) > 1 else ""),
         data=ATTRIBUTION,
         rows=-(-len(names) // across),
         columns=across,

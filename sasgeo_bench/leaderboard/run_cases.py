@@ -4,7 +4,7 @@
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,9 +31,10 @@ from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.contestants import AskedTask, ScoredTask, read_scored_task
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries
+from sasgeo_bench.scoring.flights import ScoredFlights, score_flights
 from sasgeo_bench.scoring.pose import first_pose
 from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
-from sasgeo_bench.scoring.score import MISSING, score_task, settle_not_applicable
+from sasgeo_bench.scoring.score import COLUMNS, MISSING, score_task, settle_not_applicable
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
 from sasgeo_bench.tasks.query import REAL, Query, Truth
@@ -279,16 +280,18 @@ class RunCases:
     """A matcher's scored answers.
 
     `run` is the path as given, `root` holds tasks/, truth/ and regions/. `judged` are results of rejectors by matcher
-    and rejector, its own confidence among them; `tasks` are by suite and region, `predictions` by query.
+    and rejector, its own confidence among them; `tasks` are by suite and region, `predictions` by query. Those of
+    flights are in `flights`, by suite and region, and not among the others.
     """
 
     run: Path
     entry: Entry
     root: Path
-    scores: pd.DataFrame
-    judged: Mapping[tuple[str, str], pd.DataFrame]
     tasks: Mapping[tuple[str, str], ScoredTask]
     predictions: Mapping[str, Prediction]
+    flights: Mapping[tuple[str, str], ScoredFlights]
+    scores: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(COLUMNS)))
+    judged: Mapping[tuple[str, str], pd.DataFrame] = field(default_factory=dict)
 
     def failures(self) -> pd.DataFrame:
         """Return every failure with its class (`cases.COLUMNS`), without those of a board's controls."""
@@ -326,6 +329,7 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     predictions: dict[str, Prediction] = {}
     tasks: dict[tuple[str, str], ScoredTask] = {}
     lost: list[SasgeoError] = []
+    flights: dict[tuple[str, str], ScoredFlights] = {}
     frames = []
     place_of = {} if split is None else split.place_of
     for source, about in zip(entry.sources, entry.runs, strict=True):
@@ -335,16 +339,21 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
         except SasgeoError as error:
             lost.append(error)
             continue
+        if task.is_of_flights:
+            flights[about["suite"], about["region"]] = score_flights(task.heads, task.truths, mine, place_of=place_of)
+            continue
         frames.append(score_task(task.heads, task.truths, mine, place_of=place_of))
         tasks[about["suite"], about["region"]] = task
         predictions |= mine
-    if not frames:
+    if not (frames or flights):
         raise lost[0]
     if lost:
         tell(f"left out: {counted(len(lost), 'run')} of {len(entry.sources)}, as {lost[0]}")
+    found = RunCases(run=run, entry=entry, root=root, tasks=tasks, predictions=predictions, flights=flights)
+    if not frames:
+        return found
     scores = settle_not_applicable(pd.concat(frames, ignore_index=True))
-    judged = _judged(entry, scores, predictions, split, rejectors)
-    return RunCases(run=run, entry=entry, root=root, scores=scores, judged=judged, tasks=tasks, predictions=predictions)
+    return replace(found, scores=scores, judged=_judged(entry, scores, predictions, split, rejectors))
 
 
 def _answers(source: Path, about: Mapping[str, Any], folder: Path) -> dict[str, Prediction]:

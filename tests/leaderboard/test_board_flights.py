@@ -122,3 +122,14 @@ def test_stored_results_give_the_same_board(out):
     )
     columns = ["matcher", "suite", "stratum", "metric", "n", "value", "lo", "hi"]
     pd.testing.assert_frame_equal(first[columns], second[columns], check_dtype=False)
+
+
+def test_a_run_of_flights_is_listed_and_its_worst_flight_drawn(out, program):
+    code, told, _ = program("inspect", str(out / "runs" / "far"), "--out", str(out))
+    assert code == 0
+    assert "far: 6 flights, the worst first (--query draws one)" in told
+    path = told.rpartition("map of the worst flight: ")[2].strip()
+    assert cv2.imread(path).shape[1] > 300
+    flight = read_scores(out / "boards" / "mine")["query_id"].iloc[0]
+    code, told, _ = program("inspect", str(out / "runs" / "far"), "--query", flight[:10], "--out", str(out))
+    assert (code, told) == (0, f"map of the flight: {out / 'sheets' / f'far-{flight}.png'}\n")

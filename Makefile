@@ -62,8 +62,9 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 # Three workers for two processors: now and then a test waits for a process that it has started.
 # Hundreds of processes import the same modules: none of them compiles them again.
 test test-quick test-torch: export PYTHONDONTWRITEBYTECODE :=
-# The workers fill the processors already: threads of linear algebra would wait for each other.
+# The workers fill the processors already: threads of linear algebra and of image warps would wait for each other.
 test test-quick test-torch: export OMP_NUM_THREADS := 1
+test test-quick test-torch: export OPENCV_FOR_THREADS_NUM := 1
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 3 --dist loadfile -p no:benchmark -rs $(ARGS)

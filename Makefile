@@ -37,12 +37,15 @@ $(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
 
 install: $(STAMP) ## set up .venv from requirements.lock (the other targets do it too)
 
-demo: $(STAMP) ## build an embedded town and show what is in it; then a small leaderboard, its site and a strip from pictures to poses
+demo: $(STAMP) ## build an embedded town and show what is in it; a small leaderboard, its site and a strip from pictures to poses; a flight
 	$(SASGEO) build-region town-riverside --out $(OUT) $(ARGS)
 	$(SASGEO) inspect town-riverside --out $(OUT)
 	$(SASGEO) leaderboard demo --jobs 2 --out $(OUT)
 	$(SASGEO) publish --board $(OUT)/boards/demo
 	$(SASGEO) inspect $(OUT)/boards/demo --strip 6 --out $(OUT)
+	$(SASGEO) make-queries --suite flight-clean --regions town-riverside --n 1 --up-to --out $(OUT)
+	$(SASGEO) run --matcher sasgeo_track --tasks $(OUT)/tasks/flight-clean/town-riverside --out $(OUT)
+	$(SASGEO) inspect $(OUT)/runs/sasgeo_track --out $(OUT)
 
 list-regions: $(STAMP) ## list the regions that come with the package
 	$(SASGEO) list-regions $(ARGS)

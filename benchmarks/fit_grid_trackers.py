@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fit what the grid filters of the baselines ship, on made-up towns that are in no split.
+"""Fit what filters on a grid ship, of the baselines and of the scorer, on made-up towns that are in no split.
 
-    python benchmarks/fit_grid_trackers.py --out out/grid-trackers [--tracker grid_markov --tracker lsvl_belief]
+    python benchmarks/fit_grid_trackers.py --out out/grid-trackers [--tracker grid_markov --tracker sasgeo_track ...]
 
 draws four towns from a seed that no region of ours has, with maps of 2014, 2019 and 2025, and flies over them with poor
 odometry (suite `flight-clean`) and over older maps (`flight-real-age`). It prints the ratio of densities that
 `lsvl_belief` ships, and for each temper and doubt of a filter the share of views within 25 m, the share that is
 accepted, and the mean logarithm of the belief within 25 m of the truth, at least one in a million: the higher, the
-better. The filters say at their constants which of these they took.
+better; and the median of the squared error of accepted places over their covariance, per axis: 0.69 is honest. The
+filters say at their constants which of these they took. `sasgeo_track` first learns from single views of
+the same towns (suites `clean` and `real-age`); its temper is the weight of a view of new ground, its doubt the
+probability that a view fits no place.
 """
 
 import argparse
@@ -23,6 +26,7 @@ from sasgeo_baselines.trackers.grid_markov import GridMarkov
 from sasgeo_baselines.trackers.lsvl_belief import LsvlBelief, Ratio, distances
 
 import sasgeo_bench as sgb
+from sasgeo_bench.sasgeo.trackers import SasgeoTrack
 
 MORPHOLOGIES = ("grid", "old_town", "riverside", "suburb")
 DATES = ("2014-01-01", "2019-01-01", "2025-01-01")
@@ -31,7 +35,13 @@ FLOWN = (("flight-clean", ("",), ("F1 wheel-poor",)), ("flight-real-age", ("@201
 TAUGHT_ON = (("flight-clean", ("",), ("no drift", "no drift again")), FLOWN[1])
 VIEWS = 60  # of each flight
 NEAR_M, LEAST_MASS = 25.0, 1e-6
-TEMPERS = {"grid_markov": (0.006, 0.012, 0.024, 0.048), "lsvl_belief": (0.5, 1.0, 2.0, 4.0)}
+TEMPERS = {
+    "grid_markov": (0.006, 0.012, 0.024, 0.048),
+    "lsvl_belief": (0.5, 1.0, 2.0, 4.0),
+    "sasgeo_track": (0.125, 0.25, 0.5, 1.0),
+}
+LEARNED_FROM = ("clean", "real-age")  # single views, for sasgeo_track
+SITES = 6
 DOUBTS = (1e-3, 1e-2, 1e-1)
 
 REGION = """\
@@ -99,8 +109,34 @@ def read_flights(out: Path, towns: tuple[str, ...], wanted: tuple[Flown, ...]) -
             yield from flights.values()
 
 
-def score(tracker: GridFilter, flight: Flight) -> Iterator[tuple[bool, bool, float]]:
-    """Yield whether a view's estimate is within 25 m, whether it is accepted, and the log of the belief so near."""
+def learned(out: Path, towns: tuple[str, ...]) -> str:
+    """Draw single views of the towns, and return what `sasgeo_track` learns from them."""
+    sgb.make_tasks(
+        suite=list(LEARNED_FROM),
+        regions=list(towns),
+        split=str(out / "fit-grid-trackers.toml"),
+        n=SITES,
+        seed=TASK_SEED,
+        region_files=[out / "region-files"],
+        out=out,
+        up_to=True,
+    )
+    folders = [
+        folder for suite in LEARNED_FROM for folder in sorted((out / "tasks" / suite).glob("*")) if folder.is_dir()
+    ]
+    pairs = [
+        pair
+        for folder in folders
+        for pair in zip(
+            sgb.read_queries(folder), sgb.read_truths(out / "truth" / folder.parent.name / folder.name), strict=True
+        )
+    ]
+    regions = {name: sgb.read_region(out / "regions" / name) for name in dict.fromkeys(one.region for one, _ in pairs)}
+    return SasgeoTrack().learn(sgb.Training(regions=regions, pairs=pairs))
+
+
+def score(tracker: GridFilter | SasgeoTrack, flight: Flight) -> Iterator[tuple[bool, bool, float, float]]:
+    """Yield of each view: within 25 m, accepted, log of the belief so near, and squared error over the covariance's."""
     tracker.start(flight[0][0].prior)
     for query, truth in flight:
         fix = tracker.step(query)
@@ -109,32 +145,38 @@ def score(tracker: GridFilter, flight: Flight) -> Iterator[tuple[bool, bool, flo
             away_m = math.dist((fix.pose.easting_m, fix.pose.northing_m), here_m)
             near = np.hypot(*(tracker.belief.places_m - here_m).T) <= NEAR_M
             mass = float(tracker.belief.mass.sum(axis=0).reshape(-1)[near].sum())
-            yield away_m <= NEAR_M, fix.is_accepted, math.log(max(mass, LEAST_MASS))
+            gap_m = np.subtract((fix.pose.easting_m, fix.pose.northing_m), here_m)
+            honest = float(gap_m @ np.linalg.solve(np.asarray(fix.covariance)[:2, :2], gap_m)) / 2
+            yield away_m <= NEAR_M, fix.is_accepted, math.log(max(mass, LEAST_MASS)), honest
 
 
-def try_settings(kind: type[GridFilter], out: Path, towns: tuple[str, ...], taught: str | None) -> None:
+def try_settings(
+    kind: type[GridFilter] | type[SasgeoTrack], out: Path, towns: tuple[str, ...], taught: str | None
+) -> None:
     """Print the scores of a filter with each temper and doubt."""
     flights = list(read_flights(out, towns, FLOWN))
     trackers = {}
     for name in dict.fromkeys(flight[0][0].region for flight in flights):
         trackers[name] = kind()
         trackers[name].prepare(sgb.read_region(out / "regions" / name), taught)
-    print(f"\n{kind.card.name}: {len(flights)} flights\ntemper, doubt: within 25 m, accepted, log of the belief near")
+    print(f"\n{kind.card.name}: {len(flights)} flights")
+    print("temper, doubt: within 25 m, accepted, log of the belief near, NEES")
     for temper, doubt in product(TEMPERS[kind.card.name], DOUBTS):
         rows = []
         for flight in flights:
             tracker = trackers[flight[0][0].region]
             vars(tracker).update(temper=temper, doubt=doubt)
             rows += list(score(tracker, flight))
-        near, accepted, log = np.mean(rows, axis=0)
-        print(f"{temper:g}, {doubt:g}: {near:.3f}, {accepted:.3f}, {log:.3f}", flush=True)
+        near, accepted, log, _ = np.mean(rows, axis=0)
+        nees = np.median([row[3] for row in rows if row[1]] or [math.nan])
+        print(f"{temper:g}, {doubt:g}: {near:.3f}, {accepted:.3f}, {log:.3f}, {nees:.3f}", flush=True)
 
 
 def main() -> None:
     """Fit, and print what was found."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/grid-trackers"), help="folder of the towns")
-    parser.add_argument("--tracker", action="append", choices=list(TEMPERS), help="default: both")
+    parser.add_argument("--tracker", action="append", choices=list(TEMPERS), help="default: all")
     options = parser.parse_args()
     towns = draw_towns(options.out)
     taught = None
@@ -145,9 +187,10 @@ def main() -> None:
         right, wrong = distances(sgb.Training(regions=regions, pairs=pairs))
         taught = Ratio.fitted(right, wrong).to_text()
         print(f"ratio of {len(right)} right and {len(wrong)} other poses: {taught}", flush=True)
-    for kind in (GridMarkov, LsvlBelief):
+    for kind in (GridMarkov, LsvlBelief, SasgeoTrack):
         if not options.tracker or kind.card.name in options.tracker:
-            try_settings(kind, options.out, towns, taught if kind is LsvlBelief else None)
+            given = learned(options.out, towns) if kind is SasgeoTrack else taught if kind is LsvlBelief else None
+            try_settings(kind, options.out, towns, given)
 
 
 if __name__ == "__main__":

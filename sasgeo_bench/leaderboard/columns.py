@@ -121,7 +121,7 @@ def column(term: str, *, is_number: bool = True, order: str = "none", title: str
     """Return the column of a term with its meaning; `title` where it is shown under another name.
 
     >>> column("n").meaning
-    'Queries in the denominator. Rows with different n do not compare: they are of different queries'
+    'Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones'
     """
     meaning = MEANINGS.get(term, _UNKNOWN)
     return Column(term=term, name=title or term, meaning=meaning, is_number=is_number, order=order)

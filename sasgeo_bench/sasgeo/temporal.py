@@ -36,17 +36,16 @@ from sasgeo_bench.tasks.query import Query, Step
 
 CELL_M: Final = 4.0  # of the map that is searched: of a whole country its layers take 0.3 GB
 NONE: Final = 1e-3  # probability that a view fits no place better than the rest: aged or perceived beyond recognition
-# Share of the fitted exponents for views whose ground is all new. `python benchmarks/track_weights.py` gives the table
-# that it was chosen by, on made-up train towns.
+# Of the fitted exponents, for views whose ground is all new.
 FRESH: Final = 0.5
 LEAST: Final = 0.9  # mass within 25 m of a fix that is accepted
-LOST_M: Final = 500.0  # radius of the first search for another place
+LOST_M: Final = 600.0  # radius of the first search for another place
 _MOST_LOST_M: Final = 8000.0
 _WIDER: Final = 4.0  # the next search, where the one before found nothing
 _LIFE: Final = 20  # views for which another place is followed beside the belief
 _DOUBTS: Final = 3  # views in a row that fit better elsewhere
 _PROOF_NATS: Final = 6.0  # more evidence than the belief has
-_AROUND_M: Final = 500.0  # radius of the places that a view is held against
+_AROUND_M: Final = 450.0  # radius of the places that a view is held against
 _AROUND_FACTOR: Final = 4
 _AROUND_DEG: Final = 10.0
 VIO: Final = "vio_mahalanobis"  # diagnostic: the last step of the estimate against the odometer's (Eq. 10)
@@ -149,11 +148,17 @@ class _Rival:
 
 
 class SasgeoTrack:
-    """The scorer's raster over time, with the parts that `switches` and `over_time` select."""
+    """The scorer's raster over time, with the parts that `switches` and `over_time` select.
+
+    `temper` is the share of the fitted exponents that a view of new ground has, `doubt` the probability that a view
+    fits no place.
+    """
 
     card: MatcherCard
     switches: ClassVar[Switches] = Switches(has_graph=False)
     over_time: ClassVar[OverTime] = OverTime()
+    temper: float = FRESH
+    doubt: float = NONE
 
     def __init__(self) -> None:
         self._reader: Reader | None = None
@@ -167,6 +172,14 @@ class SasgeoTrack:
         """Read a map with a trained model, or the one set by hand."""
         model = ScorerModel.from_text(learned) if learned else ScorerModel.by_hand(region.classes)
         self._reader = Reader.of(region, model, self.switches, search_cell_m=CELL_M)
+
+    @property
+    def belief(self) -> GridBelief:
+        """Return the belief after the last view."""
+        if self._belief is None:
+            message = f"{self.card.name}: call start() first, and step() with the views of a flight"
+            raise RuntimeError(message)
+        return self._belief
 
     @property
     def _map(self) -> Reader:
@@ -187,10 +200,10 @@ class SasgeoTrack:
 
     def step(self, query: Query) -> Fix:
         """Move the belief by the odometer, weigh it by the view, and say where its mass is."""
-        if self._belief is None or query.step is None:
-            message = f"{self.card.name}: call start() first, and step() with the views of a flight"
+        if query.step is None:
+            message = f"{self.card.name}: step() needs the views of a flight"
             raise RuntimeError(message)
-        belief = self._moved(self._belief, query.step)
+        belief = self._moved(self.belief, query.step)
         if self._rival is not None:
             self._rival = replace(self._rival, belief=self._moved(self._rival.belief, query.step))
         self._new_m += self._way_m(query.step)
@@ -222,9 +235,9 @@ class SasgeoTrack:
     def _seen(self, belief: GridBelief, query: Query) -> GridBelief:
         """Weigh the belief by a view, learn the flight's scale, and mind whether the view fits better elsewhere."""
         template = self._map.read(query).template
-        weight = FRESH * min(1.0, self._new_m / template.side_m)  # ground seen before says nothing new of the map
+        weight = self.temper * min(1.0, self._new_m / template.side_m)  # ground seen before says nothing new of the map
         self._new_m = 0.0
-        doubt = NONE if self.over_time.has_none else 0.0
+        doubt = self.doubt if self.over_time.has_none else 0.0
         scored = _Scored(field=self._map.field, template=template, scale=self._scale.mean, weight=weight)
         average = scored.of_average(_middle_m(belief))
         logs = scored.on(belief, elsewhere=average)
@@ -262,7 +275,7 @@ class SasgeoTrack:
             rival = _Rival(belief=GridBelief.of(near, self._map.field.grid))
         theirs = logs_on(rival.belief)
         lead_nats += rival.lead_nats + _evidence(rival.belief, theirs)
-        found = rival.belief.weighed(theirs, doubt=NONE).fitted()
+        found = rival.belief.weighed(theirs, doubt=self.doubt).fitted()
         if lead_nats > _PROOF_NATS and fix_of(found, least=LEAST).is_accepted:
             self._rival, self._doubts, self._lost_m = None, 0, LOST_M
             return found

@@ -217,7 +217,7 @@ def amount_interval(value: float, drawn: tuple[ArrayLike, ArrayLike]) -> BoardIn
 
     >>> found = amount_interval(2.0, (np.linspace(1.0, 3.0, 101), np.full(101, 2.0)))
     >>> round(found.lo, 2), round(found.hi, 2), found.how
-    (1.06, 2.94, 'places')
+    (1.04, 2.96, 'places')
     """
     places, blocks = (percentile_interval(value, one) for one in drawn)
     if math.isnan(value) or not (places.lo < places.hi or blocks.lo < blocks.hi):

@@ -192,7 +192,17 @@ def tell(text):
     return write(text)
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
-signal.signal(signal.SIGPROF, lambda *_: signal.raise_signal(signal.SIGINT))
+
+def strike(number, frame):
+    # Not where Python drops exceptions: in a callback of a weak reference, or in a destructor.
+    while frame is not None:
+        if frame.f_code.co_name in ("remove", "__del__"):
+            signal.setitimer(signal.ITIMER_PROF, 0.001)
+            return
+        frame = frame.f_back
+    signal.raise_signal(signal.SIGINT)
+
+signal.signal(signal.SIGPROF, strike)
 write, sys.stderr.write = sys.stderr.write, tell
 cli.main()
 """

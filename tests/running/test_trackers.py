@@ -8,9 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import MatchError, StoreError
-from sasgeo_bench.leaderboard.board import ScoreRequest
-from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching import follower
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
@@ -190,13 +188,3 @@ def test_the_oracle_follows_flights_and_a_matcher_that_only_ranks_does_not(task,
     assert all(item.candidates[0][0] == truths[item.query_id] and item.is_accepted for item in rows)
     rows = [item for rows in run_of(task, tmp_path, "Ranks").values() for item in rows]
     assert {(item.status, item.message) for item in rows} == {("not applicable", "track sequence")}
-
-
-def test_a_board_of_flights_is_refused_in_one_line(task, tmp_path):
-    run_of(task, tmp_path, "prior_only")
-    root = task.parents[2]
-    board, truth = tmp_path / "boards" / "flights", root / "truth"
-    request = ScoreRequest(predictions=(tmp_path / "runs",), root=root, board=board, tasks=(task,), truth=truth)
-    with pytest.raises(StoreError, match="holds flights, and boards score single views so far: leave it out"):
-        make_board(request, tell=lambda _: None)
-    assert not board.exists()

@@ -23,6 +23,7 @@ QUOTES = re.compile(r"\b(warp|wave|wavelength|gap|twin|lure|generator|perturbati
 ARGUED: Mapping[str, str] = {
     "class_weights.py:CELL_M = 4": "two cells of the search: fine enough for eight sectors of the inner ring",
     "class_weights.py:RINGS_M = 16": "a junction and the ends of its roads",
+    "temporal.py:CELL_M = 4": "two cells of the search of a single view: the layers of a country take 0.3 GB then",
     "class_weights.py:AGES_YEARS = 2": "rows of a printed table; no weight depends on them",
     "class_weights.py:AGES_YEARS = 5": "rows of a printed table; no weight depends on them",
     "class_weights.py:AGES_YEARS = 10": "rows of a printed table; no weight depends on them",

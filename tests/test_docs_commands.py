@@ -54,6 +54,7 @@ ONLY_PARSED = {
     r"(check-tracker|--matcher|runs/) ?my-tracker": "half a minute; tests/running/test_tracker_testing.py flies it",
     r"--segmenter my-segmenter": "needs tasks of pictures; tests/running/test_segment_tasks.py makes some",
     r"--suite aerial|/aerial": "minutes of painting; tests/tasks/suites/test_pictures.py takes small ones",
+    r"flight-image": "a minute of painting; tests/tasks/suites/test_flight_image.py flies a short one",
     r"--dask": "needs a scheduler; tests/running does it",
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",
     r"mine\.parquet|shard\d/": "needs a file of the reader's own; tests/cli/test_cli_runs.py does it",

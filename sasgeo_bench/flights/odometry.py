@@ -17,7 +17,7 @@ from sasgeo_bench.errors import FlightError
 from sasgeo_bench.flights.drift_profile import DriftProfile
 from sasgeo_bench.flights.processes import draw_gauss_markov, draw_walk, heading_law, mean_variance
 from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.geometry.pose import wrap_deg
+from sasgeo_bench.geometry.pose import reckon, wrap_deg
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -157,10 +157,9 @@ def dead_reckon(flown: Trajectory, steps: Odometry) -> Trajectory:
     stretch are left out, and after it the odometer goes on from where it was: nobody tells it how far it went.
     """
     yaw_deg = flown.yaw_deg[0] + np.concatenate([[0.0], np.cumsum(steps.yaw_deg)])
-    # (right, up) of a body that heads `yaw_deg` clockwise from north, as east + i north.
-    moved = (steps.right_m + 1j * steps.up_m) * np.exp(-1j * np.radians(yaw_deg[:-1]))
-    place = complex(*flown.position_m[0, :2]) + np.concatenate([[0.0], np.cumsum(moved)])
-    position_m = np.stack([place.real, place.imag, flown.position_m[:, 2]], axis=1)
+    increments = np.stack([steps.right_m, steps.up_m, steps.yaw_deg], axis=1)
+    place_m = reckon(flown.position_m[0, :2], float(flown.yaw_deg[0]), increments)
+    position_m = np.column_stack([place_m, flown.position_m[:, 2]])
     turn = Rotation.from_euler("z", -wrap_deg(yaw_deg - flown.yaw_deg)[:, None], degrees=True)
     is_kept = ~np.concatenate([[False], steps.is_lost[:-1] & steps.is_lost[1:], [False]])
     return Trajectory(

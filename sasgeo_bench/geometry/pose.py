@@ -119,6 +119,33 @@ class Prior:
         return self.center_m is not None
 
 
+def reckon(start_m: ArrayLike, yaw_deg: float, increments: ArrayLike) -> NDArray[np.float64]:
+    """Return the places that an odometer's increments lead to from a start, shape (N, 2): easting and northing, metres.
+
+    Parameters
+    ----------
+    start_m : array-like, shape (2,)
+        Easting and northing, metres.
+    yaw_deg : float
+        Heading at the start, degrees clockwise from grid north.
+    increments : array-like, shape (N - 1, 3)
+        Right and up, metres, and the turn, degrees clockwise, each in the axes of the pose before; NaN where nothing is
+        known, which counts as no motion.
+
+    Examples
+    --------
+    Ten metres north, a turn to the right, and five metres ahead, which is east:
+
+    >>> reckon([0.0, 0.0], 0.0, [[0.0, 10.0, 90.0], [0.0, 5.0, 0.0]]).round(6).tolist()
+    [[0.0, 0.0], [0.0, 10.0], [5.0, 10.0]]
+    """
+    known = np.nan_to_num(np.asarray(increments, dtype=np.float64).reshape(-1, 3))
+    yaws = np.radians(yaw_deg + np.concatenate([[0.0], np.cumsum(known[:, 2])]))[:-1]
+    moved = (known[:, 0] + 1j * known[:, 1]) * np.exp(-1j * yaws)  # east + i north; yaw is clockwise
+    at = np.concatenate([[0.0], np.cumsum(moved)])
+    return np.asarray(np.asarray(start_m, dtype=np.float64) + np.stack([at.real, at.imag], axis=1))
+
+
 def inverse(pose: Pose) -> Pose:
     """Return the pose that undoes another: composed with it, either way, it is the identity.
 

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.geometry.pose import wrap_deg
+from sasgeo_bench.geometry.pose import reckon, wrap_deg
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.tracker import SIDE
 from sasgeo_bench.scoring.base import Bools, Floats
@@ -356,8 +356,7 @@ class _Reckoned:
     def of(cls, views: pd.DataFrame, increments: Sequence[tuple[float, float, float] | None]) -> "_Reckoned":
         """Add up the increments; a lost one counts as no movement."""
         steps = np.array([(0.0, 0.0, 0.0) if one is None else one for one in increments], dtype=float)
-        turn = np.cumsum(np.radians(steps[:, 2]))
-        heading = np.concatenate([[0.0], turn[:-1]])
+        way_m = reckon((0.0, 0.0), 0.0, steps[1:])
         column = {name: views[name].to_numpy(float) for name in ("true_east_m", "true_north_m", "east_m", "north_m")}
         return cls(
             distance_m=views["distance_m"].to_numpy(float),
@@ -365,8 +364,8 @@ class _Reckoned:
             fixes=column["east_m"] + 1j * column["north_m"],
             fix_yaw=np.radians(views["yaw_deg"].to_numpy(float)),
             accepted=views["is_accepted"].to_numpy(bool),
-            way=np.cumsum((steps[:, 0] + 1j * steps[:, 1]) * np.exp(-1j * heading)),
-            turn=turn,
+            way=way_m[:, 0] + 1j * way_m[:, 1],
+            turn=np.cumsum(np.radians(steps[:, 2])),
         )
 
     def error_m(self, every_m: float) -> Floats:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import Page, page, panels, without_ticks
 from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.geometry.pose import reckon
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import paint_overview
@@ -88,37 +89,6 @@ class FlightPanel:
         if "carried_m" not in self.truth.measured:
             return None
         return int(np.argmax(np.hypot(*np.diff(self.place_m, axis=0).T))) + 1
-
-
-def reckon(start_m: Floats, yaw_deg: float, increments: Floats) -> Floats:
-    """Return the places that increments lead to from a true start.
-
-    Parameters
-    ----------
-    start_m : ndarray, shape (2,)
-        Easting and northing, metres.
-    yaw_deg : float
-        Heading at the start, degrees clockwise from grid north.
-    increments : ndarray, shape (N - 1, 3)
-        Right and up, metres, and the turn, degrees clockwise; NaN where nothing is known, which counts as no motion.
-
-    Returns
-    -------
-    ndarray, shape (N, 2)
-        Easting and northing, metres.
-
-    Examples
-    --------
-    Ten metres north, a turn to the right, and five metres ahead, which is east:
-
-    >>> reckon(np.zeros(2), 0.0, np.array([[0.0, 10.0, 90.0], [0.0, 5.0, 0.0]])).round(6).tolist()
-    [[0.0, 0.0], [0.0, 10.0], [5.0, 10.0]]
-    """
-    known = np.nan_to_num(increments)
-    yaws = np.radians(yaw_deg + np.concatenate([[0.0], np.cumsum(known[:-1, 2])]))
-    moved = (known[:, 0] + 1j * known[:, 1]) * np.exp(-1j * yaws)
-    at = complex(*start_m) + np.concatenate([[0.0], np.cumsum(moved)])
-    return np.stack([at.real, at.imag], axis=1)
 
 
 def is_of_flights(about: Mapping[str, Any]) -> bool:

@@ -15,11 +15,11 @@ from hypothesis.extra.numpy import arrays
 from PIL import Image
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.geometry.pose import wrap_deg
+from sasgeo_bench.geometry.pose import reckon, wrap_deg
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks import flight_choice
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.flight_sheet import flight_panels, is_of_flights, reckon, write_flight_sheet
+from sasgeo_bench.tasks.flight_sheet import flight_panels, is_of_flights, write_flight_sheet
 from sasgeo_bench.tasks.query import SEQUENCE_DIGITS, flight_id
 from sasgeo_bench.tasks.task_files import read_queries, read_task
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests

@@ -47,12 +47,12 @@ build-backend = "hatchling.build"
 [project]
 name = "{distribution}"
 version = "0.1.0"
-description = "A matcher for sasgeo-bench"
+description = "A {kind} for sasgeo-bench"
 requires-python = ">=3.11"
 dependencies = ["numpy>=2", "sasgeo-bench>=0.1"]
 
-[project.entry-points."sasgeo_bench.matchers"]
-{name} = "{module}.matcher:{cls}"
+[project.entry-points."{group}"]
+{name} = "{module}.{kind}:{cls}"
 
 [tool.hatch.build.targets.wheel]
 packages = ["src/{module}"]
@@ -121,13 +121,13 @@ class {cls}:
 '''
 
 _TEST: Final = '''\
-"""The matcher keeps to what every matcher keeps to."""
+"""The {kind} keeps to what every {kind} keeps to."""
 
-from sasgeo_bench import check_matcher
+from sasgeo_bench import check_{kind}
 
 
 def test_it_conforms():
-    faults = [check for check in check_matcher("{module}.matcher:{cls}") if check.outcome == "fail"]
+    faults = [check for check in check_{kind}("{module}.{kind}:{cls}") if check.outcome == "fail"]
     assert not faults, faults
 '''
 
@@ -156,24 +156,28 @@ def plugin_files(name: str) -> dict[str, str]:
 
     `name` is that of the matcher; raise `ConfigError` if it is not allowed, or taken.
     """
-    words = words_of(name, group=MATCHERS, imported=imported_names(_MATCHER))
+    return package_files(name, group=MATCHERS, code=_MATCHER, readme=_README) | {"card.toml": example_card(name)}
+
+
+def package_files(name: str, *, group: str, code: str, readme: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a plugin, by its path.
+
+    `group` is that of its entry point; `code` and `readme` are templates. Raise `ConfigError` if the name is not
+    allowed, or taken.
+    """
+    words = _words_of(name, group=group, imported=_imported_names(code))
     files = {
         "pyproject.toml": _PYPROJECT,
-        "README.md": _README,
-        "src/{module}/__init__.py": '"""The package of the matcher {name}."""\n',
-        "src/{module}/matcher.py": _MATCHER,
+        "README.md": readme,
+        "src/{module}/__init__.py": '"""The package of the {kind} {name}."""\n',
+        "src/{module}/{kind}.py": code,
         "tests/test_conforms.py": _TEST,
     }
-    return filled(files, words) | {"card.toml": example_card(name)}
-
-
-def filled(files: Mapping[str, str], words: Mapping[str, str]) -> dict[str, str]:
-    """Return files with words put into their paths and texts."""
     return {path.format(**words): text.format(**words) for path, text in files.items()}
 
 
-def words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, str]:
-    """Return the words of a new package: its name, distribution, module, class and title.
+def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, str]:
+    """Return the words of a new package: its kind, group, name, distribution, module, class and title.
 
     The class is called as none of the `imported` names is. Raise `ConfigError` if the name is not allowed, or taken.
     """
@@ -193,6 +197,8 @@ def words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, s
     words = re.split(r"[-_]", name)
     own = "".join(word.capitalize() for word in words)
     return {
+        "kind": kind,
+        "group": group,
         "name": name,
         "distribution": name.replace("_", "-"),
         "module": module,
@@ -201,7 +207,7 @@ def words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, s
     }
 
 
-def imported_names(text: str) -> frozenset[str]:
+def _imported_names(text: str) -> frozenset[str]:
     """Return the words of the import lines of a module, which its own class must not be called."""
     return frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", text, re.MULTILINE))))
 

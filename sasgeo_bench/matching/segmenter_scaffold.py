@@ -4,26 +4,7 @@
 from typing import Final
 
 from sasgeo_bench.matching.plugins import SEGMENTERS
-from sasgeo_bench.matching.scaffold import filled, imported_names, words_of
-
-_PYPROJECT: Final = """\
-[build-system]
-requires = ["hatchling>=1.27"]
-build-backend = "hatchling.build"
-
-[project]
-name = "{distribution}"
-version = "0.1.0"
-description = "A segmenter for sasgeo-bench"
-requires-python = ">=3.11"
-dependencies = ["numpy>=2", "sasgeo-bench>=0.1"]
-
-[project.entry-points."sasgeo_bench.segmenters"]
-{name} = "{module}.segmenter:{cls}"
-
-[tool.hatch.build.targets.wheel]
-packages = ["src/{module}"]
-"""
+from sasgeo_bench.matching.scaffold import package_files
 
 _SEGMENTER: Final = '''\
 """The segmenter {name}: here is where your method goes."""
@@ -80,17 +61,6 @@ def colours_of(learned: str) -> dict[str, np.ndarray]:
     return {{name: np.array(rows) for name, rows in json.loads(learned).items()}}
 '''
 
-_TEST: Final = '''\
-"""The segmenter keeps to what every segmenter keeps to."""
-
-from sasgeo_bench import check_segmenter
-
-
-def test_it_conforms():
-    faults = [check for check in check_segmenter("{module}.segmenter:{cls}") if check.outcome == "fail"]
-    assert not faults, faults
-'''
-
 _README: Final = """\
 # {title}
 
@@ -114,12 +84,4 @@ def segmenter_files(name: str) -> dict[str, str]:
     >>> sorted(segmenter_files("my-segmenter"))[-1]
     'tests/test_conforms.py'
     """
-    words = words_of(name, group=SEGMENTERS, imported=imported_names(_SEGMENTER))
-    files = {
-        "pyproject.toml": _PYPROJECT,
-        "README.md": _README,
-        "src/{module}/__init__.py": '"""The package of the segmenter {name}."""\n',
-        "src/{module}/segmenter.py": _SEGMENTER,
-        "tests/test_conforms.py": _TEST,
-    }
-    return filled(files, words)
+    return package_files(name, group=SEGMENTERS, code=_SEGMENTER, readme=_README)

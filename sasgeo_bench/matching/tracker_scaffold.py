@@ -5,26 +5,7 @@ from typing import Final
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.matching.plugins import MATCHERS, TRACKERS, shipped_names
-from sasgeo_bench.matching.scaffold import filled, imported_names, words_of
-
-_PYPROJECT: Final = """\
-[build-system]
-requires = ["hatchling>=1.27"]
-build-backend = "hatchling.build"
-
-[project]
-name = "{distribution}"
-version = "0.1.0"
-description = "A tracker for sasgeo-bench"
-requires-python = ">=3.11"
-dependencies = ["numpy>=2", "sasgeo-bench>=0.1"]
-
-[project.entry-points."sasgeo_bench.trackers"]
-{name} = "{module}.tracker:{cls}"
-
-[tool.hatch.build.targets.wheel]
-packages = ["src/{module}"]
-"""
+from sasgeo_bench.matching.scaffold import package_files
 
 _TRACKER: Final = '''\
 """The tracker {name}: here is where your method goes."""
@@ -122,17 +103,6 @@ class {cls}:
         self.taken, self.refused = self.taken + 1, 0
 '''
 
-_TEST: Final = '''\
-"""The tracker keeps to what every tracker keeps to."""
-
-from sasgeo_bench import check_tracker
-
-
-def test_it_conforms():
-    faults = [check for check in check_tracker("{module}.tracker:{cls}") if check.outcome == "fail"]
-    assert not faults, faults
-'''
-
 _README: Final = """\
 # {title}
 
@@ -158,15 +128,7 @@ def tracker_files(name: str) -> dict[str, str]:
     >>> sorted(tracker_files("my-tracker"))[-2:]
     ['src/my_tracker/tracker.py', 'tests/test_conforms.py']
     """
-    words = words_of(name, group=TRACKERS, imported=imported_names(_TRACKER))
     if name in shipped_names(MATCHERS):
         message = f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another"
         raise ConfigError(message)
-    files = {
-        "pyproject.toml": _PYPROJECT,
-        "README.md": _README,
-        "src/{module}/__init__.py": '"""The package of the tracker {name}."""\n',
-        "src/{module}/tracker.py": _TRACKER,
-        "tests/test_conforms.py": _TEST,
-    }
-    return filled(files, words)
+    return package_files(name, group=TRACKERS, code=_TRACKER, readme=_README)

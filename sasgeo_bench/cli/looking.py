@@ -193,7 +193,8 @@ def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
     Return True if `query` names one of them.
     """
     frames = [found.flights for found in cases.flights.values()]
-    flights = pd.concat(frames, ignore_index=True).sort_values("distance_within_25m", kind="stable")
+    order = ["distance_within_25m", "role", "query_id"]  # of flights that are as good the stressed first
+    flights = pd.concat(frames, ignore_index=True).sort_values(order, ascending=[True, False, True])
     named = flights if query is None else flights[flights["query_id"].str.startswith(query)]
     if named.empty:
         return False

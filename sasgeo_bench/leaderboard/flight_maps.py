@@ -23,6 +23,7 @@ from sasgeo_bench.tasks.flight_sheet import Ground, bounds_of_m, draw_flight, fl
 MOST_TRACKERS: Final = 6
 _ACROSS: Final = 3
 _INCHES: Final = 3.4
+_ONE_INCHES: Final = 6.4  # of a panel alone
 _RIGHT, _FALSE, _WITHHELD = "#00897b", "#d50000", "#5c6bc0"
 _KEYS: Final[tuple[tuple[str, dict[str, Any]], ...]] = (
     (f"accepted, within {FIX_M:g} m", {"color": "none", "marker": "o", "mfc": _RIGHT, "mec": "white", "ms": 6}),
@@ -79,7 +80,7 @@ def flight_map_pixels(
         data=ATTRIBUTION,
         rows=-(-len(names) // across),
         columns=across,
-        panel_inches=(_INCHES, _INCHES),
+        panel_inches=(_ONE_INCHES, _ONE_INCHES) if len(names) == 1 else (_INCHES, _INCHES),
         keys=[*flight_keys([panel]), *(Line2D([], [], label=label, **style) for label, style in _KEYS)],
     )
     with tempfile.TemporaryDirectory() as scratch:
@@ -107,7 +108,5 @@ def _draw_estimates(chart: Axes, views: pd.DataFrame) -> None:
 def _facts(views: pd.DataFrame) -> str:
     """Return how many views of a flight have a near estimate, an accepted fix, and a false one."""
     accepted, is_near = views["is_accepted"].to_numpy(bool), views["error_m"].to_numpy(float) <= FIX_M
-    counts = (
-        f"{is_near.sum()} within {FIX_M:g} m, {accepted.sum()} accepted, {(accepted & ~is_near).sum()} of them false"
-    )
-    return f"of {len(views)} views {counts}"
+    false = int((accepted & ~is_near).sum())
+    return f"{len(views)} views: {is_near.sum()} within {FIX_M:g} m, {accepted.sum()} accepted, {false} false"

@@ -29,7 +29,7 @@ from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.search.belief import Floats, GridBelief
 from sasgeo_bench.search.belief_scores import known_on, surface_logs
 from sasgeo_bench.search.dense import LevelView
-from sasgeo_bench.search.field import FULL, Field, Template
+from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.search.surface import surface
 from sasgeo_bench.tasks.query import Query, Step
@@ -303,7 +303,7 @@ class _Scored:
         Of a cell that the map does not know nothing is known: there a view scores `elsewhere`.
         """
         logs = surface_logs(self.field, self.template, belief, temper=self.weight, scale=self.scale)
-        known = known_on(self.field, belief)
+        known = known_on(self.field, belief.grid)
         return np.asarray(known * logs + (1 - known) * np.float32(elsewhere))
 
     def of_average(self, center_m: tuple[float, float]) -> float:
@@ -320,15 +320,7 @@ class _Scored:
             )
         except PoseError:  # the disc does not meet the map
             return 0.0
-        level = self.field.level(_AROUND_FACTOR)
-        row, col = (
-            level.grid.to_cells(found.grid.to_centres_m(np.zeros((1, 2), dtype=np.int64)))[0]
-            .round()
-            .astype(int)
-            .tolist()
-        )
-        rows, cols = found.grid.shape
-        is_known = level.cells[row : row + rows, col : col + cols, -1] > FULL // 2
+        is_known = known_on(self.field, found.grid) > 1 / 2
         if not is_known.any():
             return 0.0
         logs = self.weight * found.scores[:, is_known].astype(np.float64)

@@ -24,8 +24,8 @@ _ACCEPTS: Final = (
     "map is unknown a view fits as at an average place"
 )
 _LIMITS: Final = (
-    "without train places its rates are those set by hand; no graph (Eq. 9); errors of neighbouring increments count "
-    "as independent"
+    "without train places its rates are those set by hand; so are the numbers of rivals and acceptance; no graph "
+    "(Eq. 9); errors of neighbouring increments count as independent, and its covariances are too wide"
 )
 
 

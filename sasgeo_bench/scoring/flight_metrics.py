@@ -2,7 +2,7 @@
 """Metrics of flights: rows of the table of metrics on the track "sequence"."""
 
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -31,9 +31,13 @@ def _soon(scores: pd.DataFrame) -> Floats:
     return (scores["reacquired_m"].to_numpy(float) <= SOON_M).astype(float)
 
 
-def _mean(name: str, meaning: str, *, source: str = "mean over flights", **more: object) -> MeanMetric:
-    fields = {"tracks": (SEQUENCE,), "values": partial(_column, name=name), "counts": _every} | more
-    return MeanMetric(name=name, meaning=meaning, source=source, **fields)  # type: ignore[arg-type]
+def _mean(name: str, meaning: str, **more: Any) -> MeanMetric:  # noqa: ANN401 - other fields of the metric
+    fields: dict[str, Any] = {
+        "source": "mean over flights",
+        "values": partial(_column, name=name),
+        "counts": _every,
+    } | more
+    return MeanMetric(name=name, meaning=meaning, tracks=(SEQUENCE,), **fields)
 
 
 MEANS: Final = (

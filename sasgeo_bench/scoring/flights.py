@@ -21,7 +21,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.tracker import SIDE
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.pose import first_pose
-from sasgeo_bench.scoring.score import COLUMNS, FIX_M, MISSING, truths_of
+from sasgeo_bench.scoring.score import COLUMNS, FIX_M, MISSING, NOT_APPLICABLE, truths_of
 from sasgeo_bench.tasks.query import Head, Truth, base_of
 
 WITHIN_M: Final = (25.0, 10.0, 50.0)  # the first is the primary one
@@ -30,6 +30,7 @@ SOON_M: Final = 500.0  # after a gap, or after the drone was carried
 DIVERGED_M: Final = 100.0
 _DIVERGED_FOR_M: Final = 500.0
 _TWO_SIGMA: Final = float(chi2.ppf(math.erf(math.sqrt(2)), 2))  # squared distance within which 95.4 % of a plane lie
+_NEEDED: Final = frozenset({"distance_m", "time_s"})  # measured at each view
 _JUMP_M: Final = 1.0  # more between two views than was flown: the drone was carried
 
 Complexes = NDArray[np.complex128]  # east + i north, metres
@@ -124,7 +125,7 @@ def score_flights(
 
     Arguments and errors are as of `score.score_task`. Of the columns of `Score` the query id is that of the flight, a
     flight is answered if one of its fixes was accepted, its errors are the medians over its views, and it is right if
-    its median error is within 25 m. Its status is the first that is not "ok".
+    its median error is within 25 m. Raise MetricError, too, for views without `distance_m` or `time_s`.
     """
     asked = sorted(heads, key=lambda head: head.query_id)  # by flight, then by time
     by_id = truths_of(asked, truths, predictions)
@@ -139,12 +140,11 @@ def score_flights(
         row = {name: getattr(head, name) for name in _OF_HEAD} | {name: getattr(truth, name) for name in _OF_TRUTH}
         row |= {name: float(np.mean([getattr(one, name) for one in known])) for name in _MEANS}
         row |= {"place": place, "country": (country_of or {}).get(place, place), "cell_size_m": head.cell_size_m}
-        odd = [status for status in part["status"] if status != "ok"]
         figures = flight_score(part, [head.increment for head in asked[first:last]])
         rows.append(
             row
             | {"query_id": head.sequence_id, "pool": 0, "alias_index": None, "is_present": True, "ceiling": 1.0}
-            | {"status": odd[0] if odd else "ok", "is_answered": bool(part["is_accepted"].any())}
+            | {"status": _status(part["status"].tolist()), "is_answered": bool(part["is_accepted"].any())}
             | {"above": 0, "tied": 0, "right": 0, "confidence": math.nan, "log_scale_error": math.nan}
             | {"position_error_m": figures.error_p50_m, "yaw_error_deg": _quantile(part["yaw_error_deg"], 0.5)}
             | {"is_right": figures.error_p50_m <= FIX_M, "latency_s": float(part["latency_s"].mean())}
@@ -152,6 +152,17 @@ def score_flights(
         )
     columns = [*COLUMNS, *FLIGHT_COLUMNS]
     return ScoredFlights(pd.DataFrame(rows, columns=columns), views)
+
+
+def _status(of_views: Sequence[str]) -> str:
+    """Return the status of a flight: the first that is not "ok"; "not applicable" only where all views are.
+
+    >>> _status(["ok", "timeout", "crash"]), _status(["not applicable", "ok"]), _status(["not applicable"] * 2)
+    ('timeout', 'missing', 'not applicable')
+    """
+    if NOT_APPLICABLE in of_views:
+        return NOT_APPLICABLE if set(of_views) == {NOT_APPLICABLE} else MISSING
+    return next((status for status in of_views if status != "ok"), "ok")
 
 
 def _ends(names: Sequence[str]) -> list[int]:
@@ -188,7 +199,11 @@ def view_frame(
     is_answered = np.array([pose is not None for pose in poses], dtype=bool)
     nees, in_plane = _normalized(gaps, [None if one is None else one.covariance for one in answers])
     measured, places = [truth.measured for truth in truths], place_of or {}
-    distance_m = np.array([one.get("distance_m", math.nan) for one in measured])
+    lost = next((truth.query_id for truth in truths if not truth.measured.keys() >= _NEEDED), None)
+    if lost is not None:
+        message = f"view {lost} was drawn by an older program: remove its task and truths, and make the queries again"
+        raise MetricError(message)
+    distance_m = np.array([one["distance_m"] for one in measured])
     frame = np.array([head.frame or 0 for head in heads])
     jump_m = np.hypot(*np.diff(true[:, :2], axis=0, prepend=true[:1, :2]).T)
     table = {
@@ -197,7 +212,7 @@ def view_frame(
         "frame": frame,
         "status": [MISSING if answer is None else answer.status for answer in answers],
         "distance_m": distance_m,
-        "time_s": [one.get("time_s", math.nan) for one in measured],
+        "time_s": [one["time_s"] for one in measured],
         "is_seen": [one.get("is_seen", 1.0) > 0 for one in measured],
         "is_present": [truth.is_present for truth in truths],
         "is_carried": (frame > 0) & (jump_m > np.diff(distance_m, prepend=distance_m[:1]) + _JUMP_M),

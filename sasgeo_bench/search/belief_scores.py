@@ -4,9 +4,11 @@
 import math
 from typing import Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.search.belief import Floats, GridBelief, window_overlap
 from sasgeo_bench.search.field import FULL, Field, Template
 from sasgeo_bench.search.surface import surface
@@ -78,15 +80,17 @@ def _scores(
     return found
 
 
-def known_on(field: Field, belief: GridBelief) -> Floats:
-    """Return the share of each cell of a belief's window that the map knows, shape (rows, cols); 0 beyond the map."""
-    found = np.zeros(belief.shape, dtype=np.float32)
-    rows, cols = belief.shape
-    top, left = max(0, belief.row), max(0, belief.col)
-    under = field.known[top : belief.row + rows * belief.factor, left : belief.col + cols * belief.factor]
-    step = belief.factor
-    some = under[: under.shape[0] // step * step, : under.shape[1] // step * step]
-    shares = some.reshape(some.shape[0] // step, step, -1, step).mean(axis=(1, 3), dtype=np.float32) / np.float32(FULL)
-    down, right = (top - belief.row) // step, (left - belief.col) // step
-    found[down : down + shares.shape[0], right : right + shares.shape[1]] = shares
-    return found
+def known_on(field: Field, grid: Grid) -> Floats:
+    """Return the share of each cell of a grid that the map knows, shape of the grid; 0 beyond the map.
+
+    The cells of the grid are whole squares of cells of the map, as those of a belief's window or of a surface are.
+    """
+    cell_m = field.grid.cell_size_m
+    step = round(grid.cell_size_m / cell_m)
+    down = round((grid.north_m - field.grid.north_m) / cell_m)  # cells of the grid before the map's first, if positive
+    right = round((field.grid.west_m - grid.west_m) / cell_m)
+    fine = np.zeros((grid.rows * step, grid.cols * step), dtype=np.uint8)
+    into, part = window_overlap(fine.shape, field.known.shape, down, right)
+    fine[into] = field.known[part]
+    shares = cv2.resize(fine, (grid.cols, grid.rows), interpolation=cv2.INTER_AREA)
+    return np.asarray(shares, dtype=np.float32) / np.float32(FULL)

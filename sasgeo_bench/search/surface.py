@@ -3,7 +3,6 @@
 
 import math
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -50,7 +49,7 @@ class Surface:
         return Mode(pose=pose, score=float(self.scores[yaw, row, col]))
 
 
-def surface(  # noqa: PLR0913 - what to score, where, at which headings, and how finely
+def surface(
     field: Field,
     template: Template,
     *,
@@ -59,7 +58,6 @@ def surface(  # noqa: PLR0913 - what to score, where, at which headings, and how
     yaws_deg: ArrayLike,
     factor: int = 1,
     scale: float = 1.0,
-    threads: int = 1,
 ) -> Surface:
     """Score a view at every cell around a place and at every heading, by correlation in the Fourier domain.
 
@@ -80,8 +78,6 @@ def surface(  # noqa: PLR0913 - what to score, where, at which headings, and how
         two centres is not missed, and scores are lower than on the map's own cells.
     scale : float
         Scale of the view.
-    threads : int
-        Headings computed at a time; changes the time alone.
 
     Returns
     -------
@@ -119,16 +115,11 @@ def surface(  # noqa: PLR0913 - what to score, where, at which headings, and how
     if len(template.active):
         headings = _Headings.of(yaws, scale)
         votes = Correlation.of(level, template, tiles, headings.turns)
-
-        def fill(base: int) -> None:
-            """Score the headings of a base pose: each has its own part of the result."""
-            spectra = votes.transformed(headings.turns.bases[base])
+        for base, pose in enumerate(headings.turns.bases):
+            spectra = votes.transformed(pose)
             for yaw, quarter in headings.members(base):
                 for at, tile in enumerate(tiles):
                     _part(scores[yaw], tiles[0], tile)[:] = votes.score(spectra, at, quarter)
-
-        with ThreadPoolExecutor(threads) as pool:
-            list(pool.map(fill, range(len(headings.turns.bases))))
     scores.flags.writeable = False
     return Surface(grid=grid, yaws_deg=yaws, scores=scores)
 

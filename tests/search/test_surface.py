@@ -103,7 +103,7 @@ def test_squares_wider_than_one_transform_are_joined(view):
 
 @pytest.mark.parametrize("yaws_deg", [[350.0, 355.0, 0.0, 5.0, 10.0], [12.5], [0.0, 90.0, 45.0, 200.0], [30.0, 30.0]])
 def test_each_heading_scores_alike_whatever_others_are_asked_for(town, view, yaws_deg):
-    together = surface(town, view, center_m=MIDDLE_M, radius_m=20.0, yaws_deg=yaws_deg, threads=2)
+    together = surface(town, view, center_m=MIDDLE_M, radius_m=20.0, yaws_deg=yaws_deg)
     assert together.yaws_deg.tolist() == yaws_deg
     for yaw, score in zip(yaws_deg, together.scores, strict=True):
         alone = surface(town, view, center_m=MIDDLE_M, radius_m=20.0, yaws_deg=[yaw])

@@ -69,6 +69,7 @@ class Buildings:
         cells = np.bincount(label, minlength=len(rim_m)).astype(np.float64)
 
         def mean(values: Floats) -> Floats:
+            """Return the mean over the cells of each building."""
             return np.asarray(np.bincount(label, weights=values, minlength=len(rim_m)) / cells)
 
         area_m2 = cells * cell_m**2

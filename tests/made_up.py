@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A made-up map full of small things, and views cut from it."""
+"""A made-up map full of small things, views cut from it, and flights over it without errors of perception."""
 
 import datetime as dt
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
-from sasgeo_bench.tasks.query import Query
+from sasgeo_bench.matching.tracker import Fix, Tracker, check_fix
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence, LayerBits, observe
+from sasgeo_bench.tasks.query import Query, Step
 
 CLASSES = ("building", "road_minor", "water")
 SIDE = 420
@@ -64,3 +67,57 @@ def query_of(evidence: Evidence, prior: Prior, *, candidates: tuple[Pose, ...] =
         prior_group="r250-weak-s3",
         candidates=candidates,
     )
+
+
+def dated_region(seed: int, side: int) -> SimpleNamespace:
+    """A made-up region of the day of its views, as a reader of map ages asks for it."""
+    found = region_of(textured(seed, side))
+    found.manifest = SimpleNamespace(extract=SimpleNamespace(date=dt.date(2025, 1, 1)))
+    return found
+
+
+VIEW_CELLS = 128
+
+
+def way_of(start: Pose, count: int, step_m: float) -> list[Pose]:
+    """Poses of a straight flight, ahead of the first."""
+    ahead_m = np.array([(0.0, frame * step_m) for frame in range(count)])
+    return [replace(start, easting_m=east_m, northing_m=north_m) for east_m, north_m in start.to_map(ahead_m).tolist()]
+
+
+def flight_of(
+    region: SimpleNamespace,
+    poses: Sequence[Pose],
+    *,
+    prior: Prior,
+    increment: tuple[float, float, float],
+    sigmas: tuple[float, float, float],
+    said: Mapping[int, tuple[float, float, float]] | None = None,
+) -> list[Query]:
+    """Views at poses; the odometer says `increment` of each step, or what `said` maps a frame to."""
+    views = []
+    covariance = tuple(np.diag(np.square(sigmas)).ravel().tolist())
+    for frame, pose in enumerate(poses):
+        step = Step(sequence_id="f", frame=frame)
+        if frame:
+            step = replace(step, increment=(said or {}).get(frame, increment), covariance=covariance)
+        evidence = view_of(region, pose, size_cells=VIEW_CELLS)
+        views.append(replace(query_of(evidence, prior), track="sequence", step=step))
+    return views
+
+
+def fly(tracker: Tracker, views: Sequence[Query], prior: Prior) -> list[Fix]:
+    """Follow a flight, and check each fix."""
+    tracker.start(prior)
+    return [check_fix(tracker.step(view), top_k=5) for view in views]
+
+
+def away_m(fix: Fix, pose: Pose) -> float:
+    """Distance of an estimate from a pose."""
+    assert fix.pose is not None
+    return float(np.hypot(fix.pose.easting_m - pose.easting_m, fix.pose.northing_m - pose.northing_m))
+
+
+def blind(view: Query) -> Query:
+    """A view that shows nothing."""
+    return replace(view, evidence=view.evidence.replace(np.full_like(view.evidence.cells, UNKNOWN)))

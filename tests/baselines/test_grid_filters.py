@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The grid filters on a made-up map: they find a place without errors, and survive what a flight brings."""
 
-import datetime as dt
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -14,25 +13,21 @@ from sasgeo_baselines.trackers.lsvl_descriptors import Parts, Shares
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import Training
-from sasgeo_bench.matching.tracker import check_fix
-from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.query import Step
+from tests.made_up import VIEW_CELLS, away_m, blind, dated_region, flight_of, fly, view_of, way_of
 
 FILTERS = {"grid_markov": GridMarkov, "grid_markov_still": GridMarkovStill, "lsvl_belief": LsvlBelief}
 NEAR_M = {"grid_markov": 6.0, "grid_markov_still": 6.0, "lsvl_belief": 16.0}  # one and a half cells, and one
 SLOW = {"lsvl_belief"}  # sure of its place after more views than are flown here
-VIEW, STEP_M, VIEWS = 128, 30.0, 8
+STEP_M, VIEWS = 30.0, 8
 START = Pose(easting_m=1160.0, northing_m=8420.0, yaw_deg=22.0)
-COVARIANCE = (0.25, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.25)
 PRIOR = Prior(center_m=(1200.0, 8450.0), radius_m=150.0, yaw_deg=25.0, yaw_sigma_deg=10.0, scale_sigma=0.01)
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.01)
 
 
 @pytest.fixture(scope="module")
-def region(made):
-    found = made.region_of(made.textured(5, 640))
-    found.manifest = SimpleNamespace(extract=SimpleNamespace(date=dt.date(2025, 1, 1)))
-    return found
+def region():
+    return dated_region(5, 640)
 
 
 @pytest.fixture(scope="module")
@@ -49,31 +44,11 @@ def prepared(region):
 
 
 @pytest.fixture(scope="module")
-def flight(made, region):
+def flight(region):
     """Views of a straight flight without errors, and where each was taken."""
-    ahead_m = np.array([(0.0, frame * STEP_M) for frame in range(VIEWS)])
-    poses = [Pose(easting_m=e, northing_m=n, yaw_deg=START.yaw_deg) for e, n in START.to_map(ahead_m).tolist()]
-    views = []
-    for frame, pose in enumerate(poses):
-        step = Step(sequence_id="f", frame=frame)
-        step = replace(step, increment=(0.0, STEP_M, 0.0), covariance=COVARIANCE) if frame else step
-        evidence = made.view_of(region, pose, size_cells=VIEW)
-        views.append(replace(made.query_of(evidence, PRIOR), track="sequence", step=step))
+    poses = way_of(START, VIEWS, STEP_M)
+    views = flight_of(region, poses, prior=PRIOR, increment=(0.0, STEP_M, 0.0), sigmas=(0.5, 0.5, 0.5))
     return tuple(views), tuple(poses)
-
-
-def fly(tracker, views, prior=PRIOR):
-    """Follow a flight, and check each fix."""
-    tracker.start(prior)
-    return [check_fix(tracker.step(view), top_k=5) for view in views]
-
-
-def away_m(fix, pose):
-    return np.hypot(fix.pose.easting_m - pose.easting_m, fix.pose.northing_m - pose.northing_m)
-
-
-def blind(view):
-    return replace(view, evidence=view.evidence.replace(np.full_like(view.evidence.cells, UNKNOWN)))
 
 
 @pytest.mark.parametrize("prior", [PRIOR, ANYWHERE], ids=["disc", "anywhere"])
@@ -89,14 +64,14 @@ def test_a_flight_without_errors_is_followed(name, prior, prepared, flight):
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_flight_is_answered_alike_whatever_was_flown_before(name, prepared, flight):
     views, _ = flight
-    first, again = fly(prepared(name), views[:3]), fly(prepared(name), views[:3])
+    first, again = fly(prepared(name), views[:3], PRIOR), fly(prepared(name), views[:3], PRIOR)
     assert [fix.pose for fix in first] == [fix.pose for fix in again]
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_blank_view_only_moves_and_spreads_what_is_believed(name, prepared, flight):
     views, poses = flight
-    fixes = fly(prepared(name), [*views[:5], *map(blind, views[5:])])
+    fixes = fly(prepared(name), [*views[:5], *map(blind, views[5:])], PRIOR)
     assert away_m(fixes[-1], poses[-1]) <= 2 * NEAR_M[name]
     spread, before = (np.trace(np.array(fix.covariance)[:2, :2]) for fix in (fixes[-1], fixes[4]))
     assert spread > before
@@ -116,7 +91,7 @@ def test_without_diffusion_odometry_that_says_too_much_is_believed(prepared, fli
         else view
         for view in views
     ]
-    moved, still = (fly(prepared(name), turned) for name in ("grid_markov", "grid_markov_still"))
+    moved, still = (fly(prepared(name), turned, PRIOR) for name in ("grid_markov", "grid_markov_still"))
     assert away_m(moved[-1], poses[-1]) < 10.0 < away_m(still[-1], poses[-1])
 
 
@@ -124,9 +99,9 @@ def test_without_diffusion_odometry_that_says_too_much_is_believed(prepared, fli
 def test_a_lost_step_is_found_again(name, prepared, flight):
     views, poses = flight
     lost = [*views[:3], replace(views[3], step=Step(sequence_id="f", frame=3)), *views[4:]]
-    fixes = fly(prepared(name), lost)
+    fixes = fly(prepared(name), lost, PRIOR)
     assert away_m(fixes[-1], poses[-1]) <= 2 * NEAR_M[name] or name in SLOW
-    assert fly(prepared(name), [*lost[:3], blind(lost[3])])[-1].confidence < 0.2
+    assert fly(prepared(name), [*lost[:3], blind(lost[3])], PRIOR)[-1].confidence < 0.2
 
 
 @pytest.mark.parametrize("name", FILTERS)
@@ -138,10 +113,10 @@ def test_what_is_called_too_early_is_refused(name, flight):
         tracker.step(flight[0][0])
 
 
-def test_descriptors_of_a_view_and_of_the_map_agree_at_its_place_and_heading(made, region):
-    described = Shares.of(region).described(VIEW / 4)
+def test_descriptors_of_a_view_and_of_the_map_agree_at_its_place_and_heading(region):
+    described = Shares.of(region).described(VIEW_CELLS / 4)
     pose = Pose(easting_m=1328.0, northing_m=8680.0, yaw_deg=130.0)
-    view = Parts.of(made.view_of(region, pose, size_cells=VIEW), described.classes)
+    view = Parts.of(view_of(region, pose, size_cells=VIEW_CELLS), described.classes)
     compared = described.compared(view, described.grid)
     table = np.stack([compared.distances(yaw_deg) for yaw_deg in np.arange(0.0, 360.0, 10.0)])
     yaw, row, col = np.unravel_index(np.nanargmin(table), table.shape)

@@ -15,16 +15,15 @@ from sasgeo_baselines.trackers.zhou_smc import EMBEDDING, Embedding, Table, Zhou
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.tracker import check_fix
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.query import Step
+from tests.made_up import away_m, flight_of, fly, way_of
 
 FILTERS = {"kinnari_mcl": KinnariMcl, "ouyang_cfbvm_pf": OuyangCfbvmPf, "swapf": SwaPf, "zhou_smc": ZhouSmc}
 SLOW = {"zhou_smc"}  # sure of its place after more views than are flown here
 COUNT = 4000  # particles: enough on this map
-VIEW, STEP_M, VIEWS = 128, 30.0, 12
+STEP_M, VIEWS = 30.0, 12
 START = Pose(easting_m=1160.0, northing_m=8420.0, yaw_deg=20.0)
-COVARIANCE = (0.25, 0.0, 0.0, 0.0, 0.25, 0.0, 0.0, 0.0, 0.25)
 PRIOR = Prior(center_m=(1200.0, 8450.0), radius_m=100.0, yaw_deg=25.0, yaw_sigma_deg=10.0, scale_sigma=0.01)
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.01)
 
@@ -49,35 +48,17 @@ def prepared(region):
 
 
 @pytest.fixture(scope="module")
-def flight(made, region):
+def flight(region):
     """Views of a straight flight without errors, and where each was taken."""
-    poses = [
-        Pose(easting_m=east_m, northing_m=north_m, yaw_deg=START.yaw_deg)
-        for east_m, north_m in START.to_map(np.array([(0.0, frame * STEP_M) for frame in range(VIEWS)])).tolist()
-    ]
-    views = []
-    for frame, pose in enumerate(poses):
-        step = Step(sequence_id="f", frame=frame)
-        step = replace(step, increment=(0.0, STEP_M, 0.0), covariance=COVARIANCE) if frame else step
-        evidence = made.view_of(region, pose, size_cells=VIEW)
-        views.append(replace(made.query_of(evidence, PRIOR), track="sequence", step=step))
+    poses = way_of(START, VIEWS, STEP_M)
+    views = flight_of(region, poses, prior=PRIOR, increment=(0.0, STEP_M, 0.0), sigmas=(0.5, 0.5, 0.5))
     return tuple(views), tuple(poses)
-
-
-def fly(tracker, views, prior=PRIOR):
-    """Follow a flight, and check each fix."""
-    tracker.start(prior)
-    return [check_fix(tracker.step(view), top_k=5) for view in views]
-
-
-def away_m(fix, pose):
-    return np.hypot(fix.pose.easting_m - pose.easting_m, fix.pose.northing_m - pose.northing_m)
 
 
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_flight_without_errors_is_followed(name, prepared, flight):
     views, poses = flight
-    fixes = fly(prepared(name), views)
+    fixes = fly(prepared(name), views, PRIOR)
     assert away_m(fixes[-1], poses[-1]) <= 10.0
     assert abs(fixes[-1].pose.yaw_deg - START.yaw_deg) <= 10.0
     assert fixes[-1].is_accepted or name in SLOW
@@ -87,10 +68,10 @@ def test_a_flight_without_errors_is_followed(name, prepared, flight):
 @pytest.mark.parametrize("name", FILTERS)
 def test_a_flight_is_answered_alike_whatever_was_flown_before(name, prepared, flight):
     views, _ = flight
-    first = fly(prepared(name), views[:4])
+    first = fly(prepared(name), views[:4], PRIOR)
     other = [replace(view, step=replace(view.step, sequence_id="g")) for view in views[:4]]
-    assert fly(prepared(name), other)[-1].pose != first[-1].pose  # chance comes from the name of the flight
-    again = fly(prepared(name), views[:4])
+    assert fly(prepared(name), other, PRIOR)[-1].pose != first[-1].pose  # chance comes from the name of the flight
+    again = fly(prepared(name), views[:4], PRIOR)
     assert [fix.pose for fix in again] == [fix.pose for fix in first]
     assert all((fix.covariance == same.covariance).all() for fix, same in zip(again, first, strict=True))
 
@@ -117,7 +98,7 @@ def test_unknown_views_lost_steps_and_an_unknown_start_are_survived(name, prepar
 def test_a_view_that_is_unknown_only_spreads_the_belief(name, prepared, flight):
     views, _ = flight
     blind = views[0].evidence.replace(np.full_like(views[0].evidence.cells, UNKNOWN))
-    *_, before, after = fly(prepared(name), [*views[:6], replace(views[6], evidence=blind)])
+    *_, before, after = fly(prepared(name), [*views[:6], replace(views[6], evidence=blind)], PRIOR)
     assert np.trace(after.covariance[:2, :2]) > np.trace(before.covariance[:2, :2])
 
 

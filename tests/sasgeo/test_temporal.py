@@ -1,22 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """The scorer over time on a made-up map: it follows a flight, learns its scale, and finds a carried drone again."""
 
-import datetime as dt
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.tracker import check_fix
-from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.sasgeo.temporal import FlightScale, increment_cost
 from sasgeo_bench.sasgeo.trackers import SasgeoTrack, SasgeoTrackAlone, SasgeoTrackOne
 from sasgeo_bench.tasks.query import Step
-from tests.made_up import query_of, region_of, textured, view_of
+from tests.made_up import away_m, blind, dated_region, flight_of, fly, way_of
 
-VIEW, STEP_M, VIEWS = 128, 40.0, 7
+STEP_M, VIEWS = 40.0, 7
 START = Pose(easting_m=1160.0, northing_m=8420.0, yaw_deg=22.0)
 COVARIANCE = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.25)
 PRIOR = Prior(center_m=(1200.0, 8450.0), radius_m=150.0, yaw_deg=25.0, yaw_sigma_deg=10.0, scale_sigma=0.03)
@@ -24,42 +20,22 @@ PRIOR = Prior(center_m=(1200.0, 8450.0), radius_m=150.0, yaw_deg=25.0, yaw_sigma
 
 @pytest.fixture(scope="module")
 def region():
-    found = region_of(textured(5, 640))
-    found.manifest = SimpleNamespace(extract=SimpleNamespace(date=dt.date(2025, 1, 1)))
-    return found
+    return dated_region(5, 640)
 
 
-def views_of(region, poses, *, said=None):
-    """Return views at poses; the odometer says the true way, or what `said` maps a frame to."""
-    views = []
-    for frame, pose in enumerate(poses):
-        step = Step(sequence_id="f", frame=frame)
-        if frame:
-            increment = (said or {}).get(frame, (0.0, STEP_M, 0.0))
-            step = replace(step, increment=increment, covariance=COVARIANCE)
-        evidence = view_of(region, pose, size_cells=VIEW)
-        views.append(replace(query_of(evidence, PRIOR), track="sequence", step=step))
-    return views
+def views_of(region, poses, **options):
+    return flight_of(region, poses, prior=PRIOR, increment=(0.0, STEP_M, 0.0), sigmas=(1.0, 1.0, 0.5), **options)
 
 
-def way_of(start, count):
-    ahead_m = np.array([(0.0, frame * STEP_M) for frame in range(count)])
-    return [replace(start, easting_m=e, northing_m=n) for e, n in start.to_map(ahead_m).tolist()]
-
-
-def fly(tracker, region, views):
+def flown(tracker, region, views):
+    """Prepare a tracker, and follow a flight with it."""
     tracker.prepare(region, None)
-    tracker.start(PRIOR)
-    return [check_fix(tracker.step(view), top_k=5) for view in views]
-
-
-def away_m(fix, pose):
-    return np.hypot(fix.pose.easting_m - pose.easting_m, fix.pose.northing_m - pose.northing_m)
+    return fly(tracker, views, PRIOR)
 
 
 def test_a_flight_is_followed_and_its_covariance_holds_its_errors(region):
-    poses = way_of(START, VIEWS)
-    fixes = fly(SasgeoTrack(), region, views_of(region, poses))
+    poses = way_of(START, VIEWS, STEP_M)
+    fixes = flown(SasgeoTrack(), region, views_of(region, poses))
     assert max(away_m(fix, pose) for fix, pose in zip(fixes[2:], poses[2:], strict=True)) < 6.0
     assert fixes[-1].is_accepted
     assert fixes[-1].confidence > 0.9
@@ -69,37 +45,36 @@ def test_a_flight_is_followed_and_its_covariance_holds_its_errors(region):
 
 
 def test_a_view_that_shows_nothing_moves_the_belief_and_a_lost_step_spreads_it(region):
-    poses = way_of(START, VIEWS)
+    poses = way_of(START, VIEWS, STEP_M)
     views = views_of(region, poses)
-    blank = views[3].evidence.replace(np.full_like(views[3].evidence.cells, UNKNOWN))
-    views[3] = replace(views[3], evidence=blank)
-    fixes = fly(SasgeoTrack(), region, views)
+    views[3] = blind(views[3])
+    fixes = flown(SasgeoTrack(), region, views)
     assert away_m(fixes[3], poses[3]) < 10.0
-    lost = replace(views[4], step=replace(views[4].step, increment=None, covariance=None), evidence=blank)
-    spread = fly(SasgeoTrack(), region, [*views[:4], lost])[-1]
+    lost = replace(blind(views[4]), step=replace(views[4].step, increment=None, covariance=None))
+    spread = flown(SasgeoTrack(), region, [*views[:4], lost])[-1]
     assert not spread.is_accepted
     assert spread.covariance[0, 0] > 100 * fixes[3].covariance[0, 0]
 
 
 def test_a_carried_drone_is_found_again_by_another_belief_alone(region):
     there = Pose(easting_m=1500.0, northing_m=8900.0, yaw_deg=200.0)
-    poses = [*way_of(START, 5), *way_of(there, 12)]
+    poses = [*way_of(START, 5, STEP_M), *way_of(there, 12, STEP_M)]
     views = views_of(region, poses)
-    found = fly(SasgeoTrack(), region, views)[-1]
+    found = flown(SasgeoTrack(), region, views)[-1]
     assert away_m(found, poses[-1]) < 10.0
-    assert away_m(fly(SasgeoTrackOne(), region, views)[-1], poses[-1]) > 25.0
+    assert away_m(flown(SasgeoTrackOne(), region, views)[-1], poses[-1]) > 25.0
 
 
 def test_without_odometry_what_the_odometer_says_changes_nothing(region):
-    poses = way_of(START, 3)
-    told = fly(SasgeoTrackAlone(), region, views_of(region, poses))
-    misled = fly(SasgeoTrackAlone(), region, views_of(region, poses, said={2: (500.0, 0.0, 90.0)}))
+    poses = way_of(START, 3, STEP_M)
+    told = flown(SasgeoTrackAlone(), region, views_of(region, poses))
+    misled = flown(SasgeoTrackAlone(), region, views_of(region, poses, said={2: (500.0, 0.0, 90.0)}))
     assert [fix.pose for fix in told] == [fix.pose for fix in misled]
 
 
 def test_the_scale_of_a_flight_is_learned(region):
-    poses = [replace(pose, scale=1.05) for pose in way_of(START, VIEWS)]
-    fixes = fly(SasgeoTrack(), region, views_of(region, poses))
+    poses = [replace(pose, scale=1.05) for pose in way_of(START, VIEWS, STEP_M)]
+    fixes = flown(SasgeoTrack(), region, views_of(region, poses))
     assert fixes[0].pose.scale == pytest.approx(1.0, abs=0.05)
     assert fixes[-1].pose.scale == pytest.approx(1.05, abs=0.02)
 

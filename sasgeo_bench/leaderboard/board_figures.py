@@ -108,7 +108,7 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
         "error along flights": lambda: _each(
             "distance", distance_frame(board.views, board.scores, shown), GROUP, draw_distance, shown
         ),
-        "how rarely the map may be asked on flights": lambda: _each(
+        "how far odometers carry fixes on flights": lambda: _each(
             "interval", interval_frame(board.table, kinds_of(board.scores), shown), GROUP, draw_intervals, shown
         ),
     }

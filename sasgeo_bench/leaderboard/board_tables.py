@@ -42,7 +42,7 @@ _SOUND: Final = ("ok", "not applicable")  # all else is a miss
 _PRIOR_ALONE: Final = "prior_centre"
 _ODOMETER_ALONE: Final = "dead_reckoning"
 _OF_FLIGHTS: Final = (
-    "accepted",
+    "right_accepted",
     "false_accepted",
     "error_p95",
     "first_fix",

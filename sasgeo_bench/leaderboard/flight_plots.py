@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of flights on a board: error along the way, and how rarely the map may be asked; their tables.
+"""Figures of flights on a board: error along the way, and how far the odometer carries a fix; their tables.
 
 Each figure has a panel for each kind of flight of a suite and a line for each matcher.
 """
@@ -29,7 +29,7 @@ from sasgeo_bench.leaderboard.board_plots import (
     those_there,
     ticks_across,
 )
-from sasgeo_bench.scoring.flights import EVERY_M
+from sasgeo_bench.scoring.flights import RECKONED_M
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.scoring.strata import CONTROL, GROUP
 
@@ -39,7 +39,7 @@ _SHARES: Final = {"half": 0.5, "most": 0.9}
 _LEAST_ERROR_M: Final = 1.0
 _MOST_ERROR_M: Final = 10_000.0
 _ERROR_TICKS_M: Final = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
-_METRICS: Final = {f"fix_every_{far_m:g}m": far_m for far_m in EVERY_M}
+_METRICS: Final = {f"reckoned_{far_m:g}m": far_m for far_m in RECKONED_M}
 DISTANCE_COLUMNS: Final = (*GROUP, "kind", "matcher", "distance_m", "flights", *_SHARES)
 INTERVAL_COLUMNS: Final = (*GROUP, "kind", "matcher", "every_m", "n", "blocks", "value", "lo", "hi")
 
@@ -71,7 +71,7 @@ def distance_frame(
 def interval_frame(
     table: pd.DataFrame, kinds: Mapping[tuple[str, ...], Sequence[str]], shown: Sequence[str]
 ) -> pd.DataFrame:
-    """Return how much of the way stays within 25 m if the map is asked rarely, with the columns `INTERVAL_COLUMNS`.
+    """Return how much of the way stays within 25 m if fixes are used rarely, with the columns `INTERVAL_COLUMNS`.
 
     `table` is the leaderboard; `kinds` are the strata of a suite, track and prior group that have a panel.
     """
@@ -126,17 +126,18 @@ def draw_distance(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
 
 
 def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw how rarely the map may be asked from `interval_frame`."""
+    """Draw how far the odometer carries a fix from `interval_frame`."""
     names, kinds = those_there(rows, shown), list(dict.fromkeys(rows["kind"]))
     note = (
-        f"Share of the flown distance within {FIX_M:g} m if an accepted fix is used once in so many metres at most, "
-        f"and the odometer alone says the rest; nothing is known before the first fix. Dashed: 95 %. {INTERVALS}"
+        f"Share of the flown distance within {FIX_M:g} m if of the accepted fixes one is used in so many metres at "
+        "most and the odometer alone says the rest; nothing is known before the first fix. Of flights twice as long. "
+        f"The tracker itself was shown every view. Dashed: 95 %. {INTERVALS}"
     ).replace("n: queries of each point.", "")
-    title = f"How rarely the map may be asked: {of_which(rows.iloc[0])}"
+    title = f"How far the odometer carries a fix: {of_which(rows.iloc[0])}"
     for chart, kind, number, across in _panels(path, kinds, names, title, note, "flown between two uses of a fix (m)"):
         mine = rows[rows["kind"] == kind]
         chart.set_title(f"{kind}\nn {mine['n'].iloc[0]:g} flights, {counted(int(mine['blocks'].iloc[0]), 'block')}")
-        ticks_across(chart, list(EVERY_M), EVERY_M[0] / 1.35, EVERY_M[-1] * 1.35)
+        ticks_across(chart, list(RECKONED_M), RECKONED_M[0] / 1.35, RECKONED_M[-1] * 1.35)
         dress_share(chart)
         chart.set_ylim(-0.03, 1.04)
         chart.axhline(0.95, color="#999999", lw=0.8, ls="--")

@@ -41,7 +41,7 @@ KINDS: Final = {  # of figures, by how their names begin, in the order they are 
     "age": "Success against the age of the map",
     "strength": "Success against strength",
     "distance": "Error along the way",
-    "interval": "How rarely the map may be asked",
+    "interval": "How far the odometer carries a fix",
     "risk": "Risk against coverage",
     "reliability": "Reliability",
     "stanford": "Protection levels against errors",

@@ -25,11 +25,12 @@ from sasgeo_bench.scoring.score import COLUMNS, FIX_M, MISSING, NOT_APPLICABLE, 
 from sasgeo_bench.tasks.query import Head, Truth, base_of
 
 WITHIN_M: Final = (25.0, 10.0, 50.0)  # the first is the primary one
-EVERY_M: Final = (250.0, 500.0, 1000.0, 2000.0)  # flown between two uses of a fix
+RECKONED_M: Final = (250.0, 500.0, 1000.0, 2000.0)  # flown between two uses of a fix
 SOON_M: Final = 500.0  # after a gap, or after the drone was carried
 DIVERGED_M: Final = 100.0
 _DIVERGED_FOR_M: Final = 500.0
-_TWO_SIGMA: Final = float(chi2.ppf(math.erf(math.sqrt(2)), 2))  # squared distance within which 95.4 % of a plane lie
+SHARE_INSIDE: Final = 0.95  # of true places, that an honest ellipse of that share holds
+_INSIDE: Final = float(chi2.ppf(SHARE_INSIDE, 2))  # squared distance to the rim of that ellipse
 _NEEDED: Final = frozenset({"distance_m", "time_s"})  # measured at each view
 _JUMP_M: Final = 1.0  # more between two views than was flown: the drone was carried
 
@@ -38,7 +39,7 @@ Complexes = NDArray[np.complex128]  # east + i north, metres
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightScore:
-    """What a scored row of a flight has besides `Score`; every view is in every figure.
+    """What a scored row of a flight has besides `Score`; every view is in every figure, unless it says other views.
 
     Parameters
     ----------
@@ -49,19 +50,22 @@ class FlightScore:
     distance_within_10m, distance_within_25m, distance_within_50m : float
         Share of the flown distance with an estimate so near, accepted or not. A view stands for half the way to either
         neighbour.
-    fix_every_250m, fix_every_500m, fix_every_1000m, fix_every_2000m : float
-        Share within 25 m if an accepted fix is used once in so many metres at most, and the odometer says the rest; no
-        part before the first fix.
-    accepted, false_accepted : float
-        Share of the views with an accepted fix; and with one beyond 25 m.
-    false_per_km, accepted_per_km : float
-        The same two as counts over kilometres.
+    reckoned_250m, reckoned_500m, reckoned_1000m, reckoned_2000m : float
+        Share within 25 m if, of the tracker's accepted fixes, one is used in so many metres at most and the odometer
+        says the rest; no part before the first fix. The tracker itself was shown every view.
+    accepted, right_accepted, false_accepted : float
+        Share of the views with an accepted fix; with one within 25 m; and with one beyond.
+    false_of_accepted : float
+        Share of the accepted fixes that are false; 0 where none is accepted.
+    right_per_km, false_per_km : float
+        Accepted fixes within 25 m, and beyond, over kilometres.
     longest_without_fix_m : float
-        The longest stretch without an accepted fix; the whole flight if there is none.
+        The longest stretch without an accepted fix within 25 m; the whole flight if there is none.
     first_fix_m, first_fix_s : float
         Distance and time to the first accepted fix within 25 m; infinite without one.
     reacquired_m : float
-        The same distance after a gap, a stretch off the map, or being carried; NaN where the flight has nothing of it.
+        The same distance from the first view after being carried, or else after the longest gap or stretch off the map,
+        of two views at least; NaN where the flight has none, or ends in it.
     divergences : int
         Number of stretches of more than 500 m with accepted fixes all beyond 100 m.
     ate_m : float
@@ -69,10 +73,13 @@ class FlightScore:
     error_p50_m, error_p95_m : float
         Quantiles of the position errors of all views.
     nees : float
-        Mean normalized estimation error squared of the views with a covariance over its 3 degrees of freedom: 1 for an
-        honest covariance, more for an optimistic one. Infinite without a covariance.
-    inside_two_sigma : float
-        Share of the views with a covariance whose true position lies in the ellipse that holds 95.4 %; 0 without one.
+        Mean normalized estimation error squared of the views with an estimate, over its 3 degrees of freedom: 1 for an
+        honest covariance, more for an optimistic one. Infinite if an estimate has no covariance, or one without an
+        inverse.
+    nees_off : float
+        Its absolute logarithm: 0 for an honest covariance.
+    inside_95 : float
+        Share of the views with an estimate whose true position lies in its ellipse of 95 %; without one it does not.
     """
 
     views: int
@@ -80,14 +87,16 @@ class FlightScore:
     distance_within_25m: float
     distance_within_10m: float
     distance_within_50m: float
-    fix_every_250m: float
-    fix_every_500m: float
-    fix_every_1000m: float
-    fix_every_2000m: float
+    reckoned_250m: float
+    reckoned_500m: float
+    reckoned_1000m: float
+    reckoned_2000m: float
     accepted: float
+    right_accepted: float
     false_accepted: float
+    false_of_accepted: float
+    right_per_km: float
     false_per_km: float
-    accepted_per_km: float
     longest_without_fix_m: float
     first_fix_m: float
     first_fix_s: float
@@ -97,7 +106,8 @@ class FlightScore:
     error_p50_m: float
     error_p95_m: float
     nees: float
-    inside_two_sigma: float
+    nees_off: float
+    inside_95: float
 
 
 FLIGHT_COLUMNS: Final = tuple(field.name for field in fields(FlightScore))
@@ -186,9 +196,9 @@ def view_frame(
 ) -> pd.DataFrame:
     """Return a row for each view of flights, in order, with the columns `VIEW_COLUMNS`.
 
-    `truths` are those of `heads`, in the same order. Errors are infinite without an estimate; places, `yaw_deg`, `nees`
-    and `is_inside` are NaN or False without one, or without a covariance. `is_carried` marks the first view after the
-    drone was carried. The estimate of a method that does not say whether it is accepted counts as accepted.
+    `truths` are those of `heads`, in the same order. Errors are infinite and places NaN without an estimate. `nees` is
+    infinite and `is_inside` False without a covariance, or with one without an inverse. `is_carried` marks the first
+    view after the drone was carried. The estimate of a method that does not say whether it is accepted is accepted.
     """
     answers = [predictions.get(head.query_id) for head in heads]
     poses = [first_pose(answer) for answer in answers]
@@ -224,7 +234,7 @@ def view_frame(
         "error_m": np.where(is_answered, np.hypot(gaps[:, 0], gaps[:, 1]), np.inf),
         "yaw_error_deg": np.where(is_answered, np.abs(gaps[:, 2]), np.inf),
         "nees": nees,
-        "is_inside": in_plane <= _TWO_SIGMA,
+        "is_inside": in_plane <= _INSIDE,
         "block": [truth.block for truth in truths],
         "place": [places.get(truth.block, base_of(head.region)) for truth, head in zip(truths, heads, strict=True)],
     }
@@ -241,11 +251,12 @@ def _true_pose(truth: Truth) -> tuple[float, float, float]:
 def _normalized(gaps: Floats, covariances: Sequence[tuple[float, ...] | None]) -> tuple[Floats, Floats]:
     """Return normalized squared errors over three degrees of freedom, and squared ones of the position alone.
 
-    Both are NaN without a covariance, and where one from a file has no inverse or is not positive.
+    Both are infinite without a covariance, and where one from a file has no inverse or is not positive.
     """
     blank = (math.nan,) * SIDE**2
     table = np.array([blank if one is None else one for one in covariances], dtype=float).reshape(-1, SIDE, SIDE)
-    nees, in_plane = np.full(len(table), np.nan), np.full(len(table), np.nan)
+    table = (table + table.transpose(0, 2, 1)) / 2
+    nees, in_plane = np.full(len(table), np.inf), np.full(len(table), np.inf)
     is_given = np.isfinite(table).all(axis=(1, 2)) & np.isfinite(gaps).all(axis=1)
     is_given[is_given] = np.linalg.eigvalsh(table[is_given])[:, 0] > 0
     for size, into in ((SIDE, nees), (2, in_plane)):
@@ -266,29 +277,30 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
     per_km = 1000.0 / length_m if length_m > 0 else math.nan
     first_fix_m = _first(distance_m - distance_m[0], right)
     event = _event(column["is_seen"] & column["is_present"], column["is_carried"])
-    reckoned = _Reckoned.of(views, increments)
-    has_nees = np.isfinite(column["nees"])
+    reckoned, answered = _Reckoned.of(views, increments), column["is_answered"].astype(bool)
+    nees = float(column["nees"][answered].mean()) if answered.any() else math.inf
     return FlightScore(
         views=len(views),
         length_m=length_m,
         **{f"distance_within_{near_m:g}m": _share(way_m, error_m <= near_m) for near_m in WITHIN_M},
-        **{f"fix_every_{far_m:g}m": _share(way_m, reckoned.error_m(far_m) <= FIX_M) for far_m in EVERY_M},
+        **{f"reckoned_{far_m:g}m": _share(way_m, reckoned.error_m(far_m) <= FIX_M) for far_m in RECKONED_M},
         accepted=float(accepted.mean()),
+        right_accepted=float(right.mean()),
         false_accepted=float(false.mean()),
+        false_of_accepted=float(false.sum() / max(1, accepted.sum())),
+        right_per_km=float(right.sum()) * per_km,
         false_per_km=float(false.sum()) * per_km,
-        accepted_per_km=float(accepted.sum()) * per_km,
-        longest_without_fix_m=_longest(distance_m, accepted),
+        longest_without_fix_m=_longest(distance_m, right),
         first_fix_m=first_fix_m,
         first_fix_s=_first(column["time_s"].astype(float), right),
-        reacquired_m=math.nan
-        if event is None
-        else _first(distance_m[event:] - distance_m[max(event - 1, 0)], right[event:]),
+        reacquired_m=math.nan if event is None else _first(distance_m[event:] - distance_m[event], right[event:]),
         divergences=_divergences(distance_m, accepted & (error_m > DIVERGED_M), accepted),
         ate_m=float(np.sqrt(np.mean(error_m**2))),
         error_p50_m=_quantile(error_m, 0.5),
         error_p95_m=_quantile(error_m, 0.95),
-        nees=float(column["nees"][has_nees].mean()) if has_nees.any() else math.inf,
-        inside_two_sigma=float(column["is_inside"][has_nees].mean()) if has_nees.any() else 0.0,
+        nees=nees,
+        nees_off=abs(math.log(nees)) if 0 < nees < math.inf else math.inf,
+        inside_95=float(column["is_inside"][answered].mean()) if answered.any() else 0.0,
     )
 
 
@@ -321,13 +333,13 @@ def _first(at: Floats, is_right: Bools) -> float:
     return float(at[np.argmax(is_right)]) if is_right.any() else math.inf
 
 
-def _longest(distance_m: Floats, accepted: Bools) -> float:
-    """Return the longest stretch between accepted fixes, the start and the end.
+def _longest(distance_m: Floats, is_fix: Bools) -> float:
+    """Return the longest stretch between fixes, the start and the end.
 
     >>> _longest(np.array([0.0, 50.0, 100.0, 300.0]), np.array([False, True, True, False]))
     200.0
     """
-    known = np.concatenate([distance_m[:1], distance_m[accepted], distance_m[-1:]])
+    known = np.concatenate([distance_m[:1], distance_m[is_fix], distance_m[-1:]])
     return float(np.diff(known).max())
 
 

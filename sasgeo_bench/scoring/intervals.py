@@ -26,6 +26,7 @@ from sasgeo_bench.scoring.base import Floats, Ints, block_codes, check_column, c
 from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws
 
 LEVEL: Final = 0.95
+LEAST_CLUSTERS: Final = 6  # of an interval by draws alone: of fewer they are too narrow
 _Names = Sequence[str] | Ints
 
 
@@ -209,18 +210,18 @@ def share_interval(value: float, drawn: tuple[ArrayLike, ArrayLike], trials: flo
     )
 
 
-def amount_interval(value: float, drawn: tuple[ArrayLike, ArrayLike]) -> BoardInterval:
+def amount_interval(value: float, drawn: tuple[ArrayLike, ArrayLike], clusters: int) -> BoardInterval:
     """Return the 95 % intervals of a mean of values without an upper bound, such as a count for each kilometre.
 
     Arguments are as of `share_interval`, but for trials: no distribution is known that would widen draws of few
-    clusters, so there is no interval where nothing varies.
+    clusters (blocks), so there is no interval of fewer than `LEAST_CLUSTERS`, nor where nothing varies.
 
-    >>> found = amount_interval(2.0, (np.linspace(1.0, 3.0, 101), np.full(101, 2.0)))
+    >>> found = amount_interval(2.0, (np.linspace(1.0, 3.0, 101), np.full(101, 2.0)), 8)
     >>> round(found.lo, 2), round(found.hi, 2), found.how
     (1.04, 2.96, 'places')
     """
     places, blocks = (percentile_interval(value, one) for one in drawn)
-    if math.isnan(value) or not (places.lo < places.hi or blocks.lo < blocks.hi):
+    if clusters < LEAST_CLUSTERS or math.isnan(value) or not (places.lo < places.hi or blocks.lo < blocks.hi):
         return BoardInterval(value=value)
     lo, hi = float(np.fmin(places.lo, blocks.lo)), float(np.fmax(places.hi, blocks.hi))
     return BoardInterval(

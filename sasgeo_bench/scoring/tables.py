@@ -198,7 +198,7 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
     table = np.column_stack((*columns, *(item.is_below for item in below)))
     names = (group.places[chosen], group.blocks[chosen], group.sites[chosen])
     drawn = BoardDraws.of(*names, seed=cell.seed, draws=cell.draws)
-    means = _Means(table=table, drawn=drawn.means(table), trials=drawn.trials)
+    means = _Means(table=table, drawn=drawn.means(table), trials=drawn.trials, clusters=drawn.by_block.units_count)
     for number, metric in enumerate(metrics):
         yield from _ranked(cell, keys, metric, means.some(slice(number * count, (number + 1) * count)))
     for at, item in enumerate(below, start=len(metrics) * count):
@@ -214,6 +214,7 @@ class _Means:
     table: Floats
     drawn: tuple[Floats, Floats]
     trials: float
+    clusters: int
 
     def some(self, columns: slice) -> Self:
         """Return some columns."""
@@ -224,7 +225,7 @@ class _Means:
         """Return the intervals of one column's mean; values of a share lie in [0, 1]."""
         by_place, by_block = (means[:, column] for means in self.drawn)
         if not is_share:
-            return amount_interval(value, (by_place, by_block))
+            return amount_interval(value, (by_place, by_block), self.clusters)
         return share_interval(value, (by_place, by_block), self.trials)
 
 

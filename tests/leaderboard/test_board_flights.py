@@ -70,7 +70,7 @@ def test_figures_of_flights_stand_on_the_board(out):
     assert (whole["near", "distance_within_25m"], whole["far", "distance_within_25m"]) == (1.0, 0.0)
     assert (whole["near", "false_accepted"], whole["far", "distance_within_50m"]) == (0.0, 1.0)
     assert 0.4 < whole["far", "false_accepted"] < 0.6
-    assert whole["near", "accepted"] == 1.0
+    assert whole["near", "right_accepted"] == 1.0
     costs = table[table["suite"] == "all suites"].set_index(["matcher", "metric"])
     assert costs.loc[("near", "latency_p50"), "value"] == 0.1
     views = costs.loc[("near", "cpu_per_fix"), "n"]

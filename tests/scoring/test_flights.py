@@ -97,11 +97,11 @@ def test_a_flight_that_is_followed_exactly_has_the_best_of_every_figure():
         *(True, True),
     )
     assert (row["views"], row["length_m"], row["latency_s"]) == (11, 1000.0, 0.5)
-    shares = [name for name in FLIGHT_COLUMNS if name.startswith(("distance_within", "fix_every"))]
+    shares = [name for name in FLIGHT_COLUMNS if name.startswith(("distance_within", "reckoned"))]
     assert [row[name] for name in shares] == [1.0] * 7
-    assert (row["accepted"], row["false_accepted"], row["inside_two_sigma"], row["divergences"]) == (1.0, 0.0, 1.0, 0)
+    assert (row["accepted"], row["false_accepted"], row["inside_95"], row["divergences"]) == (1.0, 0.0, 1.0, 0)
     assert [row[name] for name in ("first_fix_m", "first_fix_s", "ate_m", "nees", "false_per_km")] == [0.0] * 5
-    assert (row["accepted_per_km"], row["longest_without_fix_m"]) == (11.0, 100.0)
+    assert (row["right_per_km"], row["longest_without_fix_m"]) == (11.0, 100.0)
     assert math.isnan(row["reacquired_m"])
 
 
@@ -124,7 +124,7 @@ def test_what_is_not_answered_stays_in_every_denominator():
     assert row["longest_without_fix_m"] == 400.0
     lost = score_of(heads, truths, {})
     assert (lost["status"], lost["is_answered"], lost["distance_within_25m"]) == (MISSING, False, 0.0)
-    assert (lost["first_fix_m"], lost["nees"], lost["inside_two_sigma"]) == (math.inf, math.inf, 0.0)
+    assert (lost["first_fix_m"], lost["nees"], lost["inside_95"]) == (math.inf, math.inf, 0.0)
     assert lost["longest_without_fix_m"] == 400.0
 
 
@@ -134,7 +134,8 @@ def test_only_accepted_fixes_can_be_false_or_first():
     row = score_of(heads, truths, answers(truths, off_m=off_m, accepted=[0, 1, 1, 0, 0, 1, 0, 0, 0, 0, 1]))
     assert (row["first_fix_m"], row["first_fix_s"]) == (500.0, 50.0)
     assert row["false_accepted"] == pytest.approx(2 / 11)
-    assert (row["false_per_km"], row["accepted_per_km"]) == (2.0, 4.0)
+    assert (row["false_per_km"], row["right_per_km"], row["false_of_accepted"]) == (2.0, 2.0, 0.5)
+    assert (row["accepted"], row["right_accepted"]) == (4 / 11, 2 / 11)
     assert row["longest_without_fix_m"] == 500.0
 
 
@@ -155,7 +156,7 @@ def test_reacquisition_begins_where_a_gap_ends(how):
     heads, truths = a_flight(11, **{how: range(3, 6)})
     right = [1, 1, 1, 0, 0, 0, 0, 1, 1, 1, 1]
     row = score_of(heads, truths, answers(truths, accepted=right))
-    assert row["reacquired_m"] == 200.0  # from the last view of the gap to the second after it
+    assert row["reacquired_m"] == 100.0  # from the first view after the gap to the second
     never = score_of(heads, truths, answers(truths, accepted=[1] * 6 + [0] * 5))
     assert never["reacquired_m"] == math.inf
 
@@ -175,16 +176,50 @@ def test_being_carried_is_found_and_its_way_does_not_count():
     late = [1] * 5 + [0, 0, 0, 1, 1, 1]
     row = score_of(heads, truths, answers(truths, accepted=late))
     assert row["length_m"] == 1000.0
-    assert row["reacquired_m"] == 400.0
+    assert row["reacquired_m"] == 300.0
 
 
 def test_covariances_are_held_against_errors():
     heads, truths = a_flight(4)
     row = score_of(heads, truths, answers(truths, off_m=[5.0, 10.0, 12.0, 20.0]))
     assert row["nees"] == pytest.approx(np.mean([1.0, 4.0, 5.76, 16.0]) / 3)
-    assert row["inside_two_sigma"] == 0.75  # 2.486 of their standard deviations hold 95.4 % of a plane
+    assert row["inside_95"] == 0.75  # 2.45 of their standard deviations hold 95 % of a plane
     odd = score_of(heads, truths, answers(truths, covariance=(-1.0, *SURE[1:])))
-    assert (odd["nees"], odd["inside_two_sigma"]) == (math.inf, 0.0)
+    assert (odd["nees"], odd["inside_95"]) == (math.inf, 0.0)
+
+
+def test_no_choice_of_covariances_flatters_them():
+    heads, truths = a_flight(4)
+    off_m = [5.0, 10.0, 12.0, 20.0]
+    given = answers(truths, off_m=off_m)
+    first = {name: replace(one, covariance=SURE if at == 0 else None) for at, (name, one) in enumerate(given.items())}
+    some = score_of(heads, truths, first)
+    assert (some["nees"], some["nees_off"], some["inside_95"]) == (math.inf, math.inf, 0.25)
+    wide = score_of(heads, truths, answers(truths, off_m=off_m, covariance=tuple(1e4 * one for one in SURE)))
+    assert wide["nees_off"] > 5.0 > score_of(heads, truths, given)["nees_off"]
+    flat = score_of(heads, truths, answers(truths, off_m=off_m, covariance=(0.0,) * 9))
+    assert (flat["nees"], flat["inside_95"]) == (math.inf, 0.0)
+
+
+def test_false_fixes_do_not_shorten_the_stretch_without_a_right_one():
+    heads, truths = a_flight(11)
+    row = score_of(heads, truths, answers(truths, off_m=[0.0] + [30.0] * 9 + [0.0]))
+    assert (row["accepted"], row["longest_without_fix_m"]) == (1.0, 1000.0)
+
+
+def test_what_covers_part_of_a_flight_is_not_a_claim_that_it_does_not_apply():
+    heads, truths = a_flight(3)
+    claimed = answers(truths, status="not applicable")
+    assert score_of(heads, truths, claimed)["status"] == "not applicable"
+    mixed = claimed | {heads[0].query_id: replace(claimed[heads[0].query_id], status="ok")}
+    assert score_of(heads, truths, mixed)["status"] == MISSING
+
+
+def test_views_that_an_older_program_drew_are_refused():
+    heads, truths = a_flight(3)
+    old = replace(truths[1], measured={"distance_m": 100.0})
+    with pytest.raises(MetricError, match="was drawn by an older program: remove its task and truths"):
+        score_flights(heads, [truths[0], old, truths[2]], {})
 
 
 def test_the_odometer_says_the_rest_between_fixes():
@@ -192,10 +227,10 @@ def test_the_odometer_says_the_rest_between_fixes():
     heads, truths = a_flight(11)
     heads[1] = replace(heads[1], increment=(0.0, STEP_M, 10.0))
     row = score_of(heads, truths, answers(truths))
-    assert row["fix_every_250m"] == 1.0
-    assert row["fix_every_2000m"] == pytest.approx(0.25)  # views 0, 1 and 2 are within 25 m
+    assert row["reckoned_250m"] == 1.0
+    assert row["reckoned_2000m"] == pytest.approx(0.25)  # views 0, 1 and 2 are within 25 m
     first = score_of(heads, truths, answers(truths, accepted=[0] * 10 + [1]))
-    assert first["fix_every_250m"] == pytest.approx(0.05)  # nothing is known before the first fix
+    assert first["reckoned_250m"] == pytest.approx(0.05)  # nothing is known before the first fix
 
 
 def test_two_flights_are_two_rows_in_the_order_of_their_ids():
@@ -220,7 +255,7 @@ def test_answers_of_other_queries_and_lost_truths_are_refused():
 
 
 def test_a_board_of_flights_has_every_figure_of_their_track():
-    parts = [a_flight(5, f"f{at}", unseen=(1, 2)) for at in range(4)]
+    parts = [a_flight(5, f"f{at}", steps_m=[1100.0] * 4, unseen=(1, 2)) for at in range(4)]
     heads, truths = ([item for part in parts for item in part[at]] for at in (0, 1))
     good = score_flights(heads, truths, answers(truths)).flights
     bad = score_flights(heads, truths, {}).flights
@@ -233,4 +268,4 @@ def test_a_board_of_flights_has_every_figure_of_their_track():
     assert whole.loc[("good", first), "n"] == 4
     assert whole.loc[("good", "reacquired_500m"), "value"] == 1.0
     assert whole.loc[("bad", "first_fix"), "value"] == math.inf
-    assert math.isnan(whole.loc[("good", "accepted_per_km"), "lo"])  # four flights that are alike
+    assert math.isnan(whole.loc[("good", "right_per_km"), "lo"])  # four flights that are alike

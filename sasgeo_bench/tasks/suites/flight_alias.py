@@ -22,7 +22,7 @@ from sasgeo_bench.tasks.suites.flight_plots import (
     Plot,
     stretches_m,
 )
-from sasgeo_bench.tasks.suites.flights import SEQUENCE, START, Mission
+from sasgeo_bench.tasks.suites.flights import SEQUENCE, START
 from sasgeo_bench.tasks.suites.twins import RIVAL_M
 from sasgeo_bench.tasks.twin import Paste, mirror
 
@@ -105,11 +105,6 @@ def _middle_m(area: shapely.Polygon) -> tuple[float, float]:
     return ((west + east) / 2, (south + north) / 2)
 
 
-def _mission(variant: Variant) -> Mission:
-    del variant  # the map is all that differs
-    return Mission()
-
-
 SUITE: Final = FlightAliasSuite(
     card=SuiteCard(
         name="flight-alias",
@@ -130,5 +125,4 @@ SUITE: Final = FlightAliasSuite(
         *(Variant(role="stress", kind="F8 copied start", strength=length_m) for length_m in sorted(STRETCHES_M)),
         Variant(role="falsifier", kind="mirror image"),
     ),
-    mission=_mission,
 )

@@ -6,7 +6,7 @@ from typing import Final
 
 from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.tasks.suites.base import SuiteCard, Variant
-from sasgeo_bench.tasks.suites.flights import SEQUENCE, START, FlightSuite, Mission
+from sasgeo_bench.tasks.suites.flights import SEQUENCE, START, FlightSuite
 from sasgeo_bench.tasks.suites.pictures import Flight, PictureSuite
 
 EVERY_M: Final = (80.0, 120.0)  # flown between two pictures, on average: rendering takes most of the time
@@ -22,11 +22,6 @@ class FlightImageSuite(PictureSuite, FlightSuite):
 def _flight(variant: Variant) -> Flight:
     season: Season = next((name for name in SEASONS if variant.kind.endswith(name)), "summer")
     return Flight(conditions=lambda ordinary: replace(ordinary, season=season))
-
-
-def _mission(variant: Variant) -> Mission:
-    del variant  # the season is all that differs
-    return Mission()
 
 
 SUITE: Final = FlightImageSuite(
@@ -52,7 +47,6 @@ SUITE: Final = FlightImageSuite(
         Variant(role="falsifier", kind="summer again"),
     ),
     flight=_flight,
-    mission=_mission,
     every_m=EVERY_M,
     longest_m=LONGEST_M,
 )

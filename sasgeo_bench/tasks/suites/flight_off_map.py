@@ -19,7 +19,7 @@ from sasgeo_bench.tasks.suites.flight_plots import (
     Plot,
     stretches_m,
 )
-from sasgeo_bench.tasks.suites.flights import SEQUENCE, START, Mission
+from sasgeo_bench.tasks.suites.flights import SEQUENCE, START
 
 OFF_MAP: Final = "off_map_m"  # measured: flown off the map
 LOST: Final = "lost_m2"  # measured: what the map lost
@@ -128,11 +128,6 @@ def _disc(center_m: Floats, radius_m: float) -> shapely.Polygon:
     return shapely.Point(center_m).buffer(radius_m, quad_segs=_ARC_SEGMENTS)
 
 
-def _mission(variant: Variant) -> Mission:
-    del variant  # the map is all that differs
-    return Mission()
-
-
 SUITE: Final = FlightOffMapSuite(
     card=SuiteCard(
         name="flight-off-map",
@@ -152,5 +147,4 @@ SUITE: Final = FlightOffMapSuite(
         *(Variant(role="stress", kind="F7 off the map", strength=length_m) for length_m in sorted(STRETCHES_M)),
         Variant(role="falsifier", kind="ground lost elsewhere"),
     ),
-    mission=_mission,
 )

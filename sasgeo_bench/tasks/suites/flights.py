@@ -57,6 +57,12 @@ class Mission:
     draw: str = ""
 
 
+def uneventful(variant: Variant) -> Mission:
+    """Return the mission of a flight on which nothing happens."""
+    del variant
+    return Mission()
+
+
 @dataclass(frozen=True, kw_only=True)
 class FlightSuite(Suite):
     """A suite of flights: all variants at a site fly the same way, and `mission` says what happens on it.
@@ -64,7 +70,7 @@ class FlightSuite(Suite):
     `every_m` are the bounds of a flight's mean spacing of views, and `longest_m` of its length.
     """
 
-    mission: Callable[[Variant], Mission]
+    mission: Callable[[Variant], Mission] = uneventful
     every_m: tuple[float, float] = SPACING_M
     longest_m: float = max(LENGTHS_M)
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Commands that look at what was made, and hold it against what it should be."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
@@ -17,7 +18,7 @@ from sasgeo_bench.leaderboard.board_files import BOARD, read_board, read_scores
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
 from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels
-from sasgeo_bench.leaderboard.run_cases import RunCases, is_run, picture_of, read_run_cases
+from sasgeo_bench.leaderboard.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
 from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Manifest
@@ -36,6 +37,7 @@ from sasgeo_bench.tasks.task_files import read_task
 
 TOP_DROPS: Final = 12
 SOME_CASES: Final = 3
+_NOT_IN_NAMES: Final = re.compile(r"[^A-Za-z0-9.@+_-]+")
 SHOWN_LETTERS: Final = 10  # of a query's id: enough to name it
 
 
@@ -114,7 +116,7 @@ def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> N
     """Print what a task is and draw its contact sheet; of flights, maps of their paths, unless a view is named."""
     about = read_task(folder)
     truth_folder = out / "truth" / about["suite"] / about["region"]
-    path = out / "sheets" / f"{about['suite']}-{about['region']}{f'-{query}' if query else ''}.png"
+    path = _sheet(out, about["suite"], about["region"], *([query] if query else []))
     is_of_view = query is not None and len(query) > SEQUENCE_DIGITS
     maps = (
         flight_panels(folder, truth_folder, count=rows, flight=query) if is_of_flights(about) and not is_of_view else ()
@@ -130,6 +132,15 @@ def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> N
     else:
         write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
     say(f"contact sheet: {path}")
+
+
+def _sheet(out: Path, *names: str) -> Path:
+    """Return where a picture is written; names of tasks and queries may come from elsewhere, and lead nowhere else.
+
+    >>> _sheet(Path("out"), "mine 2", "../../x").as_posix()
+    'out/sheets/mine-2-..-..-x.png'
+    """
+    return out / "sheets" / f"{_NOT_IN_NAMES.sub('-', '-'.join(names))}.png"
 
 
 def _text_of(value: object) -> str:
@@ -160,15 +171,14 @@ def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | Non
     if cases.flights and strip is None and _inspect_flights(cases, out, query):
         return
     if strip is not None:
-        name = cases.entry.name.replace(" ", "-")
         suites = ", ".join(sorted({suite for suite, _ in pictured_tasks(cases)}))
-        path = out / "sheets" / f"strip-{name}.png"
+        path = _sheet(out, "strip", cases.entry.name)
         write_png(path, strip_pixels(*strip_of(cases, strip), title=f"{cases.entry.name} on {suites}"))
         say(f"strip: {path}")
         return
     if query is not None:
         query_id, picture = picture_of(cases, query)
-        path = out / "sheets" / f"{cases.entry.name.replace(' ', '-')}-{query_id}.png"
+        path = _sheet(out, cases.entry.name, query_id)
         write_png(path, case_pixels(picture))
         say(f"picture: {path}")
         return
@@ -195,16 +205,18 @@ def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
     frames = [found.flights for found in cases.flights.values()]
     order = ["distance_within_25m", "role", "query_id"]  # of flights that are as good the stressed first
     flights = pd.concat(frames, ignore_index=True).sort_values(order, ascending=[True, False, True])
-    named = flights if query is None else flights[flights["query_id"].str.startswith(query)]
-    if named.empty:
-        return False
     if query is None:
         _print_flights(cases.entry.name, flights)
-    row = named.iloc[0]
+        row = flights.iloc[0]
+    else:
+        flight = find_flight(cases, query)
+        if flight is None:
+            return False
+        row = flights[flights["query_id"] == flight].iloc[0]
     key = (str(row["suite"]), str(row["region"]))
     about = read_task(cases.root / "tasks" / key[0] / key[1])
     views = {cases.entry.name: cases.flights[key].views}
-    path = out / "sheets" / f"{cases.entry.name.replace(' ', '-')}-{row['query_id']}.png"
+    path = _sheet(out, cases.entry.name, str(row["query_id"]))
     write_png(path, flight_map_pixels(about, str(row["query_id"]), views, root=cases.root))
     say(f"map of {'the worst flight' if query is None else 'the flight'}: {path}")
     return query is not None

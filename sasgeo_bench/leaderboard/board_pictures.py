@@ -23,7 +23,7 @@ from sasgeo_bench.leaderboard.cases import (
     sample_cases,
     words_of,
 )
-from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels, shown_flight
+from sasgeo_bench.leaderboard.flight_maps import MOST_TRACKERS, flight_map_pixels, shown_flight
 from sasgeo_bench.leaderboard.plot_tables import shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
@@ -242,12 +242,13 @@ def _add_flights(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]]
         if chosen is None:
             continue
         region, flight = chosen
-        views = {name: board.views[name] for name in names}
+        shown = [name for name in names if (board.views[name]["sequence_id"] == flight).any()][:MOST_TRACKERS]
+        views = {name: board.views[name] for name in shown}
         found.add(
             "flights",
             suite,
             partial(_flight_map, about[suite, region], flight, views, root),
-            {"suite": suite, "alt": f"A flight of {suite} on {region}, with the estimates of {', '.join(names)}"},
+            {"suite": suite, "alt": f"A flight of {suite} on {region}, with the estimates of {', '.join(shown)}"},
         )
 
 

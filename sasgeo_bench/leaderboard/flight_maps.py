@@ -52,7 +52,7 @@ def shown_flight(scores: Mapping[str, pd.DataFrame], suite: str, regions: Sequen
 def flight_map_pixels(
     about: Mapping[str, Any], flight: str, views: Mapping[str, pd.DataFrame], *, root: Path
 ) -> NDArray[np.uint8]:
-    """Draw a flight with the estimates of at most `MOST_TRACKERS` trackers; pixels have blue first.
+    """Draw a flight with the estimates of some trackers, a map for each; pixels have blue first.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def flight_map_pixels(
     folder = root / "regions" / region
     ground = Ground.of(folder, region_files.read_manifest(folder), bounds_of_m([panel]))
     mine = {name: frame[frame["sequence_id"] == flight] for name, frame in views.items()}
-    names = [name for name, frame in mine.items() if len(frame)][:MOST_TRACKERS]
+    names = list(mine)
     truth = panel.truth
     across = min(_ACROSS, len(names))
     sheet = Page(

@@ -412,17 +412,32 @@ def _truth(task: ScoredTask, query_id: str) -> Truth:
     return next(truth for truth in task.truths if truth.query_id == query_id)
 
 
-def _find(cases: RunCases, query: str) -> str:
-    """Return the one id that begins so."""
+def find_flight(cases: RunCases, query: str) -> str | None:
+    """Return the one flight whose id begins so, or that a view belongs to; None without one.
+
+    Raise ConfigError if there are several, or the query is empty.
+    """
+    flights = sorted(name for found in cases.flights.values() for name in found.flights["query_id"])
+    found = _beginning(cases, flights, query) or [name for name in flights if query.startswith(name)]
+    return found[0] if found else None
+
+
+def _beginning(cases: RunCases, known: Sequence[str], query: str) -> list[str]:
+    """Return the one id that begins so, in a list, or none; raise ConfigError if there are several."""
     if not query:
         message = f"--query is empty: name the beginning of an id, as 'inspect {cases.run}' lists some"
         raise ConfigError(message)
-    known = sorted(cases.scores["query_id"])
     found = [name for name in known if name.startswith(query)]
     if len(found) > 1:
-        message = f"{counted(len(found), 'query', 'queries')} begin with {query!r} ({', '.join(found[:_NAMED])}, ...)"
-        message = f"{message}: name more of the id"
+        message = f"{len(found)} ids begin with {query!r} ({', '.join(found[:_NAMED])}, ...): name more of the id"
         raise ConfigError(message)
+    return found
+
+
+def _find(cases: RunCases, query: str) -> str:
+    """Return the one id that begins so."""
+    known = sorted(cases.scores["query_id"])
+    found = _beginning(cases, known, query)
     answered = {tie.query_id for source in cases.entry.sources for tie in prediction_files.read_ties(source)}
     is_old = found and found[0] in answered and found[0] not in cases.predictions
     if is_old or (not found and any(name.startswith(query) for name in answered)):

@@ -63,7 +63,7 @@ class Tracker(Protocol):
     card: MatcherCard
 
     def prepare(self, region: Region, learned: str | None) -> None:
-        """Index a map; called and timed once for each map. `learned` is the text of `learn`, None without one."""
+        """Index a map; called in the process of each flight. `learned` is the text of `learn`, None without one."""
         ...
 
     def start(self, prior: Prior) -> None:
@@ -97,7 +97,7 @@ def check_fix(fix: object, *, top_k: int) -> Fix:
     return replace(
         fix,
         pose=found.poses[0] if found.poses else None,
-        covariance=None if fix.covariance is None else _covariance(fix.covariance),
+        covariance=None if fix.covariance is None else check_covariance(fix.covariance),
         is_accepted=bool(fix.is_accepted),
         confidence=found.confidence,
         modes=tuple(zip(found.poses[1:], found.scores[1:], strict=True)),
@@ -121,18 +121,30 @@ def match_of(fix: Fix) -> Match:
     )
 
 
-def _covariance(given: object) -> NDArray[np.float64]:
-    """Return a covariance as an array; raise `MatchError` if it is none."""
+def are_covariances(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which of some matrices, shape (N, 3, 3), are symmetric and positive definite, shape (N,).
+
+    >>> are_covariances(np.array([np.eye(3), np.ones((3, 3)), -np.eye(3)])).tolist()
+    [True, False, False]
+    """
+    turned = matrices.transpose(0, 2, 1)
+    is_even = np.isclose(matrices, turned, rtol=1e-6, atol=1e-9).all(axis=(1, 2))
+    values = np.linalg.eigvalsh((matrices + turned) / 2)
+    return np.asarray(is_even & (values[:, 0] > _LEAST_RATIO * values[:, -1]) & (values[:, -1] > 0))
+
+
+def check_covariance(given: object) -> NDArray[np.float64]:
+    """Return a covariance, 3 x 3 or row by row, as an array of shape (3, 3); raise `MatchError` if it is none."""
     try:
         found = np.array(given, dtype=np.float64)
+        found = found.reshape(SIDE, SIDE) if found.shape == (SIDE**2,) else found
     except (TypeError, ValueError) as error:
         message = f"covariance is a {type(given).__name__}, expected 3 x 3 numbers"
         raise MatchError(message) from error
     if found.shape != (SIDE, SIDE) or not np.isfinite(found).all() or np.abs(found).max() > MOST_VARIANCE:
         message = f"covariance has shape {found.shape}, expected 3 x 3 numbers of {MOST_VARIANCE:g} at most"
         raise MatchError(message)
-    values = np.linalg.eigvalsh((found + found.T) / 2)
-    if not np.allclose(found, found.T, rtol=1e-6, atol=1e-9) or values[0] <= _LEAST_RATIO * values[-1]:
+    if not are_covariances(found[None])[0]:
         message = "covariance is not symmetric and positive definite: NEES needs its inverse; or give none"
         raise MatchError(message)
     return found

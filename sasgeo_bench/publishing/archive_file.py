@@ -48,7 +48,7 @@ from sasgeo_bench.publishing.archive_folder import (
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_rows import FIX_FIELDS, PREDICTION_SCHEMA, prediction_row, predictions_of
+from sasgeo_bench.running.prediction_rows import prediction_row, predictions_of, schema_of
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.task_rows import (
     ASKED,
@@ -261,10 +261,7 @@ def _file_of(about: Mapping[str, Any]) -> str:
 def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *, is_lean: bool) -> int:
     """Write all answers, one run after the other, and return how many bytes they are."""
     tables = []
-    is_flown = any(
-        item.is_accepted is not None for listed in runs.values() for run in listed for item in run.predictions
-    )
-    plain = pa.schema([*PREDICTION_SCHEMA, *(FIX_FIELDS if is_flown else ())], metadata=PREDICTION_SCHEMA.metadata)
+    plain = schema_of(item for listed in runs.values() for run in listed for item in run.predictions)
     for name, listed in runs.items():
         rows = [prediction_row(_lean(item) if is_lean else item) for run in listed for item in run.predictions]
         table = pa.Table.from_pylist(rows, schema=plain)

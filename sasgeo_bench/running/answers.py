@@ -15,6 +15,7 @@ from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.matching.matcher import check_match, lacks
 from sasgeo_bench.matching.plugins import ORACLE
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.tracker import check_covariance
 from sasgeo_bench.regions.region_files import check_files, read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import Oracle
@@ -268,11 +269,17 @@ class _Map:
                 yield writer, query, blob
 
     def ask(self, schedule: Schedule[Question], number: int) -> None:
-        """Prepare the map in a new process with the first query, then answer groups of queries until none is left."""
+        """Prepare the map in a new process with the first query, then answer groups of queries until none is left.
+
+        Each flight has a process and a scratch folder of its own: others may fly the same way, or have flown it.
+        """
         ready = self._failed_training()
         with self._process() as worker:
             is_warm = False
             for group in schedule.groups(number):
+                if is_warm and group[0][1].step is not None:
+                    worker.end()
+                    is_warm = False
                 if ready is None:
                     result = self._plan.training_result
                     region, text = self._writers[0].part.region, None if result is None else result.text
@@ -356,6 +363,8 @@ def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
         return Prediction(query_id=query.query_id, status="invalid", message="no answer in an answer")
     try:
         match = check_match(reply.match, query, top_k=top_k)
+        if reply.covariance is not None:
+            check_covariance(reply.covariance)
     except MatchError as error:
         return Prediction(query_id=query.query_id, status="invalid", message=one_line(str(error)))
     return Prediction(

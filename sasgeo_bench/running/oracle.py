@@ -46,6 +46,9 @@ class Oracle:
     ) -> None:
         """Leave nothing."""
 
+    def end(self) -> None:
+        """End nothing: there is no process."""
+
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Read the truths; raise `StoreError` if they are missing."""
         del region, learned

@@ -18,7 +18,6 @@ from sasgeo_bench.files.parquet import read_schema, read_table, write_table
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import (
-    FIX_FIELDS,
     FLOWN_SCHEMA,
     PART_SCHEMA,
     PREDICTION_SCHEMA,
@@ -26,6 +25,7 @@ from sasgeo_bench.running.prediction_rows import (
     prediction_row,
     predictions_of,
     row_faults,
+    schema_of,
 )
 from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
 from sasgeo_bench.texts import json_text, one_line
@@ -229,9 +229,8 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
         for prediction in _to_merge(path, asked):
             found.setdefault(prediction.query_id, prediction)
     rows = [prediction_row(found[name]) for name in sorted(found)]
-    is_flown = any(row[field.name] is not None for row in rows for field in FIX_FIELDS)
     with fresh_file(into, mend="check your rights and the free space") as scratch:
-        write_table(pa.Table.from_pylist(rows, schema=FLOWN_SCHEMA if is_flown else PREDICTION_SCHEMA), scratch)
+        write_table(pa.Table.from_pylist(rows, schema=schema_of(found.values())), scratch)
     return len(rows)
 
 

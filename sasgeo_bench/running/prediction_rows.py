@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of `part-*.parquet`: their schema, conversion to and from predictions, and faults of untrusted rows."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import STATUSES, Prediction
-from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE
+from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.tasks.task_rows import ASKED, POSE_FIELDS, is_like, poses_of
 from sasgeo_bench.texts import (
@@ -46,6 +46,11 @@ FIX_FIELDS: Final = (pa.field("is_accepted", pa.bool_()), pa.field("covariance",
 FLOWN_SCHEMA: Final = pa.schema([*PREDICTION_SCHEMA, *FIX_FIELDS], metadata=PREDICTION_SCHEMA.metadata)
 _OPTIONAL: Final = (pa.field(MATCHER_S, pa.float64()), *FIX_FIELDS)
 PART_SCHEMA: Final = pa.schema([*RUN_SCHEMA, *_OPTIONAL], metadata=RUN_SCHEMA.metadata)  # of a run's own parts
+
+
+def schema_of(predictions: Iterable[Prediction]) -> pa.Schema:
+    """Return the schema of a file of predictions: with the columns of fixes where a tracker answered."""
+    return FLOWN_SCHEMA if any(item.is_accepted is not None for item in predictions) else PREDICTION_SCHEMA
 
 
 def prediction_row(prediction: Prediction) -> dict[str, Any]:
@@ -216,15 +221,23 @@ def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
 
 
 def _of_covariances(column: pa.ChunkedArray) -> Iterator[RowFault]:
-    """Check that every covariance is null, or nine numbers."""
+    """Check that every covariance is null, or nine numbers that are one."""
     whole = column.cast(pa.list_(pa.float64())).combine_chunks()
-    is_null = np.asarray(whole.is_null())
+    is_given = ~np.asarray(whole.is_null())
     rows, values = pc.list_parent_indices(whole).to_numpy(), _numbers(pc.list_flatten(whole))
-    sound = np.bincount(rows[np.abs(values) <= MOST_VARIANCE], minlength=len(whole)) == SIDE**2
     counts = np.bincount(rows, minlength=len(whole))
+    is_odd = is_given & (counts != SIDE**2)
     shown = [f"{count} numbers" for count in counts.tolist()]
-    is_wrong = ~is_null & ~(sound & (counts == SIDE**2))
-    yield from _faults("covariance", is_wrong, shown, f"{SIDE**2} numbers within {MOST_VARIANCE:g}, or null")
+    yield from _faults("covariance", is_odd, shown, f"{SIDE**2} numbers, or null")
+    bad = rows[~(np.abs(values) <= MOST_VARIANCE)]
+    is_far = is_given & ~is_odd & np.isin(np.arange(len(whole)), bad)
+    yield from _faults("covariance", is_far, ["a number beyond that"] * len(whole), f"numbers within {MOST_VARIANCE:g}")
+    whole_rows = np.flatnonzero(is_given & ~is_odd & ~is_far)
+    table = values[np.isin(rows, whole_rows)].reshape(-1, SIDE, SIDE)
+    is_none = np.zeros(len(whole), dtype=bool)
+    is_none[whole_rows] = ~are_covariances(table)
+    expected = "a symmetric and positive definite matrix, or null"
+    yield from _faults("covariance", is_none, ["a matrix that is none"] * len(whole), expected)
 
 
 def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:

@@ -309,7 +309,15 @@ class Worker(PluginProcess[Reply]):
         return reply
 
     def match(self, query: bytes, *, top_k: int) -> Reply:
-        """Ask one query, a row in Arrow's stream format, on the map prepared last."""
+        """Ask one query, a row in Arrow's stream format, on the map prepared last.
+
+        A process that ended since its last answer costs this query; one that was ended by us, or has answered for its
+        end already, is replaced, and prepares the map again.
+        """
+        if self._process is not None and self._is_gone():
+            words = self._last_words("ended between two questions")
+            self.end()
+            return self._failure("crash", words)
         if self._process is None and self._region is not None:
             again = self.prepare(self._region, self._learned)
             if again.status != "ok":

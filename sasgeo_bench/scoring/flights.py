@@ -138,6 +138,9 @@ def score_flights(
     its median error is within 25 m. Raise MetricError, too, for views without `distance_m` or `time_s`.
     """
     asked = sorted(heads, key=lambda head: head.query_id)  # by flight, then by time
+    if not asked:
+        message = "a task holds no flight: make the queries again"
+        raise MetricError(message)
     by_id = truths_of(asked, truths, predictions)
     views = view_frame(asked, [by_id[head.query_id] for head in asked], predictions, place_of)
     ends = _ends(views["sequence_id"].tolist())
@@ -274,7 +277,7 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
     false = accepted & (error_m > FIX_M)
     way_m = _ways_m(distance_m)
     length_m = float(distance_m[-1] - distance_m[0])
-    per_km = 1000.0 / length_m if length_m > 0 else math.nan
+    per_km = 1000.0 / length_m if length_m > 0 else 0.0  # of a flight that never moved
     first_fix_m = _first(distance_m - distance_m[0], right)
     event = _event(column["is_seen"] & column["is_present"], column["is_carried"])
     reckoned, answered = _Reckoned.of(views, increments), column["is_answered"].astype(bool)

@@ -18,7 +18,13 @@ from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, SubmittedFile
-from sasgeo_bench.running.prediction_rows import RUN_SCHEMA, prediction_row
+from sasgeo_bench.running.prediction_rows import (
+    FLOWN_SCHEMA,
+    PREDICTION_SCHEMA,
+    RUN_SCHEMA,
+    prediction_row,
+    schema_of,
+)
 from sasgeo_bench.tasks.task_rows import ASKED
 from sasgeo_bench.texts import MOST_MESSAGE, json_text
 
@@ -84,7 +90,8 @@ def write_submission(
     try:
         with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
             (scratch / PREDICTIONS).mkdir()
-            table = pa.Table.from_pylist(rows, schema=RUN_SCHEMA)
+            schema = schema_of(predictions).append(pa.field(ASKED, pa.string()))
+            table = pa.Table.from_pylist(rows, schema=schema)
             write_table(table, scratch / name, compression_level=_LEVEL, write_statistics=False)
             record = file_record(scratch / name)
             _check_bytes(folder / name, record.bytes)
@@ -221,7 +228,9 @@ def _check_schema(path: Path, schema: pa.Schema) -> None:
             for field in schema.remove_metadata()
         ]
     )
-    if not plain.equals(RUN_SCHEMA.remove_metadata()):
+    asked = pa.field(ASKED, pa.string())
+    allowed = [known.append(asked).remove_metadata() for known in (PREDICTION_SCHEMA, FLOWN_SCHEMA)]
+    if plain not in allowed:
         wrong = sorted(set(plain.names) ^ set(RUN_SCHEMA.names)) or ["the types of its columns"]
         message = f"{path} holds no predictions as 'submit' writes them ({wrong[0]} is not as it must be): submit again"
         raise StoreError(message)

@@ -241,7 +241,7 @@ def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_p
     assert f"did you mean {known}?" in fault(run, "--query", known[:-1] + "z")
     assert "--query is empty: name the beginning of an id" in fault(run, "--query", "")
     assert "draws a query of a task or a run" in fault("crossfit", "--query", known)
-    assert "queries begin with" in fault(run, "--query", next(_beginnings(root)))
+    assert "ids begin with" in fault(run, "--query", next(_beginnings(root)))
     out = shutil.copytree(root, tmp_path / "out", symlinks=True)
     for kind in ("tasks", "truth"):
         (out / kind).unlink()

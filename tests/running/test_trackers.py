@@ -82,6 +82,12 @@ def test_no_view_to_come_is_in_the_process_of_a_tracker(task, tmp_path):
     assert {item.diagnostics["held"] for item in rows} == {1.0}
 
 
+def test_nothing_of_another_flight_is_known(task, tmp_path):
+    rows = [item for rows in run_of(task, tmp_path, "Remembers").values() for item in rows]
+    assert {item.diagnostics["known"] for item in rows} == {1.0}
+    assert len({item.diagnostics["kept"] for item in rows}) == 1
+
+
 def test_a_tracker_reads_neither_the_views_to_come_nor_the_truths(task):
     rows = [item for rows in run_of(task, task.parents[2], "ReadsAhead").values() for item in rows]
     assert {(item.status, item.diagnostics.get("read")) for item in rows} <= {("ok", 0.0), ("refused", None)}

@@ -104,6 +104,20 @@ def test_after_a_crash_the_next_query_has_a_fresh_process(place, task):
     assert worker.starts == 3
 
 
+def test_an_end_between_two_questions_costs_one_and_the_map_is_prepared_again(place, task):
+    query = task_rows.query_bytes(next(iter(task_files.read_queries(task))))
+    region = place / "out" / "regions" / task.name
+    with Worker(spec="hostile:Plain", reach=Reach(readable=[region], hidden=[]), limits=PATIENT) as worker:
+        assert worker.prepare(region).status == "ok"
+        first = worker.match(query, top_k=5)
+        worker._process.kill()
+        worker._process.wait()
+        second, third = (worker.match(query, top_k=5) for _ in range(2))
+    assert [reply.status for reply in (first, second, third)] == ["ok", "crash", "ok"]
+    assert "died by SIGKILL" in second.message
+    assert third.match == first.match
+
+
 @shut_in
 def test_the_truth_is_out_of_reach(place, task):
     (reply,), worker = ask(place, task, "ReadsTruth")

@@ -6,6 +6,7 @@ import gc
 import os
 import time
 from pathlib import Path
+from typing import ClassVar
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import MatcherCard
@@ -33,6 +34,18 @@ class Counting:
         held = sum(isinstance(item, Query) for item in gc.get_objects())
         told = {"views": self.views, "held": held, "process": os.getpid(), "has_place": self.has_place}
         return Fix(pose=HERE, covariance=[[4, 0, 0], [0, 4, 0], [0, 0, 1]], modes=[(HERE, 0.5)], diagnostics=told)
+
+
+class Remembers(Counting):
+    """Says how many flights it knows of, in memory and in files of its own: each is begun twice, once to warm up."""
+
+    card = MatcherCard(name="remembers", tracks=("sequence",), **SAID)
+    flights: ClassVar[set[str]] = set()
+
+    def step(self, query):
+        self.flights.add(query.step.sequence_id)
+        Path(query.step.sequence_id).touch()
+        return Fix(pose=HERE, diagnostics={"known": len(self.flights), "kept": len(list(Path.cwd().iterdir()))})
 
 
 class ReadsAhead(Counting):

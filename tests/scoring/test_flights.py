@@ -207,6 +207,15 @@ def test_false_fixes_do_not_shorten_the_stretch_without_a_right_one():
     assert (row["accepted"], row["longest_without_fix_m"]) == (1.0, 1000.0)
 
 
+def test_a_flight_that_never_moved_has_figures_and_a_task_without_flights_none():
+    heads, truths = a_flight(3, steps_m=[0.0, 0.0])
+    row = score_of(heads, truths, answers(truths, off_m=[0.0, 0.0, 30.0]))
+    assert row["distance_within_25m"] == pytest.approx(2 / 3)
+    assert (row["false_per_km"], row["right_per_km"], row["longest_without_fix_m"]) == (0.0, 0.0, 0.0)
+    with pytest.raises(MetricError, match="a task holds no flight: make the queries again"):
+        score_flights([], [], {})
+
+
 def test_what_covers_part_of_a_flight_is_not_a_claim_that_it_does_not_apply():
     heads, truths = a_flight(3)
     claimed = answers(truths, status="not applicable")

@@ -35,11 +35,10 @@ from sasgeo_bench.publishing.archive_folder import check_results
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
-from sasgeo_bench.scoring.contestants import read_scored_task, rows_to_rank
+from sasgeo_bench.scoring.contestants import read_scored_task, rows_of_task, rows_to_rank
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
-from sasgeo_bench.scoring.score import score_task
 from sasgeo_bench.sensing.reference_imagery import render_place
 from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import RECALIBRATED, base_of
@@ -115,9 +114,8 @@ def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: S
     """Report what the registered contrasts could show on the drawn queries; refuse one that cannot be reached."""
     if not contrasts:
         return
-    of_split = {} if plan.split is None else {"place_of": plan.split.place_of, "country_of": plan.split.country_of}
     read = [read_scored_task(folder, plan.out / "truth") for folder in tasks]
-    frames = [score_task(task.heads, task.truths, {}, **of_split) for task in read]
+    frames = [rows_of_task(task, {}, plan.split)[0] for task in read]
     design = rows_to_rank({plan.spec.id: pd.concat(frames, ignore_index=True)}, plan.split)[plan.spec.id]
     pilots = {item.name: Pilot(**item.pilot.model_dump()) for item in plan.spec.contrast if item.pilot is not None}
     check_contrasts(contrasts, pilots, design, tell=tell)

@@ -15,7 +15,7 @@ from sasgeo_bench.experiments.paper.task import region_name
 from sasgeo_bench.experiments.sealed import Seal, seal_of
 from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.matching.plugins import YARDSTICK, check_names
+from sasgeo_bench.matching.plugins import ORACLE, YARDSTICK, check_names, is_tracker
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files
@@ -37,7 +37,7 @@ from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
 CONTROL_SPLIT: Final = "crossfit"
 CONTROL_SITES: Final = 8
-CONTROL_MATCHERS: Final = ("oracle_pose", "prior_centre")  # on all queries of every board
+CONTROL_MATCHERS: Final = (ORACLE, "prior_centre")  # on all queries of every board
 MOST_LINES: Final = 6  # of what is to be drawn, or could not be; the rest is counted
 
 
@@ -197,7 +197,7 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
         left, done = count_queries(runs)
         planned = runs[0].plan
         lacking = [
-            item for stage in own_stages for item in stage.lacking if _is_asked(plan, spec, item.suite, item.region)
+            item for stage in own_stages for item in stage.lacking if is_asked(plan, spec, item.suite, item.region)
         ]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
         behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
@@ -417,7 +417,7 @@ def count_queries(runs: Sequence[Run]) -> tuple[int, int]:
 
 def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]:
     """Plan the runs of a matcher: one, or with learning one for each group."""
-    own = [task for task in tasks if _is_asked(plan, spec, task.parent.name, base_of(task.name))]
+    own = [task for task in tasks if is_asked(plan, spec, task.parent.name, base_of(task.name))]
     learning, groups = plan.spec.learning, plan.training_groups
     is_oracle = learning is not None and spec in learning.oracles
     whole = plan_run(
@@ -450,12 +450,15 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
     ]
 
 
-def _is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
+def is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
     """Return whether a matcher is asked on a task: controls on all, all on the controls, else by the file.
 
-    Nobody is asked on a train place of a hold-out.
+    Nobody is asked on a train place of a hold-out, trackers on flights alone, and of the others `oracle_pose` alone on
+    flights; of a module:Class the card says what it can be asked.
     """
     if suite in PICTURED:  # asked with the evidence that a segmenter makes
+        return False
+    if spec != ORACLE and ":" not in spec and is_tracker(spec) != _is_of_flights(suite):
         return False
     if suite in {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}:
         return True

@@ -22,7 +22,15 @@ from sasgeo_bench.config import (
     read_document,
 )
 from sasgeo_bench.matching.plugins import YARDSTICK
-from sasgeo_bench.scoring.verdicts import OF_MATCHERS, ContrastMetric, attainable, best_value, unreachable
+from sasgeo_bench.scoring.verdicts import (
+    LOWER,
+    OF_MATCHERS,
+    RELATIVE,
+    ContrastMetric,
+    attainable,
+    best_value,
+    unreachable,
+)
 from sasgeo_bench.sensing.reference_imagery import COARSEST_M, FINEST_M, Look
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.seasons import Season
@@ -81,6 +89,9 @@ class ContrastSpec(Document):
                 'many answers are false a perfect order gains little; metric = "e_aurc" needs none'
             )
             raise ValueError(message)
+        if self.metric == "false_accepted" and self.track != "sequence":
+            message = f'contrast {self.name!r} by false_accepted is of flights: say track = "sequence"'
+            raise ValueError(message)
         pilot = self.pilot or PilotSpec()
         if self.metric != "interaction" and (pilot.control is not None or (pilot.second or 0) < 0):
             message = f'contrast {self.name!r}: a pilot with control, or second below 0, is for metric = "interaction"'
@@ -91,7 +102,6 @@ class ContrastSpec(Document):
 
     def _check_reach(self, pilot: PilotSpec, second: float) -> None:
         """Refuse what no query could make reachable, and a pilot whose second side is better than the best."""
-        is_area = self.metric in {"aurc", "e_aurc"}
         best = best_value(self.metric, control=pilot.control, false_share=pilot.false_share)
         if self.metric == "aurc" and second < best:
             message = (
@@ -99,7 +109,8 @@ class ContrastSpec(Document):
                 f"area of {best:.3f}, so the pilot's second cannot be {second}"
             )
             raise ValueError(message)
-        gain, least = attainable(best, second, is_lower_better=is_area), self.min_effect * (second if is_area else 1.0)
+        gain = attainable(best, second, is_lower_better=self.metric in LOWER)
+        least = self.min_effect * (second if self.metric in RELATIVE else 1.0)
         message = unreachable(self.name, self.metric, gain=gain, least=least) or ""
         if message:
             raise ValueError(message)

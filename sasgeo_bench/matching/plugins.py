@@ -150,8 +150,16 @@ def load_method(spec: str) -> "Matcher | Tracker":
     """
     if ":" in spec:
         return load_tracker(spec) if callable(getattr(_find(spec, TRACKERS), "step", None)) else load_matcher(spec)
-    is_tracker = spec in list_entry_points(TRACKERS) and spec not in list_entry_points()
-    return load_tracker(spec) if is_tracker else load_matcher(spec)
+    return load_tracker(spec) if is_tracker(spec) else load_matcher(spec)
+
+
+def is_tracker(name: str) -> bool:
+    """Return whether a name is registered for a tracker and for no matcher; nothing is imported.
+
+    >>> is_tracker("dead_reckoning"), is_tracker("random")
+    (True, False)
+    """
+    return name in list_entry_points(TRACKERS) and name not in list_entry_points()
 
 
 def load_segmenter(spec: str) -> "Segmenter":
@@ -244,11 +252,14 @@ def _known(name: str, group: str) -> EntryPoint:
 
 
 def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = (), segmenters: Sequence[str] = ()) -> None:
-    """Raise `MatchError` for names that no installed package registers; import nothing, accept any module:Class."""
+    """Raise `MatchError` for names that no installed package registers; import nothing, accept any module:Class.
+
+    `matchers` may name trackers, too.
+    """
     for listed, group in ((matchers, MATCHERS), (rejectors, REJECTORS), (segmenters, SEGMENTERS)):
         for name in listed:
             if ":" not in name and name != _RESERVED.get(group):
-                _known(name, group)
+                _known(name, TRACKERS if group == MATCHERS and is_tracker(name) else group)
 
 
 def check_registered(rejectors: Sequence[str], *, source: str) -> None:

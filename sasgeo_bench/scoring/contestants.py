@@ -330,6 +330,20 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
         raise ConfigError(message)
 
 
+def rows_of_task(
+    task: ScoredTask, predictions: Mapping[str, Prediction], split: Split | None
+) -> tuple[pd.DataFrame, pd.DataFrame | None]:
+    """Return a scored row per query or flight of one task, and the rows of views of flights; None if there are none.
+
+    Raise MetricError as `score_task` does.
+    """
+    of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
+    if not task.is_of_flights:
+        return score_task(task.heads, task.truths, predictions, **of_split), None
+    found = score_flights(task.heads, task.truths, predictions, **of_split)
+    return found.flights, found.views
+
+
 def _scored(
     answers: EntryAnswers,
     tasks: Sequence[ScoredTask],
@@ -338,18 +352,14 @@ def _scored(
     by_block: Collection[str],
 ) -> tuple[pd.DataFrame, pd.DataFrame | None]:
     """Return one row per query or flight of all tasks that an entry was asked, and the rows of views of flights."""
-    of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
     frames, views = [], []
     for task in tasks:
         if task.folder not in answers.asked:
             continue
         names = [head.query_id for head in task.heads]
         mine = {name: answers.predictions[name] for name in names if name in answers.predictions}
-        if task.is_of_flights:
-            frame, seen = score_flights(task.heads, task.truths, mine, **of_split)
-            views.append(seen)
-        else:
-            frame = score_task(task.heads, task.truths, mine, **of_split)
+        frame, seen = rows_of_task(task, mine, split)
+        views += [] if seen is None else [seen]
         suite = task.about["suite"]
         frame = frame.assign(block=frame["region"]) if suite in by_region else frame
         frames.append(frame.assign(place=frame["block"], country=frame["block"]) if suite in by_block else frame)

@@ -30,16 +30,23 @@ from sasgeo_bench.scoring.intervals import (
     percentile_interval,
     wilson_share,
 )
-from sasgeo_bench.scoring.metrics import THRESHOLDS, primary_of
+from sasgeo_bench.scoring.metrics import THRESHOLDS, mean_of, primary_of
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
-from sasgeo_bench.scoring.verdicts import COLUMNS, LEAST_PLACES, OF_MATCHERS, ContrastMetric, Finding
+from sasgeo_bench.scoring.verdicts import (
+    COLUMNS,
+    LEAST_PLACES,
+    LOWER,
+    OF_MATCHERS,
+    RELATIVE,
+    ContrastMetric,
+    Finding,
+)
 from sasgeo_bench.tasks.query import UNRIVALLED, Detector
 
 PRIMARY: Final = "primary"
 INTERACTION: Final = "interaction"
 AREAS: Final = {"aurc": aurc, "e_aurc": excess_aurc, "auroc": auroc}
 ACCEPTED: Final = {metric.name: metric.accepted for metric in THRESHOLDS if metric.what == "right"}
-_RELATIVE: Final = frozenset({"aurc", "e_aurc"})  # their least difference is a share of the second side
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,10 +59,11 @@ class Contrast:
 
     The metric is "primary", success or recall at 1 on present places under stress; "interaction", the same less what
     the method reaches on the control of the same site and view, so that the difference is what the stress adds to the
-    difference; or of rejectors, on all places: "e_aurc", the area under the risk-coverage curve above that of a perfect
-    order; "auroc", the chance that a right answer is surer than a false one; "right_at_absent_0.05", the share of
-    present places that are rightly accepted where 5 % of the absent ones are; "aurc", the whole area, of which a
-    perfect order has much where many answers are false. `min_effect` is the least relevant difference: of fractions,
+    difference; "false_accepted" of flights, the share of the views with an accepted fix that is false; or of rejectors,
+    on all places: "e_aurc", the area under the risk-coverage curve above that of a perfect order; "auroc", the chance
+    that a right answer is surer than a false one; "right_at_absent_0.05", the share of present places that are rightly
+    accepted where 5 % of the absent ones are; "aurc", the whole area, of which a perfect order has much where many
+    answers are false. `min_effect` is the least relevant difference: of fractions,
     or for "aurc" and "e_aurc" relative to the second method.
     """
 
@@ -242,7 +250,7 @@ def _nothing(contrast: Contrast) -> Finding:
         second=contrast.second,
         metric=contrast.metric,
         least=contrast.min_effect,
-        is_lower_better=contrast.metric in _RELATIVE,
+        is_lower_better=contrast.metric in LOWER,
     )
 
 
@@ -273,11 +281,12 @@ class _Sides:
 
 
 def _sides(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> _Sides:
-    """Return the primary metric of both sides, or which present places they rightly accept."""
+    """Return the primary metric of both sides, false fixes, or which present places they rightly accept."""
     every = np.ones(len(first), dtype=bool)
-    if contrast.metric == PRIMARY:
-        metric = primary_of(contrast.track)
-        best: Floats = first["ceiling"].to_numpy(float)
+    if contrast.metric in OF_MATCHERS:
+        is_primary = contrast.metric == PRIMARY
+        metric = primary_of(contrast.track) if is_primary else mean_of(contrast.track, contrast.metric)
+        best: Floats = first["ceiling"].to_numpy(float) if is_primary else np.zeros(len(first))
         return _Sides(ours=metric.values(first), theirs=metric.values(second), best=best, is_counted=every)
     column = ACCEPTED[contrast.metric]
     every = (first[column].notna() & second[column].notna()).to_numpy(bool)
@@ -312,7 +321,8 @@ def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, 
     found = _value_finding(contrast, first[sides.is_counted], sides, draws)
     if not found.n:
         return found
-    won = [(values == 1).astype(float) for values in (sides.ours, sides.theirs)]  # a shared tie is no win
+    whole = 0.0 if found.is_lower_better else 1.0  # a shared tie is no win
+    won = [(values == whole).astype(float) for values in (sides.ours, sides.theirs)]
     blocks = first["block"][sides.is_counted].tolist()
     exact, clustered = mcnemar_exact(won[0], won[1]), mcnemar_clustered(won[0], won[1], blocks)
     places = first["place"][sides.is_counted].tolist()
@@ -369,7 +379,7 @@ def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame)
 
     gaps = drawn.of_both(gaps_of)
     place = np.unique(first["place"], return_inverse=True)[1]
-    is_relative = contrast.metric in _RELATIVE
+    is_relative = contrast.metric in RELATIVE
     best = {"aurc": aurc(both[0]) - excess_aurc(both[0]), "e_aurc": 0.0, "auroc": 1.0}[contrast.metric]
     found = replace(
         _nothing(contrast),

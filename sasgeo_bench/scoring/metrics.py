@@ -368,6 +368,15 @@ def quantiles_of(track: str) -> tuple[QuantileMetric, ...]:
     return tuple(metric for metric in QUANTILES if metric.track == track)
 
 
+def mean_of(track: str, name: str) -> MeanMetric:
+    """Return the metric of a name; a track without it has none of that name.
+
+    >>> mean_of("sequence", "false_accepted").better
+    'lower'
+    """
+    return next(metric for metric in means_of(track) if metric.name == name)
+
+
 def primary_of(track: str) -> MeanMetric:
     """Return the metric that ranks matchers on a track."""
     return next(metric for metric in means_of(track) if metric.is_primary)

@@ -16,7 +16,7 @@ from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.scoring.base import block_codes
 from sasgeo_bench.scoring.compare import design_effect, detectable_difference
 from sasgeo_bench.scoring.contrasts import INTERACTION, Contrast, chosen_rows
-from sasgeo_bench.scoring.verdicts import ALPHA, LEAST_PLACES, attainable, best_value, unreachable
+from sasgeo_bench.scoring.verdicts import ALPHA, LEAST_PLACES, LOWER, RELATIVE, attainable, best_value, unreachable
 
 CORRELATION: Final = 0.05  # of the differences of two queries of one place, unless a pilot says otherwise
 
@@ -139,7 +139,6 @@ def registered(contrast: Contrast, pilot: Pilot, design: pd.DataFrame, *, contra
     best, blind = _best_and_blind(contrast, pilot, rows)
     second = pilot.second
     value = blind if second is None else second
-    is_relative = contrast.metric in {"aurc", "e_aurc"}  # of which less is better
     return Registration(
         name=contrast.name,
         queries=len(rows),
@@ -148,8 +147,8 @@ def registered(contrast: Contrast, pilot: Pilot, design: pd.DataFrame, *, contra
         countries=int(rows["country"].nunique()),
         best=best,
         second=second,
-        attainable=attainable(best, value, is_lower_better=is_relative),
-        least=contrast.min_effect * (value if is_relative else 1.0),
+        attainable=attainable(best, value, is_lower_better=contrast.metric in LOWER),
+        least=contrast.min_effect * (value if contrast.metric in RELATIVE else 1.0),
         detectable=_detectable(contrast, pilot, rows, ALPHA),
         detectable_first=_detectable(contrast, pilot, rows, ALPHA / contrasts),
     )
@@ -167,6 +166,7 @@ def _best_and_blind(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> tup
         "aurc": false,
         "e_aurc": false - best_value("aurc", false_share=false),
         INTERACTION: math.nan,
+        "false_accepted": math.nan,
     }
     return best, blind.get(contrast.metric, 0.0)
 

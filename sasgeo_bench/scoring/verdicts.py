@@ -13,9 +13,19 @@ ALPHA: Final = 0.05
 LEAST_PLACES: Final = 6
 LEAST_BLOCKS: Final = LEAST_PLACES  # where the question is about the places that were asked, as of two seeds
 ContrastMetric = Literal[
-    "primary", "interaction", "aurc", "e_aurc", "auroc", "right_at_absent_0.01", "right_at_absent_0.05"
+    "primary",
+    "interaction",
+    "false_accepted",
+    "aurc",
+    "e_aurc",
+    "auroc",
+    "right_at_absent_0.01",
+    "right_at_absent_0.05",
 ]
-OF_MATCHERS: Final = frozenset({"primary", "interaction"})  # the sides of other metrics are "matcher x rejector"
+# The sides of other metrics are "matcher x rejector".
+OF_MATCHERS: Final = frozenset({"primary", "interaction", "false_accepted"})
+RELATIVE: Final = frozenset({"aurc", "e_aurc"})  # their least difference is a share of the second side
+LOWER: Final = RELATIVE | {"false_accepted"}  # less is better
 _NOTHING: Final = 1e-9  # a smaller excess is a rounding error
 Outcome = Literal["decided", "decided, small", "cause open", "null", "not decided", "not tested"]
 
@@ -44,7 +54,7 @@ def best_value(
     """
     if metric == "auroc":
         return 1.0
-    if metric == "e_aurc":
+    if metric in {"e_aurc", "false_accepted"}:
         return 0.0
     if metric == "aurc":
         if false_share is None:

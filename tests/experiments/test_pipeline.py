@@ -14,7 +14,7 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.experiments import pipeline, pipeline_plan
 from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.experiments.pipeline_plan import is_asked, plan_pipeline
 from sasgeo_bench.leaderboard.pipeline_spec import (
     PipelineFile,
     find_pipeline_file,
@@ -25,6 +25,7 @@ from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks
+from sasgeo_bench.tasks.query import CONTROLS
 from tests.handmade import split_file
 from tests.threaded import threaded
 
@@ -704,3 +705,27 @@ def test_a_contrast_on_flights_names_their_track(tmp_path):
     other = TEXT.replace("[[contrast]]", '[[contrast]]\ntrack = "sequence"', 1)
     with pytest.raises(ConfigError, match="has track 'sequence', and suite 'clean' has no flights"):
         plan_pipeline(parse_toml(other, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+
+
+def test_trackers_are_asked_on_flights_alone_and_no_matcher_is_but_the_oracle(tmp_path):
+    text = TEXT.replace('["random", "prior_centre"]', '["random", "prior_only"]').replace(
+        '"prior_centre"', '"prior_only"'
+    )
+    text = text.replace('suites = ["clean"]', 'suites = ["clean", "flight-gap"]', 1)
+    plan = plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+    asked = {
+        name: [suite for suite in ("clean", "flight-gap", CONTROLS) if is_asked(plan, name, suite, "town-suburb")]
+        for name in plan.matchers
+    }
+    assert asked == {
+        "oracle_pose": ["clean", "flight-gap", CONTROLS],
+        "prior_centre": ["clean", CONTROLS],
+        "random": ["clean", CONTROLS],
+        "prior_only": ["flight-gap"],
+    }
+
+
+def test_a_contrast_by_false_fixes_is_of_flights():
+    text = TEXT.replace("[[contrast]]", '[[contrast]]\nmetric = "false_accepted"', 1)
+    with pytest.raises(ConfigError, match="by false_accepted is of flights: say track"):
+        parse_toml(text, PipelineFile, source="small.toml")

@@ -6,13 +6,16 @@ from dataclasses import replace
 from itertools import accumulate
 
 import numpy as np
+import pandas as pd
 import pytest
 
-from sasgeo_bench.errors import MetricError
+from sasgeo_bench.errors import ConfigError, MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS, score_flights
 from sasgeo_bench.scoring.metrics import means_of, primary_of, quantiles_of
+from sasgeo_bench.scoring.registration import Pilot, check_contrasts
 from sasgeo_bench.scoring.score import COLUMNS, MISSING
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks.query import Head, Truth, view_id
@@ -278,3 +281,34 @@ def test_a_board_of_flights_has_every_figure_of_their_track():
     assert whole.loc[("good", "reacquired_500m"), "value"] == 1.0
     assert whole.loc[("bad", "first_fix"), "value"] == math.inf
     assert math.isnan(whole.loc[("good", "right_per_km"), "lo"])  # four flights that are alike
+
+
+def test_a_contrast_by_false_fixes_is_won_by_the_side_with_fewer():
+    def side(counts):
+        rows = []
+        for place, count in enumerate(counts):
+            heads, truths = a_flight(5, f"f{place}")
+            fixes = answers(truths, off_m=[90.0] * count + [0.0] * (5 - count))
+            found = score_flights(heads, truths, fixes).flights
+            rows.append(found.assign(place=f"p{place}", block=f"p{place}/0", country=f"p{place}", role="stress"))
+        return pd.concat(rows, ignore_index=True)
+
+    fields = {"first": "careful", "second": "rash", "suites": ("flight-clean",), "track": "sequence"}
+    contrast = Contrast(name="none", metric="false_accepted", **fields)
+    sides = {"careful": side([1, 1, 0, 1, 0, 1, 1, 0, 1, 1]), "rash": side([4, 3, 4, 5, 5, 4, 3, 4, 4, 5])}
+    (found,) = hold_contrasts([contrast], sides, {}, draws=200)
+    assert (found.first_value, found.second_value, found.best) == pytest.approx((0.14, 0.82, 0.0))
+    assert (found.winner, found.is_lower_better, found.outcome) == ("careful", True, "decided")
+    assert (found.first_only, found.second_only) == (3, 0)  # flights without a false fix
+
+
+def test_a_registered_contrast_counts_flights_and_nobody_knows_how_many_false_fixes_there_will_be():
+    heads, truths = a_flight(5)
+    design = score_flights(heads, truths, {}).flights.assign(role="stress")
+    fields = {"first": "a", "second": "b", "suites": ("flight-clean",), "track": "sequence"}
+    (found,) = check_contrasts([Contrast(name="n", metric="false_accepted", **fields)], {}, design, tell=lambda _: None)
+    assert (found.queries, found.best) == (1, 0.0)
+    assert math.isnan(found.attainable)
+    pilots = {"n": Pilot(second=0.02)}
+    with pytest.raises(ConfigError, match=r"at most 0\.020 can be gained"):
+        check_contrasts([Contrast(name="n", metric="false_accepted", **fields)], pilots, design, tell=lambda _: None)

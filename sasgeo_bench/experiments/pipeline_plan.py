@@ -453,16 +453,17 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
 def is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
     """Return whether a matcher is asked on a task: controls on all, all on the controls, else by the file.
 
-    Nobody is asked on a train place of a hold-out, trackers on flights alone, and of the others `oracle_pose` alone on
-    flights; of a module:Class the card says what it can be asked.
+    Nobody is asked on a train place of a hold-out. Trackers are asked on flights alone, and there of the controls the
+    oracle alone.
     """
-    if suite in PICTURED:  # asked with the evidence that a segmenter makes
-        return False
-    if spec != ORACLE and ":" not in spec and is_tracker(spec) != _is_of_flights(suite):
+    is_of_flights = _is_of_flights(suite)
+    if suite in PICTURED or (not is_of_flights and is_tracker(spec)):  # pictures are asked as a segmenter sees them
         return False
     if suite in {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}:
         return True
-    return not is_train(plan, region) and (spec in CONTROL_MATCHERS or suite in plan.spec.suites_of(spec))
+    controls = {ORACLE} if is_of_flights else CONTROL_MATCHERS
+    is_named = spec in plan.spec.matchers and suite in plan.spec.suites_of(spec)
+    return not is_train(plan, region) and (spec in controls or is_named)
 
 
 def is_train(plan: PipelinePlan, region: str) -> bool:

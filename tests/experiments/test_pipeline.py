@@ -707,7 +707,7 @@ def test_a_contrast_on_flights_names_their_track(tmp_path):
         plan_pipeline(parse_toml(other, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
 
 
-def test_trackers_are_asked_on_flights_alone_and_no_matcher_is_but_the_oracle(tmp_path):
+def test_trackers_are_asked_on_flights_alone_and_of_the_controls_the_oracle(tmp_path):
     text = TEXT.replace('["random", "prior_centre"]', '["random", "prior_only"]').replace(
         '"prior_centre"', '"prior_only"'
     )
@@ -720,7 +720,7 @@ def test_trackers_are_asked_on_flights_alone_and_no_matcher_is_but_the_oracle(tm
     assert asked == {
         "oracle_pose": ["clean", "flight-gap", CONTROLS],
         "prior_centre": ["clean", CONTROLS],
-        "random": ["clean", CONTROLS],
+        "random": ["clean", "flight-gap", CONTROLS],
         "prior_only": ["flight-gap"],
     }
 

@@ -45,7 +45,7 @@ ONE_DETECTOR: Final = [PUBLISHED]
 # hash that their boards were made under.
 _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
     "contrast": {"pilot": None, "detectors": []},
-    "pilot": {"control": None},
+    "pilot": {"control": None, "spread": None},
     "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR, "segmenters": []},
     "paper": {"crop_readings": []},
     "learning": {"detector": PUBLISHED, "kinds": []},
@@ -61,6 +61,7 @@ class PilotSpec(Document):
     second: Annotated[float, Field(ge=-1, le=1)] | None = None  # of an interaction it may be below 0
     control: Annotated[float, Field(ge=0, le=1)] | None = None
     false_share: Annotated[float, Field(ge=0, le=1)] | None = None
+    spread: Annotated[float, Field(ge=0, le=1)] | None = None
     discordant: Annotated[float, Field(ge=0, le=1)] | None = None
     correlation: Annotated[float, Field(ge=0, le=1)] = 0.05
 

@@ -41,7 +41,7 @@ from sasgeo_bench.scoring.verdicts import (
     ContrastMetric,
     Finding,
 )
-from sasgeo_bench.tasks.query import UNRIVALLED, Detector
+from sasgeo_bench.tasks.query import SEQUENCE, UNRIVALLED, Detector
 
 PRIMARY: Final = "primary"
 INTERACTION: Final = "interaction"
@@ -333,7 +333,9 @@ def mean_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame, 
         second_only=exact.second_only,
         p_exact=exact.p_value,
         p_clustered=clustered.p_value,
-        detectable=sensitivity(sides.ours, sides.theirs, places) if is_enough else math.nan,
+        detectable=sensitivity(sides.ours, sides.theirs, places, are_shares=contrast.track == SEQUENCE)
+        if is_enough
+        else math.nan,
     )
 
 

@@ -14,9 +14,10 @@ import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.scoring.base import block_codes
-from sasgeo_bench.scoring.compare import design_effect, detectable_difference
+from sasgeo_bench.scoring.compare import design_effect, detectable_difference, detectable_mean
 from sasgeo_bench.scoring.contrasts import INTERACTION, Contrast, chosen_rows
 from sasgeo_bench.scoring.verdicts import ALPHA, LEAST_PLACES, LOWER, RELATIVE, attainable, best_value, unreachable
+from sasgeo_bench.tasks.query import SEQUENCE
 
 CORRELATION: Final = 0.05  # of the differences of two queries of one place, unless a pilot says otherwise
 
@@ -27,7 +28,8 @@ class Pilot:
 
     `second` is the metric of the second side, `control` of an interaction the share that the first side reaches on the
     controls, `false_share` the share of the second side's answers that are false, `discordant` the share of queries
-    that just one side gets right, `correlation` how much more alike differences of one place are than those of two.
+    that just one side gets right, `spread` of flights the standard deviation of the difference of one, `correlation`
+    how much more alike differences of one place are than those of two.
     None where nothing is known.
     """
 
@@ -35,6 +37,7 @@ class Pilot:
     control: float | None = None
     false_share: float | None = None
     discordant: float | None = None
+    spread: float | None = None
     correlation: float = CORRELATION
 
 
@@ -174,12 +177,16 @@ def _best_and_blind(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> tup
 def _detectable(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame, level: float) -> float:
     """Return the least difference that the places show; the discordant queries are twice the least difference.
 
-    Infinite where too few places have a discordant query: the sign-flip test over k of them has no p below 2 / 2^k.
+    Of flights it follows from the pilot's spread, and is not known without. Otherwise it is infinite where too few
+    places have a discordant query: the sign-flip test over k of them has no p below 2 / 2^k.
     """
     if contrast.metric in {"aurc", "e_aurc", "auroc"} or not len(rows):
         return math.nan
     sizes, _ = block_codes(rows["place"].tolist(), len(rows))
+    pairs = len(rows) / design_effect(sizes, pilot.correlation)
+    if contrast.track == SEQUENCE:
+        return math.nan if pilot.spread is None else detectable_mean(pairs, pilot.spread, level=level)
     share = min(1.0, 2 * contrast.min_effect) if pilot.discordant is None else pilot.discordant
     if min(len(sizes), share * len(rows)) < math.log2(2 / level):
         return math.inf
-    return detectable_difference(len(rows) / design_effect(sizes, pilot.correlation), share, level=level)
+    return detectable_difference(pairs, share, level=level)

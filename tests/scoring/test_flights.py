@@ -312,3 +312,16 @@ def test_a_registered_contrast_counts_flights_and_nobody_knows_how_many_false_fi
     pilots = {"n": Pilot(second=0.02)}
     with pytest.raises(ConfigError, match=r"at most 0\.020 can be gained"):
         check_contrasts([Contrast(name="n", metric="false_accepted", **fields)], pilots, design, tell=lambda _: None)
+
+
+def test_what_flights_can_show_follows_from_the_spread_of_their_differences_and_is_not_known_without():
+    heads, truths = a_flight(5)
+    one = score_flights(heads, truths, {}).flights.assign(role="stress")
+    design = pd.concat([one.assign(place=f"p{place}", query_id=f"f{place}") for place in range(16)])
+    contrast = Contrast(name="n", first="a", second="b", suites=("flight-clean",), track="sequence")
+
+    def detectable(**pilot):
+        return check_contrasts([contrast], {"n": Pilot(**pilot)}, design, tell=lambda _: None)[0].detectable
+
+    assert detectable(spread=0.4) == pytest.approx((1.96 + 0.8416) * 0.4 / 4, rel=1e-3)
+    assert math.isnan(detectable(discordant=0.5))

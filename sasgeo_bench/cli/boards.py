@@ -47,7 +47,7 @@ Cases = Annotated[
 Results = Annotated[
     Path | None,
     typer.Option(
-        help="folder to store the board in with all it was made of, at most 10 MB: DIR/<name of the board>/",
+        help="folder to store the board in with all it was made of, at most 24 MB: DIR/<name of the board>/",
         parser=_folder,
         metavar="PATH",
     ),

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest, make_extras, write_files
 from sasgeo_bench.leaderboard.board_files import check_board, read_board
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
@@ -35,7 +35,7 @@ from sasgeo_bench.scoring.rows import EntryLabel, name_alone, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
 from sasgeo_bench.scoring.verdicts import with_causes
-from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.tasks.query import SEQUENCE, base_of
 
 
 def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
@@ -191,11 +191,28 @@ def _costs(board: Board, tasks: Sequence[ScoredTask], tell: Tell) -> list[pd.Dat
                 area_km2=areas,
             )
             found.append(cost_figures(entry.name, costs))
-        answered = scores["is_answered"].to_numpy(bool)
-        rest = scores.loc[~answered, "status"].replace("ok", "withheld").value_counts()
-        others = "".join(f", {count} {status}" for status, count in sorted(rest.items()))
-        tell(f"{entry.name}: {int(answered.sum())} of {len(scores)} queries answered{others}")
+        tell(f"{entry.name}: {_answered_text(scores)}")
     return found
+
+
+def _answered_text(scores: pd.DataFrame) -> str:
+    """Say how many queries were answered, why the others were not, and how many flights have an accepted fix.
+
+    >>> rows = {"is_answered": [True, False, True], "status": ["ok", "ok", "ok"]}
+    >>> _answered_text(pd.DataFrame({**rows, "track": ["localization", "localization", "sequence"]}))
+    '1 of 2 queries answered, 1 withheld; 1 of 1 flight with an accepted fix'
+    """
+    views, parts = single_views(scores), []
+    if len(views):
+        answered = views["is_answered"].to_numpy(bool)
+        rest = views.loc[~answered, "status"].replace("ok", "withheld").value_counts()
+        others = "".join(f", {count} {status}" for status, count in sorted(rest.items()))
+        parts.append(f"{int(answered.sum())} of {counted(len(views), 'query', 'queries')} answered{others}")
+    flights = scores[(scores["track"] == SEQUENCE).to_numpy(bool)]
+    if len(flights):
+        accepted = int(flights["is_answered"].sum())
+        parts.append(f"{accepted} of {counted(len(flights), 'flight')} with an accepted fix")
+    return "; ".join(parts)
 
 
 def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) -> Board:

@@ -6,8 +6,9 @@
 follows the flights of each folder of tasks, whose truths lie beside it (`make-queries`), in this process, and prints a
 row for each tracker, role and kind of view: views, flights, shares of views within 25 m, of accepted views and of these
 beyond 25 m, median normalised squared error of place and heading (2.37 for honest covariances), and processor time of a
-step. For each tracker and map it prints the processor time to prepare. `--memory` prints what Python and NumPy allocate
-beyond the map itself, at most, and slows the rest down. It is no leaderboard: nothing is shut in, and a crash ends it.
+step. For each tracker and map it prints the processor time to prepare, what it reads of the map included. `--memory`
+prints what Python and NumPy allocate at most, what is read of the map included, and slows the rest down. It is no
+leaderboard: nothing is shut in, and a crash ends it.
 """
 
 import argparse
@@ -109,12 +110,13 @@ def main() -> None:
     head = ("views", "fl.", "<=25 m", "accept", "false", "NEES", "p50 ms", "p95", "max")
     for tasks in options.tasks:
         flights = read_flights(tasks, views=options.views)
-        region = sgb.read_region(tasks.parents[2] / "regions" / flights[0][0][0].region)
+        folder = tasks.parents[2] / "regions" / flights[0][0][0].region
         print(f"\n{tasks.parent.name} on {tasks.name}".ljust(66), " ".join(f"{word:>6s}" for word in head))
         for name in options.tracker:
             if options.memory:
                 tracemalloc.start()
             tracker = sgb.load_tracker(name)
+            region = sgb.read_region(folder, with_layers=False)
             start = time.process_time()
             tracker.prepare(region, None)
             print(

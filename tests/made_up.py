@@ -12,6 +12,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.tracker import Fix, Tracker, check_fix
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence, LayerBits, observe
+from sasgeo_bench.regions.region import Region
 from sasgeo_bench.tasks.query import Query, Step
 
 CLASSES = ("building", "road_minor", "water")
@@ -37,14 +38,22 @@ def textured(seed: int, side: int = SIDE) -> np.ndarray:
     return layers
 
 
-def region_of(layers: np.ndarray, *, cell_size_m: float = 1.0, classes: tuple[str, ...] = CLASSES) -> SimpleNamespace:
+class MadeUp(SimpleNamespace):
+    """What matchers read of a region."""
+
+    read_layer = None
+    layer = Region.layer
+    known = Region.known
+
+
+def region_of(layers: np.ndarray, *, cell_size_m: float = 1.0, classes: tuple[str, ...] = CLASSES) -> MadeUp:
     """As much of a Region as a baseline reads."""
     rows, cols = layers.shape[1:]
     grid = Grid(epsg=32632, west_m=1000.0, north_m=9000.0, cell_size_m=cell_size_m, rows=rows, cols=cols)
-    return SimpleNamespace(layers=layers, grid=grid, classes=classes)
+    return MadeUp(layers=layers, grid=grid, classes=classes)
 
 
-def view_of(region: SimpleNamespace, pose: Pose, *, size_cells: int, cell_size_m: float = 1.0) -> Evidence:
+def view_of(region: MadeUp, pose: Pose, *, size_cells: int, cell_size_m: float = 1.0) -> Evidence:
     """What is seen without an error."""
     bits = LayerBits.of(region.layers)
     cells = observe(bits, region.grid, pose, size_cells=size_cells, cell_size_m=cell_size_m)
@@ -69,7 +78,7 @@ def query_of(evidence: Evidence, prior: Prior, *, candidates: tuple[Pose, ...] =
     )
 
 
-def dated_region(seed: int, side: int) -> SimpleNamespace:
+def dated_region(seed: int, side: int) -> MadeUp:
     """A made-up region of the day of its views, as a reader of map ages asks for it."""
     found = region_of(textured(seed, side))
     found.manifest = SimpleNamespace(extract=SimpleNamespace(date=dt.date(2025, 1, 1)))
@@ -86,7 +95,7 @@ def way_of(start: Pose, count: int, step_m: float) -> list[Pose]:
 
 
 def flight_of(
-    region: SimpleNamespace,
+    region: MadeUp,
     poses: Sequence[Pose],
     *,
     prior: Prior,

@@ -4,6 +4,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import Final, Self
 
 import cv2
@@ -70,15 +71,12 @@ class Sums:
     def of(cls, region: Region, classes: tuple[str, ...] | None = None) -> Self:
         """Sum the layers of a region, or of some of its classes."""
         factor = max(1, round(_POOLED_M / region.grid.cell_size_m))
-        bands = [band for band, name in enumerate(region.classes) if classes is None or name in classes]
-        known = np.ones(region.grid.shape, dtype=bool)
-        for layer in region.layers:
-            known &= layer <= PRESENT
+        names = [name for name in region.classes if classes is None or name in classes]
+        known = region.known()
         grid = region.grid.coarsen(factor)
-        below = np.zeros((len(bands) + 1, grid.rows + 1, grid.cols + 1), dtype=np.int64)
-        for into, layer in zip(
-            below, (*((region.layers[band] == PRESENT) & known for band in bands), known), strict=True
-        ):
+        below = np.zeros((len(names) + 1, grid.rows + 1, grid.cols + 1), dtype=np.int64)
+        summed = chain(((region.layer(name) == PRESENT) & known for name in names), (known,))
+        for into, layer in zip(below, summed, strict=True):
             padded = np.zeros((grid.rows * factor, grid.cols * factor), dtype=bool)
             padded[: layer.shape[0], : layer.shape[1]] = layer
             blocks = padded.reshape(grid.rows, factor, grid.cols, factor).sum(axis=(1, 3), dtype=np.int64)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Burn features into one raster per class, by the cell-centre rule; read and write `layers.tif` window by window."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cached_property
@@ -251,15 +251,18 @@ def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
         return np.asarray(source.read(), dtype=np.uint8)
 
 
-def read_layers(path: Path, *, window: tuple[int, int, int, int] | None = None) -> NDArray[np.uint8]:
-    """Read a layer stack, or one window of it (row, col, rows, cols); shape (C, rows, cols), read-only.
+def read_layers(
+    path: Path, *, window: tuple[int, int, int, int] | None = None, bands: Sequence[int] | None = None
+) -> NDArray[np.uint8]:
+    """Read a layer stack or some bands of it, one window (row, col, rows, cols) or all; (C, rows, cols), read-only.
 
     Raise `StoreError` if the file cannot be read.
     """
     try:
         with rasterio.open(path) as source:
             part = Window(window[1], window[0], window[3], window[2]) if window else None
-            layers = np.asarray(source.read(window=part), dtype=np.uint8)
+            chosen = None if bands is None else [band + 1 for band in bands]
+            layers = np.asarray(source.read(chosen, window=part), dtype=np.uint8)
     except (RasterioError, RasterioIOError) as error:
         message = f"{path} cannot be read ({error}): build the region again"
         raise StoreError(message) from error

@@ -15,6 +15,7 @@ from sasgeo_bench.config import Document
 from sasgeo_bench.files.folders import FileRecord
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
+from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.imagery import Imagery, OrthoRecord
 from sasgeo_bench.texts import FOLDER
 
@@ -190,7 +191,8 @@ class Region:
 
     `layers` is uint8 of shape (C, rows, cols), PRESENT, ABSENT or OUTSIDE, bands in the order of `classes`, read-only;
     `coverage` is the mapped area in the region's CRS. `features` and `graph` of a stored region are read when they are
-    first asked for, and so may `layers` be. `imagery` reads windows of the aerial imagery; None if there is none.
+    first asked for, and so may `layers` be: until then `read_layer`, given the number of a class, reads it alone.
+    `imagery` reads windows of the aerial imagery; None if there is none.
     """
 
     manifest: Manifest
@@ -199,6 +201,7 @@ class Region:
     graph: Late[MapGraph] = Late()
     coverage: shapely.Geometry
     imagery: Imagery | None = None
+    read_layer: Callable[[int], NDArray[np.uint8]] | None = None
 
     @property
     def grid(self) -> Grid:
@@ -211,5 +214,15 @@ class Region:
         return self.manifest.classes
 
     def layer(self, class_name: str) -> NDArray[np.uint8]:
-        """Return the raster of one class, shape (rows, cols)."""
-        return np.asarray(self.layers[self.classes.index(class_name)])
+        """Return the raster of one class, shape (rows, cols); no other is read, for a country's take a gigabyte."""
+        at = self.classes.index(class_name)
+        if self.read_layer is not None and callable(vars(self)["layers"]):  # not read yet
+            return self.read_layer(at)
+        return np.asarray(self.layers[at])
+
+    def known(self) -> NDArray[np.bool_]:
+        """Return which cells are mapped in all classes, shape (rows, cols)."""
+        known = np.ones(self.grid.shape, dtype=bool)
+        for name in self.classes:
+            known &= self.layer(name) <= PRESENT
+        return known

@@ -99,12 +99,14 @@ def read_region(
     path: str | Path,
     *,
     around: Callable[[], AbstractContextManager[object]] = nullcontext,
+    around_layer: Callable[[], AbstractContextManager[object]] = nullcontext,
     with_layers: bool = True,
 ) -> Region:
     """Read a region: its layers now, its features and graph when they are first used.
 
-    All files are checked against their hashes now. `around` gives a context that is entered while features or graph
-    are read. Without `with_layers`, these are read when they are first used, too: a country's take a gigabyte. Raise
+    All files are checked against their hashes now. Without `with_layers`, layers are read when they are first used,
+    too, and `Region.layer` reads one of them alone: a country's take a gigabyte. `around` gives a context that is
+    entered while something is read that the region keeps, `around_layer` one for a layer that it does not keep. Raise
     `StoreError` if a file is missing, changed or unreadable.
     """
     from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
@@ -118,6 +120,12 @@ def read_region(
         """Read the layers when they are first used."""
         with around():
             return read_layers(folder / LAYERS)
+
+    def layer(index: int) -> "NDArray[np.uint8]":
+        """Read one layer whenever it is used."""
+        with around_layer():
+            found: NDArray[np.uint8] = read_layers(folder / LAYERS, bands=(index,))[0]
+            return found
 
     def features() -> "gpd.GeoDataFrame":
         """Read the features when they are first used."""
@@ -136,6 +144,7 @@ def read_region(
         graph=graph,
         coverage=shapely.from_wkt(manifest.coverage.wkt),
         imagery=_imagery(folder, manifest),
+        read_layer=layer,
     )
 
 

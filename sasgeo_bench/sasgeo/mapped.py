@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg
-from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.network import LAYERS
 from sasgeo_bench.regions.region import MapGraph, Region
 from sasgeo_bench.sasgeo.nodes import INDEX, KINDS, Bools, Floats, Ints, Nodes, nodes_of, patches_of
@@ -112,8 +111,7 @@ class MappedGraph:
     @classmethod
     def of(cls, region: Region) -> Self:
         """Prepare the graph of a region."""
-        known = np.asarray((region.layers <= PRESENT).all(axis=0))
-        return cls.make(region.graph, region.features, known=known, grid=region.grid)
+        return cls.make(region.graph, region.features, known=region.known(), grid=region.grid)
 
     @classmethod
     def make(cls, graph: MapGraph, features: gpd.GeoDataFrame, *, known: Bools, grid: Grid) -> Self:

@@ -67,17 +67,15 @@ def read_field(
     factor = max(1, round(cell_size_m / region.grid.cell_size_m))
     grid = region.grid.coarsen(factor)
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
-    is_known = np.ones(region.grid.shape, dtype=bool)
-    for layer in region.layers:  # one by one: all at once would double the memory of a country
-        is_known &= layer <= PRESENT
-    known = _share(is_known, around, grid) > FULL // 2
+    known = _share(region.known(), around, grid) > FULL // 2
     stamped = None if trust is None else strata(region)
     layers = np.zeros((len(region.classes), *grid.shape), dtype=np.uint8)
-    for at, (layer, into) in enumerate(zip(region.layers, layers, strict=True)):
-        parts, weights = [layer == PRESENT], np.ones(1)
-        if trust is not None and stamped is not None:
-            parts, weights = [stamped[at] == index for index in range(STRATA)], trust[at]
-        into[:] = _degree([_share(part, around, grid) for part in parts], weights, likeness[at], grid)
+    for at, (name, into) in enumerate(zip(region.classes, layers, strict=True)):
+        if trust is None or stamped is None:
+            shares, weights = [_share(region.layer(name) == PRESENT, around, grid)], np.ones(1)
+        else:
+            shares, weights = [_share(stamped[at] == index, around, grid) for index in range(STRATA)], trust[at]
+        into[:] = _degree(shares, weights, likeness[at], grid)
         into[~known] = 0
     return Field(grid=grid, layers=layers, known=np.where(known, np.uint8(FULL), np.uint8(0)))
 
@@ -86,15 +84,17 @@ def _degree(
     shares: Sequence[NDArray[np.uint8]], weights: NDArray[np.float64], likeness: NDArray[np.float64], grid: Grid
 ) -> NDArray[np.uint8]:
     """Return the degree to which each cell is on a class or near it, 0..FULL, from shares covered by its parts."""
-    on, near = (np.zeros(grid.shape, dtype=np.float32) for _ in range(2))
+    on, near = (np.zeros(grid.shape, dtype=np.float32) for _ in range(2))  # in place: a copy of a country takes 0.1 GB
     rest = np.full(grid.shape, FULL, dtype=np.float32)
     nearby = np.concatenate((likeness[1:2], likeness[1:])).astype(np.float32)  # ring 0: partly covered cells
     for share, factor in zip(shares, weights.astype(np.float32), strict=True):
         if share.any():
             on += factor * np.float32(likeness[0]) * share
             rest -= share
-            np.maximum(near, factor * nearby[ring_of(share > 0, cell_size_m=grid.cell_size_m)], out=near)
-    return np.asarray(np.clip(np.rint(on + near * rest), 0, FULL), dtype=np.uint8)
+            np.maximum(near, (factor * nearby)[ring_of(share > 0, cell_size_m=grid.cell_size_m)], out=near)
+    near *= rest
+    near += on
+    return np.asarray(np.clip(np.rint(near, out=near), 0, FULL, out=near), dtype=np.uint8)
 
 
 def _share(

@@ -35,12 +35,10 @@ class Chart:
     @classmethod
     def of(cls, region: Region, *, thin: tuple[str, ...] = (), reach_m: float = 0.0) -> Self:
         """Read a region; the classes in `thin` fade with the distance to the nearest cell, as in `fade`."""
-        known = np.ones(region.grid.shape, dtype=bool)
-        for layer in region.layers:
-            known &= layer <= PRESENT
-        degree = np.empty(region.layers.shape, dtype=np.uint8)
-        for name, layer, kept in zip(region.classes, region.layers, degree, strict=True):
-            present = (layer == PRESENT) & known
+        known = region.known()
+        degree = np.empty((len(region.classes), *region.grid.shape), dtype=np.uint8)
+        for name, kept in zip(region.classes, degree, strict=True):
+            present = (region.layer(name) == PRESENT) & known
             if name in thin and reach_m > 0:
                 faded = np.rint(FULL * fade(present, reach_cells=reach_m / region.grid.cell_size_m))
                 kept[:] = np.where(present, FULL, np.minimum(faded, FULL - 1)) * known

@@ -2,7 +2,6 @@
 """`graph_only`: what it tells apart, with and without vectors, and what it does not look at."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import geopandas as gpd
 import numpy as np
@@ -63,9 +62,9 @@ def prepared(made):
     for start, corners in ((52, RING), (152, ROW)):
         layers[:, 48:144, start : start + 96] |= houses(corners)
     region = made.region_of(layers)
-    graph = build_graph(features_of([*moved(FORKS, PLACES[1]), *moved(CROSS, PLACES[2])]))
+    region.graph = build_graph(features_of([*moved(FORKS, PLACES[1]), *moved(CROSS, PLACES[2])]))
     matcher = GraphOnly()
-    matcher.prepare(SimpleNamespace(**vars(region), graph=graph), None)
+    matcher.prepare(region, None)
     return matcher
 
 

@@ -21,7 +21,7 @@ from sasgeo_bench.osm.features import DTYPES, fingerprint, make_features
 from sasgeo_bench.osm.read import Reading
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.build import build_made, build_region, plan_build
-from sasgeo_bench.regions.evidence import LayerBits
+from sasgeo_bench.regions.evidence import PRESENT, LayerBits
 from sasgeo_bench.regions.layers import OUTSIDE, read_bits
 from sasgeo_bench.regions.region_files import differing_files, read_manifest, read_region
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
@@ -82,12 +82,18 @@ def test_layers_that_are_read_as_bits_hold_the_same_cells_and_a_damaged_file_is_
 def test_layers_may_be_read_when_they_are_first_used_or_never(tmp_path):
     plan, _ = built(tmp_path, small())
     whole, late, never = (read_region(plan.folder, with_layers=now) for now in (True, False, False))
+    for name in whole.classes:
+        np.testing.assert_array_equal(late.layer(name), whole.layer(name))
+    np.testing.assert_array_equal(late.known(), (whole.layers <= PRESENT).all(axis=0))
+    assert callable(vars(late)["layers"])  # has not been read: a layer is read alone
+    assert not late.layer("building").flags.writeable
     np.testing.assert_array_equal(late.layers, whole.layers)
     (plan.folder / "layers.tif").unlink()
     np.testing.assert_array_equal(late.layer("building"), whole.layer("building"))
     assert len(never.features) == len(whole.features)
-    with pytest.raises(StoreError, match="build the region again"):
-        never.layers.sum()
+    for read in (lambda: never.layers, never.known, lambda: never.layer("building")):
+        with pytest.raises(StoreError, match="build the region again"):
+            read()
 
 
 def test_every_file_carries_the_attribution(tmp_path):

@@ -108,7 +108,7 @@ class Buildings:
         grid, parts = region.grid, []
         if CLASS not in region.classes:
             return cls(middle_m=np.empty((0, 2)), shape=np.empty((0, NUMBERS)))
-        layer, margin = region.layers[region.classes.index(CLASS)], int(np.ceil(_MARGIN_M / grid.cell_size_m))
+        layer, margin = region.layer(CLASS), int(np.ceil(_MARGIN_M / grid.cell_size_m))
         for row, col, tile in grid.windows(_TILE):
             top, left = max(row - margin, 0), max(col - margin, 0)
             part = layer[top : row + tile.rows + margin, left : col + tile.cols + margin]
@@ -161,7 +161,7 @@ class Windows:
         cols, rows = max(1, round((east_m - west_m) / CELL_M)), max(1, round((north_m - south_m) / CELL_M))
         share = np.zeros((rows, cols), dtype=np.float32)
         if CLASS in region.classes:
-            present = (region.layers[region.classes.index(CLASS)] == sgb.PRESENT).astype(np.uint8) * np.uint8(255)
+            present = (region.layer(CLASS) == sgb.PRESENT).astype(np.uint8) * np.uint8(255)
             share = cv2.resize(present, (cols, rows), interpolation=cv2.INTER_AREA).astype(np.float32) / 255
         at = (np.arange(2 * round(RADIUS_M / CELL_M) + 1) - round(RADIUS_M / CELL_M)) * CELL_M
         ring = np.floor(np.hypot(at[:, None], at[None, :]) / RADIUS_M * RINGS)

@@ -58,7 +58,7 @@ class Mosaic:
             inside = present[: region.grid.rows, : region.grid.cols]
             for name in names:
                 if name in region.classes:
-                    inside[region.layers[region.classes.index(name)] == sgb.PRESENT] = 255
+                    inside[region.layer(name) == sgb.PRESENT] = 255
             coarse = cv2.resize(present, grid.shape[::-1], interpolation=cv2.INTER_AREA)
             share[:, :, number] = cv2.blur(coarse, (size, size), borderType=cv2.BORDER_CONSTANT)
         return cls(grid=grid, share=share)

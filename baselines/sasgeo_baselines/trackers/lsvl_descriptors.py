@@ -68,14 +68,11 @@ class Shares:
     def of(cls, region: sgb.Region) -> Self:
         """Read a map in cells of a whole number of its own, of about `CELL_M`."""
         grid = region.grid.coarsen(max(1, round(CELL_M / region.grid.cell_size_m)))
-        is_known = np.ones(region.grid.shape, dtype=bool)
-        for layer in region.layers:
-            is_known &= layer <= sgb.PRESENT
-        held = [at for at, layer in enumerate(region.layers) if (layer == sgb.PRESENT).any()]
-        present = np.zeros((len(held), *grid.shape), dtype=np.uint8)
-        for at, into in zip(held, present, strict=True):
-            into[:] = _share((region.layers[at] == sgb.PRESENT) & is_known, grid)
-        classes = tuple(region.classes[at] for at in held)
+        is_known = region.known()
+        classes = tuple(name for name in region.classes if (region.layer(name) == sgb.PRESENT).any())
+        present = np.zeros((len(classes), *grid.shape), dtype=np.uint8)
+        for name, into in zip(classes, present, strict=True):
+            into[:] = _share((region.layer(name) == sgb.PRESENT) & is_known, grid)
         return cls(grid=grid, classes=classes, present=present, known=_share(is_known, grid))
 
     def described(self, part_m: float) -> "Described":

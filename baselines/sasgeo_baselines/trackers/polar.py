@@ -129,11 +129,11 @@ def _coarse(region: sgb.Region, *, above: int, beside: int) -> NDArray[np.uint8]
     rows, cols = (max(1, round(side_m / CELL_M)) for side_m in (north_m - south_m, east_m - west_m))
     found = np.zeros((len(GROUPS), rows + 2 * above, cols + 2 * beside), dtype=np.uint8)
     for names, into in zip(GROUPS, found, strict=True):
-        bands = [region.classes.index(name) for name in names if name in region.classes]
+        held = [name for name in names if name in region.classes]
         present = np.zeros(region.grid.shape, dtype=np.uint8)
-        for band in bands:
-            present[region.layers[band] == sgb.PRESENT] = 255
-        if bands:
+        for name in held:
+            present[region.layer(name) == sgb.PRESENT] = 255
+        if held:
             into[above : above + rows, beside : beside + cols] = cv2.resize(
                 present, (cols, rows), interpolation=cv2.INTER_AREA
             )

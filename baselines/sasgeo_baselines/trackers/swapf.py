@@ -2,6 +2,7 @@
 """`swapf`: particles weighed by how far each labelled cell of the view lies from its class on the map (SWA-PF)."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Self
 
@@ -60,9 +61,10 @@ class DistanceMaps:
         distance = np.empty((OTHER + 1, *grid.shape), dtype=np.uint8)
         reach = math.ceil(TRUNCATION * PX_M / cell_m)
         strip = max(1, _STRIP // factor) * factor
+        labels_of_map = labels_of(region.known(), region.layer, region.classes)
         for top in range(0, region.grid.rows, strip):
             above, below = min(reach, top), top + strip + reach
-            labels = labels_of(region.layers[:, top - above : below], region.classes)
+            labels = labels_of_map[top - above : below]
             rows = slice(above + factor // 2, above + strip, factor)
             for label, into in enumerate(distance[:, top // factor : (top + strip) // factor]):
                 far_px = _far(labels == label, cell_m)[rows, factor // 2 :: factor] / PX_M
@@ -80,20 +82,22 @@ def _far(present: NDArray[np.bool_], cell_m: float) -> NDArray[np.float32]:
     return np.asarray(away * cell_m, dtype=np.float32)
 
 
-def labels_of(cells: NDArray[np.uint8], classes: tuple[str, ...]) -> NDArray[np.uint8]:
+def labels_of(
+    known: NDArray[np.bool_], layer: Callable[[str], NDArray[np.uint8]], classes: tuple[str, ...]
+) -> NDArray[np.uint8]:
     """Return the label of each cell of a view or a map, uint8 of shape (rows, cols).
 
     A cell that is not known in some class and present in none has no label.
 
-    >>> cells = np.array([[[1, 0, 0, 2]], [[1, 1, 0, 0]]], dtype=np.uint8)
-    >>> labels_of(cells, ("building", "road_minor")).tolist()
+    >>> cells = {"building": np.array([[1, 0, 0, 2]]), "road_minor": np.array([[1, 1, 0, 0]])}
+    >>> labels_of(np.array([[True, True, True, False]]), cells.__getitem__, tuple(cells)).tolist()
     [[0, 1, 3, 4]]
     """
-    found = np.where((cells > sgb.PRESENT).any(axis=0), np.uint8(UNLABELLED), np.uint8(OTHER))
+    found = np.where(known, np.uint8(OTHER), np.uint8(UNLABELLED))
     for label in reversed(range(OTHER)):
         for name in GROUPS[label]:
             if name in classes:
-                found[cells[classes.index(name)] == sgb.PRESENT] = label
+                found[layer(name) == sgb.PRESENT] = label
     return found
 
 
@@ -112,7 +116,8 @@ class Square:
     @classmethod
     def of(cls, evidence: sgb.Evidence) -> Self:
         """Turn a view."""
-        labels = labels_of(evidence.cells, evidence.classes)
+        known = (evidence.cells <= sgb.PRESENT).all(axis=0)
+        labels = labels_of(known, evidence.layer, evidence.classes)
         side_m = min(evidence.size_m) / math.sqrt(2)
         at_m = ((np.arange(LATTICE) + 0.5) / LATTICE - 0.5) * side_m
         east_m, north_m = (part.ravel() for part in np.meshgrid(at_m, -at_m))

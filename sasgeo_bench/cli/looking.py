@@ -224,7 +224,7 @@ def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
 
 def _print_flights(name: str, flights: pd.DataFrame) -> None:
     """Print a line for each flight, the worst first."""
-    shown = {"flight": "query_id", "suite": "suite", "region": "region", "kind": "kind"}
+    shown = {"flight": "query_id", "suite": "suite", "region": "region", "kind": "kind", "status": "status"}
     figures = ("distance_within_25m", "right_accepted", "false_accepted", "error_p95_m", "first_fix_m")
     table = Table(*shown, *figures, box=None, pad_edge=False)
     for row in flights.to_dict("records"):

@@ -196,11 +196,13 @@ def _costs(board: Board, tasks: Sequence[ScoredTask], tell: Tell) -> list[pd.Dat
 
 
 def _answered_text(scores: pd.DataFrame) -> str:
-    """Say how many queries were answered, why the others were not, and how many flights have an accepted fix.
+    """Say how many queries were answered, why the others were not, and how many flights have an accepted fix or failed.
 
     >>> rows = {"is_answered": [True, False, True], "status": ["ok", "ok", "ok"]}
     >>> _answered_text(pd.DataFrame({**rows, "track": ["localization", "localization", "sequence"]}))
     '1 of 2 queries answered, 1 withheld; 1 of 1 flight with an accepted fix'
+    >>> _answered_text(pd.DataFrame({"is_answered": [True], "status": ["timeout"], "track": ["sequence"]}))
+    '1 of 1 flight with an accepted fix, 1 not answered to the end (1 timeout)'
     """
     views, parts = single_views(scores), []
     if len(views):
@@ -211,7 +213,10 @@ def _answered_text(scores: pd.DataFrame) -> str:
     flights = scores[(scores["track"] == SEQUENCE).to_numpy(bool)]
     if len(flights):
         accepted = int(flights["is_answered"].sum())
-        parts.append(f"{accepted} of {counted(len(flights), 'flight')} with an accepted fix")
+        failed = flights.loc[flights["status"] != "ok", "status"].value_counts()
+        causes = ", ".join(f"{count} {status}" for status, count in sorted(failed.items()))
+        rest = f", {failed.sum()} not answered to the end ({causes})" if causes else ""
+        parts.append(f"{accepted} of {counted(len(flights), 'flight')} with an accepted fix{rest}")
     return "; ".join(parts)
 
 

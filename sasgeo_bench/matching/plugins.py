@@ -150,7 +150,11 @@ def load_method(spec: str) -> "Matcher | Tracker":
     """
     if ":" in spec:
         return load_tracker(spec) if callable(getattr(_find(spec, TRACKERS), "step", None)) else load_matcher(spec)
-    return load_tracker(spec) if is_tracker(spec) else load_matcher(spec)
+    if is_tracker(spec):
+        return load_tracker(spec)
+    if spec not in list_entry_points():
+        raise _unknown(spec, MATCHERS, TRACKERS)
+    return load_matcher(spec)
 
 
 def is_tracker(name: str) -> bool:
@@ -214,6 +218,9 @@ def _check(spec: str, plugin: object, card_type: type, group: str, verbs: Sequen
     if missing:
         message = f"{spec}: {type(plugin).__name__} is not a {KINDS[group]}, it has no {' and no '.join(missing)}"
         raise MatchError(message)
+    if group == TRACKERS and "sequence" not in getattr(card, "tracks", ()):
+        message = f"{spec}: card: tracks lacks 'sequence', which is what a tracker follows: tracks=(\"sequence\",)"
+        raise MatchError(message)
 
 
 def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any plugin
@@ -238,17 +245,23 @@ def _find(spec: str, group: str) -> Callable[[], Any]:
 
 
 def _known(name: str, group: str) -> EntryPoint:
-    points, kind = list_entry_points(group), KINDS[group]
+    points = list_entry_points(group)
     if name not in points:
-        near = difflib.get_close_matches(name, points, n=1, cutoff=0.6)
-        hint = f", did you mean {near[0]!r}?" if near else ""
-        message = f"there is no {kind} {name!r}{hint} (list-{kind}s shows all; or module:Class)"
-        raise MatchError(message)
+        raise _unknown(name, group)
     others = {point.value: point for point in _installed(group) if point.name == name and point != points[name]}
     rival = next((point for value, point in others.items() if value != points[name].value), None)
     if rival is not None and _home(points[name]) not in SHIPPED:
         raise MatchError(_clash(points[name], rival))
     return points[name]
+
+
+def _unknown(name: str, *groups: str) -> MatchError:
+    """Return the error for a name that no group has, with the nearest one."""
+    near = difflib.get_close_matches(name, [known for group in groups for known in list_entry_points(group)], n=1)
+    hint = f", did you mean {near[0]!r}?" if near else ""
+    kinds = [KINDS[group] for group in groups]
+    shown = f"{' and '.join(f'list-{kind}s' for kind in kinds)} show{'s' if len(kinds) == 1 else ''} all"
+    return MatchError(f"there is no {' or '.join(kinds)} {name!r}{hint} ({shown}; or module:Class)")
 
 
 def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = (), segmenters: Sequence[str] = ()) -> None:

@@ -188,7 +188,8 @@ def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, 
         raise ConfigError(message)
     if not _NAME.fullmatch(name):
         message = (
-            f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, as in my-{kind}; got {name!r}"
+            f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, a letter first, as in "
+            f"my-{kind}; got {name!r}"
         )
         raise ConfigError(message)
     if name in shipped_names(group):

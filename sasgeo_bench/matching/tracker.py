@@ -82,7 +82,8 @@ def check_fix(fix: object, *, top_k: int) -> Fix:
     the covariance is not a symmetric positive definite matrix of 3 x 3.
     """
     if not isinstance(fix, Fix):
-        message = f"step() returned {type(fix).__name__}, expected sasgeo_bench.matching.tracker.Fix"
+        given = "nothing" if fix is None else type(fix).__name__
+        message = f"step() returned {given}, expected a sasgeo_bench.Fix: without a pose where nothing is known"
         raise MatchError(message)
     if not isinstance(fix.is_accepted, bool | np.bool_):
         message = f"is_accepted is a {type(fix.is_accepted).__name__}, expected True or False"
@@ -141,8 +142,12 @@ def check_covariance(given: object) -> NDArray[np.float64]:
     except (TypeError, ValueError) as error:
         message = f"covariance is a {type(given).__name__}, expected 3 x 3 numbers"
         raise MatchError(message) from error
-    if found.shape != (SIDE, SIDE) or not np.isfinite(found).all() or np.abs(found).max() > MOST_VARIANCE:
-        message = f"covariance has shape {found.shape}, expected 3 x 3 numbers of {MOST_VARIANCE:g} at most"
+    if found.shape != (SIDE, SIDE):
+        message = f"covariance has shape {found.shape}, expected {SIDE} x {SIDE}: east, north, yaw"
+        raise MatchError(message)
+    if not (np.abs(found) <= MOST_VARIANCE).all():
+        odd = found[~(np.abs(found) <= MOST_VARIANCE)][0]
+        message = f"covariance holds {odd:g}, expected numbers of {MOST_VARIANCE:g} at most; or give none"
         raise MatchError(message)
     if not are_covariances(found[None])[0]:
         message = "covariance is not symmetric and positive definite: NEES needs its inverse; or give none"

@@ -30,6 +30,7 @@ from sasgeo_bench.publishing.site_pages import (
 from sasgeo_bench.publishing.site_source import Case, SiteSource
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import Verdict
+from sasgeo_bench.tasks.query import SEQUENCE
 from sasgeo_bench.texts import plain
 
 OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided", "not tested")  # as on the page
@@ -241,7 +242,7 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "seeds": seed_table(source.about),
         "warnings": warnings_of(source.board),
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
-        "counts": _counts(source, book),
+        "size": _size_text(source, book),
     }
 
 
@@ -284,15 +285,19 @@ def _controls_state(verdicts: Sequence[Verdict]) -> str:
     return "held" if verdicts and not failed else "doubtful"
 
 
-def _counts(source: SiteSource, book: Book) -> dict[str, int]:
-    """Count matchers, suites, queries, blocks and places of the board."""
+def _size_text(source: SiteSource, book: Book) -> str:
+    """Count matchers, suites, queries and flights, blocks and places of the board."""
     board, scores = source.board, source.scores
-    return {
-        "matchers": len(book.matcher_pages),
-        "suites": len(book.suite_pages),
-        "queries": int(scores["query_id"].nunique()) if "query_id" in scores else 0,
-        **{name: int(board[name].max()) if len(board) else 0 for name in ("blocks", "places")},
-    }
+    asked = scores.drop_duplicates("query_id")["track"] if "query_id" in scores else pd.Series(dtype=object)
+    flights = int((asked == SEQUENCE).sum())
+    blocks, places = (int(board[name].max()) if len(board) else 0 for name in ("blocks", "places"))
+    parts = [
+        f"{counted(len(book.matcher_pages), 'matcher or control', 'matchers and controls')}",
+        counted(len(book.suite_pages), "suite"),
+        *([counted(len(asked) - flights, "query", "queries")] if flights < len(asked) or not flights else []),
+        *([counted(flights, "flight")] if flights else []),
+    ]
+    return f"{', '.join(parts)} in {counted(blocks, 'block')} of {counted(places, 'place')}."
 
 
 def groups_of(cases: Sequence[Case]) -> tuple[Group, ...]:

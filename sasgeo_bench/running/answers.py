@@ -311,7 +311,9 @@ class _Map:
             row = self._row(query, reply)
             writer.add(row, cpu_s=reply.cpu_s)
             if query.step is not None and failed is None and row.status != "ok":
-                failed = Reply(status=row.status, message=f"since view {query.step.frame} of the flight: {row.message}")
+                failed = Reply(
+                    status=row.status, message=f"since frame {query.step.frame} of the flight: {row.message}"
+                )
 
     def _lacks(self, query: Query) -> str | None:
         """Return why a query is not applicable to the matcher, or None."""

@@ -7,6 +7,7 @@ import os
 import socket
 import sys
 import time
+import traceback
 from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Iterator, Mapping, Sequence
@@ -67,7 +68,7 @@ class PluginServer(ABC):
                 content, data = self._answer(message, blob)
                 answer = wire.packed(head | content, data)
             except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
-                answer = wire.packed(head | _failure(error))
+                answer = wire.packed(head | _failure(error, package=self._package()))
             try:
                 wire.put(self.channel, answer)
             except wire.Closed:  # the runner waited no longer
@@ -76,6 +77,10 @@ class PluginServer(ABC):
     @abstractmethod
     def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
         """Return the answer to a message, and the bytes that follow it."""
+
+    def _package(self) -> str:
+        """Return the package of the plugin; empty while it is not known."""
+        return ""
 
 
 class Server(PluginServer):
@@ -86,6 +91,9 @@ class Server(PluginServer):
         self.matcher: Matcher | Tracker | None = None
         self._grid: Grid | None = None
         self._follower: Tracker | None = None
+
+    def _package(self) -> str:
+        return package_of(self.matcher)
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
         if message["kind"] == "load":
@@ -149,14 +157,34 @@ def _step(tracker: Tracker, message: dict[str, Any], query: Query) -> dict[str, 
     return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
 
 
-def _failure(error: Exception) -> dict[str, Any]:
-    """Describe an error as an answer."""
+def _failure(error: Exception, *, package: str) -> dict[str, Any]:
+    """Describe an error as an answer; one that nobody foresaw with the last line of the plugin's package on its way."""
     if isinstance(error, MatchError):
         return {"status": "invalid", "message": one_line(str(error))}
     if isinstance(error, MemoryError):
         return {"status": "crash", "message": "out of memory"}
     is_refused = isinstance(error, OSError) and error.errno in _REFUSED
-    return {"status": "refused" if is_refused else "crash", "message": message_of(error)}
+    status = "refused" if is_refused else "crash"
+    return {"status": status, "message": one_line(message_of(error) + _last_line(error, package))}
+
+
+def package_of(plugin: object) -> str:
+    """Return the package that the class of a plugin lies in; empty for None."""
+    return "" if plugin is None else type(plugin).__module__.partition(".")[0]
+
+
+def _last_line(error: Exception, package: str) -> str:
+    """Return file and line of the innermost code of a package that an error came through, in brackets; else nothing.
+
+    >>> _last_line(ValueError("never raised"), "my_tracker")
+    ''
+    """
+    lines = [
+        f" ({Path(frame.f_code.co_filename).name}:{line})"
+        for frame, line in traceback.walk_tb(error.__traceback__)
+        if package and str(frame.f_globals.get("__name__")).partition(".")[0] == package
+    ]
+    return lines[-1] if lines else ""
 
 
 class _Cost:

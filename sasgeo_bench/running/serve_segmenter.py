@@ -17,7 +17,7 @@ from sasgeo_bench.matching.segmenter import (
     check_segmentation,
     check_text,
 )
-from sasgeo_bench.running.serve import PluginServer, code_hash
+from sasgeo_bench.running.serve import PluginServer, code_hash, package_of
 from sasgeo_bench.sensing.image_bytes import LabelledFiles, image_from
 
 # Modules of this package that segmentations depend on, as `serve.TOOLS` are those of a matcher's answers.
@@ -31,6 +31,9 @@ class SegmenterServer(PluginServer):
         super().__init__(channel, spec=spec)
         self.learned = None if luggage is None else luggage.decode()
         self.segmenter: Segmenter | None = None
+
+    def _package(self) -> str:
+        return package_of(self.segmenter)
 
     def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
         if self.segmenter is None:

@@ -173,9 +173,9 @@ class _Kit:
         """Fly again and compare."""
         for frame, (before, now) in enumerate(zip(first, self._fly(views), strict=False)):
             if now.status != "ok":
-                return Check(name=name, outcome="fail", found=f"view {frame}: {now.status}: {now.message}")
+                return Check(name=name, outcome="fail", found=f"frame {frame}: {now.status}: {now.message}")
             if (before.match, before.is_accepted, before.covariance) != (now.match, now.is_accepted, now.covariance):
-                return Check(name=name, outcome="fail", found=f"view {frame} has another answer")
+                return Check(name=name, outcome="fail", found=f"frame {frame} has another answer")
         return Check(name=name, outcome="pass", found=counted(len(views), "view"))
 
     def _unseen(self, views: Sequence[Query]) -> Check:
@@ -255,7 +255,7 @@ def _stepped(query: Query, increment: tuple[float, float, float] | None, *, sigm
 def _fault(replies: Sequence[Reply], views: Sequence[Query]) -> str | None:
     """Return where and why a flight ended before its last view."""
     if replies and replies[-1].status != "ok":
-        return f"view {len(replies) - 1} of {len(views)}: {replies[-1].status}: {replies[-1].message}"
+        return f"frame {len(replies) - 1} of 0 to {len(views) - 1}: {replies[-1].status}: {replies[-1].message}"
     return None
 
 

@@ -322,7 +322,7 @@ COSTS: Final = (
     ),
     _cost(
         name="index",
-        meaning="Files that the matcher wrote for a map, the most of all maps",
+        meaning="Memory that preparing a map adds to the matcher's process, the most of all maps",
         unit="MB",
         compute=partial(cost.most, name="index_mb"),
     ),
@@ -334,7 +334,7 @@ COSTS: Final = (
     ),
     _cost(
         name="map_per_km2",
-        meaning="Files of the maps and what the matcher wrote for them, over their mapped area (1 kB = 1000 bytes)",
+        meaning="Files of the maps and the memory that preparing them adds, over their mapped area (1 kB = 1000 bytes)",
         unit="kB/km2",
         compute=cost.map_kb_per_km2,
     ),

@@ -34,7 +34,7 @@ LOST: Final = "#7b2fa0"
 OFF_MAP: Final = "#ffc928"
 COPY: Final = "#00796b"
 _COLUMNS: Final = ("query_id", "increment", "prior_easting_m", "prior_northing_m", "prior_radius_m")
-_MOST_ACROSS: Final = 6  # panels; a site with more variants takes two rows
+_MOST_ACROSS: Final = 4  # panels; a site with more variants takes two rows
 _ALONE_ACROSS: Final = 3  # panels, where each site has one
 _PANEL_INCHES: Final = 3.4
 _ONE_INCHES: Final = 8.0  # of a flight that is drawn alone
@@ -273,7 +273,7 @@ def draw_flight(chart: Axes, panel: FlightPanel, ground: Ground) -> None:
     reckoned, place, jump = panel.reckoned_m, panel.place_m, panel.carried_to
     for part in np.split(np.arange(len(place)), [] if jump is None else [jump]):
         chart.plot(*place[part].T, color="white", lw=3.2, zorder=2)
-        chart.plot(*place[part].T, color=TRUE, lw=1.1, zorder=3)
+        chart.plot(*place[part].T, color=TRUE, lw=1.1, zorder=3.6)  # above the odometer, which may be without errors
     if jump is not None:
         ahead = {"arrowstyle": "-|>", "color": LOST, "lw": 1.4, "ls": "--", "shrinkA": 0, "shrinkB": 0}
         chart.annotate("", place[jump], place[jump - 1], arrowprops=ahead, zorder=6)

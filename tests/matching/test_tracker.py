@@ -26,7 +26,7 @@ HERE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0)
         (Fix(pose=HERE, covariance=np.zeros((3, 3))), "not symmetric and positive definite"),
         (Fix(pose=HERE, covariance=[[1, 5, 0], [0, 1, 0], [0, 0, 1]]), "not symmetric and positive definite"),
         (Fix(pose=HERE, covariance=np.eye(2)), "shape (2, 2)"),
-        (Fix(pose=HERE, covariance=math.nan * np.eye(3)), "expected 3 x 3 numbers"),
+        (Fix(pose=HERE, covariance=math.nan * np.eye(3)), "covariance holds nan, expected numbers of 1e+12 at most"),
         (Fix(pose=HERE, covariance="wide"), "covariance is a str"),
         (Fix(pose=HERE, modes=[HERE]), "pairs of a pose and a weight"),
         (Fix(pose=HERE, modes=[(HERE, 2.0)]), "scores rise from 1 to 2"),

@@ -76,11 +76,11 @@ def test_a_matcher_of_single_views_is_tried_as_it_follows(table) -> None:
         ("NoSuchClass", 0, "has no attribute 'NoSuchClass'"),
         ("Imitates", 0, "named 'dead_reckoning', as a tracker that ships: rename it"),
         ("Unprepared", 1, "ValueError: no map today"),
-        ("Singular", 2, "view 0 of 8: invalid: covariance is not symmetric and positive definite"),
+        ("Singular", 2, "frame 0 of 0 to 7: invalid: covariance is not symmetric and positive definite"),
         ("SometimesSure", 3, "4 of 8 estimates have none"),
-        ("Fickle", 4, "view 0 has another answer"),
-        ("Remembers", 5, "view 0 has another answer"),
-        ("LooksHard", 7, "view 5 of 8: crash: ValueError: nothing to see"),
+        ("Fickle", 4, "frame 0 has another answer"),
+        ("Remembers", 5, "frame 0 has another answer"),
+        ("LooksHard", 7, "frame 5 of 0 to 7: crash: ValueError: nothing to see"),
         ("AlwaysSure", 13, "8 of 8 views accepted: odometry alone does not tell the place"),
     ],
 )
@@ -105,10 +105,10 @@ def test_odd_flights_change_only_what_they_say(made) -> None:
 def test_a_tracker_of_ordinary_flights_alone_fails_at_each_odd_one(table) -> None:
     rows = table("straying:Brittle")
     assert failed(rows) == list(ROWS[8:12])
-    assert rows[ROWS[8]].found.startswith("view 5 of 8: crash: ValueError: cannot reshape")
-    assert "view 1 of 8: crash: LinAlgError" in rows[ROWS[9]].found
-    assert "view 5 of 8: crash: IndexError: off the map" in rows[ROWS[10]].found
-    assert "view 0 of 8: crash: TypeError" in rows[ROWS[11]].found
+    assert rows[ROWS[8]].found.startswith("frame 5 of 0 to 7: crash: ValueError: cannot reshape")
+    assert "frame 1 of 0 to 7: crash: LinAlgError" in rows[ROWS[9]].found
+    assert "frame 5 of 0 to 7: crash: IndexError: off the map" in rows[ROWS[10]].found
+    assert "frame 0 of 0 to 7: crash: TypeError" in rows[ROWS[11]].found
 
 
 def test_what_new_tracker_writes_finds_its_way(made) -> None:

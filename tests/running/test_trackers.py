@@ -117,7 +117,7 @@ def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_pa
     failed = flights.pop(first)
     assert [item.status for item in failed] == ["ok", "ok"] + [status] * (len(failed) - 2)
     assert told in failed[2].message
-    assert all("since view 2 of the flight: " in item.message for item in failed[3:])
+    assert all("since frame 2 of the flight: " in item.message for item in failed[3:])
     for rows in flights.values():
         assert {item.status for item in rows} == {"ok"}
         assert views_of(rows) == list(range(1, len(rows) + 1))

@@ -348,10 +348,10 @@ def flight_keys(shown: Sequence[FlightPanel]) -> list[Artist]:
         ),
         (
             any(panel.is_copied.any() for panel in shown),
-            "where the map shows the same as on the true path",
+            "the map shows the same here",
             {"color": COPY, "lw": 1.2, "marker": ".", "ms": 5},
         ),
-        (True, "odometer alone, from the true start", {"color": RECKONED, "lw": 1.4, "marker": "s", "ms": 5}),
+        (True, "odometer from the true start", {"color": RECKONED, "lw": 1.4, "marker": "s", "ms": 5}),
         (
             any(len(panel.lost) for panel in shown),
             "odometer lost on the way here",
@@ -360,7 +360,7 @@ def flight_keys(shown: Sequence[FlightPanel]) -> list[Artist]:
         (any(panel.carried_to for panel in shown), "carried", {"color": LOST, "lw": 1.4, "ls": "--"}),
         (
             any(panel.prior_m is not None for panel in shown),
-            "disc that the start is known to lie in",
+            "disc of the start (prior)",
             {"color": PRIOR, "lw": 1.2, "ls": "--"},
         ),
     ]

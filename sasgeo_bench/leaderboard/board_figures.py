@@ -15,7 +15,9 @@ from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.flight_plots import (
     distance_frame,
     draw_distance,
+    draw_drift,
     draw_intervals,
+    drift_frame,
     interval_frame,
     kinds_of,
 )
@@ -110,6 +112,9 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
         ),
         "how far odometers carry fixes on flights": lambda: _each(
             "interval", interval_frame(board.table, kinds_of(board.scores), shown), GROUP, draw_intervals, shown
+        ),
+        "success against the drift of odometers": lambda: _each(
+            "drift", drift_frame(board.table, shown), GROUP[1:], draw_drift, shown
         ),
     }
     drawn: dict[str, dict[str, Draw]] = {}

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Figures of flights on a board: error along the way, and how far the odometer carries a fix; their tables.
+"""Figures of flights on a board, with their tables: error along the way, how far odometers carry fixes, and drift.
 
-Each figure has a panel for each kind of flight of a suite and a line for each matcher.
+Each figure has a line for each matcher, and a panel for each kind of flight of a suite; of drift for each suite.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -29,9 +29,9 @@ from sasgeo_bench.leaderboard.board_plots import (
     those_there,
     ticks_across,
 )
-from sasgeo_bench.scoring.flights import RECKONED_M
+from sasgeo_bench.scoring.flights import DRIFT_M, RECKONED_M
 from sasgeo_bench.scoring.score import FIX_M
-from sasgeo_bench.scoring.strata import CONTROL, GROUP
+from sasgeo_bench.scoring.strata import CONTROL, DRIFT, GROUP, primary_rows
 
 _BIN_M: Final = 250.0
 _LEAST_FLIGHTS: Final = 2  # of a point: one flight is no distribution
@@ -39,9 +39,11 @@ _SHARES: Final = {"half": 0.5, "most": 0.9}
 _LEAST_ERROR_M: Final = 1.0
 _MOST_ERROR_M: Final = 10_000.0
 _ERROR_TICKS_M: Final = (1.0, 10.0, 100.0, 1000.0, 10_000.0)
+_ALL: Final = 100.0  # percent
 _METRICS: Final = {f"reckoned_{far_m:g}m": far_m for far_m in RECKONED_M}
 DISTANCE_COLUMNS: Final = (*GROUP, "kind", "matcher", "distance_m", "flights", *_SHARES)
 INTERVAL_COLUMNS: Final = (*GROUP, "kind", "matcher", "every_m", "n", "blocks", "value", "lo", "hi")
+DRIFT_COLUMNS: Final = (*GROUP, "kind", "matcher", "drift", "n", "blocks", "value", "lo", "hi")
 
 
 def distance_frame(
@@ -84,6 +86,17 @@ def interval_frame(
     some = rows[np.array(is_kind, dtype=bool)]
     found = some.assign(every_m=some["metric"].map(_METRICS), kind=some["stratum"])
     return found[[*INTERVAL_COLUMNS]].reset_index(drop=True)
+
+
+def drift_frame(table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
+    """Return the share of the way within 25 m by the odometer's drift, with the columns `DRIFT_COLUMNS`.
+
+    `drift` is a bin of `FlightScore.odometer_drift`, as "0.02-0.04"; `kind` is the suite, whose controls are left out.
+    """
+    is_bin = table["stratum"].str.startswith(f"{DRIFT} ") & (table["rejector"] == "")
+    rows = primary_rows(table[is_bin & table["matcher"].isin(list(shown)) & table["value"].notna()])
+    found = rows.assign(drift=rows["stratum"].str.removeprefix(f"{DRIFT} "), kind=rows["suite"])
+    return found[[*DRIFT_COLUMNS]].reset_index(drop=True)
 
 
 def kinds_of(scores: Mapping[str, pd.DataFrame]) -> dict[tuple[str, ...], list[str]]:
@@ -136,7 +149,8 @@ def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None
     title = f"How far the odometer carries a fix: {of_which(rows.iloc[0])}"
     for chart, kind, number, across in _panels(path, kinds, names, title, note, "flown between two uses of a fix (m)"):
         mine = rows[rows["kind"] == kind]
-        chart.set_title(f"{kind}\nn {mine['n'].iloc[0]:g} flights, {counted(int(mine['blocks'].iloc[0]), 'block')}")
+        many = (counted(int(mine[name].iloc[0]), word) for name, word in (("n", "flight"), ("blocks", "block")))
+        chart.set_title(f"{kind}\n{', '.join(many)}")
         ticks_across(chart, list(RECKONED_M), RECKONED_M[0] / 1.35, RECKONED_M[-1] * 1.35)
         dress_share(chart)
         chart.set_ylim(-0.03, 1.04)
@@ -145,6 +159,38 @@ def draw_intervals(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None
             line = mine[mine["matcher"] == name].sort_values("every_m")
             draw_line(chart, line, dodged(line["every_m"].to_numpy(float), at, len(names), by=0.03), at)
         label_outer(chart, number, across, len(kinds), f"share of the way\nwithin {FIX_M:g} m")
+
+
+def draw_drift(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
+    """Draw the share of the way within 25 m against the odometer's drift from `drift_frame`."""
+    names, kinds, bins = those_there(rows, shown), sorted(set(rows["kind"])), sorted(set(rows["drift"]))
+    note = (
+        f"Share of the flown distance within {FIX_M:g} m, of flights whose odometer drifts so far: its mean error "
+        f"{DRIFT_M:g} m after a true pose, over the way flown. Stress and falsifiers. {INTERVALS}"
+    ).replace("n: queries of each point.", "")
+    title = "Success against the drift of the odometer"
+    for chart, kind, number, across in _panels(path, kinds, names, title, note, "drift of the odometer (% of the way)"):
+        mine = rows[rows["kind"] == kind]
+        chart.set_title(f"{kind}\n{counted(int(mine['n'].min()), 'flight')} at least")
+        chart.set_xlim(-0.5, len(bins) - 0.5)
+        chart.xaxis.set_ticks(range(len(bins)), [_percent(one) for one in bins])
+        dress_share(chart)
+        chart.set_ylim(-0.03, 1.04)
+        for at, name in enumerate(names):
+            line = mine[mine["matcher"] == name].sort_values("drift")
+            aside = 0.06 * (at - (len(names) - 1) / 2)
+            draw_line(chart, line, np.array([bins.index(one) for one in line["drift"]]) + aside, at)
+        label_outer(chart, number, across, len(kinds), f"share of the way\nwithin {FIX_M:g} m")
+
+
+def _percent(name: str) -> str:
+    """Return a bin of shares in percent.
+
+    >>> _percent("0.01-0.02"), _percent("0.08-1")
+    ('1 to 2', '8 and more')
+    """
+    low, high = (100 * float(end) for end in name.split("-"))
+    return f"{low:g} to {high:g}" if high < _ALL else f"{low:g} and more"
 
 
 def _panels(

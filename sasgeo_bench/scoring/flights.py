@@ -27,6 +27,7 @@ from sasgeo_bench.tasks.query import Head, Truth, base_of
 WITHIN_M: Final = (25.0, 10.0, 50.0)  # the first is the primary one
 RECKONED_M: Final = (250.0, 500.0, 1000.0, 2000.0)  # flown between two uses of a fix
 SOON_M: Final = 500.0  # after a gap, or after the drone was carried
+DRIFT_M: Final = 500.0  # of the way on which the odometer's drift is measured
 DIVERGED_M: Final = 100.0
 _DIVERGED_FOR_M: Final = 500.0
 SHARE_INSIDE: Final = 0.95  # of true places, that an honest ellipse of that share holds
@@ -80,6 +81,9 @@ class FlightScore:
         Its absolute logarithm: 0 for an honest covariance.
     inside_95 : float
         Share of the views with an estimate whose true position lies in its ellipse of 95 %; without one it does not.
+    odometer_drift : float
+        Of the odometer, not of the tracker: its mean error 500 m after a true pose, over the way flown, 1 at most; of
+        the stretches on which it was not lost and the drone not carried. NaN without such a stretch.
     """
 
     views: int
@@ -108,6 +112,7 @@ class FlightScore:
     nees: float
     nees_off: float
     inside_95: float
+    odometer_drift: float
 
 
 FLIGHT_COLUMNS: Final = tuple(field.name for field in fields(FlightScore))
@@ -186,7 +191,7 @@ def _ends(names: Sequence[str]) -> list[int]:
 VIEW_COLUMNS: Final = (
     *("query_id", "sequence_id", "frame", "track", "suite", "region", "prior_group", "status"),
     *("distance_m", "time_s", "is_seen", "is_present", "is_carried", "is_answered", "is_accepted", "latency_s"),
-    *("true_east_m", "true_north_m", "east_m", "north_m", "yaw_deg", "error_m", "yaw_error_deg"),
+    *("true_east_m", "true_north_m", "true_yaw_deg", "east_m", "north_m", "yaw_deg", "error_m", "yaw_error_deg"),
     *("nees", "is_inside", "block", "place"),
 )
 
@@ -232,7 +237,7 @@ def view_frame(
         "is_answered": is_answered,
         "is_accepted": is_answered & np.array([one is not None and one.is_accepted is not False for one in answers]),
         "latency_s": [math.nan if one is None or one.latency_s is None else one.latency_s for one in answers],
-        **dict(zip(("true_east_m", "true_north_m"), true.T, strict=False)),
+        **dict(zip(("true_east_m", "true_north_m", "true_yaw_deg"), true.T, strict=True)),
         **dict(zip(("east_m", "north_m", "yaw_deg"), found.reshape(-1, SIDE).T, strict=True)),
         "error_m": np.where(is_answered, np.hypot(gaps[:, 0], gaps[:, 1]), np.inf),
         "yaw_error_deg": np.where(is_answered, np.abs(gaps[:, 2]), np.inf),
@@ -304,6 +309,7 @@ def flight_score(views: pd.DataFrame, increments: Sequence[tuple[float, float, f
         nees=nees,
         nees_off=abs(math.log(nees)) if 0 < nees < math.inf else math.inf,
         inside_95=float(column["is_inside"][answered].mean()) if answered.any() else 0.0,
+        odometer_drift=reckoned.drift(),
     )
 
 
@@ -376,9 +382,11 @@ class _Reckoned:
 
     distance_m: Floats
     true: Complexes
+    true_yaw: Floats  # radians
     fixes: Complexes
     fix_yaw: Floats  # radians
     accepted: Bools
+    is_lost: Bools  # on the way to the view: by the odometer, or since the drone was carried
     way: Complexes
     turn: Floats  # radians
 
@@ -391,12 +399,26 @@ class _Reckoned:
         return cls(
             distance_m=views["distance_m"].to_numpy(float),
             true=column["true_east_m"] + 1j * column["true_north_m"],
+            true_yaw=np.radians(views["true_yaw_deg"].to_numpy(float)),
             fixes=column["east_m"] + 1j * column["north_m"],
             fix_yaw=np.radians(views["yaw_deg"].to_numpy(float)),
             accepted=views["is_accepted"].to_numpy(bool),
+            is_lost=np.array([one is None for one in increments]) | views["is_carried"].to_numpy(bool),
             way=way_m[:, 0] + 1j * way_m[:, 1],
             turn=np.cumsum(np.radians(steps[:, 2])),
         )
+
+    def drift(self) -> float:
+        """Return `FlightScore.odometer_drift`."""
+        last = np.searchsorted(self.distance_m, self.distance_m + DRIFT_M)
+        lost = np.append(np.cumsum(self.is_lost), -1)
+        first = np.flatnonzero(lost[last] == lost[:-1])  # a stretch that the flight does not hold ends at -1
+        if not len(first):
+            return math.nan
+        last = last[first]
+        turned = np.exp(-1j * (self.true_yaw[first] - self.turn[first]))
+        off = np.abs(self.true[first] + (self.way[last] - self.way[first]) * turned - self.true[last])
+        return min(1.0, float(np.mean(off / (self.distance_m[last] - self.distance_m[first]))))
 
     def error_m(self, every_m: float) -> Floats:
         """Return the error of every view if a fix is used once in some metres at most, and the odometer then."""

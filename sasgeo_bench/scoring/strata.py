@@ -16,11 +16,13 @@ ALL: Final = "all"
 STRESS: Final = "stress"
 CONTROL: Final = "control"
 _MOST_STEPS: Final = 24  # more are no steps: each query has its own random strength
+DRIFT: Final = "odometer_drift"  # of flights
 _EDGES: Final = {  # fixed, to keep boards comparable
     "unknown_share": (0.0, 0.2, 0.4, 0.6, 1.0),
     "changed_share": (0.0, 0.1, 0.2, 0.4, 1.0),
     "feature_density": (0.0, 0.05, 0.1, 0.2, 1.0),
     "alias_index": (0.0, 0.7, 0.8, 0.9, 1.0),
+    DRIFT: (0.0, 0.01, 0.02, 0.04, 0.08, 1.0),
 }
 _MAPPING: Final = ("real-age",)  # suites whose maps differ mostly in completeness, not in construction
 
@@ -95,6 +97,8 @@ def _bins(scores: pd.DataFrame, counted: Bools) -> Iterator[tuple[str, Bools]]:
         scores["suite"].isin(_MAPPING).to_numpy(bool) if "suite" in scores else np.zeros(len(scores), dtype=bool)
     )
     for column, edges in _EDGES.items():
+        if column not in scores:
+            continue
         name = f"{column} (mostly mapping)" if column == "changed_share" and is_mapping.all() else column
         values = scores[column].to_numpy(float)
         for low, high in pairwise(edges):

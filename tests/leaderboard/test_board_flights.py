@@ -88,7 +88,7 @@ def test_a_flight_is_a_row_and_not_a_view(out):
 
 def test_errors_along_the_way_and_how_rarely_the_map_may_be_asked_are_drawn(out):
     names = {path.name.split("-")[0] for path in (out / "boards" / "mine" / "figures").glob("*.svg")}
-    assert {"distance", "interval", "stress", "price"} <= names
+    assert {"distance", "interval", "drift", "stress", "price"} <= names
     assert not {"errors", "recall", "risk", "cost"} & names
     (drawn,) = (out / "boards" / "mine" / "figures").glob("distance-*.svg")
     text = drawn.read_text(encoding="utf-8")

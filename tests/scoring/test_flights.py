@@ -245,6 +245,43 @@ def test_the_odometer_says_the_rest_between_fixes():
     assert first["reckoned_250m"] == pytest.approx(0.05)  # nothing is known before the first fix
 
 
+def drift_of(increments, **more):
+    heads, truths = a_flight(**more)
+    told = [replace(head, increment=one) for head, one in zip(heads, increments, strict=True)]
+    return score_flights(told, truths, {}).flights["odometer_drift"].item()
+
+
+def test_drift_is_what_the_odometer_alone_errs_after_half_a_kilometre():
+    exact = [None, *[(0.0, STEP_M, 0.0)] * 10]
+    assert drift_of(exact) == pytest.approx(0.0, abs=1e-12)
+    assert drift_of([None, *[(0.0, 1.02 * STEP_M, 0.0)] * 10]) == pytest.approx(0.02)
+    # A turn of 90 degrees that was not flown, halfway: its error grows with what lies behind the turn.
+    turned = [(0.0, STEP_M, 90.0 if at == 5 else 0.0) for at in range(1, 11)]
+    after_m = np.array([0, 4, 3, 2, 1, 0]) * STEP_M  # of the stretches from views 0 to 5
+    assert drift_of([None, *turned]) == pytest.approx(float(np.mean(np.sqrt(2) * after_m)) / 500, abs=1e-6)
+
+
+def test_drift_is_measured_where_the_odometer_is_not_lost_and_the_drone_not_carried():
+    way = [None, *[(0.0, 1.02 * STEP_M, 0.0)] * 10]
+    assert drift_of([*way[:5], None, *way[6:]], count=11) == pytest.approx(0.02)
+    assert drift_of([None, *[(0.0, 1.02 * STEP_M, 0.0)] * 12], count=13, carried_m=400.0) == pytest.approx(0.02)
+    assert math.isnan(drift_of(way[:5], count=5))  # shorter than half a kilometre
+    assert math.isnan(drift_of([None] * 11))
+
+
+def test_flights_are_told_apart_by_the_drift_of_their_odometers():
+    parts = [a_flight(flight=f"f{number}", kind="stress") for number in range(3)]
+    heads = [
+        replace(head, increment=None if head.frame == 0 else (0.0, STEP_M * scale, 0.0))
+        for (some, _), scale in zip(parts, (1.005, 1.015, 1.03), strict=True)
+        for head in some
+    ]
+    truths = [replace(truth, role="stress") for _, some in parts for truth in some]
+    table = leaderboard({"mine": score_flights(heads, truths, {}).flights}, draws=20)
+    counts = table[table["metric"] == primary_of("sequence").name].set_index("stratum")["n"]
+    assert [counts[f"odometer_drift {part}"] for part in ("0-0.01", "0.01-0.02", "0.02-0.04")] == [1, 1, 1]
+
+
 def test_two_flights_are_two_rows_in_the_order_of_their_ids():
     parts = [a_flight(5, name) for name in ("f1", "f0")]
     heads, truths = ([item for part in parts for item in part[at]] for at in (0, 1))

@@ -116,7 +116,7 @@ class Square:
     @classmethod
     def of(cls, evidence: sgb.Evidence) -> Self:
         """Turn a view."""
-        known = (evidence.cells <= sgb.PRESENT).all(axis=0)
+        known = np.asarray((evidence.cells <= sgb.PRESENT).all(axis=0))
         labels = labels_of(known, evidence.layer, evidence.classes)
         side_m = min(evidence.size_m) / math.sqrt(2)
         at_m = ((np.arange(LATTICE) + 0.5) / LATTICE - 0.5) * side_m

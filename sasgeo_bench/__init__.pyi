@@ -89,6 +89,9 @@ from .search.find import score_at as score_at
 from .search.plan import Disc as Disc
 from .search.plan import Mode as Mode
 from .search.plan import turns_of as turns_of
+from .search.shifts import Overlaps as Overlaps
+from .search.shifts import ShiftPlan as ShiftPlan
+from .search.shifts import ShiftSearch as ShiftSearch
 from .search.surface import Surface as Surface
 from .search.surface import surface as surface
 from .search.vote_search import VotePlan as VotePlan

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Search by scores that are no sum of votes: cross-correlations of channels at all places, combined by the matcher.
+
+Intersection over union, mutual information and phase correlation need correlations of single channels before they are
+added up. For each heading a matcher gets them (`Overlaps`) and returns a score for each place.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior, inverse
+from sasgeo_bench.search.chart import Chart
+from sasgeo_bench.search.field import between, warped
+from sasgeo_bench.search.plan import Disc, Mode, place_m, thinned, turns_of
+
+Spectra = NDArray[np.complexfloating]
+
+_TILE: Final = 256  # places a side of a tile: bounds the memory of the transforms
+_LOW: Final = -np.inf
+_STEPS: Final = 4  # headings on either side of a coarse one, where it is refined
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShiftPlan:
+    """Settings of a search by shifts.
+
+    All places are tried in cells of `coarse_m`, at headings of at most `yaw_step_deg` from each other within `spread`
+    standard deviations; scale is 1. The best `refined` modes, `apart_m` from each other, are refined in cells of
+    `fine_m`. A view may lie within `around_m` of its candidate.
+    """
+
+    coarse_m: float = 4.0
+    fine_m: float = 2.0
+    yaw_step_deg: float = 3.0
+    spread: float = 2.0
+    apart_m: float = 25.0
+    around_m: float = 24.0
+    refined: int = 8
+
+
+@dataclass(frozen=True, kw_only=True)
+class Overlaps:
+    """A turned view of V channels over a map of M channels, at all places of a tile.
+
+    Parameters
+    ----------
+    seen, mapped : ndarray of complex64
+        Transforms of the view's channels, conjugate, and of the map's, shapes (V, n, n / 2 + 1) and (M, n, n / 2 + 1).
+    places : tuple of int
+        Rows and columns of the tile.
+    totals : ndarray of float64, shape (V,)
+        Sum of each channel of the view over its cells.
+
+    Examples
+    --------
+    A view of one cell over a map of two channels reads the map itself, at each of nine places:
+
+    >>> layers = np.zeros((2, 4, 4), dtype=np.float32)
+    >>> layers[1, 2, 0] = 1
+    >>> overlaps = Overlaps.of(np.ones((1, 1, 1), dtype=np.float32), layers, places=(3, 3))
+    >>> overlaps.sums(0, 1).round(6).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    """
+
+    seen: Spectra
+    mapped: Spectra
+    places: tuple[int, int]
+    totals: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, seen: NDArray[np.float32], mapped: NDArray[np.float32], *, places: tuple[int, int]) -> Self:
+        """Transform a view, shape (V, h, h), and the map under it at all places, shape (M, h + rows - 1, ...)."""
+        size = size_of(max(mapped.shape[1:]))
+        return cls.over(seen, map_transform(mapped, size), places=places)
+
+    @classmethod
+    def over(cls, seen: NDArray[np.float32], mapped: Spectra, *, places: tuple[int, int]) -> Self:
+        """Transform a view over a map that is transformed already."""
+        size = mapped.shape[1]
+        rows = np.conj(fft.fft(fft.rfft(seen, n=size, axis=-1), n=size, axis=-2))
+        return cls(seen=rows, mapped=mapped, places=places, totals=seen.sum(axis=(1, 2), dtype=np.float64))
+
+    def cross(self, seen: int, mapped: int) -> Spectra:
+        """Return the cross-power spectrum of a channel of the view and one of the map, for `back`."""
+        return np.asarray(self.seen[seen] * self.mapped[mapped])
+
+    def back(self, spectrum: Spectra) -> NDArray[np.float32]:
+        """Return the correlation of a cross-power spectrum at each place, float32 of shape `places`."""
+        size = self.mapped.shape[1]
+        rows, cols = self.places
+        return np.asarray(fft.irfft2(spectrum, s=(size, size))[:rows, :cols], dtype=np.float32)
+
+    def sums(self, seen: int, mapped: int) -> NDArray[np.float32]:
+        """Return the sum over cells of a channel of the view times one of the map, float32 of shape `places`."""
+        return self.back(self.cross(seen, mapped))
+
+
+Scorer = Callable[[Overlaps], NDArray[np.float32]]
+
+
+def size_of(side: int) -> int:
+    """Return the size of a transform that holds a square of a side."""
+    return int(fft.next_fast_len(side, real=True))
+
+
+def map_transform(layers: NDArray[np.float32], size: int) -> Spectra:
+    """Transform channels of a map, shape (M, rows, cols), once for all headings."""
+    return np.asarray(fft.rfft2(layers, s=(size, size)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ShiftSearch:
+    """Search for one view on one map by a score of its overlaps.
+
+    Parameters
+    ----------
+    chart : Chart
+        The map. Its channels for the scorer are those of `bands`, 0..1, and last the known cells.
+    bands : ndarray of int64, shape (B,)
+        Classes of the chart that the scorer reads.
+    channels : ndarray of float32, shape (V, rows, cols)
+        The view as the scorer reads it.
+    cell_size_m : float
+        Side of its cells.
+    score : callable
+        Returns the score of each place from `Overlaps`, float32; minus infinity where there is none.
+    prior : Prior
+        What is known of the pose.
+    plan : ShiftPlan
+        Settings.
+    """
+
+    chart: Chart
+    bands: NDArray[np.int64]
+    channels: NDArray[np.float32]
+    cell_size_m: float
+    score: Scorer
+    prior: Prior
+    plan: ShiftPlan
+
+    def places(self, count: int) -> list[Mode]:
+        """Return up to `count` poses within the prior, best first, `apart_m` from each other."""
+        plan, disc = self.plan, Disc(center_m=self.prior.center_m, radius_m=self.prior.radius_m or 0.0)
+        factor = self._factor(plan.coarse_m)
+        tiles = list(self._tiles(factor, disc))
+        found = [mode for modes in self._best(tiles, factor, self._yaws_deg) for mode in modes]
+        best = thinned(_ranked(found), plan.apart_m)[: max(plan.refined, count)]
+        return thinned(_ranked(self._refined(mode, disc) for mode in best), plan.apart_m)[:count]
+
+    def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
+        """Return the best pose near each candidate; None where the map shows nothing."""
+        factor = self._factor(self.plan.coarse_m)
+        discs = [Disc(center_m=place_m(pose), radius_m=self.plan.around_m) for pose in poses]
+        tiles = [
+            self._around(place_m(pose), self.plan.around_m, factor, disc)
+            for pose, disc in zip(poses, discs, strict=True)
+        ]
+        return [next(iter(modes), None) for modes in self._best(tiles, factor, self._yaws_deg)]
+
+    @property
+    def _yaws_deg(self) -> list[float]:
+        """Return the headings to try."""
+        turns = turns_of(replace(self.prior, scale_sigma=0.0), spread=self.plan.spread, step=self._step)
+        return [base.yaw_deg + 90.0 * quarter for base in turns.bases for quarter in range(turns.quarters)]
+
+    @property
+    def _step(self) -> float:
+        return math.radians(self.plan.yaw_step_deg)
+
+    def _factor(self, size_m: float) -> int:
+        return max(1, round(size_m / self.chart.grid.cell_size_m))
+
+    def _cell(self, point_m: tuple[float, float]) -> tuple[int, int]:
+        row, col = self.chart.grid.to_cells(np.array([point_m]))[0].tolist()
+        return row, col
+
+    def _half(self, factor: int) -> int:
+        """Return cells of a factor from the middle of the view to its rim."""
+        step_m = factor * self.chart.grid.cell_size_m
+        return math.ceil(math.hypot(*self.channels.shape[1:]) * self.cell_size_m / 2 / step_m) + 1
+
+    def _tiles(self, factor: int, disc: Disc) -> Iterator["_Tile"]:
+        """Yield squares of places that hold the disc, or the whole map."""
+        rows, cols = self.chart.grid.shape
+        top, left, bottom, right = 0, 0, rows, cols
+        if disc.center_m is not None:
+            row, col = self._cell(disc.center_m)
+            reach = math.ceil(disc.radius_m / self.chart.grid.cell_size_m)
+            top, left, bottom, right = max(row - reach, 0), max(col - reach, 0), row + reach + 1, col + reach + 1
+            bottom, right = min(bottom, rows), min(right, cols)
+        if top >= bottom or left >= right:
+            return
+        count = min(_TILE, -(-max(bottom - top, right - left) // factor))
+        for row in range(top, bottom, count * factor):
+            for col in range(left, right, count * factor):
+                yield self._tile(row, col, count, factor, disc.wider(factor * self.chart.grid.cell_size_m))
+
+    def _around(self, point_m: tuple[float, float], reach_m: float, factor: int, disc: Disc) -> "_Tile":
+        """Return a square of places whose middle one is the cell of a point."""
+        reach = math.ceil(reach_m / (factor * self.chart.grid.cell_size_m))
+        row, col = self._cell(point_m)
+        back = reach * factor + factor // 2
+        return self._tile(row - back, col - back, 2 * reach + 1, factor, disc)
+
+    def _tile(self, row: int, col: int, count: int, factor: int, disc: Disc) -> "_Tile":
+        """Return a square of `count` places a side, which begins at a cell of the map."""
+        half = self._half(factor)
+        layers = self.chart.pooled(row - half * factor, col - half * factor, count + 2 * half, factor, self.bands)
+        grid = self.chart.grid
+        cells_m = (np.arange(count) + 0.5) * factor * grid.cell_size_m
+        east_m = grid.west_m + col * grid.cell_size_m + cells_m
+        north_m = grid.north_m - row * grid.cell_size_m - cells_m
+        points_m = np.stack(np.broadcast_arrays(east_m[None, :], north_m[:, None]), axis=-1)
+        west_m, south_m, most_east_m, most_north_m = grid.bounds_m
+        on_map = ((points_m >= (west_m, south_m)) & (points_m <= (most_east_m, most_north_m))).all(axis=-1)
+        allowed = on_map & disc.holds(points_m.reshape(-1, 2)).reshape(on_map.shape)
+        mapped = map_transform(layers, size_of(layers.shape[1]))
+        return _Tile(mapped=mapped, points_m=points_m, allowed=allowed)
+
+    def _best(self, tiles: Sequence["_Tile"], factor: int, yaws_deg: Sequence[float]) -> list[list[Mode]]:
+        """Return the best places of each tile, best first, `apart_m` from each other, each at its best heading."""
+        high = [np.full(tile.allowed.shape, _LOW, dtype=np.float32) for tile in tiles]
+        which = [np.zeros(tile.allowed.shape, dtype=np.int64) for tile in tiles]
+        blurred = self._blurred(factor)
+        for at, yaw_deg in enumerate(yaws_deg):
+            seen = self._laid(blurred, yaw_deg, factor)
+            overlaps: Overlaps | None = None
+            for tile, top, turn in zip(tiles, high, which, strict=True):
+                if overlaps is None:  # tiles of one search are of one size
+                    overlaps = Overlaps.over(seen, tile.mapped, places=tile.allowed.shape)
+                scores = self.score(replace(overlaps, mapped=tile.mapped))
+                better = tile.allowed & (scores > top)
+                top[better], turn[better] = scores[better], at
+        return [list(self._peaks(*item, yaws_deg)) for item in zip(high, which, tiles, strict=True)]
+
+    def _peaks(
+        self, high: NDArray[np.float32], which: NDArray[np.int64], tile: "_Tile", yaws_deg: Sequence[float]
+    ) -> Iterator[Mode]:
+        """Yield peaks, best first."""
+        left = high.copy()
+        for _ in range(self.plan.refined):
+            at = np.unravel_index(int(left.argmax()), left.shape)
+            if not left[at] > _LOW:
+                return
+            east_m, north_m = tile.points_m[at].tolist()
+            pose = Pose(easting_m=east_m, northing_m=north_m, yaw_deg=yaws_deg[int(which[at])])
+            yield Mode(pose=pose, score=float(left[at]))
+            left[self.plan.apart_m > np.hypot(*(tile.points_m - (east_m, north_m)).T).T] = _LOW
+
+    def _laid(self, blurred: NDArray[np.float32], yaw_deg: float, factor: int) -> NDArray[np.float32]:
+        """Resample a view onto a north-up lattice around its middle, means over its cells, shape (V, side, side)."""
+        step_m, half = factor * self.chart.grid.cell_size_m, self._half(factor)
+        side, reach_m = 2 * half + 1, (half + 0.5) * step_m
+        around = Grid(epsg=0, west_m=-reach_m, north_m=reach_m, cell_size_m=step_m, rows=side, cols=side)
+        rows, cols = self.channels.shape[1:]
+        frame = Grid(
+            epsg=0,
+            west_m=-cols * self.cell_size_m / 2,
+            north_m=rows * self.cell_size_m / 2,
+            cell_size_m=self.cell_size_m,
+            rows=rows,
+            cols=cols,
+        )
+        to_view = between(around, inverse(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg)), frame)
+        return np.stack([warped(band, to_view, around.shape) for band in blurred])
+
+    def _blurred(self, factor: int) -> NDArray[np.float32]:
+        """Return means of the view over about a cell of the lattice."""
+        size = 2 * round((factor * self.chart.grid.cell_size_m / self.cell_size_m - 1) / 2) + 1
+        if size <= 1:
+            return self.channels
+        return np.stack([cv2.blur(band, (size, size), borderType=cv2.BORDER_CONSTANT) for band in self.channels])
+
+    def _refined(self, mode: Mode, disc: Disc) -> Mode:
+        """Return the best pose around a coarse one, in smaller cells and steps of heading."""
+        coarse_m, factor = self.plan.coarse_m, self._factor(self.plan.fine_m)
+        tile = self._around(place_m(mode.pose), coarse_m, factor, disc.wider(coarse_m))
+        offsets_deg = self.plan.yaw_step_deg / _STEPS * np.arange(-_STEPS, _STEPS + 1)
+        (found,) = self._best([tile], factor, (mode.pose.yaw_deg + offsets_deg).tolist())
+        return found[0] if found else replace(mode, score=_LOW)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Tile:
+    """Square of places, the transformed map under all views from there, and which places are searched."""
+
+    mapped: Spectra
+    points_m: NDArray[np.float64]
+    allowed: NDArray[np.bool_]
+
+
+def _ranked(modes: "Iterator[Mode] | Sequence[Mode]") -> list[Mode]:
+    """Sort modes, best first; ties keep their order, and what has no score is left out."""
+    return sorted((mode for mode in modes if mode.score > _LOW), key=lambda mode: -mode.score)

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matchers by overlap: scores worked by hand, the property that each must have, and what they find."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from sasgeo_baselines.schmidt_segcorr import SchmidtSegcorr
+from sasgeo_baselines.vecmap_phasecorr import VecmapPhasecorr, phases, signed
+from sasgeo_baselines.zilke_semantic_mi import LABELS, NAMES, ZilkeSemanticMi
+
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import WITHHELD, Training, check_match
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.search.shifts import Overlaps
+
+MATCHERS = (SchmidtSegcorr, ZilkeSemanticMi, VecmapPhasecorr)
+HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
+PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
+
+
+@pytest.fixture(scope="module")
+def region(made):
+    return made.region_of(made.textured(5))
+
+
+@pytest.fixture(scope="module", params=MATCHERS, ids=lambda kind: kind.card.name)
+def matcher(request, region):
+    found = request.param()
+    found.prepare(region, None)
+    return found
+
+
+def seen_from(made, region, pose, **more):
+    return made.view_of(region, pose, size_cells=128, **more)
+
+
+def error_m(answer, pose=HERE):
+    best = answer.poses[0]
+    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
+
+
+def test_a_view_is_found_on_the_map(made, region, matcher):
+    query = made.query_of(seen_from(made, region, HERE), PRIOR)
+    answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
+    assert error_m(answer) < 3
+    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 2
+    assert answer == check_match(matcher.match(query, top_k=5), query, top_k=5)
+
+
+def test_a_half_hidden_view_is_found_and_one_that_shows_nothing_is_withheld(made, region, matcher):
+    seen = seen_from(made, region, HERE)
+    cells = seen.cells.copy()
+    cells[:, :, :56] = UNKNOWN
+    assert error_m(matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=1)) < 5
+    blank = seen.replace(np.full_like(cells, UNKNOWN))
+    assert matcher.match(made.query_of(blank, PRIOR), top_k=1) == WITHHELD
+
+
+def test_candidates_are_ranked_and_copies_tie(made, region, matcher):
+    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (60.0, 0.0, -50.0, 0.0))
+    anywhere = replace(PRIOR, center_m=None, radius_m=None)
+    query = made.query_of(seen_from(made, region, HERE), anywhere, candidates=places)
+    answer = check_match(matcher.match(query, top_k=4), query, top_k=4)
+    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
+    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
+
+
+def test_a_view_of_other_classes_is_withheld(made, region, matcher):
+    if isinstance(matcher, ZilkeSemanticMi):
+        pytest.skip("mutual information needs no class in common")
+    seen = seen_from(made, region, HERE)
+    alien = Evidence(classes=("railway", "green", "coastline"), cells=seen.cells, cell_size_m=1.0)
+    assert matcher.match(made.query_of(alien, PRIOR), top_k=1) == WITHHELD
+
+
+def overlaps_of(matcher, evidence, layers, names):
+    """Lay a view once on a map of the same size; the last channel of the map says where it is known."""
+    return Overlaps.of(matcher.channels(evidence, names), layers.astype(np.float32), places=(1, 1))
+
+
+def test_intersection_over_union_by_hand():
+    """Of houses 2 cells are seen and mapped and 2 more are on either side, of water 1 and 1: (2 / 4 + 1 / 2) / 2."""
+    seen = np.zeros((2, 3, 4), dtype=np.uint8)
+    seen[0, 0, :3], seen[1, 2, 0] = PRESENT, PRESENT
+    mapped = np.zeros((3, 3, 4))
+    mapped[0, 0, 1:4], mapped[1, 2, :2], mapped[2] = 1, 1, 1
+    view = Evidence(classes=("building", "water"), cells=seen, cell_size_m=1.0)
+    matcher = SchmidtSegcorr()
+    score = matcher.score(overlaps_of(matcher, view, mapped, view.classes), view.classes)
+    assert score[0, 0] == pytest.approx(0.5, abs=1e-5)
+    hidden = seen.copy()
+    hidden[0, 0, 0] = UNKNOWN  # one seen cell less, which was not mapped
+    score = matcher.score(overlaps_of(matcher, view.replace(hidden), mapped, view.classes), view.classes)
+    assert score[0, 0] == pytest.approx((2 / 3 + 1 / 2) / 2, abs=1e-5)
+    mapped[:, :, :3] = 0  # the map knows a quarter
+    assert matcher.score(overlaps_of(matcher, view, mapped, view.classes), view.classes)[0, 0] == -np.inf
+
+
+def labelled(seed):
+    """A view of houses, roads and water that tells of each cell one label or the rest."""
+    labels = np.random.default_rng(seed).integers(0, 4, (6, 6))
+    names = ("building", "road_major", "water")
+    cells = np.stack([np.where(labels == at, PRESENT, ABSENT) for at in range(3)]).astype(np.uint8)
+    return labels, Evidence(classes=names, cells=cells, cell_size_m=1.0)
+
+
+def information(matcher, evidence, labels):
+    layers = np.stack([*(labels == at for at in range(4)), np.ones(labels.shape)])
+    names = tuple(NAMES[at] for at in (0, 1, 3, 5))
+    return float(matcher.score(overlaps_of(matcher, evidence, layers, names), names)[0, 0])
+
+
+def test_mutual_information_ignores_what_labels_are_called_and_is_2_at_most():
+    labels, view = labelled(0)
+    matcher = ZilkeSemanticMi()
+    assert information(matcher, view, labels) == pytest.approx(2.0, abs=1e-4)
+    other, _ = labelled(1)
+    mixed = information(matcher, view, other)
+    assert 1.0 < mixed < 1.5
+    assert information(matcher, view, np.array([2, 0, 3, 1])[other]) == pytest.approx(mixed, abs=1e-4)
+    assert information(matcher, view, np.zeros_like(labels)) == pytest.approx(1.0, abs=1e-4)
+
+
+def test_mutual_information_by_hand():
+    """Half of the view is houses; the map has them in a quarter, all of it within: H 1 and 0.811, joint 1.5 bits."""
+    cells = np.zeros((1, 4, 4), dtype=np.uint8)
+    cells[0, :2] = PRESENT
+    mapped = np.zeros((4, 4), dtype=int) + 3
+    mapped[0] = 0
+    view = Evidence(classes=("building",), cells=cells, cell_size_m=1.0)
+    quarter = -(0.25 * np.log2(0.25) + 0.75 * np.log2(0.75))
+    assert information(ZilkeSemanticMi(), view, mapped) == pytest.approx((1 + quarter) / 1.5, abs=1e-4)
+
+
+def test_a_cell_has_one_label_the_first_of_its_classes():
+    assert len({name for group in LABELS for name in group}) == sum(map(len, LABELS))
+    cells = np.array([[[1, 0, 0, 2]], [[1, 1, 0, 0]]], dtype=np.uint8)
+    found = ZilkeSemanticMi().channels(Evidence(classes=("building", "green"), cells=cells, cell_size_m=1.0), NAMES)
+    assert found[:, 0].argmax(axis=0)[:3].tolist() == [0, 4, 5]
+    assert found[:, 0, 3].sum() == 0  # not known whether it is a house
+
+
+def test_phase_correlation_ignores_a_constant_and_the_contrast_of_the_map():
+    rng = np.random.default_rng(0)
+    town = rng.random((2, 40, 40)).astype(np.float32)
+    seen = town[:, 11:31, 7:27] - town[:, 11:31, 7:27].mean(axis=(1, 2), keepdims=True)
+    found = phases(Overlaps.of(seen, town, places=(21, 21)), [1.0, 1.0])
+    assert np.unravel_index(int(found.argmax()), found.shape) == (11, 7)
+    darker = phases(Overlaps.of(seen, np.float32(0.5) * town, places=(21, 21)), [1.0, 1.0])
+    np.testing.assert_allclose(darker, found, atol=1e-5)
+    alone = phases(Overlaps.of(seen, town, places=(21, 21)), [1.0, 0.0])
+    np.testing.assert_allclose(alone, phases(Overlaps.of(seen[:1], town[:1], places=(21, 21)), [1.0]), atol=1e-6)
+
+
+def test_signed_distances_are_truncated_and_even_where_nothing_is_known():
+    present, known = np.zeros((1, 100), dtype=bool), np.ones((1, 100), dtype=bool)
+    present[0, :50], known[0, 90:] = True, False
+    found = signed(present, known, 2.0)[0]
+    assert found[:42].min() == 1.0
+    assert found[58:90].max() == 0.0
+    assert found[95] == pytest.approx(found[:90].mean())
+
+
+def test_weights_are_learned_from_where_classes_stand_out(made, region):
+    """Water is removed from the map and drawn anew at random: it says nothing."""
+    rng = np.random.default_rng(7)
+    poses = [
+        Pose(easting_m=1210.0 + rng.uniform(-60, 60), northing_m=8790.0 + rng.uniform(-60, 60), yaw_deg=yaw)
+        for yaw in (10.0, 100.0, 250.0)
+    ]
+    views = [seen_from(made, region, pose) for pose in poses]
+    layers = region.layers.copy()
+    layers[2] = made.textured(99)[2]
+    queries = [replace(made.query_of(view, PRIOR), region="made-up") for view in views]
+    truths = [SimpleNamespace(pose=pose) for pose in poses]
+    training = Training(regions={"made-up": made.region_of(layers)}, pairs=tuple(zip(queries, truths, strict=True)))
+    text = VecmapPhasecorr().learn(training)
+    weights = json.loads(text)
+    assert weights["water"] < 0.5 * min(weights["building"], weights["road_minor"])
+    assert text == VecmapPhasecorr().learn(training)
+    taught = VecmapPhasecorr()
+    taught.prepare(training.regions["made-up"], text)
+    query = made.query_of(seen_from(made, region, HERE), PRIOR)
+    assert error_m(taught.match(query, top_k=1)) < 3

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sasgeo_baselines.shift_matcher import ShiftMatcher
 from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlaps, Pose, Query, Region, Training
 
+FULL: Final = 255
 REACH_M: Final = 16.0  # distances are truncated here
 SHARP_CELLS: Final = 1.0  # standard deviation of the low-pass, in cells
 LEARNED_AROUND_M: Final = 150.0  # places that a class is held against while weights are learned
@@ -54,7 +55,7 @@ class VecmapPhasecorr(ShiftMatcher):
         for name, into in zip(region.classes, degree, strict=True):
             present = (region.layer(name) == PRESENT) & known
             if present.any():  # a class that the map lacks stays 0, and is not used
-                into[:] = np.rint(255 * signed(present, known, region.grid.cell_size_m))
+                into[:] = signed(present, known, region.grid.cell_size_m)
         return Chart(
             grid=region.grid,
             classes=region.classes,
@@ -75,7 +76,7 @@ class VecmapPhasecorr(ShiftMatcher):
             known = layer != UNKNOWN
             if known.any():
                 distance = signed(layer == PRESENT, known, evidence.cell_size_m)
-                into[known] = distance[known] - distance[known].mean()
+                into[known] = (distance[known] - distance[known].mean(dtype=np.float64)) / FULL
         return found
 
     def score(self, overlaps: Overlaps, names: tuple[str, ...]) -> NDArray[np.float32]:
@@ -150,17 +151,18 @@ def lowpass(size: int) -> NDArray[np.float32]:
     return np.asarray(found)
 
 
-def signed(present: NDArray[np.bool_], known: NDArray[np.bool_], cell_m: float) -> NDArray[np.float32]:
-    """Return signed distances to the rim of what is present, 0 far outside to 1 deep inside; unknown is their mean.
+def signed(present: NDArray[np.bool_], known: NDArray[np.bool_], cell_m: float) -> NDArray[np.uint8]:
+    """Return signed distances to the rim of what is present, 0 far outside to `FULL` deep inside; unknown is their mean.
 
     >>> row = np.arange(60) < 30
     >>> signed(row[None], np.ones((1, 60), dtype=bool), 1.0)[0, [0, 20, 29, 30, 59]].tolist()
-    [1.0, 0.8125, 0.53125, 0.46875, 0.0]
+    [255, 207, 135, 120, 0]
     """
     inside, outside = (_distance(mask) for mask in (present, ~present))
-    found = np.clip(0.5 + (inside - outside) * cell_m / (2 * REACH_M), 0.0, 1.0).astype(np.float32)
+    share = np.clip(0.5 + (inside - outside) * cell_m / (2 * REACH_M), 0.0, 1.0)
+    found = np.rint(FULL * share).astype(np.uint8)  # in whole steps, for distances are not the same twice
     if known.any() and not known.all():
-        found[~known] = found[known].mean()
+        found[~known] = np.rint(found[known].mean(dtype=np.float64))
     return np.asarray(found)
 
 

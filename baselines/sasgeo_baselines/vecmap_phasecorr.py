@@ -152,7 +152,7 @@ def lowpass(size: int) -> NDArray[np.float32]:
 
 
 def signed(present: NDArray[np.bool_], known: NDArray[np.bool_], cell_m: float) -> NDArray[np.uint8]:
-    """Return signed distances to the rim of what is present, 0 far outside to `FULL` deep inside; unknown is their mean.
+    """Return signed distances to the rim of what is present, 0 far outside to `FULL` deep inside; the mean if unknown.
 
     >>> row = np.arange(60) < 30
     >>> signed(row[None], np.ones((1, 60), dtype=bool), 1.0)[0, [0, 20, 29, 30, 59]].tolist()

@@ -17,12 +17,14 @@ from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.controls import Falsifier, Verdict, verdict_frame
-from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT
+from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.strata import ALL
 from sasgeo_bench.scoring.verdicts import Finding
+from sasgeo_bench.tasks.query import SEQUENCE
 from sasgeo_bench.tasks.task_files import FAILED_PICTURES
 from sasgeo_bench.texts import markdown, markdown_item, tex
 
+_FLIGHT: Final = primary_of(SEQUENCE).name
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
 
 
@@ -36,12 +38,17 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
                 f"{counted(blocks, 'block')} in {counted(places, 'place')}: fewer than {_FEW_BLOCKS} in {_FEW_PLACES}, "
                 "so intervals speak of these places and little of others."
             )
-        # Between them these two count every query once: present places, and absent ones.
-        whole = board[board["metric"].isin((ANSWERED.name, FALSE_ABSENT.name)) & (board["stratum"] == ALL)]
-        for matcher, count in whole.groupby("matcher")["missing"].sum().items():
-            if count:
-                rest = "has no row and counts as a miss" if count == 1 else "have no row and count as misses"
-                warnings.append(f"{matcher}: {counted(count, 'query', 'queries')} {rest}.")
+        # Between them these count every query once: present places, absent ones, and flights.
+        whole = board[board["metric"].isin((ANSWERED.name, FALSE_ABSENT.name, _FLIGHT)) & (board["stratum"] == ALL)]
+        is_flight = whole["track"] == SEQUENCE
+        for rows, names, row in (
+            (whole[~is_flight], ("query", "queries"), "a row"),
+            (whole[is_flight], ("flight", "flights"), "a row for each view"),
+        ):
+            for matcher, count in rows.groupby("matcher")["missing"].sum().items():
+                if count:
+                    rest = f"lacks {row} and counts as a miss" if count == 1 else f"lack {row} and count as misses"
+                    warnings.append(f"{matcher}: {counted(count, *names)} {rest}.")
     return warnings
 
 

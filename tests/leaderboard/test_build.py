@@ -189,7 +189,7 @@ def test_predictions_for_half_of_the_queries_are_misses_for_the_rest(out, tmp_pa
     assert row["missing"] > 0
     assert row["value"] == pytest.approx(1 - row["missing"] / row["n"])
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
-    assert f"half: {count // 2} queries have no row and count as misses." in text
+    assert f"half: {count // 2} queries lack a row and count as misses." in text
 
 
 def moved(row, query):

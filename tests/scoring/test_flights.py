@@ -11,6 +11,7 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError, MetricError
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard.text import warnings_of
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS, score_flights
@@ -318,6 +319,8 @@ def test_a_board_of_flights_has_every_figure_of_their_track():
     assert whole.loc[("good", "reacquired_500m"), "value"] == 1.0
     assert whole.loc[("bad", "first_fix"), "value"] == math.inf
     assert math.isnan(whole.loc[("good", "right_per_km"), "lo"])  # four flights that are alike
+    assert "bad: 4 flights lack a row for each view and count as misses." in warnings_of(table)
+    assert not any(line.startswith("good") for line in warnings_of(table))
 
 
 def test_a_contrast_by_false_fixes_is_won_by_the_side_with_fewer():

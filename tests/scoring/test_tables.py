@@ -307,7 +307,7 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     board = leaderboard(tables, draws=200)
     text = board_markdown(board, ABOUT)
     assert "| mine | 0.250 [" in text
-    assert "mine: 2 queries have no row and count as misses." in text
+    assert "mine: 2 queries lack a row and count as misses." in text
     assert "4 blocks in 4 places: fewer than 36 in 12" in text
     assert "(c) OpenStreetMap contributors" in text
     latex = board_latex(board, ABOUT)
@@ -385,7 +385,7 @@ def test_one_query_of_a_kind_and_none_of_another_are_told_as_they_are():
 def test_one_of_something_is_told_in_the_singular():
     board = leaderboard({"mine": scores([1.0], blocks=1, place="here", status="missing")}, draws=200)
     assert warnings_of(board)[0].startswith("1 block in 1 place: fewer than 36 in 12")
-    assert warnings_of(board)[1] == "mine: 1 query has no row and counts as a miss."
+    assert warnings_of(board)[1] == "mine: 1 query lacks a row and counts as a miss."
     assert "| 1 in 1 place |" in board_markdown(board, ABOUT)
 
 

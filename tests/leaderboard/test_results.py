@@ -73,9 +73,17 @@ def tables_of_pictures():
     return {row.rstrip() for line in lines for row in line.splitlines()}
 
 
-def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures):
+@pytest.fixture(scope="module")
+def table_of_losses():
+    """The lines that the program of the page on flights prints of its board."""
+    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "lost_flights.py"))
+    rows = program["lines"](program["flights_of"](RESULTS / "flights", "flight-real-age"))
+    return {*program["HEAD"].splitlines(), *rows}
+
+
+def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures, table_of_losses):
     boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
-    boards |= tables_of_pictures
+    boards |= tables_of_pictures | table_of_losses
     for page in PAGES:
         if page.stem == SEGMENTERS.name:  # its tables are held as wholes, below
             continue
@@ -143,6 +151,7 @@ def test_the_stored_board_of_segmenters_is_small_and_each_trial_has_a_profile():
         ("README", "claims", set()),
         ("first", FIRST, {"age", "rejection-alias", "rejection-absent"}),
         ("pictures", "aerial-soft", set()),
+        ("flights", "flights", set()),
     ],
 )
 def test_the_claims_on_a_page_are_the_differences_and_intervals_of_its_board(page, board, unsaid):

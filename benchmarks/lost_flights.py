@@ -89,7 +89,7 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
 def lines(flights: pd.DataFrame) -> Iterator[str]:
     """Yield a row of the table for each tracker and map, first those of the least losses."""
     flights = flights[flights["role"] != "falsifier"]
-    for (kind, strength), rows in flights.groupby(["kind", "strength"], sort=False):
+    for (strength, kind), rows in flights.groupby(["strength", "kind"], sort=True):
         name = kind if strength == 0 else f"{strength:g}"
         for matcher, part in rows.groupby("matcher"):
             way_km, lost = part["kept_m"].sum() / 1000, int(part["lost"].sum())

@@ -176,6 +176,11 @@ def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
             **dict.fromkeys(("age", "age-interaction", "old-maps", "age-fresh"), "not decided"),
             "rejection-absent": "null",
         },
+        "flights": {
+            **dict.fromkeys(("odometry-stress", "none", "stability", "age"), "not decided"),
+            "odometry": "cause open",
+            "diffusion": "null",
+        },
     }
     for board, words in said.items():
         assert outcomes[board][list(words)].to_dict() == words

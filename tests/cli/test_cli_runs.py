@@ -145,7 +145,7 @@ def test_a_good_matcher_gets_a_table_and_exit_0(check) -> None:
     ("spec", "words"),
     [
         ("faulty:NoCard", "faulty:NoCard: card is a NoneType, expected a sasgeo_bench.matching.matcher.MatcherCard"),
-        ("raster_uniformm", "there is no matcher 'raster_uniformm', did you mean 'raster_uniform'?"),
+        ("raster_uniformm", "there is no matcher or tracker 'raster_uniformm', did you mean 'raster_uniform'?"),
     ],
 )
 def test_a_matcher_with_a_fault_gets_its_row_a_line_on_stderr_and_exit_2(check, spec, words) -> None:
@@ -316,7 +316,7 @@ def test_a_matcher_that_does_not_learn_says_so(program, out) -> None:
 @pytest.mark.parametrize(
     ("spec", "words"),
     [
-        ("raster-uniform", "there is no matcher 'raster-uniform', did you mean 'raster_uniform'?"),
+        ("raster-uniform", "there is no matcher or tracker 'raster-uniform', did you mean 'raster_uniform'?"),
         ("faulty:NoSuchClass", "has no attribute 'NoSuchClass'"),
         ("faulty:NoCard", "card is a NoneType"),
     ],

@@ -106,6 +106,7 @@ class VecmapPhasecorr(ShiftMatcher):
         found: dict[str, float] = {}
 
         def note(overlaps: Overlaps, names: tuple[str, ...]) -> NDArray[np.float32]:
+            """Note the leads in place of a score."""
             middle = overlaps.places[0] // 2
             for at, name in enumerate(names):
                 scores = phases(overlaps, [float(other == at) for other in range(len(names))])

@@ -120,7 +120,7 @@ class Server(PluginServer):
         self._grid = region.grid
         with (preparing := _Cost()):
             matcher.prepare(region, message["learned"])
-        grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)  # what was looked at is kept by the matcher
+        grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)  # a layer read alone is the matcher's, if it keeps it
         seconds = preparing.seconds - reading.seconds - looking.seconds
         return {"status": "ok", "seconds": seconds, "grown_bytes": grown_bytes}
 
@@ -170,7 +170,7 @@ def _failure(error: Exception, *, package: str) -> dict[str, Any]:
 
 def package_of(plugin: object) -> str:
     """Return the package that the class of a plugin lies in; empty for None."""
-    return "" if plugin is None else type(plugin).__module__.partition(".")[0]
+    return "" if plugin is None else str(type(plugin).__module__).partition(".")[0]
 
 
 def _last_line(error: Exception, package: str) -> str:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from sasgeo_baselines.shift_matcher import ShiftMatcher
 from sasgeo_bench import PRESENT, UNKNOWN, Evidence, MatcherCard, Overlaps
 
+FULL: Final = 255  # of a confidence
 LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
 LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 
@@ -44,7 +45,7 @@ class SchmidtSegcorr(ShiftMatcher):
         cells = evidence.cells[at]
         degree = (cells == PRESENT).astype(np.float32)
         if evidence.confidence is not None:
-            degree *= evidence.confidence[at].astype(np.float32)
+            degree *= evidence.confidence[at].astype(np.float32) / FULL
         known = (cells != UNKNOWN).astype(np.float32)
         return np.concatenate([degree, known, known.max(axis=0, keepdims=True)])
 

@@ -292,7 +292,7 @@ def _size_text(source: SiteSource, book: Book) -> str:
     flights = int((asked == SEQUENCE).sum())
     blocks, places = (int(board[name].max()) if len(board) else 0 for name in ("blocks", "places"))
     parts = [
-        f"{counted(len(book.matcher_pages), 'matcher or control', 'matchers and controls')}",
+        counted(len(book.matcher_pages), "matcher or control", "matchers and controls"),
         counted(len(book.suite_pages), "suite"),
         *([counted(len(asked) - flights, "query", "queries")] if flights < len(asked) or not flights else []),
         *([counted(flights, "flight")] if flights else []),

@@ -120,7 +120,8 @@ class Server(PluginServer):
         self._grid = region.grid
         with (preparing := _Cost()):
             matcher.prepare(region, message["learned"])
-        grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)  # a layer read alone is the matcher's, if it keeps it
+        # The region keeps what it read for good; a layer that was read alone is the matcher's, if it is kept.
+        grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
         seconds = preparing.seconds - reading.seconds - looking.seconds
         return {"status": "ok", "seconds": seconds, "grown_bytes": grown_bytes}
 

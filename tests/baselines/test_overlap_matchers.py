@@ -95,6 +95,12 @@ def test_intersection_over_union_by_hand():
     hidden[0, 0, 0] = UNKNOWN  # one seen cell less, which was not mapped
     score = matcher.score(overlaps_of(matcher, view.replace(hidden), mapped, view.classes), view.classes)
     assert score[0, 0] == pytest.approx((2 / 3 + 1 / 2) / 2, abs=1e-5)
+    sure = np.full(seen.shape, 255, dtype=np.uint8)
+    half = matcher.channels(view.replace(seen, sure // 2), view.classes)
+    np.testing.assert_array_equal(
+        matcher.channels(view.replace(seen, sure), view.classes), matcher.channels(view, view.classes)
+    )
+    assert half[0, 0, 0] == pytest.approx(127 / 255)  # a cell counts by how sure the detector is of it
     mapped[:, :, :3] = 0  # the map knows a quarter
     assert matcher.score(overlaps_of(matcher, view, mapped, view.classes), view.classes)[0, 0] == -np.inf
 

@@ -122,7 +122,8 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
     (line,) = told
     assert line == (
         "figures left out, for nothing on this board is seen in them: success against strength, recall against K, "
-        "success against cost, error along flights, how far odometers carry fixes on flights"
+        "success against cost, error along flights, how far odometers carry fixes on flights, success against the "
+        "drift of odometers"
     )
     for name, draw in figures.items():
         draw(tmp_path / name)
@@ -156,6 +157,7 @@ def test_a_board_without_data_has_no_figures_and_says_so(board):
         "protection levels against errors",
         "error along flights",
         "how far odometers carry fixes on flights",
+        "success against the drift of odometers",
     ]
 
 

@@ -16,7 +16,8 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from sasgeo_baselines.trackers import kinnari_mcl, polar, zhou_smc
+from sasgeo_baselines import polar
+from sasgeo_baselines.trackers import kinnari_mcl, zhou_smc
 from sasgeo_baselines.trackers.ouyang_cfbvm_pf import OuyangCfbvmPf
 from sasgeo_baselines.trackers.particles import NEAR_M, Particles
 from sklearn.linear_model import LogisticRegression

@@ -75,6 +75,10 @@ from .running.tracker_testing import check_tracker as check_tracker
 from .running.tracker_testing import tiny_flights as tiny_flights
 from .sasgeo.by_hand import map_by_hand as map_by_hand
 from .sasgeo.by_hand import view_by_hand as view_by_hand
+from .sasgeo.mapped import MappedGraph as MappedGraph
+from .sasgeo.nodes import NODE_KINDS as NODE_KINDS
+from .sasgeo.nodes import Nodes as Nodes
+from .sasgeo.observed import ObservedGraph as ObservedGraph
 from .search.belief import GridBelief as GridBelief
 from .search.belief import prepare_levels as prepare_levels
 from .search.belief import window_overlap as window_overlap
@@ -88,6 +92,7 @@ from .search.field import Template as Template
 from .search.find import score_at as score_at
 from .search.plan import Disc as Disc
 from .search.plan import Mode as Mode
+from .search.plan import thinned as thinned
 from .search.plan import turns_of as turns_of
 from .search.shifts import Overlaps as Overlaps
 from .search.shifts import ShiftPlan as ShiftPlan

@@ -262,7 +262,7 @@ def test_the_package_says_the_version_it_is_released_under() -> None:
 
 def test_the_baselines_ask_for_the_package_by_its_name() -> None:
     asked = requirement_names(project("baselines/pyproject.toml")["dependencies"])
-    assert asked == {project()["name"], "lightgbm", "scikit-learn"}
+    assert asked == {project()["name"], "lightgbm", "networkx", "scikit-learn"}
 
 
 def test_the_version_to_cite_is_that_of_the_package() -> None:

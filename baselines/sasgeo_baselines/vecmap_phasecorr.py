@@ -48,7 +48,7 @@ class VecmapPhasecorr(ShiftMatcher):
         ),
     )
 
-    def read(self, region: Region) -> Chart:
+    def chart_of(self, region: Region) -> Chart:
         """Return the signed distances of the map as degrees: 1 deep within a class, 0 far from it."""
         known = region.known()
         degree = np.zeros((len(region.classes), *region.grid.shape), dtype=np.uint8)
@@ -63,9 +63,9 @@ class VecmapPhasecorr(ShiftMatcher):
             known=known.astype(np.uint8) * np.uint8(255),
         )
 
-    def prepare(self, region: Region, learned: str | None) -> None:
+    def read(self, region: Region, learned: str | None) -> None:
         """Read the map and the weights."""
-        super().prepare(region, None)
+        super().read(region, None)
         self.weights: Mapping[str, float] = json.loads(learned) if learned else {}
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
@@ -115,7 +115,7 @@ class VecmapPhasecorr(ShiftMatcher):
             return np.zeros(overlaps.places, dtype=np.float32)
 
         known = replace(query.prior, yaw_deg=pose.yaw_deg, yaw_sigma_deg=0.01)
-        search = self.search(replace(query, prior=known))
+        search = self.look(replace(query, prior=known))
         if search is not None:
             names = tuple(search.chart.classes[band] for band in search.bands.tolist())
             plan = replace(search.plan, around_m=LEARNED_AROUND_M)

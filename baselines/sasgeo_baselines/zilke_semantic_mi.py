@@ -51,7 +51,7 @@ class ZilkeSemanticMi(ShiftMatcher):
     )
     plan = ShiftPlan(coarse_m=6.0, fine_m=3.0)
 
-    def read(self, region: Region) -> Chart:
+    def chart_of(self, region: Region) -> Chart:
         """Return the labels of the map, one to a known cell."""
         known = region.known()
         left, degree = known.copy(), np.zeros((len(NAMES), *region.grid.shape), dtype=np.uint8)

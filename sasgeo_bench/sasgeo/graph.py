@@ -24,12 +24,12 @@ from sasgeo_bench.sasgeo.graph_rules import (
     degree_step,
 )
 from sasgeo_bench.sasgeo.mapped import MappedGraph
-from sasgeo_bench.sasgeo.nodes import KINDS, Bools, Floats, Ints
+from sasgeo_bench.sasgeo.nodes import NODE_KINDS, Bools, Floats, Ints
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 
 START: Final = GraphRules()  # of nodes of masks, and of all nodes before training
-_SPREAD_M: Final = np.array([kind.spread_m for kind in KINDS])
-_IS_DRAWN: Final = np.array([kind.drawing == "vectors" for kind in KINDS])
+_SPREAD_M: Final = np.array([kind.spread_m for kind in NODE_KINDS])
+_IS_DRAWN: Final = np.array([kind.drawing == "vectors" for kind in NODE_KINDS])
 _NONE: Final[frozenset[int]] = frozenset()
 _SLACK_M: Final = 1.0
 _LEAST_MATCHED: Final = 3  # nodes needed to estimate a local shift
@@ -368,7 +368,7 @@ class _Judge:
         is_matched, is_free = np.zeros_like(is_due), np.ones_like(counts)
         is_matched[pairs.mapped], is_free[pairs.seen] = True, False
         chosen = (around[is_due], around[is_due & is_matched], ours[counts], ours[counts & is_free])
-        return np.stack([np.bincount(kind, minlength=len(KINDS)) for kind in chosen])
+        return np.stack([np.bincount(kind, minlength=len(NODE_KINDS)) for kind in chosen])
 
 
 def _by_kind(rules: GraphRules, name: str) -> Floats:

@@ -9,7 +9,7 @@ import numpy as np
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import wrap_deg
-from sasgeo_bench.sasgeo.nodes import INDEX, KINDS, Floats, Ints
+from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS, Floats, Ints
 
 DEGREES: Final = 3  # equal degrees, degrees that differ by one, and by more
 _OF_KINDS: Final = ("hit", "extra")
@@ -47,8 +47,8 @@ class GraphRules:
     link, false_link, lost_link : float
         Log ratios of a way between two nodes on both sides, in the view alone, and on the map alone.
     hit, extra : tuple of float
-        For each of `KINDS`: the probability that a visible map node is seen, and the share of seen nodes that no map
-        has.
+        For each of `NODE_KINDS`: the probability that a visible map node is seen, and the share of seen nodes that no
+        map has.
 
     Raises
     ------
@@ -71,8 +71,8 @@ class GraphRules:
     link: float = 0.6
     false_link: float = -1.5
     lost_link: float = -0.7
-    hit: tuple[float, ...] = tuple(kind.hit for kind in KINDS)
-    extra: tuple[float, ...] = tuple(kind.extra for kind in KINDS)
+    hit: tuple[float, ...] = tuple(kind.hit for kind in NODE_KINDS)
+    extra: tuple[float, ...] = tuple(kind.extra for kind in NODE_KINDS)
 
     def __post_init__(self) -> None:
         """Check ranges."""
@@ -84,14 +84,14 @@ class GraphRules:
             if not fits.all():
                 message = f"{item.name} of the graph is out of range: {getattr(self, item.name)!r}"
                 raise ConfigError(message)
-        if (len(self.degrees), len(self.hit), len(self.extra)) != (DEGREES, len(KINDS), len(KINDS)):
-            message = f"the graph has {DEGREES} ratios of degrees and {len(KINDS)} kinds of nodes"
+        if (len(self.degrees), len(self.hit), len(self.extra)) != (DEGREES, len(NODE_KINDS), len(NODE_KINDS)):
+            message = f"the graph has {DEGREES} ratios of degrees and {len(NODE_KINDS)} kinds of nodes"
             raise ConfigError(message)
 
     def to_stored(self) -> dict[str, Any]:
         """Return the numbers for JSON, those of kinds by name."""
         return asdict(self) | {
-            name: {kind.name: value for kind, value in zip(KINDS, getattr(self, name), strict=True)}
+            name: {kind.name: value for kind, value in zip(NODE_KINDS, getattr(self, name), strict=True)}
             for name in _OF_KINDS
         }
 

@@ -14,7 +14,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.regions.network import LAYERS
 from sasgeo_bench.regions.region import MapGraph, Region
-from sasgeo_bench.sasgeo.nodes import INDEX, KINDS, Bools, Floats, Ints, Nodes, nodes_of, patches_of
+from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS, Bools, Floats, Ints, Nodes, nodes_of, patches_of
 
 Bits = NDArray[np.uint64]
 
@@ -166,7 +166,7 @@ def _raised(places_m: Floats, kind: Ints) -> Floats:
 
 
 def _density(nodes: Nodes) -> Floats:
-    found = np.zeros(len(KINDS))
+    found = np.zeros(len(NODE_KINDS))
     for kind in np.unique(nodes.kind):
         places_m = nodes.places_m[nodes.kind == kind]
         counts = cKDTree(places_m).query_ball_point(places_m, CROWD_M, return_length=True)

@@ -50,7 +50,7 @@ _WATER: Final = (*ROADS, "waterway")
 # Vectors show connections and separate houses; a mask shows neither, so its nodes have kinds of their own. A junction
 # is seen only where all its roads are, and a road that is missed leaves new ends: crossings are hit less often than
 # houses, and ends are often extra. These are guesses to start from (`rule_fitting`).
-KINDS: Final = (
+NODE_KINDS: Final = (
     _kind("intersection", "vectors", ROADS, 0.75, 0.08),
     _kind("dead_end", "vectors", ROADS, 0.7, 0.5),
     _kind("crossing", "vectors", ROADS, 0.75, 0.08),
@@ -70,8 +70,8 @@ KINDS: Final = (
     _kind("parking patch", "mask", ("parking",), 0.5, 0.4, 4.0),
     _kind("water patch", "mask", ("water",), 0.5, 0.4, 6.0),
 )
-INDEX: Final = {kind.name: at for at, kind in enumerate(KINDS)}
-PATCHES: Final = tuple(kind.classes[0] for kind in KINDS if kind.name.endswith("patch"))
+INDEX: Final = {kind.name: at for at, kind in enumerate(NODE_KINDS)}
+PATCHES: Final = tuple(kind.classes[0] for kind in NODE_KINDS if kind.name.endswith("patch"))
 
 
 Floats = NDArray[np.float64]
@@ -102,11 +102,11 @@ _IN_A_MASK: Final = {
 class Nodes:
     """Nodes and their relations.
 
-    `places_m`, shape (N, 2), are easting and northing of a map, (right, up) of a view; `kind` is an index into `KINDS`.
-    `degree` counts the roads that meet: 0 where none do or several junctions are one. `area_m2` is that of buildings
-    and patches, else NaN. `arms_deg`, shape (N, MOST_ARMS), are bearings of the roads that leave a junction or an end,
-    NaN behind the last one. `pairs`, shape (E, 2), are edges and `relation` their index into `graph.RELATIONS`.
-    `feature` is the `osm_id` of a node's feature, -1 for several.
+    `places_m`, shape (N, 2), are easting and northing of a map, (right, up) of a view; `kind` is an index into
+    `NODE_KINDS`. `degree` counts the roads that meet: 0 where none do or several junctions are one. `area_m2` is that
+    of buildings and patches, else NaN. `arms_deg`, shape (N, MOST_ARMS), are bearings of the roads that leave a
+    junction or an end, NaN behind the last one. `pairs`, shape (E, 2), are edges and `relation` their index into
+    `graph.RELATIONS`. `feature` is the `osm_id` of a node's feature, -1 for several.
     """
 
     places_m: Floats
@@ -176,7 +176,8 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
     names = table["kind"].to_numpy(dtype=object)
     on_road = table["class"].isin(ROADS).to_numpy()
     names = np.where((names == "crossing") & ~on_road, "", names)  # a railway over a river is no landmark
-    renamed = _IN_A_MASK if drawing == "mask" else {kind.name: kind.name for kind in KINDS if kind.drawing == drawing}
+    own = [kind.name for kind in NODE_KINDS if kind.drawing == drawing]
+    renamed = _IN_A_MASK if drawing == "mask" else dict(zip(own, own, strict=True))
     kind = np.array([INDEX[renamed[name]] if name in renamed else -1 for name in names], dtype=np.int64)
     places_m = np.asarray(shapely.get_coordinates(table.geometry.to_numpy())).reshape(-1, 2)
     code = {name: at for at, name in enumerate(RELATIONS)}

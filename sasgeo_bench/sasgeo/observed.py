@@ -21,7 +21,7 @@ from sasgeo_bench.regions.network import LAYERS, ROAD, make_network
 from sasgeo_bench.regions.shapes import delaunay_pairs
 from sasgeo_bench.sasgeo.nodes import (
     INDEX,
-    KINDS,
+    NODE_KINDS,
     PATCHES,
     ROADS,
     Bools,
@@ -107,8 +107,8 @@ LEAST_M2: Final = 12.0  # smaller patches are noise
 _FACING_DEG: Final = 30.0
 _MOSTLY: Final = 0.9  # of the cells around a place
 _FAMILIES: Final = (ROADS, ("railway",), ("waterway",), ("building",))
-_SIGHTS: Final = tuple(dict.fromkeys(kind.classes for kind in KINDS))
-_VISIBLE_OF: Final = np.array([_SIGHTS.index(kind.classes) for kind in KINDS])
+_SIGHTS: Final = tuple(dict.fromkeys(kind.classes for kind in NODE_KINDS))
+_VISIBLE_OF: Final = np.array([_SIGHTS.index(kind.classes) for kind in NODE_KINDS])
 _FREE: Final = (INDEX["dead_end"], INDEX["mask dead_end"])
 
 
@@ -146,7 +146,8 @@ class ObservedGraph:
         >>> cells = np.zeros((1, 96, 96), dtype=np.uint8)
         >>> cells[0, 45:51] = cells[0, :48, 60:66] = 1
         >>> seen = ObservedGraph.make(Evidence(classes=("road_minor",), cells=cells, cell_size_m=1.0))
-        >>> [(KINDS[kind].name, place.round().tolist()) for kind, place in zip(seen.nodes.kind, seen.nodes.places_m)]
+        >>> nodes = seen.nodes
+        >>> [(NODE_KINDS[kind].name, place.round().tolist()) for kind, place in zip(nodes.kind, nodes.places_m)]
         [('mask intersection', [14.0, 0.0])]
         """
         names = set() if vectors is None else set(vectors["class"])
@@ -231,7 +232,7 @@ def _asked(evidence: Evidence, names: set[str], drawn: set[str]) -> Bools:
     } - drawn
     shown = {"vectors": names, "mask": present}
     found = []
-    for kind in KINDS:
+    for kind in NODE_KINDS:
         own = shown[kind.drawing]
         families = [set(ROADS) if name in ROADS else {name} for name in kind.classes]
         found.append(all(own & family for family in families))

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from sasgeo_baselines.trackers.buildings import RINGS, Buildings, Windows, ring_shares
+from sasgeo_baselines.buildings import RINGS, Buildings, Windows, ring_shares
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN
@@ -59,7 +59,7 @@ def test_buildings_that_are_cut_off_are_left_out(made, houses):
 
 def test_buildings_of_tiles_are_those_of_the_whole_map(houses, monkeypatch):
     whole = Buildings.of_map(houses)
-    monkeypatch.setattr("sasgeo_baselines.trackers.buildings._TILE", 160)
+    monkeypatch.setattr("sasgeo_baselines.buildings._TILE", 160)
     tiled = Buildings.of_map(houses)
     order, other = np.argsort(whole.shape[:, 0]), np.argsort(tiled.shape[:, 0])
     assert tiled.middle_m[other] == pytest.approx(whole.middle_m[order])

@@ -6,7 +6,8 @@ from functools import cache
 
 import numpy as np
 import pytest
-from sasgeo_baselines.trackers import kinnari_mcl, polar
+from sasgeo_baselines import polar
+from sasgeo_baselines.trackers import kinnari_mcl
 from sasgeo_baselines.trackers.kinnari_mcl import SHIFTS, KinnariMcl, Mosaic, Template, surfaces
 from sasgeo_baselines.trackers.ouyang_cfbvm_pf import OuyangCfbvmPf
 from sasgeo_baselines.trackers.particles import Particles

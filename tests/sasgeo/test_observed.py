@@ -6,7 +6,7 @@ import pytest
 import shapely
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.nodes import INDEX, KINDS
+from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS
 from sasgeo_bench.sasgeo.observed import ObservedGraph, bridged, lines_of_mask, middle_lines
 from sasgeo_bench.tasks.vectors import vector_table
 
@@ -25,7 +25,7 @@ def view(**boxes):
 def found(graph):
     """Names and rounded places of the nodes."""
     places = graph.nodes.places_m.round().astype(int).tolist()
-    return sorted((KINDS[kind].name, *place) for kind, place in zip(graph.nodes.kind, places, strict=True))
+    return sorted((NODE_KINDS[kind].name, *place) for kind, place in zip(graph.nodes.kind, places, strict=True))
 
 
 FORK = {"road_minor": [(57, 63, 0, 120), (0, 60, 77, 83)]}

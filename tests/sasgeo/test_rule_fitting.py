@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.sasgeo.graph import START, Matching
-from sasgeo_bench.sasgeo.nodes import INDEX, KINDS
+from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS
 from sasgeo_bench.sasgeo.rule_fitting import broadened, fit_rules
 
 MANY = 20_000
@@ -18,7 +18,7 @@ def matching(count, *, seed=0, sigma_m=3.0, degrees=(0, 0, 0), links=(0, 0, 0)):
     rng = np.random.default_rng(seed)
     length_m = rng.uniform(10, 80, count)
     error_m = np.hypot(*(rng.normal(size=(2, count)) * np.hypot(1.0, 0.1 * length_m)))
-    kinds = np.zeros((4, len(KINDS)), dtype=np.int64)
+    kinds = np.zeros((4, len(NODE_KINDS)), dtype=np.int64)
     kinds[:, INDEX["building"]] = (count, 0.9 * count, count, 0.3 * count)
     mapped = rng.normal(4.0, 0.5, count)
     return Matching(

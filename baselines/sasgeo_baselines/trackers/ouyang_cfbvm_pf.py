@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.trackers.buildings import RADIUS_M, Buildings, Windows, ring_shares
+from sasgeo_baselines.buildings import RADIUS_M, Buildings, Windows, ring_shares
 from sasgeo_baselines.trackers.particles import Floats, Noise, ParticleFilter, Particles
 
 WINDOWS: Final = 50  # most like the view by their rings

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
+from sasgeo_baselines.polar import CELL_M, map_rows, padded_strips, turned, view_descriptor
 from sasgeo_baselines.trackers.particles import Floats, Noise, ParticleFilter, Particles
-from sasgeo_baselines.trackers.polar import CELL_M, map_rows, padded_strips, turned, view_descriptor
 
 YAWS: Final = 8  # headings for which the map has embeddings
 DIMENSIONS: Final = 16

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`spatial_graph_clique`: the largest set of objects whose distances from each other agree on both sides."""
+
+from typing import Final
+
+import networkx as nx  # type: ignore[import-untyped, unused-ignore]
+import numpy as np
+
+from sasgeo_baselines.object_matcher import Floats, Ints, ObjectMatcher, Pairs, Sight, fitted
+from sasgeo_bench import Disc, MatcherCard, Mode, thinned
+
+AGREE_M: Final = 5.0  # two distances that may be the same
+NEAR_M: Final = 14.0  # of a peak of votes: pairs whose votes lie so near are looked at together
+YAW_STEP_DEG: Final = 5.0
+TRIED: Final = 24  # peaks
+MOST_PAIRS: Final = 60  # of one peak, the nearest first: bounds the search for a clique
+FEWEST: Final = 3  # of a clique: two pairs always agree with something
+APART_M: Final = 25.0
+
+
+class SpatialGraphClique(ObjectMatcher):
+    """Maximum clique of the graph of correspondences; its size is the score."""
+
+    card = MatcherCard(
+        name="spatial_graph_clique",
+        version="1",
+        title="Maximum clique of objects with the same distances",
+        source=(
+            "Graph-theoretic localization by landmarks, arXiv 2306.03641, as its abstract describes it: a graph of "
+            "correspondences whose edges join those that keep distances, and its maximum clique"
+        ),
+        ours=(
+            "Objects are the nodes of the SASGeo scorer's graph, correspondences those of one kind; distances agree "
+            "within 5 m. The graph of all correspondences of a map is too large, so poses that many pairs vote for "
+            "(cells of 8 m, headings 5 degrees apart within two standard deviations of the prior) are looked at one by "
+            "one: at each of the best 24 the 60 pairs nearest to it. The clique's pose is the least-squares fit of its "
+            "pairs; its score is its size, and of two of a size the one that fits better"
+        ),
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        limits=(
+            "Blind where fewer than three whole objects are seen; no cells, so that shapes and empty ground say "
+            "nothing; scale is 1; no sequence, no weights by what lasts, no unknown; the size of the clique, a "
+            "diagnostic, is its only confidence"
+        ),
+    )
+
+    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+        """Return the poses of the largest cliques."""
+        pairs = Pairs.of_kind(view, self.mapped.nodes, self.within(view, disc))
+        found = []
+        for peak in pairs.peaks(disc, view.yaws_deg(YAW_STEP_DEG), count=TRIED):
+            chosen = _around(pairs, peak)
+            clique = chosen[largest_clique(pairs.seen_m[chosen], pairs.mapped_m[chosen], owners(pairs, chosen))]
+            if len(clique) < FEWEST:
+                continue
+            pose, error_m = fitted(pairs.seen_m[clique], pairs.mapped_m[clique])
+            if view.allows(pose, disc):
+                found.append(Mode(pose=pose, score=len(clique) + 0.5 / (1.0 + error_m)))
+        return thinned(sorted(found, key=lambda mode: -mode.score), APART_M)[:count]
+
+
+def _around(pairs: Pairs, peak: Mode) -> Ints:
+    """Return rows of the pairs that vote for a place near a peak, the nearest first."""
+    away_m = np.hypot(*(pairs.places_m(peak.pose.yaw_deg) - (peak.pose.easting_m, peak.pose.northing_m)).T)
+    near = np.flatnonzero(away_m <= NEAR_M)
+    return np.asarray(near[np.argsort(away_m[near], kind="stable")[:MOST_PAIRS]], dtype=np.int64)
+
+
+def owners(pairs: Pairs, chosen: Ints) -> Ints:
+    """Return the seen and the mapped object of each chosen pair, shape (P, 2)."""
+    return np.column_stack([pairs.seen[chosen], pairs.mapped[chosen]])
+
+
+def largest_clique(seen_m: Floats, mapped_m: Floats, owner: Ints) -> Ints:
+    """Return rows of the largest set of pairs whose distances agree pairwise; of several the first.
+
+    Parameters
+    ----------
+    seen_m, mapped_m : ndarray of float, shape (P, 2)
+        Places of each pair in the view and on the map.
+    owner : ndarray of int, shape (P, 2)
+        The seen and the mapped object of each pair: an object belongs to one pair of a clique.
+
+    Examples
+    --------
+    Three corners of a square agree; the fourth lies 9 m off:
+
+    >>> seen_m = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [40.0, 40.0]])
+    >>> mapped_m = seen_m + (100.0, 0.0) + np.array([[0, 0], [0, 0], [0, 0], [0, 9.0]])
+    >>> largest_clique(seen_m, mapped_m, np.arange(4)[:, None].repeat(2, axis=1)).tolist()
+    [0, 1, 2]
+    """
+    if not len(seen_m):
+        return np.zeros(0, dtype=np.int64)
+    apart = [np.linalg.norm(places[:, None] - places[None, :], axis=2) for places in (seen_m, mapped_m)]
+    is_free = (owner[:, None] != owner[None, :]).all(axis=2)
+    agree = is_free & (np.abs(apart[0] - apart[1]) < AGREE_M)
+    graph = nx.from_numpy_array(agree)
+    clique, _ = nx.max_weight_clique(graph, weight=None)
+    return np.array(sorted(clique), dtype=np.int64)

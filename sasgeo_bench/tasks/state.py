@@ -107,6 +107,11 @@ class State:
         return np.asarray(self.bits.bits & np.uint32(bit | unknown) == np.uint32(bit))
 
     @cached_property
+    def shares(self) -> NDArray[np.float64]:
+        """Return the share of each class on the mapped ground, shape (C,)."""
+        return np.array([self.has(name).sum() for name in self.classes]) / max(1, int(self.known.sum()))
+
+    @cached_property
     def drawn(self) -> NDArray[np.bool_]:
         """Return where any of `DRAWN_CLASSES` is present."""
         mask = np.uint32(sum(1 << self.classes.index(name) for name in DRAWN_CLASSES if name in self.classes))

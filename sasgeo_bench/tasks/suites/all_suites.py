@@ -37,6 +37,7 @@ from sasgeo_bench.tasks.suites import (
     season_image,
     stable_not_distinctive,
     synthetic_age,
+    telemetry,
     topology_twins,
     volatile_lure,
 )
@@ -62,6 +63,7 @@ SUITES: Final[dict[str, Suite]] = {
         stable_not_distinctive.SUITE,
         alias.SUITE,
         absent.SUITE,
+        telemetry.SUITE,
     )
 }
 # Queries of these are pictures, of which a segmenter makes evidence; they are drawn where they are named.

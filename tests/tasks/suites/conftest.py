@@ -47,6 +47,7 @@ TOWN_OF = {
     "volatile-lure": "town-old-town large",
     "alias": "town-agricultural huge",
     "controls": "town-suburb large",
+    "telemetry": "town-grid",
     "flight-real-age": "town-suburb",
     **dict.fromkeys(("flight-clean", "flight-start", "flight-gap", "flight-kidnap"), "town-grid"),
     "flight-overconfident": "town-grid",

@@ -30,6 +30,7 @@ GROWS = {
     "growth": "changed_share",
     "season": "cells_changed",
     "stable-not-distinctive": "cells_changed",
+    "telemetry": "cells_changed",
 }
 # Suites in whose stress the view itself is that of the control: the map, the vectors, the priors or the candidates are
 # what differs.

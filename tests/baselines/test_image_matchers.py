@@ -19,7 +19,10 @@ from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.frames import encode_webp
 from tests.regions.imagery_place import SOUTH, WEST, make_hamlet
 
-NAMES = ("deep_retrieval", "hog_colour", "ncc_gradient", "orb_homography", "orb_vlad")
+NAMES = (
+    *("deep_retrieval", "hog_colour", "hu_dual_reference", "hu_imagery_only", "ncc_gradient", "orb_homography"),
+    "orb_vlad",
+)
 SIDE_M, PICTURE_PX, HEIGHT_M = 112.0, 400, 80.0
 TRUTH = sgb.Pose(easting_m=WEST + 205.0, northing_m=SOUTH + 172.0, yaw_deg=65.0, scale=1.03)
 PRIOR = sgb.Prior(

@@ -1,0 +1,322 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`hu_dual_reference`: map and imagery as one reference, their scores added (Hu 2024); and each of them alone."""
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+import sasgeo_bench as sgb
+from sasgeo_baselines.image.dense import (
+    MOST_PLACES,
+    Field,
+    Planes,
+    Search,
+    Stack,
+    answer_candidates,
+    answer_places,
+    bounds_of,
+    disc_of,
+    size_for,
+    turns_for,
+)
+from sasgeo_baselines.image.ncc_gradient import directions
+from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, grey_of, side_of, sight_of
+
+PIXEL_M: Final = 2.0
+SHARES: Final = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)  # of the imagery in the sum, that learning tries
+UNTAUGHT: Final = 0.5
+RIGHT_M: Final = 25.0
+MOST_LESSONS: Final = 60
+_SAMPLED: Final = 8  # headings that tell the mean and the spread of scores
+_STEP: Final = 2.0  # pixels at the edge of a view between two headings
+
+
+@dataclass(frozen=True, kw_only=True)
+class Reference:
+    """Map and imagery on one lattice: channels of classes, and directions of gradients where there is imagery."""
+
+    grid: sgb.Grid
+    classes: tuple[str, ...]
+    drawn: Stack
+    pictured: Stack | None
+
+    @classmethod
+    def of(cls, region: sgb.Region) -> "Reference":
+        """Read a map and its imagery in pixels of 2 m."""
+        factor = max(1, round(PIXEL_M / region.grid.cell_size_m))
+        rows, cols = (-(-cells // factor) for cells in region.grid.shape)
+        grid = replace(region.grid, cell_size_m=factor * region.grid.cell_size_m, rows=rows, cols=cols)
+        known = pooled(region.known(), factor) > 0.5  # noqa: PLR2004 - most of a pixel
+        layers = [pooled(region.layer(name) == sgb.PRESENT, factor) for name in region.classes]
+        return cls(grid=grid, classes=region.classes, drawn=centred(layers, known), pictured=_pictured(region, grid))
+
+
+def pooled(mask: NDArray[np.bool_], factor: int) -> Planes:
+    """Return shares of set cells in blocks of `factor` cells a side; beyond the edge nothing is set.
+
+    >>> pooled(np.array([[True, False, True]]), 2).tolist()
+    [[0.25, 0.25]]
+    """
+    rows, cols = (-(-cells // factor) for cells in mask.shape)
+    wide = np.zeros((rows * factor, cols * factor), dtype=np.float32)
+    wide[: mask.shape[0], : mask.shape[1]] = mask
+    return np.asarray(cv2.resize(wide, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def centred(layers: list[Planes], known: NDArray[np.bool_]) -> Stack:
+    """Return channels less their mean over what is known, 0 elsewhere; each as strong as any other where it varies."""
+    found = np.zeros((len(layers), *known.shape), dtype=np.float32)
+    for layer, into in zip(layers, found, strict=True):
+        values = layer[known]
+        if len(values) and values.std() > 0:
+            into[known] = (values - values.mean()) / values.std()
+    return Stack(channels=found, is_known=known)
+
+
+def _pictured(region: sgb.Region, grid: sgb.Grid) -> Stack | None:
+    """Return directions of gradients of the imagery on the lattice of the map."""
+    ortho = Ortho.of(region, gsd_m=grid.cell_size_m)
+    if ortho is None:
+        return None
+    stack = directions(grey_of(ortho.rgb, ortho.is_known), ortho.is_known)
+    corner = grid.to_centres_m(np.array([[0, 0]]))
+    right, down = (ortho.grid.to_uv(corner)[0] - 0.5).tolist()
+    onto = np.array([[1.0, 0.0, right], [0.0, 1.0, down]])
+    size, how = (grid.cols, grid.rows), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    planes = [
+        cv2.warpAffine(plane, onto, size, flags=how) for plane in (*stack.channels, stack.is_known.astype(np.float32))
+    ]
+    is_known = np.asarray(planes[-1]) > 0.99  # noqa: PLR2004 - all of a pixel, but for rounding
+    return Stack(channels=np.stack([np.where(is_known, plane, 0) for plane in planes[:-1]]), is_known=is_known)
+
+
+class HuDualReference:
+    """Scores of the map and of the imagery, each in standard deviations, added at every pose."""
+
+    card = sgb.MatcherCard(
+        name="hu_dual_reference",
+        version="1",
+        title="Map and imagery as one reference",
+        source=(
+            "Hu et al., Combining OpenStreetMap with Satellite Imagery to Enhance Cross-View Geo-Localization, Sensors "
+            "25(1), 2024: a reference of two kinds, fused, as its abstract describes it; its query is a street view"
+        ),
+        ours=(
+            "All but the two references: the map's score is the correlation of class layers, the imagery's that of "
+            f"directions of gradients ({PICTURE}), in pixels of 2 m at every place, heading and scale within 2.5 "
+            "standard deviations; each less its mean over places, over its standard deviation; the share of the "
+            "imagery is that of seven that is right most often on training places, half without training"
+        ),
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        needs=("image", "imagery"),
+        limits=(
+            "Nothing of the source's network; no graph, no sequence, no weights by what lasts, no rejection; places no "
+            f"finer than 2 m; half of the view must be on the map; {LIMITS}"
+        ),
+    )
+    share: ClassVar[float | None] = None  # of the imagery; None: learned
+
+    def __init__(self) -> None:
+        self._reference: Reference | None = None
+
+    def prepare(self, region: sgb.Region, learned: str | None) -> None:
+        """Read map, imagery, and the share of the imagery."""
+        is_useless = "imagery" in self.card.needs and region.imagery is None
+        self._reference = None if is_useless else Reference.of(region)
+        taught = UNTAUGHT if learned is None else float(json.loads(learned)["share"])
+        self._share = taught if self.share is None else self.share
+
+    def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
+        """Return the best poses, or rank the candidates by the best pose near each."""
+        pair = None if self._reference is None else _Pair.of(query, self._reference)
+        field = None if pair is None else pair.fields((self._share,))[0]
+        if field is None:
+            return sgb.WITHHELD
+        diagnostics = {"peak": field.peak()}
+        if query.track == "retrieval":
+            return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
+        modes = field.best(disc_of(query.prior), most=min(top_k, MOST_PLACES) + 1)
+        return answer_places(modes, top_k=min(top_k, MOST_PLACES), diagnostics=diagnostics)
+
+    def learn(self, training: sgb.Training) -> str:
+        """Return the share of the imagery that is right most often; of equal ones the nearest to one half."""
+        pairs = [pair for pair in training.pairs if pair[0].track == "localization" and pair[1].pose is not None]
+        chosen = [pair for pair in pairs if pair[0].frames][:: max(1, len(pairs) // MOST_LESSONS)]
+        right, at = dict.fromkeys(SHARES, 0), ""
+        for query, truth in sorted(chosen, key=lambda pair: pair[0].region):
+            if query.region != at:
+                at, reference = query.region, Reference.of(training.regions[query.region])
+            pair = _Pair.of(query, reference)
+            for share, field in zip(SHARES, pair.fields(SHARES) if pair else (), strict=False):
+                right[share] += _is_right(field, query, truth)
+        return json.dumps({"share": max(SHARES, key=lambda share: (right[share], -abs(share - UNTAUGHT)))})
+
+
+class HuMapOnly(HuDualReference):
+    """`hu_map_only`: the map alone."""
+
+    share = 0.0
+    card = replace(
+        HuDualReference.card,
+        name="hu_map_only",
+        title="Map alone, as one half of hu_dual_reference",
+        needs=(),
+        ours="The map's half of `hu_dual_reference`: the correlation of class layers in pixels of 2 m",
+        limits="One half of `hu_dual_reference`, to see what the other adds; no confidence",
+    )
+
+
+class HuImageryOnly(HuDualReference):
+    """`hu_imagery_only`: the imagery alone."""
+
+    share = 1.0
+    card = replace(
+        HuDualReference.card,
+        name="hu_imagery_only",
+        title="Imagery alone, as one half of hu_dual_reference",
+        ours="The imagery's half of `hu_dual_reference`: the correlation of directions of gradients in pixels of 2 m",
+        limits=f"One half of `hu_dual_reference`, to see what the other adds; {LIMITS}",
+    )
+
+
+def _is_right(field: Field | None, query: sgb.Query, truth: sgb.Truth) -> bool:
+    """Return whether the best place is the true one."""
+    found = field.best(disc_of(query.prior), most=1) if field else []
+    if not found or truth.pose is None:
+        return False
+    east_m, north_m = (sgb.points_of([truth.pose]) - sgb.points_of([found[0].pose]))[0].tolist()
+    return math.hypot(east_m, north_m) <= RIGHT_M
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """One reference under one view: a search over its places, and the mean and spread of scores there."""
+
+    search: Search
+    view: "_Drawn | _Pictured"
+    size_px: int
+
+    def scores(self, turn: sgb.Pose) -> Planes:
+        """Return the score of each place at a heading and scale."""
+        return self.search.scores(self.view.turned(turn, self.size_px))
+
+    def scale(self, turns: Sequence[sgb.Pose]) -> tuple[np.float32, np.float32]:
+        """Return mean and standard deviation of the scores of some headings over all places."""
+        some = [self.scores(turn) for turn in turns[:: max(1, len(turns) // _SAMPLED)]]
+        values = np.concatenate([scores[np.isfinite(scores)] for scores in some])
+        spread = values.std() if len(values) else np.float32(0)
+        return (values.mean(), spread) if spread > 0 else (np.float32(0), np.float32(1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pair:
+    """Map and imagery under one view, over the same places, headings and scales; None for what says nothing."""
+
+    place: sgb.Grid
+    turns: tuple[sgb.Pose, ...]
+    parts: tuple[_Part | None, _Part | None]
+
+    @classmethod
+    def of(cls, query: sgb.Query, reference: Reference) -> "_Pair | None":
+        """Lay a view on both references; None where the query leaves no place open."""
+        top, left, bottom, right = bounds = bounds_of(query, reference.grid)
+        if top >= bottom or left >= right:
+            return None
+        gsd_m = reference.grid.cell_size_m
+        turns = turns_for(query, reach_m=side_of(query) / 2, step_m=_STEP * gsd_m)
+        size_px = size_for(turns, side_of(query) / gsd_m)
+        sight = sight_of(query, gsd_m=gsd_m)
+        laid = (
+            (reference.drawn, _Drawn.of(query, reference.classes, gsd_m=gsd_m)),
+            (reference.pictured, None if sight is None else _Pictured(sight=sight)),
+        )
+        found = [
+            _Part(search=Search.of(stack, reference.grid, bounds, margin=size_px // 2), view=view, size_px=size_px)
+            if stack is not None and view is not None
+            else None
+            for stack, view in laid
+        ]
+        place = reference.grid.window(top, left, bottom - top, right - left)
+        return cls(place=place, turns=turns, parts=(found[0], found[1]))
+
+    def fields(self, shares: Sequence[float]) -> list[Field | None]:
+        """Return the best sum at every place, for each share of the imagery; None where nothing that counts is seen."""
+        weights = [(1.0 - share, share) for share in shares]
+        used = [part if any(pair[at] > 0 for pair in weights) else None for at, part in enumerate(self.parts)]
+        scales = [None if part is None else part.scale(self.turns) for part in used]
+        best = [np.full(self.place.shape, -np.inf, dtype=np.float32) for _ in shares]
+        which = [np.zeros(self.place.shape, dtype=np.int32) for _ in shares]
+        for at, turn in enumerate(self.turns):
+            parts = [
+                None if part is None or scale is None else (part.scores(turn) - scale[0]) / scale[1]
+                for part, scale in zip(used, scales, strict=True)
+            ]
+            for pair, top, mine in zip(weights, best, which, strict=True):
+                summed = zip(pair, parts, strict=True)
+                counted = [np.float32(weight) * part for weight, part in summed if part is not None and weight > 0]
+                if counted:
+                    total = np.sum(counted, axis=0)
+                    better = total > top
+                    top[better], mine[better] = total[better], at
+        return [
+            Field(grid=self.place, scores=top, which=mine, turns=self.turns) if np.isfinite(top).any() else None
+            for top, mine in zip(best, which, strict=True)
+        ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Pictured:
+    """A picture."""
+
+    sight: Sight
+
+    def turned(self, turn: sgb.Pose, size_px: int) -> Stack:
+        """Return the directions of its gradients north up, if its heading and scale are those of `turn`."""
+        seen = self.sight.turned(turn, size_px)
+        return directions(seen.grey, seen.is_seen)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Drawn:
+    """A view of classes: shares of each on pixels of the map, and where all are known."""
+
+    layers: Planes
+    is_known: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, query: sgb.Query, classes: tuple[str, ...], *, gsd_m: float) -> "_Drawn | None":
+        """Read a view; None where it knows no class of the map, or shows nothing that varies."""
+        seen = query.evidence
+        size = max(1, round(side_of(query) / gsd_m))
+        layers = np.zeros((len(classes), size, size), dtype=np.float32)
+        is_known = np.zeros((size, size), dtype=bool)
+        for name, into in zip(classes, layers, strict=True):
+            if name in seen.classes:
+                cells = seen.layer(name)
+                into[:] = _resized(cells == sgb.PRESENT, size)
+                is_known |= _resized(cells != sgb.UNKNOWN, size) > 0.5  # noqa: PLR2004 - most of a pixel
+        return cls(layers=layers, is_known=is_known) if centred(list(layers), is_known).channels.any() else None
+
+    def turned(self, turn: sgb.Pose, size_px: int) -> Stack:
+        """Return the view north up, if its heading and scale are those of `turn`."""
+        along, across = (how(math.radians(turn.yaw_deg)) / turn.scale for how in (math.cos, math.sin))
+        turning = np.array([[along, across], [-across, along]])
+        shift = (len(self.is_known) - 1) / 2 - turning @ np.full(2, (size_px - 1) / 2)
+        matrix, how = np.column_stack([turning, shift]), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        planes = [cv2.warpAffine(plane, matrix, (size_px, size_px), flags=how) for plane in self._planes()]
+        return centred([np.asarray(plane, dtype=np.float32) for plane in planes[:-1]], np.asarray(planes[-1]) > 0.5)  # noqa: PLR2004
+
+    def _planes(self) -> Iterator[Planes]:
+        yield from self.layers
+        yield self.is_known.astype(np.float32)
+
+
+def _resized(mask: NDArray[np.bool_], size: int) -> Planes:
+    return np.asarray(cv2.resize(mask.astype(np.float32), (size, size), interpolation=cv2.INTER_AREA), dtype=np.float32)

@@ -195,12 +195,18 @@ class Matcher(Protocol):
 
 
 @runtime_checkable
-class Learner(Matcher, Protocol):
-    """A matcher that learns, once for each set of training places and in a process of its own.
+class Learner(Protocol):
+    """A matcher or a tracker that learns, once for each set of training places and in a process of its own.
 
     The result is a text, which the runner stores and passes to every `prepare`; the same training gives the same text.
     After a failed training `prepare` gets None: a matcher that then cannot answer needs "training" on its card.
     """
+
+    card: MatcherCard
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Index a map; `learned` is the text of `learn`."""
+        ...
 
     def learn(self, training: Training) -> str:
         """Return the result as JSON or any other text of at most `MOST_LEARNED_BYTES`."""

@@ -77,6 +77,24 @@ def test_views_of_a_flight_come_in_order_to_one_process(task, tmp_path, jobs):
         assert {item.diagnostics["has_place"] for item in rows} == {1.0}
 
 
+def test_what_a_tracker_learnt_reaches_every_step(task, tasks, tmp_path):
+    (train,) = (tasks / "tasks" / "alias").glob("town-grid*")
+    flights = run_of(task, tmp_path, "Taught", train=(train,))
+    lessons = {item.diagnostics["lessons"] for rows in flights.values() for item in rows}
+    (count,) = lessons
+    assert 0 < count <= len(task_files.read_ids(train))
+    untaught = run_of(task, tmp_path, "Taught")
+    assert {item.diagnostics["lessons"] for rows in untaught.values() for item in rows} == {-1.0}
+
+
+@pytest.mark.parametrize("name", ["sasgeo_track", "lsvl_belief"])
+def test_a_tracker_that_learns_is_planned_to_learn(task, tasks, tmp_path, name):
+    (train,) = (tasks / "tasks" / "alias").glob("town-grid*")
+    plan = plan_run(RunRequest(spec=name, tasks=(task,), out=tmp_path, train=(train,)))
+    assert plan.learns
+    assert "to be trained on" in plan.to_text()
+
+
 def test_no_view_to_come_is_in_the_process_of_a_tracker(task, tmp_path):
     rows = [item for rows in run_of(task, tmp_path, "Counting").values() for item in rows]
     assert {item.diagnostics["held"] for item in rows} == {1.0}

@@ -36,6 +36,21 @@ class Counting:
         return Fix(pose=HERE, covariance=[[4, 0, 0], [0, 4, 0], [0, 0, 1]], modes=[(HERE, 0.5)], diagnostics=told)
 
 
+class Taught(Counting):
+    """Learns how many views it was taught by, and says so at each step; -1 where it has learnt nothing."""
+
+    card = MatcherCard(name="taught", tracks=("sequence",), **SAID)
+
+    def learn(self, training):
+        return str(len(training.pairs))
+
+    def prepare(self, region, learned):
+        self.lessons = -1 if learned is None else int(learned)
+
+    def step(self, query):
+        return Fix(pose=HERE, diagnostics={"lessons": self.lessons})
+
+
 class Remembers(Counting):
     """Says how many flights it knows of, in memory and in files of its own: each is begun twice, once to warm up."""
 

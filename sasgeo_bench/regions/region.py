@@ -2,8 +2,8 @@
 """Region: grid, layers, graph, features, coverage and provenance; immutable."""
 
 import datetime as dt
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar, cast
 
 import numpy as np
@@ -219,6 +219,35 @@ class Region:
         if self.read_layer is not None and callable(vars(self)["layers"]):  # not read yet
             return self.read_layer(at)
         return np.asarray(self.layers[at])
+
+    def cuts(self, boxes: Sequence[tuple[int, int, int, int]]) -> "list[Region]":
+        """Return parts of the map: first row and column, rows and columns of each, which is cut at the map's edge.
+
+        Each has its layers, in memory, and the features, graph and coverage of the whole map. Layers are read one after
+        the other, so that a large map is never held whole.
+
+        Parameters
+        ----------
+        boxes : sequence of tuple of int
+            Row, column, rows and columns.
+        """
+        grid = self.grid
+        spans = [
+            (max(row, 0), max(col, 0), min(row + rows, grid.rows), min(col + cols, grid.cols))
+            for row, col, rows, cols in boxes
+        ]
+        parts = [np.empty((len(self.classes), end - top, last - left), np.uint8) for top, left, end, last in spans]
+        for band, name in enumerate(self.classes):
+            layer = self.layer(name)
+            for part, (top, left, end, last) in zip(parts, spans, strict=True):
+                part[band] = layer[top:end, left:last]
+        found = []
+        for part, (top, left, end, last) in zip(parts, spans, strict=True):
+            own = grid.window(top, left, end - top, last - left)
+            changed = {"bounds_m": own.bounds_m, "rows": own.rows, "cols": own.cols}
+            part.flags.writeable = False
+            found.append(replace(self, manifest=self.manifest.model_copy(update=changed), layers=part, read_layer=None))
+        return found
 
     def known(self) -> NDArray[np.bool_]:
         """Return which cells are mapped in all classes, shape (rows, cols)."""

@@ -229,7 +229,7 @@ class Maps(Mapping[str, Region]):
         if name not in self._kept:
             while len(self._kept) >= MOST_MAPS:
                 self._kept.popitem(last=False)
-            self._kept[name] = read_region(folder)
+            self._kept[name] = read_region(folder, with_layers=False)
         self._kept.move_to_end(name)
         return self._kept[name]
 

@@ -2,6 +2,7 @@
 """Training on views of known place: rates and rules at the true pose, weights from the modes of a search."""
 
 import math
+from collections import ChainMap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -35,6 +36,9 @@ from sasgeo_bench.tasks.query import Query, Truth, base_of
 
 MODES: Final = 16  # of each training search
 WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
+MOST_VALUES: Final = 400_000_000  # cells in all layers of a map that is held whole: 16 km2 in cells of 1 m
+_MARGIN_M: Final = 64.0  # of a part of a map
+_UNIT: Final = 64  # cells: parts begin where cells of any size of the search do
 
 
 ViewsByMap = Mapping[str, Sequence[tuple[Query, Truth]]]  # by the map they lie on
@@ -83,6 +87,45 @@ def on_maps_of_the_day(views: ViewsByMap, regions: Mapping[str, Region]) -> View
     return found
 
 
+def around_views(
+    views: ViewsByMap, regions: Mapping[str, Region], *, most_values: int = MOST_VALUES
+) -> tuple[ViewsByMap, Mapping[str, Region]]:
+    """Cut each large map to what its views may be held against: a part for each view, under a name of its own.
+
+    So training on a whole country needs no more memory than on towns. Maps of at most `most_values` cells in all layers
+    stay as they are, and so do those whose views may lie anywhere.
+    """
+    found: dict[str, Sequence[tuple[Query, Truth]]] = {}
+    parts: dict[str, Region] = {}
+    for name, some in views.items():
+        region = regions[name]
+        is_small = len(region.classes) * region.grid.rows * region.grid.cols <= most_values
+        if is_small or any(query.prior.center_m is None for query, _ in some):
+            found[name] = some
+            continue
+        boxes = [_box(query, truth, region.grid) for query, truth in some]
+        for number, ((query, truth), part) in enumerate(zip(some, region.cuts(boxes), strict=True)):
+            own = f"{name} {number}"
+            parts[own] = part
+            found[own] = [(replace(query, region=own), truth)]
+    return found, ChainMap(parts, regions)  # type: ignore[arg-type] # neither is written to
+
+
+def _box(query: Query, truth: Truth, grid: Grid) -> tuple[int, int, int, int]:
+    """Return the cells around all places that a view may have, and around the true one: row, column, rows, columns."""
+    pose = _pose(truth)
+    middles_m = np.array([query.prior.center_m, (pose.easting_m, pose.northing_m)], dtype=np.float64)
+    reach_m = (query.prior.radius_m or 0.0, 0.0)
+    view_m = math.hypot(*query.evidence.size_m) / 2 * (1 + 3 * query.prior.scale_sigma)
+    low, high = [], []
+    for (row, col), radius_m in zip(grid.to_cells(middles_m).tolist(), reach_m, strict=True):
+        reach = math.ceil((radius_m + view_m + RINGS_M[-1] + _MARGIN_M) / grid.cell_size_m)
+        low.append((row - reach, col - reach))
+        high.append((row + reach, col + reach))
+    (top, left), (bottom, right) = np.min(low, axis=0) // _UNIT * _UNIT, np.max(high, axis=0) // _UNIT * _UNIT + _UNIT
+    return int(top), int(left), int(bottom - top), int(right - left)
+
+
 def _map_of_the_day(name: str, query: Query, regions: Mapping[str, Region]) -> str | None:
     """Return the map of a name with another date or none: the view's own day; None if there is no such map."""
     dated, plus, edits = name.partition("+")
@@ -111,11 +154,12 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     views = views_by_map(training)
     if not switches.learns_from_old:
         views = on_maps_of_the_day(views, training.regions)
-    classes = classes_of(training.regions[name] for name in views)
-    model = _fit_classes(training, views, switches, classes) if switches.learns else _even(views, classes)
+    views, regions = around_views(views, training.regions)
+    classes = classes_of(regions[name] for name in views)
+    model = _fit_classes(regions, views, switches, classes) if switches.learns else _even(views, classes)
     lists: list[_ScoredModes] = []
     for name, some in views.items():
-        reader = Reader.of(training.regions[name], model, replace(switches, has_graph=False))
+        reader = Reader.of(regions[name], model, replace(switches, has_graph=False))
         lists += [_list(query, _pose(truth), reader, plan or Plan(), classes) for query, truth in some]
     lists = [one for one in lists if len(one.by_class) > 1]
     if not lists:
@@ -124,8 +168,8 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
     if not switches.has_graph:
         return model
-    model = replace(model, rules=_fit_rules(lists, training.regions))
-    return replace(model, blend=_fit_blend(lists, model, training.regions))
+    model = replace(model, rules=_fit_rules(lists, regions))
+    return replace(model, blend=_fit_blend(lists, model, regions))
 
 
 def classes_of(regions: Iterable[Region]) -> tuple[str, ...]:
@@ -139,12 +183,14 @@ def classes_of(regions: Iterable[Region]) -> tuple[str, ...]:
     return tuple(name for name in load_taxonomy().names if name in known)
 
 
-def _fit_classes(training: Training, views: ViewsByMap, switches: Switches, classes: tuple[str, ...]) -> ScorerModel:
+def _fit_classes(
+    regions: Mapping[str, Region], views: ViewsByMap, switches: Switches, classes: tuple[str, ...]
+) -> ScorerModel:
     """Fit rates, likeness, seasons and trust of classes."""
     tallies: dict[str, list[Tally]] = {"": []}
     stamps: list[StampTally] = []
     for name, some in views.items():
-        region = training.regions[name]
+        region = regions[name]
         stamps += _stamps(region, some, switches, classes) if switches.is_stamped else ()
         for query, truth in some:
             tallies.setdefault(query.season, []).append(_tally(query, truth, region, switches, classes))

@@ -3,15 +3,17 @@
 
 import datetime as dt
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.matching.matcher import Training
-from sasgeo_bench.sasgeo.learning import on_maps_of_the_day, views_by_map
+from sasgeo_bench.sasgeo import learning
+from sasgeo_bench.sasgeo.learning import around_views, on_maps_of_the_day, views_by_map
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
-from sasgeo_bench.sasgeo.variants import SasgeoFresh, SasgeoFreshAgeless
+from sasgeo_bench.sasgeo.variants import SasgeoFresh, SasgeoFreshAgeless, SasgeoNoGraph
 
 TODAY = dt.date(2025, 9, 1)
 
@@ -80,3 +82,55 @@ def test_an_arm_that_learns_from_maps_of_the_day_keeps_the_rates_of_ageing_set_b
             assert fitted.vanish_per_year == pytest.approx(start.vanish_per_year, rel=1e-3)
             assert fitted.appear_per_year == pytest.approx(start.appear_per_year, rel=1e-3)
     assert one == other  # they differ only where a map is old
+
+
+def near(tiny, count=3):
+    """Views of known place whose prior is a disc."""
+    return [
+        (query, truth)
+        for query, truth in zip(tiny.queries, tiny.truths, strict=True)
+        if query.suite == "clean" and query.track == "localization" and query.evidence.shape[0] == 192
+    ][:count]
+
+
+def test_parts_of_a_large_map_teach_what_the_whole_map_does(tiny, monkeypatch):
+    training = Training(regions={tiny.queries[0].region: tiny.region}, pairs=near(tiny))
+    whole = SasgeoNoGraph().learn(training)
+    cut = partial(around_views, most_values=1)
+    monkeypatch.setattr(learning, "around_views", cut)
+    assert SasgeoNoGraph().learn(training) == whole
+
+
+def test_each_view_of_a_large_map_has_a_part_that_holds_its_prior(tiny):
+    name = tiny.queries[0].region
+    small = [
+        (replace(query, prior=replace(query.prior, radius_m=100.0, center_m=(pose.easting_m, pose.northing_m))), truth)
+        for query, truth in near(tiny)
+        for pose in [truth.pose]
+    ]
+    views, regions = around_views({name: small}, {name: tiny.region}, most_values=1)
+    assert [len(some) for some in views.values()] == [1, 1, 1]
+    for own, [(query, truth)] in views.items():
+        part, grid = regions[own], tiny.region.grid
+        assert query.region == own
+        assert part.grid.rows * part.grid.cols < grid.rows * grid.cols
+        west_m, south_m, east_m, north_m = part.grid.bounds_m
+        reach_m = 100.0 + 96 * 2**0.5
+        map_west_m, map_south_m, map_east_m, map_north_m = grid.bounds_m
+        assert west_m <= max(truth.pose.easting_m - reach_m, map_west_m)
+        assert east_m >= min(truth.pose.easting_m + reach_m, map_east_m)
+        assert south_m <= max(truth.pose.northing_m - reach_m, map_south_m)
+        assert north_m >= min(truth.pose.northing_m + reach_m, map_north_m)
+        row, col = ((map_north_m - north_m) / grid.cell_size_m, (west_m - map_west_m) / grid.cell_size_m)
+        window = tiny.region.layers[:, int(row) :, int(col) :][:, : part.grid.rows, : part.grid.cols]
+        assert (part.layers == window).all()
+        assert part.manifest.extract == tiny.region.manifest.extract
+
+
+def test_small_maps_and_views_from_anywhere_keep_the_whole_map(tiny):
+    name = tiny.queries[0].region
+    some = near(tiny)
+    views, regions = around_views({name: some}, {name: tiny.region})
+    assert (views[name], regions[name]) == (some, tiny.region)
+    lost = [(replace(query, prior=replace(query.prior, center_m=None, radius_m=None)), truth) for query, truth in some]
+    assert list(around_views({name: lost}, {name: tiny.region}, most_values=1)[0]) == [name]

@@ -30,7 +30,7 @@ SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
 FEWEST: Final = 3  # objects of a view that can be told from chance
 CELL_M: Final = 8.0  # of votes
 # Ends of roads are gaps of perception more often than ends; bends of rivers lie nowhere in particular.
-_LEFT_OUT: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.name.endswith(("dead_end", "river_bend")))
+LEFT_OUT: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.name.endswith(("dead_end", "river_bend")))
 _WINDOW: Final = 3  # cells a side that vote together
 _EACH: Final = 8  # peaks of a heading
 _MOST_OFF: Final = 3.0  # standard deviations of the prior, of a heading that is fitted
@@ -79,7 +79,7 @@ class ObjectMatcher(PlaceMatcher[Sight]):
     def look(self, query: Query) -> Sight | None:
         """Return the whole objects of a view; None if they are fewer than three."""
         seen = ObservedGraph.of(query)
-        nodes = seen.nodes.taken(~seen.is_cut & ~np.isin(seen.nodes.kind, _LEFT_OUT))
+        nodes = seen.nodes.taken(~seen.is_cut & ~np.isin(seen.nodes.kind, LEFT_OUT))
         return Sight(nodes=nodes, prior=query.prior) if len(nodes) >= FEWEST else None
 
     def within(self, sight: Sight, disc: Disc) -> Ints:

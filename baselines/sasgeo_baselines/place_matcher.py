@@ -38,6 +38,11 @@ class PlaceMatcher(ABC, Generic[View]):
         discs = [Disc(center_m=(pose.easting_m, pose.northing_m), radius_m=AROUND_M) for pose in poses]
         return [next(iter(self.modes(view, disc, count=1)), None) for disc in discs]
 
+    def diagnostics(self, view: View, found: Sequence[Mode]) -> dict[str, float]:
+        """Return further numbers about an answer of at least one pose, best first; by default none."""
+        del view, found
+        return {}
+
     def prepare(self, region: Region, learned: str | None) -> None:
         """Index the map."""
         self.read(region, learned)
@@ -55,11 +60,14 @@ class PlaceMatcher(ABC, Generic[View]):
         if query.track == "retrieval":
             near = self.near(view, query.candidates)
             poses = [mode.pose if mode else pose for mode, pose in zip(near, query.candidates, strict=True)]
-            return ranked_candidates(query, [mode.score if mode else None for mode in near], top_k=top_k, poses=poses)
+            best = sorted((mode for mode in near if mode), key=lambda mode: -mode.score)
+            told = self.diagnostics(view, best) if best else {}
+            scores = [mode.score if mode else None for mode in near]
+            return ranked_candidates(query, scores, top_k=top_k, poses=poses, diagnostics=told)
         disc = Disc(center_m=query.prior.center_m, radius_m=query.prior.radius_m or 0.0)
         found = self.modes(view, disc, count=max(2, min(top_k, MOST_PLACES)))
         if not found:
             return WITHHELD
-        scores = [mode.score for mode in found]
-        margin = {"margin": scores[0] - scores[1]} if len(scores) > 1 else {}
-        return Match(poses=[mode.pose for mode in found][:top_k], scores=scores[:top_k], diagnostics=margin)
+        values = [mode.score for mode in found]
+        told = self.diagnostics(view, found) | ({"margin": values[0] - values[1]} if len(values) > 1 else {})
+        return Match(poses=[mode.pose for mode in found][:top_k], scores=values[:top_k], diagnostics=told)

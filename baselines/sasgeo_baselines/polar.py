@@ -32,23 +32,24 @@ DEPTH: Final = RINGS * SECTORS + len(DISTANCES_M)  # numbers of a group
 _FINE: Final = 4  # points a side of a cell, for its share in each sector
 _PRESENT: Final = 0.25  # occupancy from which a cell counts for distances
 _LEAST_KNOWN: Final = 0.25  # of a sector; else it is unknown
+_BAND: Final = 256  # rows of cells whose distances are measured together
 
 # Of shape (len(GROUPS) * (1 + len(DISTANCES_M)), rows, cols): occupancies, then nearness by distance.
 Planes = NDArray[np.float32]
 
 
 @cache
-def _sectors() -> sparse.csr_array:
-    """Return the share of each cell of the square in each sector, shape (RINGS * SECTORS, SIDE^2); rows sum to 1."""
+def sector_weights(rings: int = RINGS, sectors: int = SECTORS) -> sparse.csr_array:
+    """Return the share of each cell of the square in each sector, shape (rings * sectors, SIDE^2); rows sum to 1."""
     points = (np.arange(SIDE * _FINE) + 0.5) / _FINE * CELL_M - RADIUS_M
     right_m, up_m = np.meshgrid(points, -points)
-    ring = np.floor(np.hypot(right_m, up_m) / RADIUS_M * RINGS).astype(np.int64)
-    sector = np.floor(np.mod(np.arctan2(right_m, up_m) / (2 * np.pi), 1.0) * SECTORS).astype(np.int64) % SECTORS
+    ring = np.floor(np.hypot(right_m, up_m) / RADIUS_M * rings).astype(np.int64)
+    sector = np.floor(np.mod(np.arctan2(right_m, up_m) / (2 * np.pi), 1.0) * sectors).astype(np.int64) % sectors
     cell = np.arange(SIDE * _FINE) // _FINE
     cells = cell[:, None] * SIDE + cell[None, :]
-    inside = ring < RINGS
-    at = (ring[inside] * SECTORS + sector[inside], cells[inside])
-    counts = sparse.coo_array((np.ones(len(at[0])), at), shape=(RINGS * SECTORS, SIDE * SIDE)).tocsr()
+    inside = ring < rings
+    at = (ring[inside] * sectors + sector[inside], cells[inside])
+    counts = sparse.coo_array((np.ones(len(at[0])), at), shape=(rings * sectors, SIDE * SIDE)).tocsr()
     return sparse.csr_array(sparse.diags_array(1.0 / counts.sum(axis=1)) @ counts).astype(np.float32)
 
 
@@ -75,6 +76,15 @@ def _away_m(present: NDArray[np.bool_]) -> NDArray[np.float32]:
 
 def view_descriptor(evidence: sgb.Evidence) -> NDArray[np.float32]:
     """Return the descriptor of a view, shape (len(GROUPS) * DEPTH,): by group, NaN where too little is known."""
+    present, known = view_planes(evidence)
+    return _view_means(present, known)
+
+
+def view_planes(evidence: sgb.Evidence) -> NDArray[np.float32]:
+    """Return the shares of each cell of the square where a group is present, and where it is known, in a view.
+
+    The result has shape (2, len(GROUPS), SIDE^2). A group is known where each of its classes is, or one is present.
+    """
     height, width = evidence.shape
     down_m = (np.arange(height) + 0.5 - height / 2) * evidence.cell_size_m + RADIUS_M
     right_m = (np.arange(width) + 0.5 - width / 2) * evidence.cell_size_m + RADIUS_M
@@ -91,14 +101,14 @@ def view_descriptor(evidence: sgb.Evidence) -> NDArray[np.float32]:
         is_known = is_present | np.all([layer != sgb.UNKNOWN for layer in layers], axis=0)
         known[group] = np.minimum(np.bincount(at, weights=is_known[inside], minlength=SIDE * SIDE) / full, 1.0)
         present[group] = np.minimum(np.bincount(at, weights=is_present[inside], minlength=SIDE * SIDE) / full, 1.0)
-    return _view_means(present, known)
+    return np.stack([present, known])
 
 
 def _view_means(present: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return means of sectors and of the disc over what is known, by group."""
     occupancy = np.divide(present, np.maximum(known, 1e-6), dtype=np.float32)
     planes = planes_of(occupancy.reshape(-1, SIDE, SIDE)).reshape(1 + len(DISTANCES_M), len(GROUPS), -1)
-    sectors, disc = _sectors(), _disc()
+    sectors, disc = sector_weights(), _disc()
     found = np.empty((len(GROUPS), DEPTH), dtype=np.float32)
     for group, into in enumerate(found):
         weight = np.concatenate([sectors @ known[group], np.full(len(DISTANCES_M), disc @ known[group])])
@@ -116,14 +126,18 @@ def padded_strips(region: sgb.Region, *, stride: int) -> Iterator[Planes]:
     square beyond the map on all sides, where nothing is.
     """
     reach = round(max(DISTANCES_M) / CELL_M)
-    padded = _coarse(region, above=SIDE // 2 + reach, beside=SIDE // 2)
-    for row in range((padded.shape[1] - SIDE - 2 * reach) // stride + 1):
-        top = row * stride
-        strip = padded[:, top : top + SIDE + 2 * reach].astype(np.float32) / np.float32(255)
-        yield planes_of(strip)[:, reach : reach + SIDE]
+    padded = coarse_groups(region, above=SIDE // 2 + reach, beside=SIDE // 2)
+    count, together = (padded.shape[1] - SIDE - 2 * reach) // stride + 1, max(1, _BAND // stride)
+    for first in range(0, count, together):
+        tops = [row * stride for row in range(first, min(first + together, count))]
+        band = padded[:, tops[0] : tops[-1] + SIDE + 2 * reach].astype(np.float32) / np.float32(255)
+        planes = planes_of(band)
+        for top in tops:
+            at = top - tops[0] + reach
+            yield planes[:, at : at + SIDE]
 
 
-def _coarse(region: sgb.Region, *, above: int, beside: int) -> NDArray[np.uint8]:
+def coarse_groups(region: sgb.Region, *, above: int, beside: int) -> NDArray[np.uint8]:
     """Return the occupancy of each group in cells of CELL_M, 0..255, with a margin, uint8 of shape (groups, H, W)."""
     west_m, south_m, east_m, north_m = region.grid.bounds_m
     rows, cols = (max(1, round(side_m / CELL_M)) for side_m in (north_m - south_m, east_m - west_m))
@@ -148,7 +162,7 @@ def map_rows(strip: Planes, *, stride: int) -> NDArray[np.float32]:
     groups = len(GROUPS)
     found = np.empty((groups, DEPTH, places), dtype=np.float32)
     for group in range(groups):
-        found[group, : RINGS * SECTORS] = _sectors() @ flat[group]
+        found[group, : RINGS * SECTORS] = sector_weights() @ flat[group]
     near = np.einsum("c,pcn->pn", _disc(), flat[groups:]).reshape(len(DISTANCES_M), groups, places)
     found[:, RINGS * SECTORS :] = near.transpose(1, 0, 2)
     return np.ascontiguousarray(found.reshape(groups * DEPTH, places).T)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`spatial_graph_clique`: the largest set of objects whose distances from each other agree on both sides."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import networkx as nx  # type: ignore[import-untyped, unused-ignore]
@@ -58,6 +59,11 @@ class SpatialGraphClique(ObjectMatcher):
             if view.allows(pose, disc):
                 found.append(Mode(pose=pose, score=len(clique) + 0.5 / (1.0 + error_m)))
         return thinned(sorted(found, key=lambda mode: -mode.score), APART_M)[:count]
+
+    def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
+        """Return the size of the largest clique."""
+        del view
+        return {"inliers": float(int(found[0].score))}
 
 
 def _around(pairs: Pairs, peak: Mode) -> Ints:

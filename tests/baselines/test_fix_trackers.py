@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sasgeo_baselines.trackers.ekf_loose import EkfLoose
 from sasgeo_baselines.trackers.foundloc_ransac import FoundlocRansac
+from sasgeo_baselines.trackers.satloc_layers import SatlocLayers
 from sasgeo_baselines.trackers.se2_trajectory import Se2Trajectory
 from sasgeo_baselines.trackers.vio_dead_reckoning import VioDeadReckoning
 
@@ -19,7 +20,7 @@ from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.query import Query, Step
 from tests.baselines.conftest import region_of, textured, view_of
 
-FUSING = (EkfLoose, FoundlocRansac, Se2Trajectory)
+FUSING = (EkfLoose, FoundlocRansac, SatlocLayers, Se2Trajectory)
 SIGMAS = (0.8, 0.8, 1.0)  # of an increment: metres, metres, degrees
 SCALE = 1.015  # by which the odometer is off
 NOTHING = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
@@ -230,3 +231,19 @@ def test_odometry_alone_is_accepted_while_it_believes_that_it_is_near():
     assert not far.accepted.any()
     again = fly(tracker, poses, views_of(poses, radius_m=6.0))
     assert (again.away_m == near.away_m).all()
+
+
+def test_a_fix_of_half_the_confidence_has_twice_the_covariance():
+    here = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+    tracker = SatlocLayers(Fair([here]))
+    grid = Grid(epsg=32632, west_m=0.0, north_m=6000.0, cell_size_m=2.0, rows=3000, cols=3000)
+    tracker.prepare(type("Map", (), {"grid": grid}), None)
+    tracker.start(NOTHING)
+    query = views_of([here])[0]
+    sure, half, none = (
+        tracker.covariance_of(Match(poses=[here], scores=[1.0], diagnostics=said), query)
+        for said in ({"ks_share": 1.0}, {"ks_share": 0.5}, {"ks_share": 0.0})
+    )
+    assert np.allclose(half, 2 * sure)
+    assert np.allclose(none, 10 * sure)
+    assert np.allclose(tracker.covariance_of(Match(poses=[here], scores=[1.0]), query), sure)

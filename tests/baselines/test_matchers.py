@@ -29,8 +29,11 @@ REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in 
 VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
 DENSE = ("fft_vote", "raster_soft", "raster_uniform", *VARIANTS)
 OVERLAPPING = ("schmidt_segcorr", "vecmap_phasecorr", "zilke_semantic_mi")
-OF_OBJECTS = ("spatial_graph_clique",)  # they withhold where a view shows few whole objects
-STRIDES = dict.fromkeys((*VARIANTS, *OVERLAPPING, *OF_OBJECTS, "raster_soft"), 12) | {
+# These withhold where a view shows few whole objects.
+OF_OBJECTS = ("liu_object_graph", "ouyang_shape_votes", "spatial_graph_clique")
+OF_PLACES = ("brm_grid", "polar_vsc", "vojir_instance_rays", "zhang_hier_consensus")
+SYSTEMS = (*OVERLAPPING, *OF_OBJECTS, *OF_PLACES)
+STRIDES = dict.fromkeys((*VARIANTS, *SYSTEMS, "raster_soft"), 12) | {
     "fft_vote": 6,
     "raster_uniform": 6,
     "graph_only": 6,
@@ -84,7 +87,7 @@ def test_a_matcher_is_registered_under_the_name_of_its_card(name) -> None:
 
 
 def test_every_matcher_is_registered() -> None:
-    assert set(REGISTERED) == {"global_descriptor", "graph_only", *OVERLAPPING, *OF_OBJECTS, *DENSE, *CONTROLS}
+    assert set(REGISTERED) == {"global_descriptor", "graph_only", *SYSTEMS, *DENSE, *CONTROLS}
 
 
 @pytest.mark.parametrize("name", REGISTERED)

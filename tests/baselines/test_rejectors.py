@@ -13,10 +13,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sasgeo_baselines.rejectors import leads
 from sasgeo_baselines.rejectors.entropy import Entropy
+from sasgeo_baselines.rejectors.inliers import Inliers
 from sasgeo_baselines.rejectors.isotonic_margin import IsotonicMargin
+from sasgeo_baselines.rejectors.ks_gate import KsGate
 from sasgeo_baselines.rejectors.logistic_all import LogisticAll
 from sasgeo_baselines.rejectors.margin import Margin
 from sasgeo_baselines.rejectors.margin_nms import MarginNms
+from sasgeo_baselines.rejectors.nearest_score import NearestScore
+from sasgeo_baselines.rejectors.ratio_spread import RatioSpread
+from sasgeo_baselines.rejectors.score_ratio import ScoreRatio
+from sasgeo_baselines.rejectors.similarity_distribution import SimilarityDistribution
+from sasgeo_baselines.rejectors.sue import Sue
 from sklearn.isotonic import IsotonicRegression
 
 from sasgeo_bench.geometry.pose import Pose
@@ -26,7 +33,10 @@ from sasgeo_bench.matching.results import Prediction
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
 REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.rejectors"]
-RULES = (Margin, MarginNms, Entropy)
+RULES = (
+    *(Margin, MarginNms, Entropy, Inliers, KsGate, NearestScore, RatioSpread, ScoreRatio, SimilarityDistribution),
+    Sue,
+)
 LEARNERS = (IsotonicMargin, LogisticAll)
 WITHHELD = Prediction(query_id="withheld")
 SCORES = st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=6)

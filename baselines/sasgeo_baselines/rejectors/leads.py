@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Statistics of the scores of an answer: lead of the first place, and entropy over places."""
+"""Statistics of the scores and places of an answer: lead of the first place, entropy and spread over places."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -54,18 +54,53 @@ def entropy(prediction: Prediction) -> float:
     scores = scores_of(prediction)
     if len(scores) == 1:
         return math.log(2)
+    shares = softmax(scores)
+    return float(-(shares * np.log(np.maximum(shares, 1e-300))).sum())
+
+
+def softmax(scores: Values) -> Values:
+    """Return shares that sum to 1, by a softmax of scores over their standard deviation; equal shares of equal scores.
+
+    >>> softmax(np.array([30.0, 10.0])).round(3).tolist() == softmax(np.array([3.0, 1.0])).round(3).tolist()
+    True
+    """
     scaled = scores / max(float(np.abs(scores).max()), 1e-300)
     spread = float(scaled.std())
     if not np.ptp(scaled) > 0 or not spread > 0:
-        return math.log(len(scores))
+        return np.full(len(scores), 1.0 / len(scores))
     weights = np.exp((scaled - scaled.max()) / spread)
-    shares = weights / weights.sum()
-    return float(-(shares * np.log(np.maximum(shares, 1e-300))).sum())
+    return np.asarray(weights / weights.sum())
+
+
+def ratios(scores: Values) -> Values:
+    """Return the ratio of each further score to the first, 0..1: 1 for a tie, 0 for one that is nothing beside it.
+
+    Scores are similarities, or negative distances: then the ratio is that of the first distance to the further one.
+    Where the first is positive and another is not, that other is nothing beside it.
+
+    >>> ratios(np.array([4.0, 3.0, -1.0])).tolist(), ratios(np.array([-1.0, -4.0])).tolist()
+    ([0.75, 0.0], [0.25])
+    """
+    first, others = scores[0], scores[1:]
+    above, below = (np.maximum(others, 0.0), first) if first > 0 else (np.full(len(others), first), others)
+    return np.divide(above, below, out=np.ones(len(others)), where=below != 0)
 
 
 def scores_of(prediction: Prediction) -> Values:
     """Return the scores of the candidates, best first, shape (N,)."""
     return np.clip(np.array([score for _, score in prediction.candidates], dtype=np.float64), -MOST, MOST)
+
+
+def spread_m2(prediction: Prediction, *, most: int, far_m: float) -> float:
+    """Return the variance along an axis of the places of the first candidates, weighed by `softmax`, m2.
+
+    It is the mean of both axes; an offset from the mean place counts as `far_m` at most.
+    """
+    chosen = prediction.candidates[:most]
+    places_m = np.array([_place(pose) for pose, _ in chosen])
+    shares = softmax(scores_of(prediction)[:most])
+    away_m = np.abs(places_m - shares @ places_m)
+    return float((shares @ np.square(np.minimum(away_m, far_m))).mean())
 
 
 def _place(pose: Pose) -> tuple[float, float]:

@@ -1,0 +1,240 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`polar_vsc`: rings of classes find places, a test drops unlikely ones, sectors give the heading.
+
+Visual Semantic Context, NAVIGATION 71(1).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, special
+
+from sasgeo_baselines.place_matcher import PlaceMatcher
+from sasgeo_baselines.polar import CELL_M
+from sasgeo_baselines.visual_context import AREAS_M2, SECTORS, STRIDE, Context, ContextMap, Floats, Shares
+from sasgeo_bench import Disc, MatcherCard, Mode, Pose, Prior, Query, Region, points_of, thinned, wrap_deg
+
+ALPHA: Final = 0.01  # of the test, for each ring
+PATCH_M: Final = 8.0  # as wide as a ring: ground that counts as one observation, as neighbouring cells are alike
+SHORTLIST: Final = 200  # places whose sectors are compared
+REFINED: Final = 16  # places around which the best one is searched
+AROUND: Final = 2  # cells to each side: halfway to the next place
+LEAST_SHARED: Final = 0.5  # of what is known of a view, that the map must know
+SPREAD: Final = 2.0  # standard deviations of the prior's heading that are allowed
+STEP_DEG: Final = 360.0 / SECTORS
+APART_M: Final = 25.0
+_BLOCK: Final = 50_000  # places that are tested together: bounds the memory
+
+Ints = NDArray[np.int64]
+
+
+def ring_p_values(seen: Shares, mapped: Shares) -> NDArray[np.float64]:
+    """Return the p-values of two-sample Kolmogorov-Smirnov tests of the classes in each ring, shape (N, RINGS).
+
+    The groups of classes, in their order and last what has none, are the values that are observed, once for each patch
+    of `PATCH_M` that is known: cells are no independent observations. A value is NaN where too little is known.
+
+    Parameters
+    ----------
+    seen : Shares
+        Rings of a view, shape (G, RINGS); groups that it does not know are compared in no ring.
+    mapped : Shares
+        Rings of places, shape (N, G, RINGS).
+
+    Examples
+    --------
+    The third ring has 15.7 patches. Half of them are houses; on the map all are, or a few less than half:
+
+    >>> known = np.ones((1, 3), dtype=np.float32)
+    >>> seen = Shares(value=np.float32([[0.0, 0.0, 0.5]]), known=known)
+    >>> mapped = Shares(value=np.float32([[[0.0, 0.0, 1.0]], [[0.0, 0.0, 0.4]]]), known=np.ones((2, 1, 3)))
+    >>> ring_p_values(seen, mapped).round(3).tolist()
+    [[1.0, 1.0, 0.039], [1.0, 1.0, 1.0]]
+    """
+    compared = seen.known > 0
+    count = compared.sum(axis=0)
+    distance = np.abs(_cumulative(seen.value * compared) - _cumulative(mapped.value * compared)).max(axis=-2)
+    patches = AREAS_M2[: seen.value.shape[-1]] / PATCH_M**2
+    mine = patches * seen.known.sum(axis=0) / np.maximum(count, 1)
+    theirs = patches * mapped.known[:, 0]
+    effective = mine * theirs / np.maximum(mine + theirs, 1.0)
+    return np.where(effective > 0, special.kolmogorov(np.sqrt(effective) * distance), np.nan)
+
+
+def _cumulative(values: Floats) -> Floats:
+    """Return cumulative shares over groups; where these overlap, as on a bridge, they share the ground."""
+    total = np.cumsum(values, axis=-2)
+    return np.asarray(total / np.maximum(total[..., -1:, :], 1.0))
+
+
+def passing_share(p_values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the share of the judged rings of each place, shape (N, RINGS), that pass the test; 0 where none is judged.
+
+    >>> passing_share(np.array([[0.5, 0.02, 0.001, np.nan], [np.nan] * 4])).round(3).tolist()
+    [0.667, 0.0]
+    """
+    judged = np.isfinite(p_values)
+    return np.asarray((judged & (p_values >= ALPHA)).sum(axis=1) / np.maximum(judged.sum(axis=1), 1))
+
+
+def correlations(seen: Shares, mapped: Shares, mean: Floats) -> NDArray[np.float64]:
+    """Return the correlation of the sectors of a view, turned clockwise by 0, 1, ... of them, with those of places.
+
+    Parameters
+    ----------
+    seen : Shares
+        Of a view, shape (G, RINGS, SECTORS).
+    mapped : Shares
+        Of places, shape (N, G, RINGS, SECTORS).
+    mean : ndarray of float32, shape (G,)
+        Share of each group over the map: it is taken off both.
+
+    Returns
+    -------
+    ndarray of float64, shape (N, SECTORS)
+        -1..1, over what is known on both sides, rings by their areas; minus infinity where that is less than half of
+        what is known of the view.
+    """
+    areas = AREAS_M2.astype(np.float32)[:, None] / np.float32(AREAS_M2.sum())
+    weight = seen.known * areas
+    mine, theirs = (shares.value - mean[:, None, None] for shares in (seen, mapped))
+    known = np.broadcast_to(mapped.known, mapped.value.shape)
+    both = _turned_sums(weight * mine, known * theirs)
+    squares = _turned_sums(weight * mine**2, known) * _turned_sums(weight, known * theirs**2)
+    shared = _turned_sums(weight, known) >= LEAST_SHARED * weight.sum()
+    return np.where(shared & (squares > 0), both / np.sqrt(np.maximum(squares, 1e-12)), -np.inf)
+
+
+def _turned_sums(seen: Floats, mapped: Floats) -> NDArray[np.float64]:
+    """Return sums of products over all, the view turned clockwise by 0, 1, ... sectors, shape (N, SECTORS)."""
+    spectra = np.conj(fft.rfft(seen, axis=-1)) * fft.rfft(mapped, axis=-1)
+    return np.asarray(fft.irfft(spectra.sum(axis=(1, 2)), n=SECTORS, axis=-1), dtype=np.float64)
+
+
+def vertices(before: Floats, here: Floats, after: Floats) -> NDArray[np.float64]:
+    """Return where parabolas through three values, one step apart, peak: -1/2..1/2 around the middle one.
+
+    Where that is no peak, or a value is not finite, it is the middle one:
+
+    >>> vertices(np.array([0.0, 0.0, 3.0]), np.array([1.0, 1.0, 2.0]), np.array([0.0, 1.0, 1.0])).tolist()
+    [0.0, 0.5, 0.0]
+    """
+    finite = np.isfinite(before) & np.isfinite(here) & np.isfinite(after)
+    low, middle, high = (np.where(finite, values, 0.0) for values in (before, here, after))
+    is_peak = (middle >= low) & (middle >= high) & (low + high < 2 * middle)
+    bend = np.where(is_peak, low - 2 * middle + high, -1.0)
+    return np.asarray(np.where(is_peak, (low - high) / (2 * bend), 0.0) + 0.0)  # no -0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sight:
+    """A view as it is matched, and what is known of its pose."""
+
+    context: Context
+    prior: Prior
+
+    def is_allowed(self) -> NDArray[np.bool_]:
+        """Return which turns by whole sectors the prior allows, shape (SECTORS,); that nearest to it always."""
+        if self.prior.yaw_deg is None or self.prior.yaw_sigma_deg is None:
+            return np.ones(SECTORS, dtype=bool)
+        away_deg = np.abs(wrap_deg(np.arange(SECTORS) * STEP_DEG - self.prior.yaw_deg))
+        return np.asarray(away_deg <= SPREAD * self.prior.yaw_sigma_deg + STEP_DEG / 2)
+
+
+class PolarVsc(PlaceMatcher[Sight]):
+    """Two stages: rings with the heading marginalised, gated by a test; then sectors."""
+
+    card = MatcherCard(
+        name="polar_vsc",
+        version="1",
+        title="Visual semantic context: rings, a Kolmogorov-Smirnov gate, sectors",
+        source=(
+            "Visual semantic context, NAVIGATION 71(1), navi.634, by its abstract: semantics in polar bins; a first "
+            "stage marginalises the heading and searches places coarsely, a Kolmogorov-Smirnov test rejects unlikely "
+            "ones, a second stage refines place and heading"
+        ),
+        ours=(
+            "All numbers and measures: 7 groups of classes in 12 rings and 36 sectors of a disc of 96 m in radius; "
+            "places 16 m apart; a two-sample test of the groups in each ring at alpha 0.01, in which each patch of 8 m "
+            "counts as one observation, with the asymptotic distribution; places where fewer rings pass than at the "
+            "best place are dropped, so that an answer remains where no place passes in all; the 200 nearest of the "
+            "rest by squared differences of rings; then the circular correlation of sectors, less the mean shares of "
+            "the map, at headings within two standard deviations of the prior, with a parabola between sectors; then "
+            "the best place in steps of 4 m around the best 16. ks_share, the share of rings that pass at the answer, "
+            "and ks_p, the least p-value, are diagnostics, which the rejector ks_gate reads"
+        ),
+        licence="Apache-2.0",
+        tracks=("retrieval", "localization"),
+        limits=(
+            "Views beyond 96 m to each side are cut, thin and thick roads are one group, and no sequence is used; the "
+            "test depends on the order of the groups, and errors of a detector make right places fail; what is "
+            "unknown in a view or on the map is not compared; a view that shows the same all around has no heading; "
+            "scale is 1, no confidence"
+        ),
+    )
+
+    def read(self, region: Region, learned: str | None) -> None:
+        """Describe the map."""
+        del learned
+        self._map = ContextMap.of(region)
+
+    def look(self, query: Query) -> Sight | None:
+        """Describe a view; None where it knows no class that the map has."""
+        context = Context.of_view(query.evidence, self._map.is_used)
+        return Sight(context=context, prior=query.prior) if context.sectors.known.any() else None
+
+    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+        """Return the best correlations of sectors around the places whose rings are alike."""
+        start = self._turned(view, self._map.places_m[self._shortlist(view, disc)])
+        best = points_of([mode.pose for mode in thinned(start, APART_M)[: max(REFINED, count)]])
+        steps_m = CELL_M * np.array(list(product(range(-AROUND, AROUND + 1), repeat=2)))
+        found = self._turned(view, (best[:, None] + steps_m).reshape(-1, 2))
+        wide = disc.wider(CELL_M)
+        return thinned((mode for mode in found if wide.has(mode.pose)), APART_M)[:count]
+
+    def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
+        """Return the least p-value of the rings at the best place, and the share of rings that pass there."""
+        best = found[0].pose
+        p_values = ring_p_values(view.context.rings, self._map.at(np.array([[best.easting_m, best.northing_m]])).rings)
+        least = np.min(p_values, initial=1.0, where=np.isfinite(p_values))
+        return {"ks_p": float(least), "ks_share": float(passing_share(p_values)[0])}
+
+    def _shortlist(self, view: Sight, disc: Disc) -> Ints:
+        """Return the places in a disc where most rings pass the test, and of these the most similar by their rings."""
+        near = np.flatnonzero(disc.wider(STRIDE * CELL_M).holds(self._map.places_m))
+        seen = view.context.rings
+        weight = seen.known * AREAS_M2
+        share, away = np.empty(len(near)), np.empty(len(near))
+        for first in range(0, len(near), _BLOCK):
+            part = slice(first, first + _BLOCK)
+            mapped = self._map.rings_at(near[part])
+            share[part] = passing_share(ring_p_values(seen, mapped))
+            both = weight * mapped.known
+            squares = (both * np.square(seen.value - mapped.value)).sum(axis=(1, 2))
+            away[part] = squares / np.maximum(both.sum(axis=(1, 2)), 1.0)
+        passing = np.flatnonzero(share == share.max(initial=0.0))
+        return near[passing[np.argsort(away[passing], kind="stable")[:SHORTLIST]]]
+
+    def _turned(self, view: Sight, places_m: NDArray[np.float64]) -> list[Mode]:
+        """Return places with their best headings, best first; without those of which the map knows too little."""
+        if not len(places_m):
+            return []
+        found = correlations(view.context.sectors, self._map.at(places_m).sectors, self._map.mean)
+        allowed = np.flatnonzero(view.is_allowed())
+        best = allowed[found[:, allowed].argmax(axis=1)]
+        rows = np.arange(len(found))
+        before, here, after = (found[rows, (best + step) % SECTORS] for step in (-1, 0, 1))
+        offset = vertices(before, here, after)
+        score = here + np.subtract(after, before, out=np.zeros(len(found)), where=offset != 0) * offset / 4
+        modes = [
+            Mode(pose=Pose(easting_m=east_m, northing_m=north_m, yaw_deg=yaw_deg), score=value)
+            for (east_m, north_m), yaw_deg, value in zip(
+                places_m.tolist(), ((best + offset) * STEP_DEG).tolist(), score.tolist(), strict=True
+            )
+            if np.isfinite(value)
+        ]
+        return sorted(modes, key=lambda mode: -mode.score)

@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matchers by consensus of patches and of objects: cases by hand, the property that each must have, what they find."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sasgeo_baselines import liu_object_graph
+from sasgeo_baselines.liu_object_graph import (
+    LiuObjectGraph,
+    complete_iou,
+    edge_weights,
+    local_features,
+    node_features,
+    posed,
+    sinkhorn,
+)
+from sasgeo_baselines.patches import Patches, consensus, correlation, matches, mutual, soft_mutual
+from sasgeo_baselines.spatial_graph_clique import SpatialGraphClique
+from sasgeo_baselines.zhang_hier_consensus import ZhangHierConsensus, similarity
+
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import WITHHELD, check_match
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.sasgeo.nodes import INDEX, MOST_ARMS, Nodes
+from sasgeo_bench.search.plan import Disc
+
+HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
+PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
+ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
+
+
+def error_m(answer, pose=HERE):
+    best = answer.poses[0]
+    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
+
+
+# Patches
+
+
+def scores_of(seed, shape=(3, 4, 5, 6)):
+    return np.random.default_rng(seed).random(shape).astype(np.float32)
+
+
+@given(st.integers(0, 50))
+def test_consensus_treats_both_sides_alike(seed):
+    scores = scores_of(seed)
+    turned = consensus(scores.transpose(2, 3, 0, 1)).transpose(2, 3, 0, 1)
+    np.testing.assert_allclose(consensus(scores), turned, rtol=1e-5)
+    turned = soft_mutual(scores.transpose(2, 3, 0, 1)).transpose(2, 3, 0, 1)
+    np.testing.assert_allclose(soft_mutual(scores), turned, rtol=1e-5)
+
+
+def test_neighbours_decide_between_two_patches_alike():
+    """A patch has two twins on the map; its neighbour has one partner, beside the second twin."""
+    scores = np.zeros((1, 2, 1, 6), dtype=np.float32)
+    scores[0, 0, 0, [0, 3]] = 1.0
+    scores[0, 1, 0, 4] = 1.0
+    assert mutual(scores)[1].tolist() == [0, 4]
+    assert mutual(consensus(scores))[1].tolist() == [3, 4]
+
+
+def test_a_pair_is_mutual_and_patches_without_a_score_have_none():
+    scores = np.array([[0.9, 0.0], [0.8, 0.0], [0.0, 0.0]], dtype=np.float32).reshape(3, 1, 2, 1)
+    mine, theirs = mutual(scores)
+    assert (mine.tolist(), theirs.tolist()) == ([0], [0])
+
+
+def test_a_view_matches_itself_and_what_is_unknown_matches_nothing(made):
+    cells = made.textured(3, side=96)
+    whole = Patches.of(cells, 1.0)
+    seen_m, mapped_m = matches(whole, whole, rounds=2)
+    assert (seen_m == mapped_m).all(axis=1).mean() > 0.95
+    hidden = cells.copy()
+    hidden[:, :48] = UNKNOWN
+    scores = correlation(Patches.of(hidden, 1.0), whole)
+    assert (scores[:6] == 0).all()
+    assert scores[6:].max() > 0.9
+
+
+def test_a_patch_is_described_by_the_cells_that_are_known():
+    cells = np.zeros((1, 8, 8), dtype=np.uint8)
+    cells[0, :2], cells[0, 4:] = PRESENT, UNKNOWN
+    found = Patches.of(cells, 1.0)
+    assert found.values[0, 0, 0] == pytest.approx(0.5)
+    assert found.known.min() == 1
+    cells[0, 3:] = UNKNOWN
+    assert Patches.of(cells, 1.0).known.max() == 0
+
+
+def test_a_similarity_needs_four_matches_that_agree():
+    crop = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
+    seen_m = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0]])
+    assert similarity(seen_m, seen_m, crop) == (None, 0)
+    assert similarity(np.zeros((6, 2)), np.zeros((6, 2)), crop)[0] is None
+
+
+# Zhang
+
+
+@pytest.fixture(scope="module")
+def zhang(made):
+    found = ZhangHierConsensus()
+    found.prepare(made.region_of(made.textured(5)), None)
+    return found
+
+
+@pytest.fixture(scope="module")
+def seen(made):
+    return made.view_of(made.region_of(made.textured(5)), HERE, size_cells=160)
+
+
+def test_a_view_is_found_on_the_map(made, zhang, seen):
+    query = made.query_of(seen, PRIOR)
+    answer = check_match(zhang.match(query, top_k=5), query, top_k=5)
+    assert error_m(answer) < 3
+    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 2
+    assert answer == zhang.match(query, top_k=5)
+    assert answer.diagnostics["inlier_ratio"] > 0.5
+    assert answer.diagnostics["inliers"] > 50
+
+
+def test_a_view_of_the_middle_of_a_crop_is_found_without_a_prior(made, zhang):
+    there = Pose(easting_m=1000.0 + 9 * 24, northing_m=9000.0 - 8 * 24, yaw_deg=200.0)
+    query = made.query_of(made.view_of(made.region_of(made.textured(5)), there, size_cells=160), ANYWHERE)
+    assert error_m(zhang.match(query, top_k=1), there) < 3
+
+
+def test_a_half_hidden_view_is_found_and_one_that_shows_nothing_is_withheld(made, zhang, seen):
+    cells = seen.cells.copy()
+    cells[:, :, :70] = UNKNOWN
+    assert error_m(zhang.match(made.query_of(seen.replace(cells), PRIOR), top_k=1)) < 8
+    blank = seen.replace(np.full_like(cells, UNKNOWN))
+    assert zhang.match(made.query_of(blank, PRIOR), top_k=1) == WITHHELD
+    alien = Evidence(classes=("railway", "green", "coastline"), cells=seen.cells, cell_size_m=1.0)
+    assert zhang.match(made.query_of(alien, PRIOR), top_k=1) == WITHHELD
+
+
+def test_candidates_are_ranked_and_copies_tie(made, zhang, seen):
+    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (110.0, 0.0, -90.0, 0.0))
+    query = made.query_of(seen, replace(PRIOR, center_m=None, radius_m=None), candidates=places)
+    answer = check_match(zhang.match(query, top_k=4), query, top_k=4)
+    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
+    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
+    assert answer.diagnostics["inliers"] > 50
+
+
+def test_a_view_of_another_place_has_few_inliers(made, zhang, seen):
+    other = made.view_of(made.region_of(made.textured(77)), HERE, size_cells=160)
+    wrong, right = (zhang.match(made.query_of(view, PRIOR), top_k=3).diagnostics for view in (other, seen))
+    assert wrong["inlier_ratio"] < right["inlier_ratio"] / 2
+    assert wrong["inliers"] < right["inliers"] / 2
+
+
+# Liu
+
+
+def nodes(places_m, areas_m2=None, names=None):
+    places_m = np.asarray(places_m, dtype=np.float64).reshape(-1, 2)
+    count = len(places_m)
+    return Nodes(
+        places_m=places_m,
+        kind=np.array([INDEX[name] for name in names or ["building patch"] * count], dtype=np.int64),
+        degree=np.zeros(count, dtype=np.int64),
+        area_m2=np.full(count, 100.0) if areas_m2 is None else np.asarray(areas_m2, dtype=np.float64),
+        arms_deg=np.full((count, MOST_ARMS), np.nan),
+        pairs=np.zeros((0, 2), dtype=np.int64),
+        relation=np.zeros(0, dtype=np.int64),
+        feature=np.full(count, -1),
+    )
+
+
+def test_weights_of_edges_by_hand():
+    """Squares of 10 m, 30 m apart, lie in a box of 40 m x 10 m: 0.6 (0 - 900 / 1700) + 0.2 + 0.3."""
+    houses = nodes([[0, 0], [0, 30]])
+    edges = edge_weights(houses, local_features(houses))
+    assert edges[0, 1] == edges[1, 0] == pytest.approx(0.6 * -900 / 1700 + 0.5)
+    assert edges.diagonal().tolist() == [0.0, 0.0]
+    touching = complete_iou(np.array([[5.0]]), np.array([5.0]))  # half of each lies in the other
+    assert touching[0, 0] == pytest.approx(50 / 150 - 25 / (15**2 + 10**2))
+
+
+@given(st.floats(0, 360), st.integers(0, 20))
+def test_features_do_not_depend_on_heading_or_order(yaw_deg, seed):
+    rng = np.random.default_rng(seed)
+    town = nodes(rng.uniform(-90, 90, (8, 2)), rng.uniform(30, 900, 8), ["building patch"] * 5 + ["green patch"] * 3)
+    turned = replace(town, places_m=replace(HERE, yaw_deg=yaw_deg).to_map(town.places_m))
+    np.testing.assert_allclose(node_features(town), node_features(turned), atol=1e-9)
+    order = rng.permutation(8)
+    mixed = nodes(town.places_m[order], town.area_m2[order])
+    mixed = replace(mixed, kind=town.kind[order])
+    np.testing.assert_allclose(node_features(town)[order], node_features(mixed), atol=1e-9)
+
+
+@given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 20))
+def test_no_object_is_matched_more_than_once(rows, cols, seed):
+    partners = sinkhorn(np.random.default_rng(seed).random((rows, cols)))
+    assert partners.min() >= 0
+    assert partners.sum(axis=1).max() < 1.1  # rows converge last
+    assert partners.sum(axis=0).max() <= 1 + 1e-9
+
+
+def test_wrong_matches_do_not_move_the_pose():
+    rng = np.random.default_rng(0)
+    seen_m = rng.uniform(-90, 90, (12, 2))
+    mapped_m = HERE.to_map(seen_m)
+    mapped_m[8:] += rng.uniform(40, 80, (4, 2))
+    pose, inliers = posed(seen_m, mapped_m, np.ones(12))
+    assert inliers == 8
+    assert pose.easting_m == pytest.approx(HERE.easting_m)
+    assert pose.yaw_deg == pytest.approx(HERE.yaw_deg)
+    assert posed(seen_m[:2], mapped_m[:2], np.ones(2)) == (None, 0)
+
+
+class OnMadeUp(LiuObjectGraph):
+    """The matcher on a map of nodes alone."""
+
+    def read(self, region, learned):
+        del learned
+        self.mapped, self.grid = region, region.grid
+
+
+def houses_of(view_m, sides_m):
+    """A view of 192 m with square houses, right and up of its middle, and a pond in its middle."""
+    cells = np.zeros((2, 192, 192), dtype=np.uint8)
+    cells[1, 90:102, 90:102] = PRESENT
+    for (right, up), side in zip(view_m, sides_m, strict=True):
+        row, col = round(96 - up - side / 2), round(96 + right - side / 2)
+        cells[0, row : row + side, col : col + side] = PRESENT
+    return Evidence(classes=("building", "water"), cells=cells, cell_size_m=1.0)
+
+
+@pytest.fixture(scope="module")
+def village():
+    """Sixteen houses and a pond in a view, and a map that has houses and ponds around them."""
+    rng = np.random.default_rng(4)
+    lattice = np.stack(np.meshgrid(np.arange(-60, 61, 40.0), np.arange(-60, 61, 40.0)), axis=-1).reshape(-1, 2)
+    view_m = np.round(lattice + rng.uniform(-9, 9, lattice.shape))
+    sides = rng.integers(6, 20, len(view_m))
+    others_m = rng.uniform((1050, 8630), (1400, 8950), (100, 2))
+    others_m = others_m[np.hypot(*(others_m - (HERE.easting_m, HERE.northing_m)).T) > 140]
+    others = rng.integers(6, 20, len(others_m))
+    names = ["building patch"] * len(view_m) + ["water patch"] + ["building patch", "water patch"] * len(others_m)
+    places_m = np.concatenate([HERE.to_map(np.concatenate([view_m, [[0.0, 0.0]]])), others_m])
+    town = nodes(places_m, np.concatenate([sides, [12], others]) ** 2.0, names[: len(places_m)])
+
+    def around(place_m, radius_m):
+        return np.flatnonzero(np.hypot(*(town.places_m - place_m).T) <= radius_m)
+
+    grid = Grid(epsg=32632, west_m=1000.0, north_m=9000.0, cell_size_m=1.0, rows=420, cols=420)
+    return SimpleNamespace(nodes=town, around=around, grid=grid, seen=houses_of(view_m, sides.tolist()))
+
+
+@pytest.fixture(scope="module")
+def liu(village):
+    found = OnMadeUp()
+    found.prepare(village, None)
+    return found
+
+
+def test_a_view_is_found_by_its_objects(made, liu, village):
+    query = made.query_of(village.seen, PRIOR)
+    answer = check_match(liu.match(query, top_k=5), query, top_k=5)
+    assert error_m(answer) < 2
+    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 2
+    assert answer.diagnostics["inliers"] >= 12
+    assert answer == liu.match(query, top_k=5)
+
+
+def test_a_half_hidden_view_is_found_by_the_objects_left(made, liu, village):
+    """What is hidden counts on neither side, so that the score does not fall by half."""
+    cells = village.seen.cells.copy()
+    cells[:, :, :80] = UNKNOWN
+    whole, half = (
+        liu.match(made.query_of(evidence, PRIOR), top_k=1) for evidence in (village.seen, village.seen.replace(cells))
+    )
+    assert error_m(half) < 4
+    assert half.scores[0] > 0.7 * whole.scores[0]
+
+
+def test_of_too_many_tiles_those_with_the_mix_of_kinds_are_looked_at(made, liu, village, monkeypatch):
+    query = made.query_of(village.seen, ANYWHERE)
+    whole = liu.match(query, top_k=1)
+    assert error_m(whole) < 2
+    monkeypatch.setattr(liu_object_graph, "MOST_TILES", 40)
+    view = liu.look(query)
+    assert len({tile.pose.easting_m for tile in liu.tiles(view, Disc(center_m=None, radius_m=0.0))}) <= 40
+    assert error_m(liu.match(query, top_k=1)) < 2
+
+
+def test_objects_rank_candidates(made, liu, village):
+    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (90.0, 0.0, 0.0))
+    query = made.query_of(village.seen, replace(PRIOR, center_m=None, radius_m=None), candidates=places)
+    answer = check_match(liu.match(query, top_k=3), query, top_k=3)
+    assert answer.poses[0].easting_m == HERE.easting_m
+    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
+
+
+def test_a_view_of_two_objects_is_withheld(made, liu):
+    few = houses_of([(40.0, 10.0)], [12])
+    assert liu.match(made.query_of(few, PRIOR), top_k=1) == WITHHELD
+
+
+# Clique
+
+
+class CliqueOnMadeUp(SpatialGraphClique):
+    """The matcher on a map of nodes alone."""
+
+    def read(self, region, learned):
+        del learned
+        self.mapped = region
+
+
+def test_the_size_of_a_clique_is_told_as_inliers(made, village):
+    matcher = CliqueOnMadeUp()
+    matcher.prepare(village, None)
+    answer = matcher.match(made.query_of(village.seen, PRIOR), top_k=3)
+    assert answer.diagnostics["inliers"] == int(answer.scores[0]) >= 12
+    candidates = made.query_of(village.seen, PRIOR, candidates=(HERE,))
+    assert matcher.match(candidates, top_k=1).diagnostics["inliers"] >= 12

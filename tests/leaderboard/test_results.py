@@ -75,9 +75,10 @@ def tables_of_pictures():
 
 @pytest.fixture(scope="module")
 def table_of_losses():
-    """The lines that the program of the page on flights prints of its board."""
+    """The lines that the program of the page on flights prints of its boards."""
     program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "lost_flights.py"))
-    rows = program["lines"](program["flights_of"](RESULTS / "flights", "flight-real-age"))
+    boards = (RESULTS / name for name in ("flights", "countries"))
+    rows = [row for board in boards for row in program["lines"](program["flights_of"](board, "flight-real-age"))]
     return {*program["HEAD"].splitlines(), *rows}
 
 

@@ -28,11 +28,12 @@ REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in 
 }
 VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
 DENSE = ("fft_vote", "raster_soft", "raster_uniform", *VARIANTS)
-OVERLAPPING = ("schmidt_segcorr", "vecmap_phasecorr", "zilke_semantic_mi")
+OVERLAPPING = ("schmidt_segcorr", "ubev_template", "vecmap_phasecorr", "zilke_semantic_mi")
 # These withhold where a view shows few whole objects.
 OF_OBJECTS = ("liu_object_graph", "ouyang_shape_votes", "spatial_graph_clique")
-OF_PLACES = ("brm_grid", "polar_vsc", "vojir_instance_rays", "zhang_hier_consensus")
-SYSTEMS = (*OVERLAPPING, *OF_OBJECTS, *OF_PLACES)
+OF_PLACES = ("brm_grid", "maplocnet_regress", "polar_vsc", "vojir_instance_rays", "zhang_hier_consensus")
+OF_TILES = ("anyvisloc_pipeline", "lcm_balanced", "sues_multi_height", "u1652_instance_retrieval")
+SYSTEMS = (*OVERLAPPING, *OF_OBJECTS, *OF_PLACES, *OF_TILES)
 STRIDES = dict.fromkeys((*VARIANTS, *SYSTEMS, "raster_soft"), 12) | {
     "fft_vote": 6,
     "raster_uniform": 6,

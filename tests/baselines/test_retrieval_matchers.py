@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Matchers of tiles by a learned embedding: parts worked by hand, what each kind of lessons teaches, what they find."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from sasgeo_baselines.embedding import DIMENSIONS, NUMBERS, STRIDE, Embedding, Ground, north_up
+from sasgeo_baselines.lcm_balanced import LcmBalanced
+from sasgeo_baselines.polar import CELL_M, map_rows, padded_strips, view_descriptor
+from sasgeo_baselines.sues_multi_height import SuesMultiHeight
+from sasgeo_baselines.u1652_instance_retrieval import U1652InstanceRetrieval
+
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import MOST_LEARNED_BYTES, WITHHELD, Training, check_match
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+
+MATCHERS = (U1652InstanceRetrieval, SuesMultiHeight, LcmBalanced)
+HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
+PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
+WITHIN_M = STRIDE * CELL_M * 0.71  # half a diagonal of the lattice
+
+
+@pytest.fixture(scope="module")
+def region(made):
+    return made.region_of(made.textured(5))
+
+
+@pytest.fixture(scope="module")
+def ground(region):
+    return Ground.of(region)
+
+
+@pytest.fixture(scope="module")
+def training(made):
+    """Three places of another map, each seen from two headings."""
+    other = made.region_of(made.textured(6))
+    places = [(1150.0, 8850.0), (1230.0, 8750.0), (1290.0, 8830.0)]
+    poses = [Pose(easting_m=e, northing_m=n, yaw_deg=yaw) for e, n in places for yaw in (20.0, 200.0)]
+    queries = [replace(made.query_of(seen_from(made, other, pose), PRIOR), region="other") for pose in poses]
+    truths = [SimpleNamespace(pose=pose) for pose in poses]
+    return Training(regions={"other": other}, pairs=tuple(zip(queries, truths, strict=True)))
+
+
+@pytest.fixture(scope="module")
+def learned(training):
+    """What each kind learns, with few locations that no view shows."""
+    return {kind: small(kind).learn(training) for kind in MATCHERS}
+
+
+def small(kind, *, others=36):
+    matcher = kind()
+    matcher.others = others
+    matcher.made_up = min(kind.made_up, 12)
+    matcher.copies = min(kind.copies, 12)
+    return matcher
+
+
+def seen_from(made, region, pose):
+    return made.view_of(region, pose, size_cells=192)
+
+
+def error_m(answer, pose=HERE):
+    best = answer.poses[0]
+    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
+
+
+def test_a_tile_on_the_lattice_is_what_the_gallery_has_there(region, ground):
+    strips = list(padded_strips(region, stride=STRIDE))
+    row, col = 8, 5
+    place = Pose(easting_m=1000.0 + col * STRIDE * CELL_M, northing_m=9000.0 - row * STRIDE * CELL_M, yaw_deg=0.0)
+    np.testing.assert_allclose(ground.tiles([place])[0], map_rows(strips[row], stride=STRIDE)[col], atol=0.003)
+
+
+def test_a_tile_at_a_pose_is_what_a_view_from_there_shows(made, region, ground):
+    seen = view_descriptor(seen_from(made, region, HERE))
+    at = ground.tiles([HERE, replace(HERE, yaw_deg=HERE.yaw_deg + 180.0)])
+    alike, turned = (np.nanmean(np.abs(row - seen)) for row in at)
+    assert alike < 0.3 * turned
+    upright = view_descriptor(north_up(seen_from(made, region, HERE), HERE.yaw_deg))
+    assert np.nanmean(np.abs(ground.tiles([replace(HERE, yaw_deg=0.0)])[0] - upright)) < 0.3 * turned
+
+
+def test_beyond_the_map_nothing_is(ground):
+    far = Pose(easting_m=9000.0, northing_m=0.0, yaw_deg=0.0)
+    assert not ground.tiles([far]).any()
+    assert ground.tiles([]).shape == (0, NUMBERS)
+
+
+def test_a_feature_by_hand():
+    """Of two numbers that differ from the mean by 3 and 4 one is doubled; what is unknown adds nothing."""
+    mean, weights = np.zeros(NUMBERS, dtype=np.float32), np.zeros((NUMBERS, DIMENSIONS), dtype=np.float32)
+    mean[:2], weights[0, 0], weights[1, 1] = 1.0, 2.0, 1.0
+    row = mean.copy()
+    row[:3] = 4.0, 9.0, np.nan
+    found = Embedding(mean=mean, weights=weights).features(row[None])[0]
+    assert found[:3].tolist() == pytest.approx([0.6, 0.8, 0.0])
+    assert Embedding(mean=mean).features(mean[None]).any() == 0
+
+
+@pytest.mark.parametrize("kind", MATCHERS)
+@pytest.mark.parametrize("is_taught", [False, True], ids=["untaught", "taught"])
+def test_a_view_is_found_on_another_map_than_those_of_training(made, region, learned, kind, is_taught):
+    matcher = kind()
+    matcher.prepare(region, learned[kind] if is_taught else None)
+    query = made.query_of(seen_from(made, region, HERE), PRIOR)
+    answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
+    assert error_m(answer) < WITHIN_M
+    assert answer == check_match(matcher.match(query, top_k=5), query, top_k=5)
+
+
+def test_the_same_training_gives_the_same_text_and_it_is_small(training, learned):
+    for kind, text in learned.items():
+        assert len(text.encode()) < MOST_LEARNED_BYTES / 3
+        assert Embedding.read(text, name="x").weights.shape == (NUMBERS, DIMENSIONS)
+        first, again = (small(kind, others=4).learn(training) for _ in range(2))
+        assert first == again != text
+
+
+def test_training_without_a_place_teaches_nothing(training):
+    nowhere = Training(
+        regions=training.regions, pairs=[(query, SimpleNamespace(pose=None)) for query, _ in training.pairs]
+    )
+    with pytest.raises(ValueError, match=r"^lcm_balanced: training shows 0 locations, expected two at least$"):
+        LcmBalanced().learn(nowhere)
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "other", "no JSON", "list"])
+def test_a_damaged_text_is_refused_in_one_line(region, learned, damage):
+    text = learned[U1652InstanceRetrieval]
+    saved = json.loads(text)
+    numbers = saved["numbers"]
+    broken = {
+        "cut": json.dumps(saved | {"numbers": numbers[:-10]}),
+        "changed": json.dumps(saved | {"numbers": numbers[:70] + ("1" if numbers[70] == "0" else "0") + numbers[71:]}),
+        "other": json.dumps(saved | {"format": "embedding 0"}),
+        "no JSON": text[:-1],
+        "list": "[]",
+    }[damage]
+    with pytest.raises(ValueError, match=r"^u1652_instance_retrieval: the learned text is damaged, .*: learn again$"):
+        U1652InstanceRetrieval().prepare(region, broken)
+
+
+def likeness(text, one, other):
+    """Mean cosine of pairs of descriptors, less that of descriptors of different places."""
+    first, second = (Embedding.read(text, name="x").features(rows) for rows in (one, other))
+    cosine = first @ second.T
+    return np.diag(cosine).mean() - cosine[~np.eye(len(cosine), dtype=bool)].mean()
+
+
+def test_turned_copies_teach_to_bear_turns_and_heights_to_bear_heights(ground, learned):
+    rng = np.random.default_rng(3)
+    poses = [
+        Pose(easting_m=1210.0 + east, northing_m=8790.0 + north, yaw_deg=0.0)
+        for east, north in rng.uniform(-110.0, 110.0, (20, 2)).tolist()
+    ]
+    upright = ground.tiles(poses)
+    turned = ground.tiles([replace(pose, yaw_deg=90.0) for pose in poses])
+    higher = ground.tiles([replace(pose, scale=1.4) for pose in poses])
+    plain = learned[U1652InstanceRetrieval]
+    assert likeness(learned[LcmBalanced], upright, turned) > 2 * likeness(plain, upright, turned)
+    assert likeness(learned[SuesMultiHeight], upright, higher) > 1.1 * likeness(plain, upright, higher)
+
+
+@pytest.fixture(scope="module")
+def matcher(region):
+    found = U1652InstanceRetrieval()
+    found.prepare(region, None)
+    return found
+
+
+def test_a_view_is_found_anywhere_and_heading_anyhow(made, region, matcher):
+    anywhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
+    answer = matcher.match(made.query_of(seen_from(made, region, HERE), anywhere), top_k=1)
+    assert error_m(answer) < WITHIN_M
+    assert abs(answer.poses[0].yaw_deg % 360.0 - HERE.yaw_deg) < 8
+
+
+def test_candidates_are_ranked_and_copies_tie(made, region, matcher):
+    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (60.0, 0.0, -50.0, 0.0))
+    anywhere = replace(PRIOR, center_m=None, radius_m=None)
+    query = made.query_of(seen_from(made, region, HERE), anywhere, candidates=places)
+    answer = check_match(matcher.match(query, top_k=4), query, top_k=4)
+    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
+    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
+
+
+def test_a_half_hidden_view_is_found_and_what_tells_nothing_is_withheld(made, region, matcher):
+    seen = seen_from(made, region, HERE)
+    cells = seen.cells.copy()
+    cells[:, :, :80] = UNKNOWN
+    assert error_m(matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=1)) < WITHIN_M
+    blank = seen.replace(np.full_like(cells, UNKNOWN))
+    alien = Evidence(classes=("railway", "green", "coastline"), cells=seen.cells, cell_size_m=1.0)
+    for evidence in (blank, alien):
+        assert matcher.match(made.query_of(evidence, PRIOR), top_k=1) == WITHHELD

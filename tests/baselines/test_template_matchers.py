@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Templates of height layers, a regressed pose, and local features: worked by hand, properties, what is found."""
+
+import json
+from dataclasses import replace
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sasgeo_baselines.anyvisloc_pipeline import (
+    GREYS,
+    GROUND,
+    AnyvislocPipeline,
+    Drawing,
+    drawn,
+    map_features,
+    view_features,
+)
+from sasgeo_baselines.maplocnet_regress import COARSE_M, MaplocnetRegress, Peak, field_of, lessons, templates_of
+from sasgeo_baselines.ubev_template import HEIGHTS, UbevTemplate, drawn_in, layers_of
+
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.matching.matcher import WITHHELD, Training, check_match
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.search.plan import Mode
+from sasgeo_bench.search.shifts import Overlaps
+
+MATCHERS = (AnyvislocPipeline, MaplocnetRegress, UbevTemplate)
+HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
+PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
+WITHIN_M = {AnyvislocPipeline: 3.0, MaplocnetRegress: 12.0, UbevTemplate: 3.0}
+
+
+@pytest.fixture(scope="module")
+def region(made):
+    return made.region_of(made.textured(5))
+
+
+@pytest.fixture(scope="module")
+def prepared(region):
+    found = {kind: kind() for kind in MATCHERS}
+    for matcher in found.values():
+        matcher.prepare(region, None)
+    return found
+
+
+@pytest.fixture(params=MATCHERS, ids=lambda kind: kind.card.name)
+def matcher(request, prepared):
+    return prepared[request.param]
+
+
+def seen_from(made, region, pose):
+    return made.view_of(region, pose, size_cells=160)
+
+
+def error_m(answer, pose=HERE):
+    best = answer.poses[0]
+    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
+
+
+def test_a_view_is_found_on_the_map(made, region, matcher):
+    query = made.query_of(seen_from(made, region, HERE), PRIOR)
+    answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
+    assert error_m(answer) < WITHIN_M[type(matcher)]
+    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 8
+    assert answer == check_match(matcher.match(query, top_k=5), query, top_k=5)
+    anywhere = replace(PRIOR, center_m=None, radius_m=None)
+    anyhow = replace(PRIOR, radius_m=45.0, yaw_deg=None, yaw_sigma_deg=None)
+    for prior in (anywhere, anyhow):
+        assert error_m(matcher.match(made.query_of(query.evidence, prior), top_k=1)) < WITHIN_M[type(matcher)]
+
+
+def test_a_half_hidden_view_is_found_and_what_tells_nothing_is_withheld(made, region, matcher):
+    seen = seen_from(made, region, HERE)
+    cells = seen.cells.copy()
+    cells[:, :, :56] = UNKNOWN
+    assert error_m(matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=1)) < WITHIN_M[type(matcher)]
+    blank = seen.replace(np.full_like(cells, UNKNOWN))
+    alien = Evidence(classes=("railway", "green", "coastline"), cells=seen.cells, cell_size_m=1.0)
+    for evidence in (blank, alien):
+        assert matcher.match(made.query_of(evidence, PRIOR), top_k=1) == WITHHELD
+
+
+def test_candidates_are_ranked_and_copies_tie(made, region, matcher):
+    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (60.0, 0.0, -50.0, 0.0))
+    anywhere = replace(PRIOR, center_m=None, radius_m=None)
+    query = made.query_of(seen_from(made, region, HERE), anywhere, candidates=places)
+    answer = check_match(matcher.match(query, top_k=4), query, top_k=4)
+    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
+    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
+
+
+# Height layers
+
+
+@given(st.integers(20, 60), st.sampled_from(HEIGHTS[1:]))
+def test_a_roof_that_leans_outwards_is_drawn_back_onto_its_footprint(away, height):
+    """A roof of height h is seen at r / (1 - h / H); the cell that is drawn in covers r."""
+    seen = np.zeros((1, 201), dtype=np.float32)
+    seen[0, 100 + round(away / (1 - height))] = 1
+    ground = drawn_in(seen, height)[0]
+    assert np.average(np.arange(201), weights=ground) - 100 == pytest.approx(away, abs=1.0)
+
+
+def test_only_buildings_stand_up_and_the_rim_is_unknown_below_their_roofs():
+    cells = np.full((2, 41, 41), PRESENT, dtype=np.uint8)
+    seen = Evidence(classes=("building", "water"), cells=cells, cell_size_m=1.0)
+    assert len(layers_of(seen, "water")) == 1
+    layers = layers_of(seen, "building")
+    known = [float(known.mean()) for _, known in layers]
+    assert known == pytest.approx([(1 - height) ** 2 for height in HEIGHTS], abs=0.03)
+
+
+def leaning(evidence, height):
+    """A view in which all buildings have such a height."""
+    rows, cols = evidence.shape
+    grown = np.array([[1, 0, -height * (cols - 1) / 2], [0, 1, -height * (rows - 1) / 2]]) / (1 - height)
+    cells = evidence.cells.copy()
+    at = evidence.classes.index("building")
+    cells[at] = cv2.warpAffine(cells[at], grown, (cols, rows), flags=cv2.INTER_NEAREST)
+    return evidence.replace(cells)
+
+
+def test_each_height_is_a_template_by_itself_and_the_sum_counts_as_one_class(made, region):
+    """Over the map itself a flat view fits in its lowest layer, one of high roofs in its highest."""
+    matcher = UbevTemplate()
+    names = ("building", "water")
+    flat = seen_from(made, region, HERE)
+    layers = np.stack([*((flat.layer(name) == PRESENT) for name in names), np.ones(flat.shape)]).astype(np.float32)
+    fits = {}
+    for height in (0.0, HEIGHTS[-1]):
+        seen = matcher.channels(leaning(flat, height), names)
+        overlaps = Overlaps.of(seen, layers, places=(1, 1))
+        sheets = len(HEIGHTS) + 1
+        assert len(seen) == 2 * sheets + 1
+        fits[height] = [over_of(seen[at], seen[sheets + at], layers[0]) for at in range(len(HEIGHTS))]
+        score = float(matcher.score(overlaps, names)[0, 0])
+        assert score == pytest.approx((np.mean(fits[height]) + 1.0) / 2, abs=1e-3)  # water is where it is mapped
+    assert fits[0.0] == sorted(fits[0.0], reverse=True)
+    assert fits[0.0][0] == pytest.approx(1.0, abs=1e-3)
+    assert int(np.argmax(fits[HEIGHTS[-1]])) == len(HEIGHTS) - 1
+
+
+def over_of(present, known, mapped):
+    both = float((present * mapped).sum())
+    return both / (float(present.sum()) + float((known * mapped).sum()) - both)
+
+
+def test_a_view_of_high_roofs_is_found(made, region, prepared):
+    query = made.query_of(leaning(seen_from(made, region, HERE), HEIGHTS[-1]), PRIOR)
+    assert error_m(prepared[UbevTemplate].match(query, top_k=1)) < 5
+
+
+# Regression
+
+
+def test_residuals_turn_with_the_surface():
+    """The true place lies a cell to the east and half a step clockwise; turned counter-clockwise it lies north."""
+    here = Pose(easting_m=100.0, northing_m=100.0, yaw_deg=355.0)
+    part = np.zeros((3, 5, 5))
+    part[1, 2, 3] = 1.0  # east of the middle
+    found, residuals = lessons(
+        Peak(mode=Mode(pose=here, score=1.0), part=part), replace(here, easting_m=100.0 + COARSE_M, yaw_deg=0.0)
+    )
+    assert residuals.tolist() == [[1, 0, 0.5], [0, 1, 0.5], [-1, 0, 0.5], [0, -1, 0.5]]
+    at = [np.unravel_index(int(row.argmax()), part.shape) for row in found]
+    assert at == [(1, 2, 3), (1, 1, 2), (1, 2, 1), (1, 3, 2)]
+
+
+def test_a_class_that_the_map_lacks_has_no_votes(region):
+    seen = Evidence(
+        classes=("railway", "building"), cells=np.array([[[PRESENT]], [[ABSENT]]], dtype=np.uint8), cell_size_m=1.0
+    )
+    votes, counts = templates_of(seen, region.classes)
+    assert votes.weights[:, 0, 0].tolist() == [-1.0, 0.0, 0.0]
+    assert counts.known.tolist() == [[1.0]]
+    assert field_of(region).grid.cell_size_m == 4.0
+
+
+@pytest.fixture(scope="module")
+def training(made):
+    """Views of another map, from places all over a coarse cell."""
+    other, rng = made.region_of(made.textured(6)), np.random.default_rng(4)
+    poses = poses_of(rng, 24)
+    queries = [replace(query_from(made, other, pose), region="other") for pose in poses]
+    truths = [SimpleNamespace(pose=pose) for pose in poses]
+    return Training(regions={"other": other}, pairs=tuple(zip(queries, truths, strict=True)))
+
+
+def poses_of(rng, count):
+    return [
+        Pose(easting_m=1210.0 + east, northing_m=8790.0 + north, yaw_deg=yaw)
+        for east, north, yaw in rng.uniform((-60, -60, 0), (60, 60, 360), (count, 3)).tolist()
+    ]
+
+
+def query_from(made, region, pose):
+    return made.query_of(seen_from(made, region, pose), replace(PRIOR, yaw_deg=pose.yaw_deg + 4.0))
+
+
+def test_a_taught_pose_is_nearer_than_the_highest_cell(made, region, prepared, training):
+    text = MaplocnetRegress().learn(training)
+    assert text == MaplocnetRegress().learn(training)
+    taught = MaplocnetRegress()
+    taught.prepare(region, text)
+    errors = {"taught": [], "coarse": []}
+    for pose in poses_of(np.random.default_rng(5), 12):
+        query = query_from(made, region, pose)
+        errors["taught"].append(error_m(taught.match(query, top_k=5), pose))
+        errors["coarse"].append(error_m(prepared[MaplocnetRegress].match(query, top_k=5), pose))
+    assert np.median(errors["taught"]) < 0.9 * np.median(errors["coarse"])
+
+
+def test_a_regressed_pose_has_no_rivals_and_no_confidence(made, region, prepared):
+    answer = prepared[MaplocnetRegress].match(made.query_of(seen_from(made, region, HERE), PRIOR), top_k=5)
+    assert len(answer.poses) == 1
+    assert answer.confidence is None
+    assert not answer.diagnostics
+
+
+@pytest.mark.parametrize("text", ["", "{}", "[]", json.dumps({"format": "maplocnet_regress 1", "weights": [[0.0]]})])
+def test_damaged_coefficients_are_refused_in_one_line(region, text):
+    with pytest.raises(ValueError, match=r"^maplocnet_regress: the learned text is damaged, .*: learn again$"):
+        MaplocnetRegress().prepare(region, text)
+
+
+def test_a_disc_beyond_the_map_has_no_answer(made, region, prepared):
+    far = replace(PRIOR, center_m=(9000.0, 9000.0))
+    assert prepared[MaplocnetRegress].match(made.query_of(seen_from(made, region, HERE), far), top_k=1) == WITHHELD
+
+
+# Local features
+
+
+def test_every_class_is_drawn_and_later_ones_cover_earlier_ones():
+    assert set(GREYS) == {item.name for item in load_taxonomy().classes}
+    ones = np.ones((1, 1), dtype=bool)
+    assert drawn(lambda _: ones, ("building", "green"), (1, 1)).item() == GREYS["building"]
+    assert drawn(lambda _: ~ones, ("building", "green"), (1, 1)).item() == GROUND
+
+
+def test_view_and_map_are_drawn_alike(made, region):
+    """A view that faces north, with cells twice as small as those of the map."""
+    pose = Pose(easting_m=1200.0, northing_m=8800.0, yaw_deg=0.0)
+    view = made.view_of(region, pose, size_cells=160, cell_size_m=0.5)
+    drawing = Drawing.of_view(view, 1.0)
+    np.testing.assert_array_equal(drawing.grey, Drawing.of_map(region).grey[160:240, 160:240])
+    assert drawing.is_known.all()
+
+
+def test_features_of_view_and_map_lie_where_the_pose_puts_them(made, region):
+    pose = Pose(easting_m=1200.0, northing_m=8800.0, yaw_deg=0.0)
+    seen = view_features(Drawing.of_view(made.view_of(region, pose, size_cells=200), 1.0), region.grid)
+    mapped = map_features(Drawing.of_map(region), region.grid)
+    away_m = np.linalg.norm(pose.to_map(seen.points)[:, None] - mapped.points[None], axis=2).min(axis=1)
+    assert len(seen) > 100
+    assert (away_m < 1.5).mean() > 0.7
+
+
+def test_inliers_are_told_and_a_heading_that_is_unlikely_is_dropped(made, region, prepared):
+    matcher = prepared[AnyvislocPipeline]
+    query = made.query_of(seen_from(made, region, HERE), PRIOR)
+    found = matcher.match(query, top_k=5)
+    assert found.diagnostics["inliers"] == found.scores[0] > 30
+    assert found.scores[0] == int(found.scores[0])
+    wrong = matcher.match(replace(query, prior=replace(PRIOR, yaw_deg=260.0)), top_k=5)
+    assert wrong.diagnostics["inliers"] < 10
+    assert wrong.scores[0] < found.scores[0] / 4

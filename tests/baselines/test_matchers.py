@@ -28,9 +28,12 @@ REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in 
 }
 VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
 DENSE = ("fft_vote", "raster_soft", "raster_uniform", *VARIANTS)
-OVERLAPPING = ("schmidt_segcorr", "ubev_template", "vecmap_phasecorr", "zilke_semantic_mi")
+OVERLAPPING = ("popov_roadplane", "schmidt_segcorr", "ubev_template", "vecmap_phasecorr", "zilke_semantic_mi")
 # These withhold where a view shows few whole objects.
-OF_OBJECTS = ("liu_object_graph", "ouyang_shape_votes", "spatial_graph_clique")
+OF_OBJECTS = (
+    *("liu_object_graph", "ouyang_shape_votes", "road_2rit", "spatial_graph_clique", "stfm_centroids"),
+    "triangle_rsim",
+)
 OF_PLACES = ("brm_grid", "maplocnet_regress", "polar_vsc", "vojir_instance_rays", "zhang_hier_consensus")
 OF_TILES = ("anyvisloc_pipeline", "lcm_balanced", "sues_multi_height", "u1652_instance_retrieval")
 SYSTEMS = (*OVERLAPPING, *OF_OBJECTS, *OF_PLACES, *OF_TILES)
@@ -101,7 +104,7 @@ def test_answers_are_valid_and_the_same_in_any_order(name, region, prepared, que
     assert forward == backward
     least = 0.5 if name in OF_OBJECTS else 1.0
     assert sum(bool(match.poses) for match in forward.values()) >= least * len(forward)
-    assert all(match.confidence is None for match in forward.values())
+    assert all(match.confidence is None for match in forward.values() if match.poses)
 
 
 @pytest.mark.parametrize("name", REGISTERED)

@@ -178,6 +178,7 @@ class Alignment:
             return (mapped.places_m[row] - there_m) @ turn, mapped.outward[row] @ turn
 
         def share(parameters: Floats) -> float:
+            """Return the share of the borders that lie on mapped ones."""
             return float((np.linalg.norm(nearest(parameters)[0], axis=1) <= NEAR_M).mean())
 
         found = np.zeros(8)
@@ -212,6 +213,7 @@ def straightened(query: Query, matrix: Floats) -> Query:
     in_cells = np.linalg.inv(to_view) @ matrix @ to_view
 
     def warped(layers: NDArray[np.uint8], beyond: int) -> NDArray[np.uint8]:
+        """Move layers; what comes from beyond the view has the value `beyond`."""
         found = [
             cv2.warpPerspective(
                 layer,

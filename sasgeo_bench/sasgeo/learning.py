@@ -37,7 +37,7 @@ from sasgeo_bench.tasks.query import Query, Truth, base_of
 MODES: Final = 16  # of each training search
 WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
 MOST_VALUES: Final = 400_000_000  # cells in all layers of a map that is held whole: 16 km2 in cells of 1 m
-_MARGIN_M: Final = 64.0  # of a part of a map
+_MARGIN_M: Final = 72.0  # of a part of a map, beyond what any view there shows
 _UNIT: Final = 64  # cells: parts begin where cells of any size of the search do
 
 

@@ -37,10 +37,10 @@ OF_OBJECTS = (
 OF_PLACES = ("brm_grid", "maplocnet_regress", "polar_vsc", "vojir_instance_rays", "zhang_hier_consensus")
 OF_TILES = ("anyvisloc_pipeline", "lcm_balanced", "sues_multi_height", "u1652_instance_retrieval")
 SYSTEMS = (*OVERLAPPING, *OF_OBJECTS, *OF_PLACES, *OF_TILES)
-STRIDES = dict.fromkeys((*VARIANTS, *SYSTEMS, "raster_soft"), 12) | {
-    "fft_vote": 6,
-    "raster_uniform": 6,
-    "graph_only": 6,
+STRIDES = {
+    **dict.fromkeys((*OVERLAPPING, *OF_PLACES, *OF_TILES), 24),
+    **dict.fromkeys((*VARIANTS, *OF_OBJECTS, "raster_soft"), 12),
+    **dict.fromkeys(("fft_vote", "raster_uniform", "graph_only"), 6),
 }
 CONTROLS = ("random", "prior_centre", "map_density_prior")
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sasgeo_baselines.buildings import CLASS, Windows, ring_shares
 from sasgeo_baselines.global_descriptor import Sums
-from sasgeo_baselines.place_matcher import PlaceMatcher
+from sasgeo_baselines.place_matcher import SPREAD, PlaceMatcher
 from sasgeo_baselines.schmidt_segcorr import FULL, SchmidtSegcorr
 from sasgeo_bench import (
     PRESENT,
@@ -35,7 +35,6 @@ PART_M: Final = 32.0  # a grid of four lies within a view of 192 m at any headin
 BEST: Final = 50  # windows whose masks are compared
 NEAR_M: Final = 20.0  # of a window; neighbours are 24 m apart
 YAW_STEP_DEG: Final = 10.0  # between headings of the grid: half of it moves a corner by 8 m, a quarter of a part
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
 LEAST_KNOWN: Final = 0.25  # of a part of a view; else it is not compared
 LEAST_MAPPED: Final = 0.5  # of the grid around a place that the map must know
 LEAST_SPREAD: Final = 0.01  # of a share over a map: where hardly anything is built

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.global_descriptor import separate
-from sasgeo_baselines.place_matcher import PlaceMatcher
+from sasgeo_baselines.place_matcher import SPREAD, PlaceMatcher
 from sasgeo_baselines.polar import (
     CELL_M,
     DEPTH,
@@ -47,7 +47,6 @@ from sasgeo_bench import (
 STRIDE: Final = 6  # cells between two tiles of a gallery: 24 m, so that no place is farther than 17 m from one
 APART_M: Final = 25.0  # between two places of an answer
 YAW_STEP_DEG: Final = 7.5  # a third of a sector
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
 DIMENSIONS: Final = 128  # of the learned feature, as the recipe has it
 NUMBERS: Final = len(GROUPS) * DEPTH  # of a descriptor
 

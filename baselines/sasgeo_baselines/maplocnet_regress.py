@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.place_matcher import PlaceMatcher
+from sasgeo_baselines.place_matcher import SPREAD, PlaceMatcher
 from sasgeo_bench import (
     PRESENT,
     Disc,
@@ -37,7 +37,6 @@ from sasgeo_bench import (
 CELL_M: Final = 4.0  # of the map that is read
 COARSE_M: Final = 16.0  # of a cell of the surface: leaves a residual that a finer search would find
 YAW_STEP_DEG: Final = 10.0  # moves the rim of a view by a cell of the surface
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
 LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 REACH: Final = 2  # cells to each side of the highest one whose scores are read, and one heading
 PENALTY: Final = 100.0  # of squared coefficients; scores count in standard deviations of the part

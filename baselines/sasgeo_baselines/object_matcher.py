@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_baselines.place_matcher import PlaceMatcher
+from sasgeo_baselines.place_matcher import SPREAD, PlaceMatcher
 from sasgeo_bench import (
     NODE_KINDS,
     Disc,
@@ -26,7 +26,6 @@ from sasgeo_bench import (
     wrap_deg,
 )
 
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
 FEWEST: Final = 3  # objects of a view that can be told from chance
 CELL_M: Final = 8.0  # of votes
 # Ends of roads are gaps of perception more often than ends; bends of rivers lie nowhere in particular.

@@ -5,12 +5,44 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Final, Generic, TypeVar
 
-from sasgeo_bench import WITHHELD, Disc, Match, MatcherCard, Mode, Pose, Query, Region, is_blind, ranked_candidates
+import numpy as np
+from numpy.typing import NDArray
+
+from sasgeo_bench import (
+    WITHHELD,
+    Disc,
+    Match,
+    MatcherCard,
+    Mode,
+    Pose,
+    Prior,
+    Query,
+    Region,
+    is_blind,
+    ranked_candidates,
+    wrap_deg,
+)
 
 MOST_PLACES: Final = 10  # poses of one answer
+SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
 AROUND_M: Final = 24.0  # a view may lie so far from its candidate
 
 View = TypeVar("View")
+
+
+def turns_within(prior: Prior, count: int, *, spread: float = SPREAD) -> NDArray[np.int64]:
+    """Return which of `count` equal parts of a circle are headings that a prior allows, at least that nearest to it.
+
+    >>> ahead = Prior(center_m=None, radius_m=None, yaw_deg=10.0, yaw_sigma_deg=20.0, scale_sigma=0.0)
+    >>> turns_within(ahead, 12).tolist()
+    [0, 1, 2, 11]
+    """
+    turns = np.arange(count)
+    if prior.yaw_deg is None or prior.yaw_sigma_deg is None:
+        return turns
+    step_deg = 360.0 / count
+    away_deg = np.abs(wrap_deg(turns * step_deg - prior.yaw_deg))
+    return np.flatnonzero(away_deg <= spread * prior.yaw_sigma_deg + step_deg / 2)
 
 
 class PlaceMatcher(ABC, Generic[View]):

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, special
 
-from sasgeo_baselines.place_matcher import PlaceMatcher
+from sasgeo_baselines.place_matcher import PlaceMatcher, turns_within
 from sasgeo_baselines.polar import CELL_M
 from sasgeo_baselines.visual_context import AREAS_M2, SECTORS, STRIDE, Context, ContextMap, Floats, Shares
-from sasgeo_bench import Disc, MatcherCard, Mode, Pose, Prior, Query, Region, points_of, thinned, wrap_deg
+from sasgeo_bench import Disc, MatcherCard, Mode, Pose, Prior, Query, Region, points_of, thinned
 
 ALPHA: Final = 0.01  # of the test, for each ring
 PATCH_M: Final = 8.0  # as wide as a ring: ground that counts as one observation, as neighbouring cells are alike
@@ -24,7 +24,6 @@ SHORTLIST: Final = 200  # places whose sectors are compared
 REFINED: Final = 16  # places around which the best one is searched
 AROUND: Final = 2  # cells to each side: halfway to the next place
 LEAST_SHARED: Final = 0.5  # of what is known of a view, that the map must know
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are allowed
 STEP_DEG: Final = 360.0 / SECTORS
 APART_M: Final = 25.0
 _BLOCK: Final = 50_000  # places that are tested together: bounds the memory
@@ -137,13 +136,6 @@ class Sight:
     context: Context
     prior: Prior
 
-    def is_allowed(self) -> NDArray[np.bool_]:
-        """Return which turns by whole sectors the prior allows, shape (SECTORS,); that nearest to it always."""
-        if self.prior.yaw_deg is None or self.prior.yaw_sigma_deg is None:
-            return np.ones(SECTORS, dtype=bool)
-        away_deg = np.abs(wrap_deg(np.arange(SECTORS) * STEP_DEG - self.prior.yaw_deg))
-        return np.asarray(away_deg <= SPREAD * self.prior.yaw_sigma_deg + STEP_DEG / 2)
-
 
 class PolarVsc(PlaceMatcher[Sight]):
     """Two stages: rings with the heading marginalised, gated by a test; then sectors."""
@@ -224,7 +216,7 @@ class PolarVsc(PlaceMatcher[Sight]):
         if not len(places_m):
             return []
         found = correlations(view.context.sectors, self._map.at(places_m).sectors, self._map.mean)
-        allowed = np.flatnonzero(view.is_allowed())
+        allowed = turns_within(view.prior, SECTORS)
         best = allowed[found[:, allowed].argmax(axis=1)]
         rows = np.arange(len(found))
         before, here, after = (found[rows, (best + step) % SECTORS] for step in (-1, 0, 1))

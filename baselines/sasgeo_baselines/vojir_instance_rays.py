@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from sasgeo_baselines.instance_rays import CLASS, REACH_M, BuildingMap, Floats, Points, Rays, cast
-from sasgeo_baselines.place_matcher import PlaceMatcher
+from sasgeo_baselines.place_matcher import PlaceMatcher, turns_within
 from sasgeo_bench import (
     ABSENT,
     Disc,
@@ -26,7 +26,6 @@ from sasgeo_bench import (
     Training,
     rotation,
     thinned,
-    wrap_deg,
 )
 
 RAYS: Final = 360
@@ -42,7 +41,6 @@ WEIGHTS: Final = (1.0, 1.0, 1.0)  # of range, boundary and hit
 START_M: Final = 16.0  # from the middle of a view: rays of 80 m from there lie within a view of 192 m
 LEAST_JUDGED: Final = 0.5  # of the rays, where some are left out
 LEAST_SPREAD: Final = 1e-3
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are allowed
 APART_M: Final = 25.0
 SAMPLED_M: Final = 50.0  # between places of a training map
 
@@ -163,14 +161,6 @@ class Sight:
     start_m: Points
     prior: Prior
 
-    def turns(self) -> NDArray[np.int64]:
-        """Return the turns by whole rays that the prior allows, at least that nearest to it."""
-        every, step_deg = np.arange(RAYS), 360.0 / RAYS
-        if self.prior.yaw_deg is None or self.prior.yaw_sigma_deg is None:
-            return every
-        away_deg = np.abs(wrap_deg(every * step_deg - self.prior.yaw_deg))
-        return np.flatnonzero(away_deg <= SPREAD * self.prior.yaw_sigma_deg + step_deg / 2)
-
 
 class VojirInstanceRays(PlaceMatcher[Sight]):
     """Nearest places by waves of rays, then the turn and the place by the rays themselves."""
@@ -259,7 +249,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
 
     def _turned(self, view: Sight, places_m: Points) -> list[Mode]:
         """Return the best pose whose rays begin at each place; minus infinity is the score of one that is not known."""
-        turns = view.turns()
+        turns = turns_within(view.prior, RAYS)
         found = differences(view.profile, Profiles.of(self._map.rays(places_m, RAYS), censors=self.censors), turns)
         best = found.argmin(axis=1)
         yaws_deg, least = turns[best] * (360.0 / RAYS), found[np.arange(len(found)), best]

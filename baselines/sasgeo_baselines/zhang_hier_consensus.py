@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_baselines.global_descriptor import separate
 from sasgeo_baselines.patches import SIDE, Patches, matches
-from sasgeo_baselines.place_matcher import AROUND_M, PlaceMatcher
+from sasgeo_baselines.place_matcher import AROUND_M, PlaceMatcher, turns_within
 from sasgeo_baselines.polar import (
     CELL_M,
     DEPTH,
@@ -43,7 +43,6 @@ STRIDE: Final = 6  # cells of 4 m between two crops: a view is at most 17 m off 
 MARGIN_M: Final = 48.0  # of a crop around a view: twice that, so that turned views fit, too
 CROPS_APART_M: Final = 48.0  # nearer ones show the same ground
 APART_M: Final = 25.0  # two answers
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
 ROUNDS: Final = 2  # of consensus: a patch hears of those two patches away
 NEAR_M: Final = 8.0  # of a match from where the similarity puts it: the side of a patch, as places are middles of them
 LEAST: Final = 4  # matches that agree: two make a similarity
@@ -110,15 +109,6 @@ class Seen:
     descriptor: Floats
     patches: Patches
     prior: Prior
-
-    @property
-    def turns(self) -> list[int]:
-        """Return headings to try, sectors east of north."""
-        prior = self.prior
-        if prior.yaw_deg is None or prior.yaw_sigma_deg is None:
-            return list(range(SECTORS))
-        reach_deg = SPREAD * prior.yaw_sigma_deg + _STEP_DEG / 2
-        return [turn for turn in range(SECTORS) if abs(wrap_deg(turn * _STEP_DEG - prior.yaw_deg)) <= reach_deg]
 
     def allows(self, pose: Pose, disc: Disc) -> bool:
         """Return whether place, heading and scale of a pose are likely by the prior."""
@@ -220,7 +210,7 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
         rows = np.flatnonzero(disc.holds(self._crops.middles_m))
         if not len(rows):
             return []
-        turns = view.turns
+        turns = turns_within(view.prior, SECTORS).tolist()  # sectors east of north
         likeness = self._crops.likeness(view.descriptor, rows, turns)
         turn, best = likeness.argmax(axis=1), likeness.max(axis=1)
         middles_m = self._crops.middles_m[rows]

@@ -17,6 +17,7 @@ from sasgeo_bench.tasks.query import Query, Step
 
 CLASSES = ("building", "road_minor", "water")
 SIDE = 420
+HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)  # on a map of that side, far enough from its edges
 
 
 def textured(seed: int, side: int = SIDE) -> np.ndarray:
@@ -44,6 +45,12 @@ class MadeUp(SimpleNamespace):
     read_layer = None
     layer = Region.layer
     known = Region.known
+
+
+def error_m(answer, pose=HERE):
+    """How far the first pose of an answer is from a place."""
+    best = answer.poses[0]
+    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
 
 
 def region_of(layers: np.ndarray, *, cell_size_m: float = 1.0, classes: tuple[str, ...] = CLASSES) -> MadeUp:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.place_matcher import SPREAD, PlaceMatcher
+from sasgeo_baselines.pose_votes import allowed
 from sasgeo_bench import (
     NODE_KINDS,
     Disc,
@@ -23,7 +24,6 @@ from sasgeo_bench import (
     Region,
     rotation,
     turns_of,
-    wrap_deg,
 )
 
 FEWEST: Final = 3  # objects of a view that can be told from chance
@@ -32,7 +32,6 @@ CELL_M: Final = 8.0  # of votes
 LEFT_OUT: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.name.endswith(("dead_end", "river_bend")))
 _WINDOW: Final = 3  # cells a side that vote together
 _EACH: Final = 8  # peaks of a heading
-_MOST_OFF: Final = 3.0  # standard deviations of the prior, of a heading that is fitted
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -58,13 +57,7 @@ class Sight:
 
     def allows(self, pose: Pose, disc: Disc) -> bool:
         """Return whether a fitted pose lies in a disc, and heads within three standard deviations of the prior."""
-        is_inside = bool(disc.wider(CELL_M).holds(np.array([[pose.easting_m, pose.northing_m]]))[0])
-        if self.prior.yaw_deg is None or self.prior.yaw_sigma_deg is None:
-            return is_inside
-        return (
-            is_inside
-            and abs(float(wrap_deg(pose.yaw_deg - self.prior.yaw_deg))) <= _MOST_OFF * self.prior.yaw_sigma_deg
-        )
+        return bool(allowed(np.array([[pose.easting_m, pose.northing_m, pose.yaw_deg]]), self.prior, disc)[0])
 
 
 class ObjectMatcher(PlaceMatcher[Sight]):

@@ -17,8 +17,8 @@ from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.sasgeo.nodes import INDEX
 from sasgeo_bench.tasks.vectors import as_features, vector_table
+from tests.made_up import HERE, error_m
 
-HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
 PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
 SIDE, VIEW = 420, 176
@@ -72,11 +72,6 @@ def matcher(request, region):
 @pytest.fixture
 def query(made, region):
     return made.query_of(made.view_of(region, HERE, size_cells=VIEW), PRIOR)
-
-
-def error_m(answer, pose=HERE):
-    best = answer.poses[0]
-    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
 
 
 def hidden(query, cols):

@@ -28,15 +28,10 @@ from sasgeo_bench.matching.matcher import WITHHELD, check_match
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.nodes import INDEX, MOST_ARMS, Nodes
 from sasgeo_bench.search.plan import Disc
+from tests.made_up import HERE, error_m
 
-HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
 PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
-
-
-def error_m(answer, pose=HERE):
-    best = answer.poses[0]
-    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
 
 
 # Patches

@@ -15,9 +15,9 @@ from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import WITHHELD, Training, check_match
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.search.shifts import Overlaps
+from tests.made_up import HERE, error_m
 
 MATCHERS = (SchmidtSegcorr, ZilkeSemanticMi, VecmapPhasecorr)
-HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
 PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
 
 
@@ -35,11 +35,6 @@ def matcher(request, region):
 
 def seen_from(made, region, pose, **more):
     return made.view_of(region, pose, size_cells=128, **more)
-
-
-def error_m(answer, pose=HERE):
-    best = answer.poses[0]
-    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
 
 
 def test_a_view_is_found_on_the_map(made, region, matcher):

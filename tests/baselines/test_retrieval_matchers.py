@@ -16,9 +16,9 @@ from sasgeo_baselines.u1652_instance_retrieval import U1652InstanceRetrieval
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import MOST_LEARNED_BYTES, WITHHELD, Training, check_match
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from tests.made_up import HERE, error_m
 
 MATCHERS = (U1652InstanceRetrieval, SuesMultiHeight, LcmBalanced)
-HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
 PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
 WITHIN_M = STRIDE * CELL_M * 0.71  # half a diagonal of the lattice
 
@@ -60,11 +60,6 @@ def small(kind, *, others=36):
 
 def seen_from(made, region, pose):
     return made.view_of(region, pose, size_cells=192)
-
-
-def error_m(answer, pose=HERE):
-    best = answer.poses[0]
-    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
 
 
 def test_a_tile_on_the_lattice_is_what_the_gallery_has_there(region, ground):

@@ -28,9 +28,9 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.search.plan import Mode
 from sasgeo_bench.search.shifts import Overlaps
+from tests.made_up import HERE, error_m
 
 MATCHERS = (AnyvislocPipeline, MaplocnetRegress, UbevTemplate)
-HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
 PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
 WITHIN_M = {AnyvislocPipeline: 3.0, MaplocnetRegress: 12.0, UbevTemplate: 3.0}
 
@@ -55,11 +55,6 @@ def matcher(request, prepared):
 
 def seen_from(made, region, pose):
     return made.view_of(region, pose, size_cells=160)
-
-
-def error_m(answer, pose=HERE):
-    best = answer.poses[0]
-    return np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m)
 
 
 def test_a_view_is_found_on_the_map(made, region, matcher):

@@ -9,12 +9,13 @@ import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.global_descriptor import separate
+from sasgeo_baselines.learned import read_learned, sound
 from sasgeo_baselines.place_matcher import SPREAD, PlaceMatcher
 from sasgeo_baselines.polar import (
     CELL_M,
@@ -171,16 +172,15 @@ class Embedding:
     @classmethod
     def read(cls, text: str, *, name: str) -> Self:
         """Read a learned text for the matcher `name`; raise one line if it is damaged."""
-        try:
-            saved = json.loads(text)
+
+        def read(saved: dict[str, Any]) -> NDArray[np.float32]:
+            """Return all numbers."""
             content = base64.b85decode(saved["numbers"])
             numbers = np.frombuffer(content, dtype="<f2").astype(np.float32).reshape(NUMBERS, 1 + DIMENSIONS)
             is_whole = saved["format"] == _FORMAT and saved["crc32"] == zlib.crc32(content)
-        except (ValueError, KeyError, TypeError, AttributeError):
-            is_whole = False
-        if not is_whole or not np.isfinite(numbers).all():
-            message = f"{name}: the learned text is damaged, or of another version of this matcher: learn again"
-            raise ValueError(message)
+            return sound(numbers, is_sound=is_whole and bool(np.isfinite(numbers).all()))
+
+        numbers = read_learned(name, text, read)
         return cls(mean=numbers[:, 0], weights=numbers[:, 1:])
 
 

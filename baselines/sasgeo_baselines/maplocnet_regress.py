@@ -6,12 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
-from typing import Final
+from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_baselines.learned import read_learned, sound
 from sasgeo_baselines.place_matcher import SPREAD, PlaceMatcher
 from sasgeo_bench import (
     PRESENT,
@@ -269,13 +270,11 @@ def lessons(peak: Peak, truth: Pose) -> tuple[Floats, Floats]:
 
 def weights_of(learned: str) -> Floats:
     """Read the coefficients; raise one line if their text is damaged."""
-    try:
-        saved = json.loads(learned)
+
+    def read(saved: dict[str, Any]) -> Floats:
+        """Return the coefficients."""
         weights = np.array(saved["weights"], dtype=np.float64)
         is_whole = saved["format"] == _FORMAT and weights.shape == _SHAPE and bool(np.isfinite(weights).all())
-    except (ValueError, KeyError, TypeError):
-        is_whole = False
-    if not is_whole:
-        message = "maplocnet_regress: the learned text is damaged, or of another version of this matcher: learn again"
-        raise ValueError(message)
-    return weights
+        return sound(weights, is_sound=is_whole)
+
+    return read_learned("maplocnet_regress", learned, read)

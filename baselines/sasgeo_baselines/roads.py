@@ -142,6 +142,7 @@ def _points_of_vectors(query: Query) -> Floats | None:
     if vectors is None or not vectors["class"].isin(ROADS).any():
         return None
     lines = vectors.geometry.to_numpy()[vectors["class"].isin(ROADS).to_numpy()]
+    lines = lines[shapely.length(lines) > 0]  # a line between equal points cannot be cut
     return np.asarray(shapely.get_coordinates(shapely.segmentize(lines, STEP_M)), dtype=np.float64)
 
 

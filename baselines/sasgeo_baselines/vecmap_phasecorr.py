@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_baselines.learned import read_learned, sound
 from sasgeo_baselines.shift_matcher import ShiftMatcher
 from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlaps, Pose, Query, Region, Training
 
@@ -66,7 +67,7 @@ class VecmapPhasecorr(ShiftMatcher):
     def read(self, region: Region, learned: str | None) -> None:
         """Read the map and the weights."""
         super().read(region, None)
-        self.weights: Mapping[str, float] = json.loads(learned) if learned else {}
+        self.weights: Mapping[str, float] = {} if learned is None else read_learned(self.card.name, learned, _weights)
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the signed distances of the view, less their mean over known cells, 0 where it is unknown."""
@@ -121,6 +122,11 @@ class VecmapPhasecorr(ShiftMatcher):
             plan = replace(search.plan, around_m=LEARNED_AROUND_M)
             replace(search, plan=plan, score=lambda overlaps: note(overlaps, names)).candidates([pose])
         return found
+
+
+def _weights(saved: dict[str, float]) -> dict[str, float]:
+    """Return the learned weights; raise where they are none."""
+    return sound(dict(saved), is_sound=all(0 <= weight < np.inf for weight in saved.values()))
 
 
 def phases(overlaps: Overlaps, weights: Sequence[float]) -> NDArray[np.float32]:

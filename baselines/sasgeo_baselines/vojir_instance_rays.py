@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from sasgeo_baselines.instance_rays import CLASS, REACH_M, BuildingMap, Floats, Points, Rays, cast
+from sasgeo_baselines.learned import read_learned, sound
 from sasgeo_baselines.place_matcher import PlaceMatcher, turns_within
 from sasgeo_bench import (
     ABSENT,
@@ -214,7 +215,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         least_m = float(np.sqrt(grid.rows * grid.cols / MOST_PLACES)) * grid.cell_size_m
         places_m, waves = zip(*self._described(self._map, max(STEP_M, least_m)), strict=True)
         self._places_m = np.concatenate(places_m)
-        self._spread = np.array(json.loads(learned)["spread"], dtype=np.float32) if learned else spread_of(waves)
+        self._spread = spread_of(waves) if learned is None else read_learned(self.card.name, learned, _spread)
         self._waves = np.concatenate(waves) / self._spread
 
     def look(self, query: Query) -> Sight | None:
@@ -277,3 +278,9 @@ def _ranked(modes: Sequence[Mode], disc: Disc) -> list[Mode]:
     return sorted(
         (mode for mode in modes if np.isfinite(mode.score) and disc.has(mode.pose)), key=lambda mode: -mode.score
     )
+
+
+def _spread(saved: dict[str, list[float]]) -> Floats:
+    """Return the learned spread; raise where it is none."""
+    found = np.array(saved["spread"], dtype=np.float32)
+    return sound(found, is_sound=found.ndim == 1 and bool((np.isfinite(found) & (found > 0)).all()))

@@ -80,3 +80,14 @@ def test_a_class_counts_the_same_however_rare_it_is():
     channels = centred(layers, known).channels
     assert np.allclose((channels**2).sum(axis=(1, 2)), 100)
     assert np.allclose(channels.sum(axis=(1, 2)), 0, atol=1e-4)
+
+
+@pytest.mark.parametrize("text", ["x", "{}", "null", '{"share": 3}', '{"share": NaN}'])
+def test_a_damaged_share_is_refused_in_one_line(region, text):
+    with pytest.raises(ValueError, match="hu_dual_reference: the learned text"):
+        prepared(HuDualReference, region, text)
+
+
+def test_no_candidates_have_no_answer(region, seen):
+    query = replace(query_of(NOISE, evidence=seen(TRUTH)), frames=(), track="retrieval", candidates=())
+    assert prepared(HuMapOnly, region).match(query, top_k=1) == sgb.WITHHELD

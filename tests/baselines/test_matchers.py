@@ -119,6 +119,28 @@ def test_no_more_is_given_than_asked_for(name, prepared, queries) -> None:
     assert len(prepared(name).match(query, top_k=1).poses) == 1 or name in OF_OBJECTS
 
 
+LEARNERS = (
+    *("lcm_balanced", "maplocnet_regress", "sues_multi_height", "u1652_instance_retrieval", "vecmap_phasecorr"),
+    "vojir_instance_rays",
+)
+
+
+@pytest.mark.parametrize("text", ["x", "", "null", "[]", '{"spread": [0]}', '{"building": "much"}'])
+@pytest.mark.parametrize("name", LEARNERS)
+def test_a_damaged_learned_text_is_refused_in_one_line(name, text, region) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: the learned text is damaged.*learn again$"):
+        make(name).prepare(region, text)
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_no_candidates_have_no_answer_and_a_view_of_one_cell_is_borne(name, prepared, queries) -> None:
+    asked = next(item for item in queries if item.track == "retrieval")
+    nobody = prepared(name).match(replace(asked, candidates=()), top_k=5)
+    assert not check_match(nobody, replace(asked, candidates=()), top_k=5).poses
+    tiny = replace(asked, evidence=asked.evidence.replace(asked.evidence.cells[:, 96:97, 96:97].copy()))
+    check_match(prepared(name).match(tiny, top_k=5), tiny, top_k=5)
+
+
 @pytest.mark.parametrize("name", DENSE)
 def test_dense_matchers_find_what_has_no_errors(name, prepared, queries, truths) -> None:
     matcher = prepared(name)

@@ -98,7 +98,8 @@ def test_a_view_of_vectors_is_found_by_its_junctions(query, region, matcher):
     view = shapely.box(-VIEW / 2, -VIEW / 2, VIEW / 2, VIEW / 2)
     streets = shapely.transform(region.features.geometry.to_numpy(), inverse(HERE).to_map)
     cut = [street for street in shapely.intersection(streets, view) if not street.is_empty]
-    drawn = vector_table([("road_minor", 0, False, street) for street in cut])
+    point = shapely.LineString([(0, 0), (0, 0)])  # as a detector may draw it
+    drawn = vector_table([("road_minor", 0, False, street) for street in (*cut, point)])
     answer = matcher.match(replace(query, vectors=drawn), top_k=1)
     assert error_m(answer) < 1
     assert answer.scores[0] > 0.9

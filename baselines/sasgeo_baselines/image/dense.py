@@ -97,6 +97,8 @@ def bounds_of(query: sgb.Query, grid: sgb.Grid) -> Bounds:
     """Return the places that a query leaves open."""
     if query.track == "retrieval":
         points_m, reach_m = sgb.points_of(query.candidates), AROUND_M
+        if not len(points_m):
+            return 0, 0, 0, 0
     elif query.prior.center_m is not None:
         points_m, reach_m = np.array([query.prior.center_m]), query.prior.radius_m or 0.0
     else:

@@ -40,6 +40,8 @@ class Features:
 
 def detect(grey: NDArray[np.uint8], is_known: NDArray[np.bool_], *, most: int) -> Features:
     """Return the strongest ORB features of a picture; places are (u, v), pixels from its upper left corner."""
+    if min(grey.shape) <= 2 * _RIM_PX:  # OpenCV cannot make a pyramid of so few pixels
+        return Features(points=np.zeros((0, 2)), descriptors=np.zeros((0, _BYTES), dtype=np.uint8))
     inside = cv2.erode(
         cv2.copyMakeBorder(is_known.astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1),
         np.ones((2 * _RIM_PX + 1,) * 2, dtype=np.uint8),

@@ -27,6 +27,7 @@ from sasgeo_baselines.image.dense import (
 )
 from sasgeo_baselines.image.ncc_gradient import directions
 from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, grey_of, side_of, sight_of
+from sasgeo_baselines.learned import read_learned, sound
 
 PIXEL_M: Final = 2.0
 SHARES: Final = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)  # of the imagery in the sum, that learning tries
@@ -130,7 +131,7 @@ class HuDualReference:
         """Read map, imagery, and the share of the imagery."""
         is_useless = "imagery" in self.card.needs and region.imagery is None
         self._reference = None if is_useless else Reference.of(region)
-        taught = UNTAUGHT if learned is None else float(json.loads(learned)["share"])
+        taught = UNTAUGHT if learned is None else read_learned(self.card.name, learned, _share)
         self._share = taught if self.share is None else self.share
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
@@ -184,6 +185,11 @@ class HuImageryOnly(HuDualReference):
         ours="The imagery's half of `hu_dual_reference`: the correlation of directions of gradients in pixels of 2 m",
         limits=f"One half of `hu_dual_reference`, to see what the other adds; {LIMITS}",
     )
+
+
+def _share(saved: dict[str, float]) -> float:
+    """Return the learned share; raise where it is none."""
+    return sound(float(saved["share"]), is_sound=saved["share"] in SHARES)
 
 
 def _is_right(field: Field | None, query: sgb.Query, truth: sgb.Truth) -> bool:

@@ -250,7 +250,7 @@ def plan_pipeline(
     for number, task in enumerate(spec.task):
         asked = Wanted(
             suites=tuple(task.suites),
-            regions=tuple(spec.regions),
+            regions=tuple(task.regions or spec.regions),
             split=str(spec.split),  # a file with tasks names one
             count=task.sites,
             seed=seed,

@@ -46,7 +46,7 @@ ONE_DETECTOR: Final = [PUBLISHED]
 _NEWER: Final[Mapping[str, Mapping[str, object]]] = {
     "contrast": {"pilot": None, "detectors": []},
     "pilot": {"control": None, "spread": None},
-    "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR, "segmenters": []},
+    "task": {**{key: [] for key in CHOICE}, "detectors": ONE_DETECTOR, "segmenters": [], "regions": []},
     "paper": {"crop_readings": []},
     "learning": {"detector": PUBLISHED, "kinds": []},
 }
@@ -120,7 +120,8 @@ class ContrastSpec(Document):
 class TaskSpec(Document):
     """Suites that are drawn alike; several of these make up a pipeline.
 
-    `prior` is that of each suite unless given; `matchers` are those that are asked, all of the file unless given.
+    `prior` is that of each suite unless given; `matchers` are those that are asked and `regions` those that are drawn,
+    all of the file unless given.
     `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where they are empty: fewer variants
     at more sites say more. Each variant is drawn with each of `detectors`. Suites of pictures name `segmenters` from
     `list-segmenters`: each makes evidence of all pictures, which is asked, learned from and compared as a suite of its
@@ -139,6 +140,7 @@ class TaskSpec(Document):
     tracks: list[Track] = []
     detectors: Annotated[list[Detector], Field(min_length=1)] = ONE_DETECTOR
     segmenters: list[SegmenterName] = []
+    regions: list[str] = []
 
     @field_validator("detectors")
     @classmethod
@@ -304,6 +306,7 @@ class PipelineFile(NamedDocument):
             ("suite", suites),
             ("region", self.regions),
             *(("detector", [str(name) for name in task.detectors]) for task in self.task),
+            *(("region", task.regions) for task in self.task),
             ("matcher", self.matchers),
             ("rejector", self.rejectors),
             ("contrast", [item.name for item in self.contrast]),
@@ -343,6 +346,10 @@ class PipelineFile(NamedDocument):
             strange = next((name for name in task.matchers if name not in self.matchers), None)
             if strange is not None:
                 message = f"a [[task]] asks {strange!r}, which is not among 'matchers': name it there, too"
+                raise ValueError(message)
+            strange = next((name for name in task.regions if name not in (self.regions or task.regions)), None)
+            if strange is not None:
+                message = f"a [[task]] draws {strange!r}, which is not among 'regions': name it there, too"
                 raise ValueError(message)
         oracles = [] if self.learning is None else self.learning.oracles
         strange = next((name for name in oracles if name not in self.matchers), None)

@@ -230,6 +230,14 @@ def test_what_changes_queries_has_them_drawn_anew(made, changes, tmp_path):
     assert made_tasks(other.requests[0]) is None
 
 
+def test_a_task_of_its_own_regions_is_drawn_on_these_alone(tmp_path):
+    own = '[[task]]\nsuites = ["occlusion"]\nsites = 1\nregions = ["town-grid"]\n[[contrast]]'
+    both = {'regions = ["town-suburb"]': 'regions = ["town-suburb", "town-grid"]'}
+    plan = plan_pipeline(small(**{"[[contrast]]": own} | both), out=tmp_path, tell=lambda _: None)
+    found = [(item.suite, item.region.id) for item in plan.requests]
+    assert found == [("clean", "town-suburb"), ("clean", "town-grid"), ("occlusion", "town-grid")]
+
+
 def test_a_task_that_was_touched_is_not_up_to_date(made):
     plan, _, _ = made
     path = plan.out / "tasks" / "clean" / "town-suburb" / "queries.parquet"
@@ -277,6 +285,11 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ({'name = "nothing"': 'name = "a|b"'}, "'contrast.0.name': String should match pattern"),
         ({"sites = 1": 'sites = 1\nprior = "r7-known-s3"'}, "is no prior group"),
         ({"sites = 1": "sites = 1\ndetectors = []"}, "at least 1 item"),
+        (
+            {"sites = 1": 'sites = 1\nregions = ["monaco"]'},
+            "draws 'monaco', which is not among 'regions': name it there",
+        ),
+        ({"sites = 1": 'sites = 1\nregions = ["town-grid", "town-grid"]'}, "region 'town-grid' is listed twice"),
         (
             {"[[contrast]]": '[[contrast]]\ndetectors = ["measured"]'},
             "counts views of measured alone, and its suites",
@@ -482,7 +495,7 @@ def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
         "learning": True,
         "reference_imagery": True,
         "contrast": {"__all__": {"pilot", "detectors"}},
-        "task": {"__all__": {"views_cells", "kinds", "tracks", "detectors", "segmenters"}},
+        "task": {"__all__": {"views_cells", "kinds", "tracks", "detectors", "segmenters", "regions"}},
     }
     assert spec.sha256 == hashlib.sha256(spec.model_dump_json(exclude=newer).encode()).hexdigest()
     for key in ("views_cells = [192]", 'detectors = ["published", "measured"]'):

@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Final, Self
 
@@ -293,11 +294,26 @@ class _Shared:
 
 
 def _family(number: int) -> list[int]:
-    try:
-        root = psutil.Process(number)
-        return [number, *(child.pid for child in root.children(recursive=True))]
-    except psutil.Error:
-        return []
+    """Return a process and its descendants."""
+    if not _has_children_lists():
+        try:
+            root = psutil.Process(number)
+            return [number, *(child.pid for child in root.children(recursive=True))]
+        except psutil.Error:
+            return []
+    found = [number]
+    for parent in found:  # grows
+        with contextlib.suppress(OSError):
+            listed = [_lines(task / "children") for task in Path(f"/proc/{parent}/task").iterdir()]
+            found += [int(child) for lines in listed for child in " ".join(lines).split()]
+    return list(dict.fromkeys(found))
+
+
+@cache
+def _has_children_lists() -> bool:
+    """Return whether the kernel lists the children of a thread, which spares a look at all processes of the system."""
+    number = os.getpid()
+    return Path(f"/proc/{number}/task/{number}/children").is_file()
 
 
 def _resident_bytes(family: Iterable[int]) -> int:

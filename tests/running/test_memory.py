@@ -3,6 +3,7 @@
 
 import fcntl
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -67,6 +68,25 @@ def test_who_looks_odd_once_while_it_ends_is_looked_at_again(monkeypatch, tmp_pa
     watch = memory.MemoryWatch(process=SimpleNamespace(pid=0), most_bytes=1, kill=lambda: None, scratch=tmp_path)
     assert not watch.look()
     assert not watch.is_over
+
+
+@pytest.mark.parametrize("lists", [False, memory._has_children_lists()])
+def test_a_family_holds_what_a_thread_of_a_child_has_started(monkeypatch, lists):
+    monkeypatch.setattr(memory, "_has_children_lists", lambda: lists)
+    program = (
+        "import subprocess, sys, threading\n"
+        "start = lambda: print(subprocess.Popen(['sleep', '600'], stdout=subprocess.DEVNULL).pid, flush=True)\n"
+        "thread = threading.Thread(target=lambda: (start(), threading.Event().wait()))\n"
+        "thread.start()\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as child:  # noqa: S603 - our own program
+        grandchild = int(child.stdout.readline())
+        try:
+            assert sorted(memory._family(child.pid)) == sorted([child.pid, grandchild])
+        finally:
+            os.kill(grandchild, signal.SIGKILL)
+            child.kill()
+    assert grandchild not in memory._family(child.pid)
 
 
 @pytest.fixture

@@ -111,7 +111,7 @@ def read_views(out: Path, name: str, *, kinds: tuple[str, ...] = KINDS) -> Itera
 def map_descriptors(town: Town) -> Floats:
     """Descriptors of the map at the poses of the views, as the table of the tracker reads them."""
     stride = round(zhou_smc.STEP_M / polar.CELL_M)
-    rows = np.stack([polar.map_rows(strip, stride=stride) for strip in polar.padded_strips(town.region, stride=stride)])
+    rows = np.stack(list(polar.described(town.region, stride=stride)))
     west_m, _, _, north_m = town.region.grid.bounds_m
     return np.stack([_between(rows, view.pose, west_m, north_m) for view in town.views])
 

@@ -72,8 +72,9 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
     with tempfile.TemporaryDirectory() as scratch:
         folders = [path for path in unpack_tasks(folder, Path(scratch)) if path.parent.name == suite]
         tasks = [read_scored_task(path, Path(scratch) / "truth") for path in folders]
+        asked = {head.query_id for task in tasks for head in task.heads}
         for matcher in matchers:
-            mine = {item.query_id: item for item in read_stored_predictions(folder, matcher)}
+            mine = {item.query_id: item for item in read_stored_predictions(folder, matcher, queries=asked)}
             for task in tasks:
                 answers = {head.query_id: mine[head.query_id] for head in task.heads if head.query_id in mine}
                 scored = score_flights(task.heads, task.truths, answers)

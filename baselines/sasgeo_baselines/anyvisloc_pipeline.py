@@ -35,8 +35,6 @@ from sasgeo_bench import (
 TOP: Final = 5  # tiles that are matched
 STEP: Final = 0.5  # of the side of a tile to the next: they overlap by half
 APART_M: Final = 25.0
-RATIO: Final = 0.85  # of the nearest to the second nearest feature
-PER_M2: Final = 0.02  # features: one for about 7 x 7 m, as houses have corners
 GROUND: Final = 128  # grey of what has no class
 # Later classes are drawn over earlier ones; neighbours differ in grey, so that their rims are seen.
 GREYS: Final = {
@@ -137,12 +135,18 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         ),
     )
 
+    open_numbers = {
+        "ratio": (0.75, 0.85, 0.95),  # of the nearest to the second nearest feature
+        "per_m2": (0.01, 0.02),  # features: one for about 10 x 10 or 7 x 7 m, as houses have corners
+    }
+    chosen = {"ratio": 0.85, "per_m2": 0.02}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Sum the classes of the map, and find its features."""
         del learned
         self._grid, self._classes = region.grid, region.classes
         self._sums = Sums.of(region)
-        self._features = map_features(Drawing.of_map(region), region.grid)
+        self._features = map_features(Drawing.of_map(region), region.grid, per_m2=self.numbers["per_m2"])
 
     def look(self, query: Query) -> Sight | None:
         """Return descriptor and features of a view; None where no class of the map is known in it."""
@@ -153,7 +157,8 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
             return None
         drawing = Drawing.of_view(seen, self._grid.cell_size_m)
         side_m = max(seen.size_m)
-        return Sight(roots=roots, features=view_features(drawing, self._grid), side_m=side_m, prior=query.prior)
+        features = view_features(drawing, self._grid, per_m2=self.numbers["per_m2"])
+        return Sight(roots=roots, features=features, side_m=side_m, prior=query.prior)
 
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return the poses of the best tiles, and the number of inliers of the first."""
@@ -201,7 +206,7 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         """Match a view with the features of a tile; None where too few agree, or on what the prior excludes."""
         away_m = np.abs(self._features.points - (tile.easting_m, tile.northing_m))
         mapped = self._features.chosen(np.asarray((away_m <= view.side_m / 2).all(axis=1)))
-        seen_m, mapped_m = paired(view.features, mapped)
+        seen_m, mapped_m = paired(view.features, mapped, ratio=self.numbers["ratio"])
         mode = similarity(seen_m, mapped_m)
         if mode is None or not is_likely(mode.pose, view.prior) or not disc.has(mode.pose):
             return None
@@ -209,32 +214,32 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         return replace(mode, score=float((errors_m <= NEAR_M).sum()))
 
 
-def paired(seen: Features, mapped: Features) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def paired(seen: Features, mapped: Features, *, ratio: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return places of features that are clearly nearest to each other by their descriptors, shape (N, 2) each."""
     if min(len(seen), len(mapped)) < LEAST_MATCHES:
         return np.zeros((0, 2)), np.zeros((0, 2))
     nearest = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(seen.descriptors, mapped.descriptors, k=2)
-    chosen = [first for first, second in nearest if first.distance < RATIO * second.distance]
+    chosen = [first for first, second in nearest if first.distance < ratio * second.distance]
     ours, theirs = (np.array([getattr(item, name) for item in chosen], dtype=int) for name in ("queryIdx", "trainIdx"))
     return seen.points[ours], mapped.points[theirs]
 
 
-def view_features(drawing: Drawing, grid: Grid) -> Features:
+def view_features(drawing: Drawing, grid: Grid, *, per_m2: float) -> Features:
     """Return the features of a view, (right, up) of its middle, metres."""
-    found = detect(drawing.grey, drawing.is_known, most=_most(drawing.grey.shape, grid))
+    found = detect(drawing.grey, drawing.is_known, most=_most(drawing.grey.shape, grid, per_m2))
     rows, cols = drawing.grey.shape
     right_up = (found.points - (cols / 2, rows / 2)) * (grid.cell_size_m, -grid.cell_size_m)
     return Features(points=right_up, descriptors=found.descriptors)
 
 
-def map_features(drawing: Drawing, grid: Grid) -> Features:
+def map_features(drawing: Drawing, grid: Grid, *, per_m2: float) -> Features:
     """Return the features of a map, easting and northing, found tile by tile."""
     parts = []
     for row, col, tile in grid.windows(_TILE_CELLS):
         top, left = max(row - _MARGIN_CELLS, 0), max(col - _MARGIN_CELLS, 0)
         cut = np.s_[top : row + tile.rows + _MARGIN_CELLS, left : col + tile.cols + _MARGIN_CELLS]
         grey = drawing.grey[cut]
-        found = detect(grey, drawing.is_known[cut], most=_most(grey.shape, grid))
+        found = detect(grey, drawing.is_known[cut], most=_most(grey.shape, grid, per_m2))
         points = found.points + np.array([left, top])
         is_own = np.asarray(((points >= (col, row)) & (points < (col + tile.cols, row + tile.rows))).all(axis=1))
         parts.append(Features(points=grid.to_en_m(points), descriptors=found.descriptors).chosen(is_own))
@@ -244,6 +249,6 @@ def map_features(drawing: Drawing, grid: Grid) -> Features:
     )
 
 
-def _most(shape: tuple[int, ...], grid: Grid) -> int:
+def _most(shape: tuple[int, ...], grid: Grid, per_m2: float) -> int:
     """Return how many features an area has at most."""
-    return max(1, round(PER_M2 * shape[0] * shape[1] * grid.cell_size_m**2))
+    return max(1, round(per_m2 * shape[0] * shape[1] * grid.cell_size_m**2))

@@ -32,11 +32,10 @@ from sasgeo_bench import (
 
 SIDE: Final = 4  # parts of the grid along each of its sides
 PART_M: Final = 32.0  # a grid of four lies within a view of 192 m at any heading
-BEST: Final = 50  # windows whose masks are compared
 NEAR_M: Final = 20.0  # of a window; neighbours are 24 m apart
-YAW_STEP_DEG: Final = 10.0  # between headings of the grid: half of it moves a corner by 8 m, a quarter of a part
 LEAST_KNOWN: Final = 0.25  # of a part of a view; else it is not compared
-LEAST_MAPPED: Final = 0.5  # of the grid around a place that the map must know
+LEAST_MAPPED: Final = 0.5  # of the grid around a place, and of a view, that the map must know
+CELL_M: Final = 4.0  # of masks
 LEAST_SPREAD: Final = 0.01  # of a share over a map: where hardly anything is built
 APART_M: Final = 25.0
 
@@ -68,8 +67,8 @@ class RatioMap:
         )
         return cls(places_m=windows.middle_m[is_mapped], shares=shares[is_mapped], spread=spread)
 
-    def best(self, seen: Floats, disc: Disc) -> Floats:
-        """Return places in a disc that are most like a view at its best heading, at most `BEST`, the best first.
+    def best(self, seen: Floats, disc: Disc, *, count: int) -> Floats:
+        """Return places in a disc that are most like a view at its best heading, at most `count`, the best first.
 
         `seen`, shape (headings, D), are shares of the view, NaN where too little is known: by the root mean square of
         the differences of z-scores over what is known.
@@ -81,7 +80,7 @@ class RatioMap:
             if is_known.any():
                 difference = (self.shares[rows][:, is_known] - shares[is_known]) / self.spread[is_known]
                 away = np.minimum(away, np.square(difference).mean(axis=1))
-        order = np.argsort(away, kind="stable")[:BEST]
+        order = np.argsort(away, kind="stable")[:count]
         return np.asarray(self.places_m[rows[order[np.isfinite(away[order])]]])
 
 
@@ -126,9 +125,9 @@ def grid_shares(evidence: Evidence, yaw_deg: float) -> Floats:
     return np.asarray(np.where(known >= LEAST_KNOWN * full, present / np.maximum(known, 1), np.nan))
 
 
-def headings_deg(prior: Prior) -> list[float]:
-    """Return headings to try within two standard deviations, or all around, at most `YAW_STEP_DEG` apart."""
-    turns = turns_of(replace(prior, scale_sigma=0.0), spread=SPREAD, step=float(np.radians(YAW_STEP_DEG)))
+def headings_deg(prior: Prior, step_deg: float) -> list[float]:
+    """Return headings to try within two standard deviations, or all around, at most a step apart."""
+    turns = turns_of(replace(prior, scale_sigma=0.0), spread=SPREAD, step=float(np.radians(step_deg)))
     return [base.yaw_deg + 90.0 * quarter for base in turns.bases for quarter in range(turns.quarters)]
 
 
@@ -178,13 +177,19 @@ class BrmGrid(PlaceMatcher[Sight]):
         ),
     )
 
+    open_numbers = {
+        "windows": (25, 50, 100),  # whose masks are compared
+        "yaw_step_deg": (5.0, 10.0),  # between headings of the grid
+    }
+    chosen = {"windows": 50, "yaw_step_deg": 10.0}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Measure ratios of a map, and keep its buildings."""
         del learned
         self._is_built = CLASS in region.classes
         if self._is_built:
             self._ratios = RatioMap.of(region)
-            self._overlap = MaskOverlap()
+            self._overlap = MaskOverlap(coarse_m=CELL_M, least_share=LEAST_MAPPED)
             self._overlap.read(region, None)
 
     def look(self, query: Query) -> Sight | None:
@@ -196,15 +201,14 @@ class BrmGrid(PlaceMatcher[Sight]):
         if search is None:
             return None
         rings = ring_shares(seen)
-        shares = [np.concatenate([grid_shares(seen, yaw_deg), rings]) for yaw_deg in headings_deg(query.prior)]
+        yaws_deg = headings_deg(query.prior, self.numbers["yaw_step_deg"])
+        shares = [np.concatenate([grid_shares(seen, yaw_deg), rings]) for yaw_deg in yaws_deg]
         return Sight(shares=np.array(shares), search=search)
 
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the best overlaps near the best windows."""
-        windows = [
-            Pose(easting_m=east_m, northing_m=north_m, yaw_deg=0.0)
-            for east_m, north_m in self._ratios.best(view.shares, disc.wider(NEAR_M)).tolist()
-        ]
+        places_m = self._ratios.best(view.shares, disc.wider(NEAR_M), count=int(self.numbers["windows"]))
+        windows = [Pose(easting_m=east_m, northing_m=north_m, yaw_deg=0.0) for east_m, north_m in places_m.tolist()]
         near = replace(view.search, plan=replace(view.search.plan, around_m=NEAR_M)).candidates(windows)
         found = sorted((mode for mode in near if mode and disc.has(mode.pose)), key=lambda mode: -mode.score)
         return thinned(found, APART_M)[:count]

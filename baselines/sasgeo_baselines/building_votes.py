@@ -46,13 +46,13 @@ class Town:
             mean=buildings.shape.mean(axis=0) if is_built else np.zeros(len(SCALES)),
         )
 
-    def votes(self, seen: "Seen", disc: sgb.Disc, *, yaws_deg: Floats) -> Floats:
-        """Return votes of the windows in a disc that are most like a view, as `votes_for`; none where it shows none."""
+    def votes(self, seen: "Seen", disc: sgb.Disc, *, yaws_deg: Floats, count: int = WINDOWS) -> Floats:
+        """Return votes of the `count` windows in a disc that are most like a view, as `votes_for`."""
         if self.tree is None or not seen.is_judged:
             return np.empty((0, 5))
         place_m = disc.center_m or (0.0, 0.0)
         radius_m = np.inf if disc.center_m is None else disc.radius_m
-        middles_m = self.windows.nearest(seen.share, count=WINDOWS, place_m=place_m, radius_m=radius_m)
+        middles_m = self.windows.nearest(seen.share, count=count, place_m=place_m, radius_m=radius_m)
         found = self.tree.query_ball_point(middles_m, REACH_M)
         windows = [list(window) for window in np.atleast_1d(np.asarray(found, dtype=object)) if window]
         if not windows:
@@ -128,7 +128,7 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
-def mixture_of(votes: Floats) -> Mixture:
+def mixture_of(votes: Floats, *, bandwidth_m: float = BANDWIDTH_M) -> Mixture:
     """Return the places where votes agree, by mean shift with a flat kernel; a seen building counts once at each.
 
     The height of a component is the number of its votes times their mean correlation; its width is their spread.
@@ -141,7 +141,7 @@ def mixture_of(votes: Floats) -> Mixture:
     votes = votes[np.argsort(-votes[:, 4], kind="stable")[:MOST_VOTES]]
     turn = np.radians(votes[:, 2])
     points = np.column_stack(  # headings on a circle, so that neighbours are at most a kernel apart
-        [votes[:, :2] / BANDWIDTH_M, np.stack([np.sin(turn), np.cos(turn)], axis=1) / np.radians(1.5 * YAW_STEP_DEG)]
+        [votes[:, :2] / bandwidth_m, np.stack([np.sin(turn), np.cos(turn)], axis=1) / np.radians(1.5 * YAW_STEP_DEG)]
     )
     tree, at = KDTree(points), points.copy()
     for _ in range(5):

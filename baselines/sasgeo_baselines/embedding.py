@@ -24,8 +24,10 @@ from sasgeo_baselines.polar import (
     RADIUS_M,
     SECTORS,
     SIDE,
+    described,
     map_rows,
     padded_strips,
+    places_m,
     turned,
     view_descriptor,
 )
@@ -62,8 +64,6 @@ _FULL: Final = 255.0
 _DIGITS: Final = 6  # of a cosine: equal tiles are equal
 _AT_ONCE: Final = 64  # tiles cut together: 16 MB
 _SMALL: Final = 0.05  # standard deviation of a number of the descriptor that is noise
-_PENALTY: Final = 1e-3  # of squared weights
-_EPOCHS: Final = 30
 _RATE: Final = 1e-3
 
 # Of the cards of all who learn an embedding.
@@ -186,28 +186,21 @@ class Embedding:
 
 @dataclass(frozen=True, kw_only=True)
 class Gallery:
-    """Features of tiles, north up, on a lattice from the north-western corner of a map; float16, (rows, cols, F)."""
+    """Places of a map, shape (N, 2), and features of the tiles around them, north up, shape (N, F)."""
 
-    corner_m: tuple[float, float]
+    places_m: NDArray[np.float64]
     features: NDArray[np.float16]
 
     @classmethod
-    def of(cls, grid: Grid, described: NDArray[np.float16], embedding: Embedding) -> Self:
+    def of(cls, grid: Grid, rows: NDArray[np.float16], embedding: Embedding) -> Self:
         """Embed the descriptors of a map, shape (rows, cols, NUMBERS)."""
-        west_m, _, _, north_m = grid.bounds_m
-        features = [embedding.features(row.astype(np.float32)).astype(np.float16) for row in described]
-        return cls(corner_m=(west_m, north_m), features=np.stack(features))
+        features = [embedding.features(row.astype(np.float32)).astype(np.float16) for row in rows]
+        return cls(places_m=places_m(grid, rows.shape[:2], stride=STRIDE), features=np.concatenate(features))
 
     def within(self, disc: Disc) -> tuple[NDArray[np.float64], NDArray[np.float16]]:
-        """Return places of the lattice within a disc, shape (N, 2), and their features."""
-        rows, cols = self.features.shape[:2]
-        step_m = STRIDE * CELL_M
-        east_m, north_m = np.meshgrid(
-            self.corner_m[0] + np.arange(cols) * step_m, self.corner_m[1] - np.arange(rows) * step_m
-        )
-        places_m = np.column_stack([east_m.ravel(), north_m.ravel()])
-        inside = disc.holds(places_m)
-        return places_m[inside], self.features.reshape(rows * cols, -1)[inside]
+        """Return the places within a disc, shape (N, 2), and their features."""
+        inside = disc.holds(self.places_m)
+        return self.places_m[inside], self.features[inside]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -227,17 +220,17 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
     others = OTHERS
     several_deg: tuple[float, ...] = (0.0,)  # turns of the copies of a view whose mean is its feature
 
+    open_numbers = {"penalty": (1e-4, 1e-3, 1e-2), "epochs": (15, 30)}  # of squared weights; of training
+    chosen = {"penalty": 1e-3, "epochs": 30}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the map, by the plain descriptor if nothing was learned."""
+        taught = None if learned is None else Embedding.read(learned, name=self.card.name)
         self._classes = region.classes
         self._ground = Ground.of(region)
-        strips = padded_strips(region, stride=STRIDE)
-        described = np.stack([map_rows(strip, stride=STRIDE).astype(np.float16) for strip in strips])
-        if learned is None:
-            self._embedding = Embedding(mean=described.mean(axis=(0, 1), dtype=np.float32))
-        else:
-            self._embedding = Embedding.read(learned, name=self.card.name)
-        self._gallery = Gallery.of(region.grid, described, self._embedding)
+        rows = np.stack([row.astype(np.float16) for row in described(region, stride=STRIDE)])
+        self._embedding = taught or Embedding(mean=rows.mean(axis=(0, 1), dtype=np.float32))
+        self._gallery = Gallery.of(region.grid, rows, self._embedding)
 
     def look(self, query: Query) -> Sight | None:
         """Return the features of a view at the headings that it may have; None where nothing is known near its middle.
@@ -315,7 +308,12 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         if len(lessons) < 2:  # noqa: PLR2004 - two classes
             message = f"{self.card.name}: training shows {len(lessons)} locations, expected two at least"
             raise ValueError(message)
-        return fitted(lessons, _rng(self.card.name)).to_text()
+        return fitted(
+            lessons,
+            _rng(self.card.name),
+            penalty=self.numbers["penalty"],
+            epochs=int(self.numbers["epochs"]),
+        ).to_text()
 
     def _of_views(self, ground: Ground, pairs: Sequence[tuple[Query, Truth]]) -> Iterator["Lessons"]:
         """Yield the lessons of each location that views of training show."""
@@ -388,7 +386,7 @@ class Lessons:
     is_made_up: bool
 
 
-def fitted(lessons: Sequence[Lessons], rng: np.random.Generator) -> Embedding:
+def fitted(lessons: Sequence[Lessons], rng: np.random.Generator, *, penalty: float, epochs: int) -> Embedding:
     """Return the weights of a bottleneck before a softmax over locations: shared by tiles and views (instance loss)."""
     from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415
     from sklearn.neural_network import MLPClassifier  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415
@@ -407,10 +405,10 @@ def fitted(lessons: Sequence[Lessons], rng: np.random.Generator) -> Embedding:
     model = MLPClassifier(
         hidden_layer_sizes=(DIMENSIONS,),
         activation="identity",
-        alpha=_PENALTY,
+        alpha=penalty,
         learning_rate_init=_RATE,
-        max_iter=_EPOCHS,
-        n_iter_no_change=_EPOCHS,
+        max_iter=epochs,
+        n_iter_no_change=epochs,
         random_state=int(rng.integers(2**31)),
     )
     with warnings.catch_warnings():

@@ -27,7 +27,6 @@ from sasgeo_bench import (
     thinned,
 )
 
-STEP_M: Final = 24.0  # of tiles: a view is at most 17 m off the middle of one
 YAW_STEP_DEG: Final = 15.0  # an object 90 m away moves by 12 m at most
 APART_M: Final = 25.0
 # Of an edge, as in the source's code: overlap of boxes, same class, cosine of features. They sum to 1.1.
@@ -40,7 +39,6 @@ NEAR_M: Final = 24.0  # standard deviation of places in a tile: offset of the ti
 MOST_TILES: Final = 1500  # more than a disc of 500 m holds: of more, those with the view's mix of kinds are looked at
 TRIED: Final = 64  # tiles and headings that are matched in full, the best first by their best similarities
 SINKHORN: Final = 20  # iterations
-SLACK: Final = 0.5  # similarity below which an object rather has no partner
 SOFTNESS: Final = 0.1  # of the assignment
 LEAST_SHARE: Final = 0.1  # of an object that a match must have
 AGREE_M: Final = 8.0
@@ -109,6 +107,12 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
         ),
     )
 
+    open_numbers = {
+        "step_m": (24.0, 32.0),  # of tiles: a view is at most 17 or 23 m off the middle of one
+        "slack": (0.3, 0.5, 0.7),  # similarity below which an object rather has no partner
+    }
+    chosen = {"step_m": 24.0, "slack": 0.5}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Read the nodes of the map."""
         del learned
@@ -125,7 +129,7 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
         """Return the poses of the tiles with the highest scores."""
         found: list[Mode] = []
         for tile in nlargest(TRIED, self.tiles(view, disc), key=lambda tile: tile.bound):
-            partners = sinkhorn(tile.likeness)
+            partners = sinkhorn(tile.likeness, slack=self.numbers["slack"])
             score = float((partners * tile.likeness).sum() / max(tile.likeness.shape))
             pose, inliers = self._posed(view, tile, partners)
             if pose is None or not view.allows(pose, disc):
@@ -163,7 +167,7 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
         kinds = len(NODE_KINDS)
         asked = view.seen.asked & ~np.isin(np.arange(kinds), LEFT_OUT)
         found, counts = [], []
-        for middle_m in lattice_m(around, self.grid, step_m=STEP_M):
+        for middle_m in lattice_m(around, self.grid, step_m=self.numbers["step_m"]):
             rows = self.mapped.around(middle_m, view.reach_m + NEAR_M)
             rows = rows[asked[self.mapped.nodes.kind[rows]]]
             if len(rows) >= FEWEST:
@@ -242,16 +246,16 @@ def complete_iou(apart_m: Floats, half_m: Floats) -> Floats:
     return np.asarray(both / either - apart_m**2 / diagonal)
 
 
-def sinkhorn(likeness: Floats) -> Floats:
+def sinkhorn(likeness: Floats, *, slack: float) -> Floats:
     """Return the share of each pair in an assignment with slack: rows and columns sum to at most 1, shape (N, M).
 
-    >>> sinkhorn(np.array([[1.0, 0.9], [0.9, 0.0]])).round(1).tolist()  # the second has no other partner
+    >>> sinkhorn(np.array([[1.0, 0.9], [0.9, 0.0]]), slack=0.5).round(1).tolist()  # the second has no other partner
     [[0.3, 0.7], [0.7, 0.0]]
     """
     rows, cols = likeness.shape
-    padded = np.full((rows + 1, cols + 1), SLACK)
+    padded = np.full((rows + 1, cols + 1), slack)
     padded[:rows, :cols] = likeness
-    kernel = np.exp((padded - max(SLACK, float(likeness.max(initial=0.0)))) / SOFTNESS)
+    kernel = np.exp((padded - max(slack, float(likeness.max(initial=0.0)))) / SOFTNESS)
     mine, theirs = np.ones(rows + 1), np.ones(cols + 1)
     mine[-1], theirs[-1] = cols, rows
     down, right = np.ones(rows + 1), np.ones(cols + 1)

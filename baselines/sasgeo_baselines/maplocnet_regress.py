@@ -40,7 +40,6 @@ COARSE_M: Final = 16.0  # of a cell of the surface: leaves a residual that a fin
 YAW_STEP_DEG: Final = 10.0  # moves the rim of a view by a cell of the surface
 LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 REACH: Final = 2  # cells to each side of the highest one whose scores are read, and one heading
-PENALTY: Final = 100.0  # of squared coefficients; scores count in standard deviations of the part
 MOST_OFF: Final = 1.5  # cells or steps: a larger residual belongs to another peak, of which the part does not tell
 MOST_LESSONS: Final = 400
 
@@ -105,12 +104,15 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
         ),
     )
 
+    open_numbers = {"penalty": (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)}  # of squared coefficients
+    chosen = {"penalty": 100.0}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Read the map and the coefficients."""
+        self._weights = None if learned is None else weights_of(learned)
         self._field, self._classes = field_of(region), region.classes
         self._factor = max(1, round(COARSE_M / self._field.grid.cell_size_m))
         self._field.level(self._factor)
-        self._weights = None if learned is None else weights_of(learned)
 
     def look(self, query: Query) -> Sight | None:
         """Return the template of a view; None where it shares no class with the map."""
@@ -182,7 +184,7 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
                         parts.append(turned)
                         residuals.append(missed)
         table, wanted = np.concatenate(parts), np.concatenate(residuals)
-        weights = np.linalg.solve(table.T @ table + PENALTY * np.eye(_SHAPE[0]), table.T @ wanted)
+        weights = np.linalg.solve(table.T @ table + self.numbers["penalty"] * np.eye(_SHAPE[0]), table.T @ wanted)
         return json.dumps({"format": _FORMAT, "weights": weights.round(6).tolist()})
 
 

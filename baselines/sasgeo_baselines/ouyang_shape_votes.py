@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from sasgeo_baselines.building_votes import BANDWIDTH_M, Mixture, Seen, Town, headings, mixture_of
+from sasgeo_baselines.building_votes import Mixture, Seen, Town, headings, mixture_of
 from sasgeo_baselines.place_matcher import PlaceMatcher
 from sasgeo_bench import Disc, MatcherCard, Mode, Pose, Prior, Query, Region, thinned
 
@@ -58,6 +58,9 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
         ),
     )
 
+    open_numbers = {"windows": (25, 50, 100), "bandwidth_m": (8.0, 12.0)}  # the most alike; of the mean shift of votes
+    chosen = {"windows": 50, "bandwidth_m": 12.0}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Index buildings and windows."""
         del learned
@@ -74,11 +77,12 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
         """Return the highest components of the mixture of the votes in a disc."""
         prior = view.prior
         sigma_deg = _ANY_DEG if prior.yaw_sigma_deg is None else prior.yaw_sigma_deg
-        votes = self._town.votes(view.seen, disc, yaws_deg=headings(prior.yaw_deg or 0.0, sigma_deg))
-        votes = votes[disc.wider(BANDWIDTH_M).holds(votes[:, :2])]
+        yaws_deg, bandwidth_m = headings(prior.yaw_deg or 0.0, sigma_deg), self.numbers["bandwidth_m"]
+        votes = self._town.votes(view.seen, disc, yaws_deg=yaws_deg, count=int(self.numbers["windows"]))
+        votes = votes[disc.wider(bandwidth_m).holds(votes[:, :2])]
         if not len(votes):
             return []
-        mixture = mixture_of(votes)
+        mixture = mixture_of(votes, bandwidth_m=bandwidth_m)
         certain = credibility(mixture, self._reach_m if disc.center_m is None else disc.radius_m)
         found = [
             Component(

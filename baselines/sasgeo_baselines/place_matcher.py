@@ -8,11 +8,11 @@ from typing import Final, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_baselines.tunable import Tunable
 from sasgeo_bench import (
     WITHHELD,
     Disc,
     Match,
-    MatcherCard,
     Mode,
     Pose,
     Prior,
@@ -45,12 +45,11 @@ def turns_within(prior: Prior, count: int, *, spread: float = SPREAD) -> NDArray
     return np.flatnonzero(away_deg <= spread * prior.yaw_sigma_deg + step_deg / 2)
 
 
-class PlaceMatcher(ABC, Generic[View]):
+class PlaceMatcher(Tunable, ABC, Generic[View]):
     """A matcher of single views; a subclass says how it reads a map, how a view, and which poses are best."""
 
-    card: MatcherCard
-
-    def __init__(self) -> None:
+    def __init__(self, **numbers: float) -> None:
+        super().__init__(**numbers)
         self._is_ready = False
 
     @abstractmethod

@@ -168,6 +168,24 @@ def map_rows(strip: Planes, *, stride: int) -> NDArray[np.float32]:
     return np.ascontiguousarray(found.reshape(groups * DEPTH, places).T)
 
 
+def described(region: sgb.Region, *, stride: int) -> Iterator[NDArray[np.float32]]:
+    """Yield the descriptors of each row of places of a map (`places_m`), facing north, shape (cols, D)."""
+    for strip in padded_strips(region, stride=stride):
+        yield map_rows(strip, stride=stride)
+
+
+def places_m(grid: sgb.Grid, shape: tuple[int, int], *, stride: int) -> NDArray[np.float64]:
+    """Return easting and northing of places in so many rows and columns, row by row, shape (rows * cols, 2).
+
+    >>> grid = sgb.Grid(epsg=32632, west_m=0.0, north_m=90.0, cell_size_m=1.0, rows=90, cols=90)
+    >>> places_m(grid, (2, 2), stride=6).tolist()
+    [[0.0, 90.0], [24.0, 90.0], [0.0, 66.0], [24.0, 66.0]]
+    """
+    west_m, _, _, north_m = grid.bounds_m
+    down, right = np.indices(shape).reshape(2, -1) * stride * CELL_M
+    return np.column_stack((west_m + right, north_m - down))
+
+
 def turned(values: NDArray[np.float32], turn: int, *, yaws: int) -> NDArray[np.float32]:
     """Turn descriptors, or weights of them, shape (D, ...), clockwise by `turn` of `yaws` parts of a circle.
 

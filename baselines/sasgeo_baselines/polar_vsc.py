@@ -18,8 +18,6 @@ from sasgeo_baselines.polar import CELL_M
 from sasgeo_baselines.visual_context import AREAS_M2, SECTORS, STRIDE, Context, ContextMap, Floats, Shares
 from sasgeo_bench import Disc, MatcherCard, Mode, Pose, Prior, Query, Region, points_of, thinned
 
-ALPHA: Final = 0.01  # of the test, for each ring
-PATCH_M: Final = 8.0  # as wide as a ring: ground that counts as one observation, as neighbouring cells are alike
 SHORTLIST: Final = 200  # places whose sectors are compared
 REFINED: Final = 16  # places around which the best one is searched
 AROUND: Final = 2  # cells to each side: halfway to the next place
@@ -31,11 +29,11 @@ _BLOCK: Final = 50_000  # places that are tested together: bounds the memory
 Ints = NDArray[np.int64]
 
 
-def ring_p_values(seen: Shares, mapped: Shares) -> NDArray[np.float64]:
+def ring_p_values(seen: Shares, mapped: Shares, *, patch_m: float) -> NDArray[np.float64]:
     """Return the p-values of two-sample Kolmogorov-Smirnov tests of the classes in each ring, shape (N, RINGS).
 
     The groups of classes, in their order and last what has none, are the values that are observed, once for each patch
-    of `PATCH_M` that is known: cells are no independent observations. A value is NaN where too little is known.
+    of `patch_m` that is known: cells are no independent observations. A value is NaN where too little is known.
 
     Parameters
     ----------
@@ -43,6 +41,8 @@ def ring_p_values(seen: Shares, mapped: Shares) -> NDArray[np.float64]:
         Rings of a view, shape (G, RINGS); groups that it does not know are compared in no ring.
     mapped : Shares
         Rings of places, shape (N, G, RINGS).
+    patch_m : float
+        Side of ground that counts as one observation, as neighbouring cells are alike.
 
     Examples
     --------
@@ -51,13 +51,13 @@ def ring_p_values(seen: Shares, mapped: Shares) -> NDArray[np.float64]:
     >>> known = np.ones((1, 3), dtype=np.float32)
     >>> seen = Shares(value=np.float32([[0.0, 0.0, 0.5]]), known=known)
     >>> mapped = Shares(value=np.float32([[[0.0, 0.0, 1.0]], [[0.0, 0.0, 0.4]]]), known=np.ones((2, 1, 3)))
-    >>> ring_p_values(seen, mapped).round(3).tolist()
+    >>> ring_p_values(seen, mapped, patch_m=8.0).round(3).tolist()
     [[1.0, 1.0, 0.039], [1.0, 1.0, 1.0]]
     """
     compared = seen.known > 0
     count = compared.sum(axis=0)
     distance = np.abs(_cumulative(seen.value * compared) - _cumulative(mapped.value * compared)).max(axis=-2)
-    patches = AREAS_M2[: seen.value.shape[-1]] / PATCH_M**2
+    patches = AREAS_M2[: seen.value.shape[-1]] / patch_m**2
     mine = patches * seen.known.sum(axis=0) / np.maximum(count, 1)
     theirs = patches * mapped.known[:, 0]
     effective = mine * theirs / np.maximum(mine + theirs, 1.0)
@@ -70,14 +70,14 @@ def _cumulative(values: Floats) -> Floats:
     return np.asarray(total / np.maximum(total[..., -1:, :], 1.0))
 
 
-def passing_share(p_values: NDArray[np.float64]) -> NDArray[np.float64]:
+def passing_share(p_values: NDArray[np.float64], alpha: float) -> NDArray[np.float64]:
     """Return the share of the judged rings of each place, shape (N, RINGS), that pass the test; 0 where none is judged.
 
-    >>> passing_share(np.array([[0.5, 0.02, 0.001, np.nan], [np.nan] * 4])).round(3).tolist()
+    >>> passing_share(np.array([[0.5, 0.02, 0.001, np.nan], [np.nan] * 4]), 0.01).round(3).tolist()
     [0.667, 0.0]
     """
     judged = np.isfinite(p_values)
-    return np.asarray((judged & (p_values >= ALPHA)).sum(axis=1) / np.maximum(judged.sum(axis=1), 1))
+    return np.asarray((judged & (p_values >= alpha)).sum(axis=1) / np.maximum(judged.sum(axis=1), 1))
 
 
 def correlations(seen: Shares, mapped: Shares, mean: Floats) -> NDArray[np.float64]:
@@ -169,6 +169,12 @@ class PolarVsc(PlaceMatcher[Sight]):
         ),
     )
 
+    open_numbers = {
+        "alpha": (0.001, 0.01, 0.05),  # of the test, for each ring
+        "patch_m": (4.0, 8.0),  # ground that counts as one observation; a ring is 8 m wide
+    }
+    chosen = {"alpha": 0.01, "patch_m": 8.0}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the map."""
         del learned
@@ -191,9 +197,10 @@ class PolarVsc(PlaceMatcher[Sight]):
     def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
         """Return the least p-value of the rings at the best place, and the share of rings that pass there."""
         best = found[0].pose
-        p_values = ring_p_values(view.context.rings, self._map.at(np.array([[best.easting_m, best.northing_m]])).rings)
+        here = self._map.at(np.array([[best.easting_m, best.northing_m]])).rings
+        p_values = ring_p_values(view.context.rings, here, patch_m=self.numbers["patch_m"])
         least = np.min(p_values, initial=1.0, where=np.isfinite(p_values))
-        return {"ks_p": float(least), "ks_share": float(passing_share(p_values)[0])}
+        return {"ks_p": float(least), "ks_share": float(passing_share(p_values, self.numbers["alpha"])[0])}
 
     def _shortlist(self, view: Sight, disc: Disc) -> Ints:
         """Return the places in a disc where most rings pass the test, and of these the most similar by their rings."""
@@ -204,7 +211,9 @@ class PolarVsc(PlaceMatcher[Sight]):
         for first in range(0, len(near), _BLOCK):
             part = slice(first, first + _BLOCK)
             mapped = self._map.rings_at(near[part])
-            share[part] = passing_share(ring_p_values(seen, mapped))
+            share[part] = passing_share(
+                ring_p_values(seen, mapped, patch_m=self.numbers["patch_m"]), self.numbers["alpha"]
+            )
             both = weight * mapped.known
             squares = (both * np.square(seen.value - mapped.value)).sum(axis=(1, 2))
             away[part] = squares / np.maximum(both.sum(axis=(1, 2)), 1.0)

@@ -27,8 +27,6 @@ from sasgeo_bench import (
 )
 
 LENGTH_M: Final = (20.0, 230.0)  # of a pair: past one junction, and up to the diagonal of a view
-LENGTH_SLACK_M: Final = 5.0  # of a length, or two standard deviations of the scale if that is more
-TURN_DEG: Final = 20.0  # of a road: that of a mask bends within a road's width of a junction
 MOST_PAIRS: Final = 150  # of a view, the longest first: they give the best heading
 FIRST_POINTS: Final = 60  # seen points of the first test
 TESTED: Final = 600  # poses of the second test: all seen points, and the mapped ones
@@ -93,7 +91,7 @@ class Tuples:
         return type(self)(ends_m=self.ends_m[:, ::-1], length_m=self.length_m, arms_deg=arms_deg)
 
 
-def same_arms(ours_deg: Floats, theirs_deg: Floats) -> Bools:
+def same_arms(ours_deg: Floats, theirs_deg: Floats, *, turn_deg: float) -> Bools:
     """Return which junctions may be the same by the bearings of their roads: all agree but one, at least two.
 
     Parameters
@@ -102,15 +100,18 @@ def same_arms(ours_deg: Floats, theirs_deg: Floats) -> Bools:
         Bearings of one junction, NaN behind the last one.
     theirs_deg : ndarray of float, shape (N, B)
         Those of others.
+    turn_deg : float
+        By which two bearings of one road may differ.
 
     Examples
     --------
     >>> crossing = np.array([0.0, 90.0, 180.0, 270.0])
-    >>> same_arms(crossing, np.array([[80.0, 170.0, 281.0], [45.0, 170.0, 281.0], [45.0, 135.0, 270.0]])).tolist()
+    >>> others = np.array([[80.0, 170.0, 281.0], [45.0, 170.0, 281.0], [45.0, 135.0, 270.0]])
+    >>> same_arms(crossing, others, turn_deg=20.0).tolist()
     [True, True, False]
     """
     off_deg = np.abs(np.mod(theirs_deg[:, :, None] - ours_deg + 180.0, 360.0) - 180.0)
-    agrees = off_deg <= TURN_DEG  # never of a NaN
+    agrees = off_deg <= turn_deg  # never of a NaN
     common = np.minimum(agrees.any(axis=1).sum(axis=1), agrees.any(axis=2).sum(axis=1))
     fewer = np.minimum(np.isfinite(ours_deg).sum(), np.isfinite(theirs_deg).sum(axis=1))
     return np.asarray(common >= np.maximum(fewer - 1, _SAME_ARMS))
@@ -155,6 +156,12 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         ),
     )
 
+    open_numbers = {
+        "turn_deg": (10.0, 20.0, 30.0),  # of a road: that of a mask bends within a road's width of a junction
+        "slack_m": (5.0, 8.0),  # of a length, or two standard deviations of the scale if that is more
+    }
+    chosen = {"turn_deg": 20.0, "slack_m": 5.0}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Read junctions and roads of the map."""
         del learned
@@ -188,7 +195,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
 
     def _hypotheses(self, view: RoadSight, disc: Disc) -> Iterator[Floats]:
         for kind, ours in view.pairs.items():
-            slack_m = np.maximum(LENGTH_SLACK_M, 2.0 * view.prior.scale_sigma * ours.length_m)
+            slack_m = np.maximum(self.numbers["slack_m"], 2.0 * view.prior.scale_sigma * ours.length_m)
             for row in range(len(ours.length_m))[: -MOST_PAIRS - 1 : -1]:
                 low, high = ours.length_m[row] - slack_m[row], ours.length_m[row] + slack_m[row]
                 once = self._pairs[kind].some(slice(*np.searchsorted(self._pairs[kind].length_m, [low, high])))
@@ -196,7 +203,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
                     poses = rigid_poses(np.broadcast_to(ours.ends_m[row], theirs.ends_m.shape), theirs.ends_m)
                     may = np.flatnonzero(allowed(poses, view.prior, disc))
                     for end, own_deg in enumerate(ours.arms_deg[row]):
-                        may = may[same_arms(own_deg, theirs.arms_deg[may, end])]
+                        may = may[same_arms(own_deg, theirs.arms_deg[may, end], turn_deg=self.numbers["turn_deg"])]
                     yield poses[may]
 
     def _tested(self, view: RoadSight, poses: Floats, disc: Disc) -> list[Mode]:

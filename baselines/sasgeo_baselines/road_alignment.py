@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from sasgeo_baselines.place_matcher import AROUND_M
 from sasgeo_baselines.roads import Bools, Floats, road_cells, road_mask, view_grid
 from sasgeo_baselines.schmidt_segcorr import SchmidtSegcorr
+from sasgeo_baselines.tunable import Tunable
 from sasgeo_bench import (
     PRESENT,
     UNKNOWN,
@@ -41,8 +42,6 @@ BORDER_M: Final = 10.0  # standard deviation of the place of a border: of one am
 # place, heading and scale of the start open; shear is small; a perspective of 0.2 is a tilt of 15 degrees from 137 m.
 SIMILARITY, SHEAR, PERSPECTIVE = 0.15, 0.05, 0.2
 LEAST_POINTS: Final = 60  # of borders, for eight unknowns
-LEAST_GAIN: Final = 0.05  # of the share of seen borders that lie on mapped ones
-LEAST_SHARE: Final = 0.3  # of seen borders that lie on mapped ones: in a dense town chance alone gives half of it
 AROUND_DEG: Final = 5.0  # standard deviation of the heading of a first answer
 APART_M: Final = 25.0
 _MARGIN_M: Final = 40.0  # of the map around a view
@@ -236,7 +235,7 @@ def straightened(query: Query, matrix: Floats) -> Query:
     return replace(query, evidence=evidence.replace(warped(evidence.cells, UNKNOWN), confidence), vectors=vectors)
 
 
-class PopovRoadplane:
+class PopovRoadplane(Tunable):
     """A matcher before which views are straightened by the borders of roads around its first answers."""
 
     card = MatcherCard(
@@ -265,7 +264,15 @@ class PopovRoadplane:
         ),
     )
 
-    def __init__(self, inner: Matcher | None = None) -> None:
+    open_numbers = {
+        # Of seen borders that lie on mapped ones, and their gain: in a dense town chance alone gives a share of 0.15.
+        "least_share": (0.2, 0.3, 0.4),
+        "least_gain": (0.02, 0.05),
+    }
+    chosen = {"least_share": 0.3, "least_gain": 0.05}
+
+    def __init__(self, inner: Matcher | None = None, **numbers: float) -> None:
+        super().__init__(**numbers)
         self.inner: Matcher = inner or SchmidtSegcorr()
 
     def prepare(self, region: Region, learned: str | None) -> None:
@@ -281,7 +288,8 @@ class PopovRoadplane:
         found = self.alignment(query, first.poses[:STARTS])
         told = {} if found is None else {"borders": found.share, "borders_before": found.before}
         answer = first
-        if found is not None and found.share >= max(LEAST_SHARE, found.before + LEAST_GAIN):
+        least_share, least_gain = self.numbers["least_share"], self.numbers["least_gain"]
+        if found is not None and found.share >= max(least_share, found.before + least_gain):
             answer = _better(first, self.inner.match(self._again(query, found), top_k=top_k), query)
         told["is_straightened"] = float(answer is not first)
         return replace(

@@ -11,7 +11,6 @@ from sasgeo_bench import PRESENT, UNKNOWN, Evidence, MatcherCard, Overlaps
 
 FULL: Final = 255  # of a confidence
 LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
-LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 
 
 class SchmidtSegcorr(ShiftMatcher):
@@ -39,6 +38,12 @@ class SchmidtSegcorr(ShiftMatcher):
         ),
     )
 
+    open_numbers = {
+        "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
+        "coarse_m": (4.0, 6.0),
+    }
+    chosen = {"least_share": 0.5, "coarse_m": 4.0}
+
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the degree of each class, then where each is known, then where any is."""
         at = [evidence.classes.index(name) for name in names]
@@ -62,4 +67,5 @@ class SchmidtSegcorr(ShiftMatcher):
             total += np.where(is_there, both / np.maximum(either, LEAST_CELLS), 0)
             classes += is_there
         share = overlaps.sums(2 * count, count) / max(1.0, float(overlaps.totals[-1]))
-        return np.where(share >= LEAST_SHARE, total / np.maximum(classes, 1), -np.inf).astype(np.float32)
+        is_known = share >= self.numbers["least_share"]
+        return np.where(is_known, total / np.maximum(classes, 1), -np.inf).astype(np.float32)

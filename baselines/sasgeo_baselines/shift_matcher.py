@@ -14,7 +14,13 @@ from sasgeo_bench import Chart, Disc, Evidence, Mode, Overlaps, Pose, Query, Reg
 class ShiftMatcher(PlaceMatcher[ShiftSearch]):
     """A matcher of single views by a score of their overlaps with the map; a subclass says which."""
 
-    plan = ShiftPlan()
+    yaw_step_deg: float = 3.0
+
+    @property
+    def plan(self) -> ShiftPlan:
+        """Return the settings of the search: its coarse cells are an open number, the fine ones half as wide."""
+        coarse_m = self.numbers["coarse_m"]
+        return ShiftPlan(coarse_m=coarse_m, fine_m=coarse_m / 2, yaw_step_deg=self.yaw_step_deg)
 
     def chart_of(self, region: Region) -> Chart:
         """Return the map; by default its classes as they are."""

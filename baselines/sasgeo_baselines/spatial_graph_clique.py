@@ -10,8 +10,6 @@ import numpy as np
 from sasgeo_baselines.object_matcher import Floats, Ints, ObjectMatcher, Pairs, Sight, fitted
 from sasgeo_bench import Disc, MatcherCard, Mode, thinned
 
-AGREE_M: Final = 5.0  # two distances that may be the same
-NEAR_M: Final = 14.0  # of a peak of votes: pairs whose votes lie so near are looked at together
 YAW_STEP_DEG: Final = 5.0
 TRIED: Final = 24  # peaks
 MOST_PAIRS: Final = 60  # of one peak, the nearest first: bounds the search for a clique
@@ -46,13 +44,20 @@ class SpatialGraphClique(ObjectMatcher):
         ),
     )
 
+    open_numbers = {
+        "agree_m": (3.0, 5.0, 8.0),  # two distances that may be the same
+        "near_m": (10.0, 14.0),  # of a peak of votes: pairs whose votes lie so near are looked at together
+    }
+    chosen = {"agree_m": 5.0, "near_m": 14.0}
+
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses of the largest cliques."""
         pairs = Pairs.of_kind(view, self.mapped.nodes, self.within(view, disc))
         found = []
         for peak in pairs.peaks(disc, view.yaws_deg(YAW_STEP_DEG), count=TRIED):
-            chosen = _around(pairs, peak)
-            clique = chosen[largest_clique(pairs.seen_m[chosen], pairs.mapped_m[chosen], owners(pairs, chosen))]
+            near = _around(pairs, peak, self.numbers["near_m"])
+            places_m, owner = (pairs.seen_m[near], pairs.mapped_m[near]), owners(pairs, near)
+            clique = near[largest_clique(*places_m, owner, agree_m=self.numbers["agree_m"])]
             if len(clique) < FEWEST:
                 continue
             pose, error_m = fitted(pairs.seen_m[clique], pairs.mapped_m[clique])
@@ -66,10 +71,10 @@ class SpatialGraphClique(ObjectMatcher):
         return {"inliers": float(int(found[0].score))}
 
 
-def _around(pairs: Pairs, peak: Mode) -> Ints:
+def _around(pairs: Pairs, peak: Mode, near_m: float) -> Ints:
     """Return rows of the pairs that vote for a place near a peak, the nearest first."""
     away_m = np.hypot(*(pairs.places_m(peak.pose.yaw_deg) - (peak.pose.easting_m, peak.pose.northing_m)).T)
-    near = np.flatnonzero(away_m <= NEAR_M)
+    near = np.flatnonzero(away_m <= near_m)
     return np.asarray(near[np.argsort(away_m[near], kind="stable")[:MOST_PAIRS]], dtype=np.int64)
 
 
@@ -78,7 +83,7 @@ def owners(pairs: Pairs, chosen: Ints) -> Ints:
     return np.column_stack([pairs.seen[chosen], pairs.mapped[chosen]])
 
 
-def largest_clique(seen_m: Floats, mapped_m: Floats, owner: Ints) -> Ints:
+def largest_clique(seen_m: Floats, mapped_m: Floats, owner: Ints, *, agree_m: float) -> Ints:
     """Return rows of the largest set of pairs whose distances agree pairwise; of several the first.
 
     Parameters
@@ -87,6 +92,8 @@ def largest_clique(seen_m: Floats, mapped_m: Floats, owner: Ints) -> Ints:
         Places of each pair in the view and on the map.
     owner : ndarray of int, shape (P, 2)
         The seen and the mapped object of each pair: an object belongs to one pair of a clique.
+    agree_m : float
+        By which two distances may differ.
 
     Examples
     --------
@@ -94,14 +101,14 @@ def largest_clique(seen_m: Floats, mapped_m: Floats, owner: Ints) -> Ints:
 
     >>> seen_m = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [40.0, 40.0]])
     >>> mapped_m = seen_m + (100.0, 0.0) + np.array([[0, 0], [0, 0], [0, 0], [0, 9.0]])
-    >>> largest_clique(seen_m, mapped_m, np.arange(4)[:, None].repeat(2, axis=1)).tolist()
+    >>> largest_clique(seen_m, mapped_m, np.arange(4)[:, None].repeat(2, axis=1), agree_m=5.0).tolist()
     [0, 1, 2]
     """
     if not len(seen_m):
         return np.zeros(0, dtype=np.int64)
     apart = [np.linalg.norm(places[:, None] - places[None, :], axis=2) for places in (seen_m, mapped_m)]
     is_free = (owner[:, None] != owner[None, :]).all(axis=2)
-    agree = is_free & (np.abs(apart[0] - apart[1]) < AGREE_M)
+    agree = is_free & (np.abs(apart[0] - apart[1]) < agree_m)
     graph = nx.from_numpy_array(agree)
     clique, _ = nx.max_weight_clique(graph, weight=None)
     return np.array(sorted(clique), dtype=np.int64)

@@ -28,9 +28,7 @@ from sasgeo_bench import (
     thinned,
 )
 
-NEIGHBOURS: Final = 5  # of an object, the nearest: few enough to lie within a small view around most objects
 WIDEST_M: Final = 30.0  # radius of an object: a view cuts wider ones
-MATCHES: Final = 10  # mapped objects for a seen one, the most alike first
 TRIED: Final = 24  # poses that most matches vote for
 APART_M: Final = 25.0
 _LABEL: Final = float(np.sqrt(0.5))  # so that two labels that differ are 1 apart, as the greatest ratio and 0 are
@@ -40,7 +38,7 @@ _LABEL: Final = float(np.sqrt(0.5))  # so that two labels that differ are 1 apar
 class Patterns:
     """Objects, each with its nearest neighbours in the order of their labels, then of distance.
 
-    `kind`, shape (P,), is the label of the object itself; `corners_m`, shape (P, 1 + NEIGHBOURS, 2), its place, then
+    `kind`, shape (P,), is the label of the object itself; `corners_m`, shape (P, 1 + neighbours, 2), its place, then
     those of its neighbours; `vector`, shape (P, D), is what is compared; `reach_m`, shape (P,), how far the farthest
     neighbour lies.
     """
@@ -51,8 +49,8 @@ class Patterns:
     reach_m: Floats
 
     @classmethod
-    def of(cls, places_m: Floats, kind: Ints) -> Self:
-        """Describe objects by each other; there must be more than `NEIGHBOURS`.
+    def of(cls, places_m: Floats, kind: Ints, *, neighbours: int) -> Self:
+        """Describe objects by each other, of which there must be more than `neighbours`.
 
         `vector` holds the ratio of each neighbour's distance to that of the farthest, the turn from the neighbour
         before (from the last one, for the first) as half of its cosine and sine, and the label.
@@ -62,11 +60,11 @@ class Patterns:
         Five neighbours of one kind, 10 m apart on a line that leads north from the first object:
 
         >>> places_m = np.array([[0.0, 10.0 * at] for at in range(6)])
-        >>> first = Patterns.of(places_m, np.zeros(6, dtype=np.int64)).vector[0]
+        >>> first = Patterns.of(places_m, np.zeros(6, dtype=np.int64), neighbours=5).vector[0]
         >>> first[:5].tolist(), first[5:10].tolist()
         ([0.2, 0.4, 0.6, 0.8, 1.0], [0.5, 0.5, 0.5, 0.5, 0.5])
         """
-        found = cKDTree(places_m).query(places_m, k=range(2, NEIGHBOURS + 2))  # the nearest of an object is itself
+        found = cKDTree(places_m).query(places_m, k=range(2, neighbours + 2))  # the nearest of an object is itself
         away_m, near = (np.asarray(part) for part in found)
         order = np.lexsort((away_m, kind[near]), axis=1)
         away_m, near = np.take_along_axis(away_m, order, axis=1), np.take_along_axis(near, order, axis=1)
@@ -152,6 +150,16 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         ),
     )
 
+    open_numbers = {
+        "neighbours": (4, 5, 6),  # of an object, the nearest: few enough to lie within a small view around most objects
+        "matches": (10, 30),  # mapped objects for a seen one, the most alike first
+    }
+    chosen = {"neighbours": 5, "matches": 10}
+
+    def __init__(self, **numbers: float) -> None:
+        super().__init__(**numbers)
+        self._neighbours, self._matches = int(self.numbers["neighbours"]), int(self.numbers["matches"])
+
     def read(self, region: Region, learned: str | None) -> None:
         """Read the objects of the map."""
         del learned
@@ -165,9 +173,9 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         """Return the objects of a view and their patterns; None if no object has all its neighbours in view."""
         seen = ObservedGraph.of(query)
         nodes = objects_of(seen.nodes.taken(~seen.is_cut))
-        if len(nodes) <= NEIGHBOURS:
+        if len(nodes) <= self._neighbours:
             return None
-        found = Patterns.of(nodes.places_m, nodes.kind)
+        found = Patterns.of(nodes.places_m, nodes.kind, neighbours=self._neighbours)
         is_whole = found.reach_m < clear_m(query.evidence, found.corners_m[:, 0])
         if not is_whole.any():
             return None
@@ -182,12 +190,12 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         """Return the poses of the most alike objects that the prior allows."""
         within = disc.wider(view.reach_m).holds(self._nodes.places_m)
         nodes = self._nodes.taken(within & np.isin(self._nodes.kind, view.nodes.kind))
-        if len(nodes) <= NEIGHBOURS:
+        if len(nodes) <= self._neighbours:
             return Votes.of(np.zeros((0, 3)), np.zeros(0))
-        ours, theirs = view.patterns, Patterns.of(nodes.places_m, nodes.kind)
+        ours, theirs = view.patterns, Patterns.of(nodes.places_m, nodes.kind, neighbours=self._neighbours)
         away = cdist(ours.vector, theirs.vector)
         away[ours.kind[:, None] != theirs.kind] = np.inf
-        best = np.argsort(away.round(9), axis=1, kind="stable")[:, :MATCHES]
+        best = np.argsort(away.round(9), axis=1, kind="stable")[:, : self._matches]
         seen = np.repeat(np.arange(len(best)), best.shape[1])
         away, best = away[seen, best.ravel()], best.ravel()
         poses = rigid_poses(ours.corners_m[seen], theirs.corners_m[best])

@@ -34,14 +34,12 @@ from sasgeo_bench import (
 CLASS: Final = "building"
 NEAREST: Final = 5  # buildings around each, any two of which make a triangle with it
 LONGEST_M: Final = 150.0  # side of a triangle: longer ones seldom fit into a view
-RATIO: Final = 0.15  # difference of two ratios of sides, alone, that may be: 4 m at either end of 50 m
-LOG_SIZE: Final = 0.15  # the same of the logarithm of the longest side
-LOG_AREA: Final = 1.0  # the same of the logarithm of a ratio of building areas: masks merge and cut houses
+LOG_SIZE: Final = 0.15  # difference of two logarithms of the longest side, alone, that may be
 TRIED: Final = 24  # poses that most triangles vote for
 SAME_M: Final = 10.0  # a seen and a mapped building this near are one, for the fit
 APART_M: Final = 25.0
 FULL: Final = 255  # of a map's degrees
-_TURNED_APART: Final = 2.0  # a triangle and its mirror image: more than all that may differ
+_SENSE: Final = 0.5  # a triangle and its mirror image differ by 2: more than all that may differ
 _EACH: Final = 100  # triangles of a map for one of a view, the most alike first
 
 KINDS: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.classes == (CLASS,))
@@ -51,8 +49,7 @@ KINDS: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.classes ==
 class Triangles:
     """Triangles of places, their corners ordered by the length of the side opposite, the shortest first.
 
-    `corners`, int64 of shape (T, 3), are rows of places; `shape`, shape (T, 6), what two like triangles share: two
-    triangles may be the same if they lie within 1 of each other.
+    `corners`, int64 of shape (T, 3), are rows of places; `shape`, shape (T, 6), what two like triangles share.
     """
 
     corners: Ints
@@ -67,7 +64,7 @@ class Triangles:
         >>> found = Triangles.of(np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 30.0]]), np.full(3, 100.0))
         >>> found.corners.tolist()
         [[1, 2, 0]]
-        >>> (found.shape[0, :2] * RATIO).round(2).tolist()
+        >>> found.shape[0, :2].round(2).tolist()
         [0.6, 0.8]
         """
         corners = _neighbours(places_m)
@@ -101,7 +98,7 @@ def _sides_m(places_m: Floats, corners: Ints) -> Floats:
 
 
 def shapes_of(places_m: Floats, area_m2: Floats, corners: Ints) -> Floats:
-    """Return the invariants of triangles with their corners in a given order, shape (T, 6), in units of tolerance.
+    """Return the invariants of triangles with their corners in a given order, shape (T, 6).
 
     Ratios of the first two sides to the third, logarithm of the third, logarithms of the ratios of the first two
     buildings' areas to the third's, and the sense of rotation.
@@ -111,12 +108,17 @@ def shapes_of(places_m: Floats, area_m2: Floats, corners: Ints) -> Floats:
     sense = np.sign(one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
     return np.column_stack(
         [
-            sides_m[:, :2] / sides_m[:, 2:] / RATIO,
-            np.log(sides_m[:, 2]) / LOG_SIZE,
-            (log_area[:, :2] - log_area[:, 2:]) / LOG_AREA,
-            sense * _TURNED_APART,
+            sides_m[:, :2] / sides_m[:, 2:],
+            np.log(sides_m[:, 2]),
+            log_area[:, :2] - log_area[:, 2:],
+            sense,
         ]
     )
+
+
+def differences(ratio: float, log_area: float) -> Floats:
+    """Return by how much each number of the shape of like triangles may differ alone, shape (6,)."""
+    return np.array([ratio, ratio, LOG_SIZE, log_area, log_area, _SENSE])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,6 +157,12 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
             "no weights by what lasts; the overlap is its only confidence"
         ),
     )
+
+    open_numbers = {
+        "ratio": (0.1, 0.15, 0.25),  # difference of two ratios of sides, alone, that may be
+        "log_area": (0.5, 1.0),  # the same of the logarithm of a ratio of building areas: masks merge and cut houses
+    }
+    chosen = {"ratio": 0.15, "log_area": 1.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read the buildings of the map and their triangles."""
@@ -203,12 +211,14 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
         within = np.flatnonzero(disc.wider(view.reach_m).holds(middle_m))
         if not len(within):
             return
-        tree = cKDTree(theirs.shape[within])
+        may_differ = differences(**self.numbers)
+        tree = cKDTree(theirs.shape[within] / may_differ)
         ours = Triangles.of(view.nodes.places_m, view.nodes.area_m2)
         for order in permutations(range(3)):  # nearly equal sides come in any order
             corners = ours.corners[:, order]
             shape = shapes_of(view.nodes.places_m, view.nodes.area_m2, corners)
-            away, near = (np.asarray(part) for part in tree.query(shape, k=_EACH, distance_upper_bound=1.0))
+            found = tree.query(shape / may_differ, k=_EACH, distance_upper_bound=1.0)
+            away, near = (np.asarray(part) for part in found)
             row, at = np.nonzero(np.isfinite(away))
             hits = within[near[row, at]]
             poses = rigid_poses(view.nodes.places_m[corners[row]], nodes.places_m[theirs.corners[hits]])

@@ -8,14 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.shift_matcher import ShiftMatcher
-from sasgeo_bench import PRESENT, UNKNOWN, Evidence, MatcherCard, Overlaps, ShiftPlan
+from sasgeo_bench import PRESENT, UNKNOWN, Evidence, MatcherCard, Overlaps
 
 TALL: Final = "building"  # the class that stands up from the ground
 # Of a roof over that of the camera. A view of 192 m is taken from about 160 m: 0, 8 (houses) and 24 m (blocks).
 HEIGHTS: Final = (0.0, 0.05, 0.15)
 YAW_STEP_DEG: Final = 4.0  # half of it moves the rim of a view by less than a cell of 4 m: more layers, fewer headings
 LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
-LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 
 
 class UbevTemplate(ShiftMatcher):
@@ -45,7 +44,12 @@ class UbevTemplate(ShiftMatcher):
         ),
     )
 
-    plan = ShiftPlan(yaw_step_deg=YAW_STEP_DEG)
+    open_numbers = {
+        "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
+        "coarse_m": (4.0, 6.0),
+    }
+    chosen = {"least_share": 0.5, "coarse_m": 4.0}
+    yaw_step_deg = YAW_STEP_DEG
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the presence of each layer, then where each is known, then where any class is."""
@@ -66,7 +70,8 @@ class UbevTemplate(ShiftMatcher):
             classes += is_there
             at += heights
         share = overlaps.sums(2 * sheets, ground) / max(1.0, float(overlaps.totals[-1]))
-        return np.where(share >= LEAST_SHARE, total / np.maximum(classes, 1), -np.inf).astype(np.float32)
+        is_known = share >= self.numbers["least_share"]
+        return np.where(is_known, total / np.maximum(classes, 1), -np.inf).astype(np.float32)
 
 
 def layers_of(evidence: Evidence, name: str) -> list[tuple[NDArray[np.float32], NDArray[np.float32]]]:

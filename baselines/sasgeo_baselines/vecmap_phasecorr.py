@@ -16,7 +16,6 @@ from sasgeo_baselines.shift_matcher import ShiftMatcher
 from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlaps, Pose, Query, Region, Training
 
 FULL: Final = 255
-REACH_M: Final = 16.0  # distances are truncated here
 SHARP_CELLS: Final = 1.0  # standard deviation of the low-pass, in cells
 LEARNED_AROUND_M: Final = 150.0  # places that a class is held against while weights are learned
 MOST_LESSONS: Final = 120
@@ -49,6 +48,9 @@ class VecmapPhasecorr(ShiftMatcher):
         ),
     )
 
+    open_numbers = {"reach_m": (8.0, 16.0, 32.0), "coarse_m": (4.0, 6.0)}  # where distances are truncated; cells
+    chosen = {"reach_m": 16.0, "coarse_m": 4.0}
+
     def chart_of(self, region: Region) -> Chart:
         """Return the signed distances of the map as degrees: 1 deep within a class, 0 far from it."""
         known = region.known()
@@ -56,7 +58,7 @@ class VecmapPhasecorr(ShiftMatcher):
         for name, into in zip(region.classes, degree, strict=True):
             present = (region.layer(name) == PRESENT) & known
             if present.any():  # a class that the map lacks stays 0, and is not used
-                into[:] = signed(present, known, region.grid.cell_size_m)
+                into[:] = self._signed(present, known, region.grid.cell_size_m)
         return Chart(
             grid=region.grid,
             classes=region.classes,
@@ -66,8 +68,8 @@ class VecmapPhasecorr(ShiftMatcher):
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read the map and the weights."""
-        super().read(region, None)
         self.weights: Mapping[str, float] = {} if learned is None else read_learned(self.card.name, learned, _weights)
+        super().read(region, None)
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the signed distances of the view, less their mean over known cells, 0 where it is unknown."""
@@ -76,9 +78,12 @@ class VecmapPhasecorr(ShiftMatcher):
             layer = evidence.layer(name)
             known = layer != UNKNOWN
             if known.any():
-                distance = signed(layer == PRESENT, known, evidence.cell_size_m)
+                distance = self._signed(layer == PRESENT, known, evidence.cell_size_m)
                 into[known] = (distance[known] - distance[known].mean(dtype=np.float64)) / FULL
         return found
+
+    def _signed(self, present: NDArray[np.bool_], known: NDArray[np.bool_], cell_m: float) -> NDArray[np.uint8]:
+        return signed(present, known, cell_m, reach_m=self.numbers["reach_m"])
 
     def score(self, overlaps: Overlaps, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the weighted sum of phase correlations."""
@@ -158,15 +163,15 @@ def lowpass(size: int) -> NDArray[np.float32]:
     return np.asarray(found)
 
 
-def signed(present: NDArray[np.bool_], known: NDArray[np.bool_], cell_m: float) -> NDArray[np.uint8]:
+def signed(present: NDArray[np.bool_], known: NDArray[np.bool_], cell_m: float, *, reach_m: float) -> NDArray[np.uint8]:
     """Return signed distances to the rim of what is present, 0 far outside to `FULL` deep inside; the mean if unknown.
 
     >>> row = np.arange(60) < 30
-    >>> signed(row[None], np.ones((1, 60), dtype=bool), 1.0)[0, [0, 20, 29, 30, 59]].tolist()
+    >>> signed(row[None], np.ones((1, 60), dtype=bool), 1.0, reach_m=16.0)[0, [0, 20, 29, 30, 59]].tolist()
     [255, 207, 135, 120, 0]
     """
     inside, outside = (_distance(mask) for mask in (present, ~present))
-    share = np.clip(0.5 + (inside - outside) * cell_m / (2 * REACH_M), 0.0, 1.0)
+    share = np.clip(0.5 + (inside - outside) * cell_m / (2 * reach_m), 0.0, 1.0)
     found = np.rint(FULL * share).astype(np.uint8)  # in whole steps, for distances are not the same twice
     if known.any() and not known.all():
         found[~known] = np.rint(found[known].mean(dtype=np.float64))

@@ -37,9 +37,7 @@ MOST_PLACES: Final = 400_000  # on a larger map they lie further apart
 SHORTLIST: Final = 200
 REFINED: Final = 12  # places that are refined
 STEPS_M: Final = (5.0, 2.5)  # of a place, one after the other
-BLUR: Final = 5  # rays over which a boundary is spread: a degree off, it still overlaps
 WEIGHTS: Final = (1.0, 1.0, 1.0)  # of range, boundary and hit
-START_M: Final = 16.0  # from the middle of a view: rays of 80 m from there lie within a view of 192 m
 LEAST_JUDGED: Final = 0.5  # of the rays, where some are left out
 LEAST_SPREAD: Final = 1e-3
 APART_M: Final = 25.0
@@ -80,10 +78,10 @@ class Profiles:
         """Return each `step`-th ray."""
         return type(self)(values=self.values[..., ::step], is_judged=self.is_judged[:, ::step])
 
-    def compared(self) -> Floats:
-        """Return the signals as they are compared: boundaries are spread over their neighbours, all are weighed."""
+    def compared(self, blur: int) -> Floats:
+        """Return the signals as they are compared: boundaries are spread over `blur` rays, all are weighed."""
         values = self.values.copy()
-        values[:, 1] = ndimage.maximum_filter1d(values[:, 1], BLUR, axis=-1, mode="wrap")
+        values[:, 1] = ndimage.maximum_filter1d(values[:, 1], blur, axis=-1, mode="wrap")
         return values * np.array(WEIGHTS, dtype=np.float32)[:, None]
 
     def magnitudes(self) -> Floats:
@@ -105,7 +103,7 @@ def spread_of(parts: Sequence[Floats]) -> Floats:
     return np.maximum(spread, LEAST_SPREAD).astype(np.float32)
 
 
-def differences(seen: Profiles, mapped: Profiles, turns: NDArray[np.int64]) -> NDArray[np.float64]:
+def differences(seen: Profiles, mapped: Profiles, turns: NDArray[np.int64], *, blur: int) -> NDArray[np.float64]:
     """Return mean differences of one view, turned clockwise by whole rays, from places, shape (N, turns).
 
     They are infinite where less than half of the rays are compared.
@@ -114,10 +112,10 @@ def differences(seen: Profiles, mapped: Profiles, turns: NDArray[np.int64]) -> N
     >>> values[0, 0, 2] = 0.8  # a wall on the right of the view; on the map it is in the south
     >>> seen = Profiles(values=values, is_judged=np.ones((1, 8), dtype=bool))
     >>> mapped = Profiles(values=np.roll(values, 2, axis=-1), is_judged=seen.is_judged)
-    >>> differences(seen, mapped, np.array([0, 2])).round(3).tolist()
+    >>> differences(seen, mapped, np.array([0, 2]), blur=5).round(3).tolist()
     [[0.2, 0.0]]
     """
-    mine, theirs = seen.compared(), mapped.compared()
+    mine, theirs = seen.compared(blur), mapped.compared(blur)
     found = np.full((len(theirs), len(turns)), np.inf)
     for at, turn in enumerate(turns.tolist()):
         judged = mapped.is_judged & np.roll(seen.is_judged, turn, axis=-1)
@@ -127,15 +125,15 @@ def differences(seen: Profiles, mapped: Profiles, turns: NDArray[np.int64]) -> N
     return found
 
 
-def open_ground(states: NDArray[np.uint8], *, cell_m: float) -> NDArray[np.float64] | None:
+def open_ground(states: NDArray[np.uint8], *, cell_m: float, within_m: float) -> NDArray[np.float64] | None:
     """Return where the rays of a view begin, cells right and down from its upper left corner; None without open ground.
 
-    It is the cell within `START_M` of the middle that lies furthest from what is no open ground, or the nearest one
+    It is the cell within `within_m` of the middle that lies furthest from what is no open ground, or the nearest one
     that is open where none is within.
 
     >>> states = np.ones((9, 9), dtype=np.uint8)
     >>> states[:, 3:8] = ABSENT  # a street
-    >>> open_ground(states, cell_m=1.0).tolist()
+    >>> open_ground(states, cell_m=1.0, within_m=16.0).tolist()
     [5.5, 4.5]
     """
     is_open = (states == ABSENT).astype(np.uint8)
@@ -145,7 +143,7 @@ def open_ground(states: NDArray[np.uint8], *, cell_m: float) -> NDArray[np.float
     middles = np.column_stack([cols, rows]) + 0.5
     away_m = np.hypot(*(middles - np.array(states.shape[::-1]) / 2).T) * cell_m
     clear = cv2.distanceTransform(is_open, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[rows, cols]
-    near = away_m <= START_M
+    near = away_m <= within_m
     order = np.lexsort((away_m, -clear * near)) if near.any() else np.argsort(away_m, kind="stable")
     return np.asarray(middles[order[0]])
 
@@ -197,8 +195,14 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         ),
     )
 
-    def __init__(self, *, censors: bool = False) -> None:
-        super().__init__()
+    open_numbers = {
+        "start_m": (0.0, 8.0, 16.0),  # from the middle of a view: rays of 80 m from there lie within a view of 192 m
+        "blur": (1, 5),  # rays over which a boundary is spread: a degree off, it still overlaps
+    }
+    chosen = {"start_m": 16.0, "blur": 5}
+
+    def __init__(self, *, censors: bool = False, **numbers: float) -> None:
+        super().__init__(**numbers)
         self.censors = censors
 
     def learn(self, training: Training) -> str:
@@ -210,18 +214,21 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
 
     def read(self, region: Region, learned: str | None) -> None:
         """Describe places of a map."""
+        taught = None if learned is None else read_learned(self.card.name, learned, _spread)
         self._map = BuildingMap.of(region)
         grid = region.grid
         least_m = float(np.sqrt(grid.rows * grid.cols / MOST_PLACES)) * grid.cell_size_m
         places_m, waves = zip(*self._described(self._map, max(STEP_M, least_m)), strict=True)
         self._places_m = np.concatenate(places_m)
-        self._spread = spread_of(waves) if learned is None else read_learned(self.card.name, learned, _spread)
+        self._spread = spread_of(waves) if taught is None else taught
         self._waves = np.concatenate(waves) / self._spread
 
     def look(self, query: Query) -> Sight | None:
         """Cast rays from open ground at the middle of a view; None where they meet nothing."""
         seen = query.evidence
-        start = open_ground(seen.layer(CLASS), cell_m=seen.cell_size_m) if CLASS in seen.classes else None
+        if CLASS not in seen.classes:
+            return None
+        start = open_ground(seen.layer(CLASS), cell_m=seen.cell_size_m, within_m=self.numbers["start_m"])
         if start is None:
             return None
         rays = cast(seen.layer(CLASS), start[None], RAYS, cell_m=seen.cell_size_m)
@@ -251,7 +258,8 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
     def _turned(self, view: Sight, places_m: Points) -> list[Mode]:
         """Return the best pose whose rays begin at each place; minus infinity is the score of one that is not known."""
         turns = turns_within(view.prior, RAYS)
-        found = differences(view.profile, Profiles.of(self._map.rays(places_m, RAYS), censors=self.censors), turns)
+        mapped = Profiles.of(self._map.rays(places_m, RAYS), censors=self.censors)
+        found = differences(view.profile, mapped, turns, blur=int(self.numbers["blur"]))
         best = found.argmin(axis=1)
         yaws_deg, least = turns[best] * (360.0 / RAYS), found[np.arange(len(found)), best]
         modes = []

@@ -14,13 +14,12 @@ from sasgeo_baselines.global_descriptor import separate
 from sasgeo_baselines.patches import SIDE, Patches, matches
 from sasgeo_baselines.place_matcher import AROUND_M, PlaceMatcher, turns_within
 from sasgeo_baselines.polar import (
-    CELL_M,
     DEPTH,
     GROUPS,
     RINGS,
     SECTORS,
-    map_rows,
-    padded_strips,
+    described,
+    places_m,
     turned,
     view_descriptor,
 )
@@ -39,12 +38,11 @@ from sasgeo_bench import (
     wrap_deg,
 )
 
-STRIDE: Final = 6  # cells of 4 m between two crops: a view is at most 17 m off the middle of one
 MARGIN_M: Final = 48.0  # of a crop around a view: twice that, so that turned views fit, too
 CROPS_APART_M: Final = 48.0  # nearer ones show the same ground
 APART_M: Final = 25.0  # two answers
 ROUNDS: Final = 2  # of consensus: a patch hears of those two patches away
-NEAR_M: Final = 8.0  # of a match from where the similarity puts it: the side of a patch, as places are middles of them
+SLACK_M: Final = 8.0  # beyond the disc of the prior: the side of a patch, as places are middles of them
 LEAST: Final = 4  # matches that agree: two make a similarity
 MOST_OFF: Final = 3.0  # standard deviations of the prior, of a heading or scale that is found
 ALIGNED: Final = 5  # candidates of a retrieval query whose patches are matched, the best first
@@ -65,17 +63,15 @@ class Crops:
     spread: Floats
 
     @classmethod
-    def of(cls, region: Region) -> Self:
-        """Describe the crops of a map, 24 m apart."""
-        rows = [map_rows(strip, stride=STRIDE) for strip in padded_strips(region, stride=STRIDE)]
-        west_m, _, _, north_m = region.grid.bounds_m
-        down, right = np.indices((len(rows), len(rows[0]))).reshape(2, -1) * STRIDE * CELL_M
+    def of(cls, region: Region, *, stride: int) -> Self:
+        """Describe the crops of a map, so many cells of 4 m apart."""
+        rows = list(described(region, stride=stride))
         values = np.concatenate(rows)
         mean, spread = _alike(values.mean(axis=0)), np.sqrt(_alike(values.var(axis=0)))
         spread = np.maximum(spread, np.float32(_LEAST_SPREAD))
         np.subtract(values, mean, out=values)
         np.divide(values, spread, out=values)
-        middles_m = np.column_stack((west_m + right, north_m - down))
+        middles_m = places_m(region.grid, (len(rows), len(rows[0])), stride=stride)
         return cls(middles_m=middles_m, values=values, mean=mean, spread=spread)
 
     def likeness(self, descriptor: Floats, rows: NDArray[np.int64], turns: Sequence[int]) -> Floats:
@@ -115,9 +111,9 @@ class Seen:
         prior = self.prior
         off_deg = 0.0 if prior.yaw_deg is None else abs(float(wrap_deg(pose.yaw_deg - prior.yaw_deg)))
         return (
-            disc.wider(NEAR_M).has(pose)
+            disc.wider(SLACK_M).has(pose)
             and off_deg <= MOST_OFF * (prior.yaw_sigma_deg or 0.0) + _STEP_DEG / 2
-            and abs(math.log(pose.scale)) <= MOST_OFF * prior.scale_sigma + NEAR_M / max(self.evidence.size_m)
+            and abs(math.log(pose.scale)) <= MOST_OFF * prior.scale_sigma + SLACK_M / max(self.evidence.size_m)
         )
 
 
@@ -160,10 +156,16 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
         ),
     )
 
+    open_numbers = {
+        "stride": (6, 8),  # cells between two crops: a view is at most 17 or 23 m off the middle of one
+        "near_m": (6.0, 8.0, 12.0),  # of a match from where the similarity puts it; the side of a patch is 8 m
+    }
+    chosen = {"stride": 6, "near_m": 8.0}
+
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the crops of the map."""
         del learned
-        self._crops = Crops.of(region)
+        self._crops = Crops.of(region, stride=int(self.numbers["stride"]))
         self._chart = Chart.of(region)
         self._used = self._chart.used()
 
@@ -236,27 +238,29 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
         if (town == UNKNOWN).all():
             return Agreed(pose=crop.pose, score=crop.score, inliers=0, matched=0)
         seen_m, mapped_m = matches(view.patches, Patches.of(town, cell_m), rounds=ROUNDS)
-        pose, inliers = similarity(seen_m, mapped_m, crop.pose)
+        pose, inliers = similarity(seen_m, mapped_m, crop.pose, near_m=self.numbers["near_m"])
         if pose is None or not view.allows(pose, disc):
             pose, inliers = crop.pose, 0
         return Agreed(pose=pose, score=crop.score, inliers=inliers, matched=len(seen_m))
 
 
-def similarity(seen_m: NDArray[np.float64], mapped_m: NDArray[np.float64], crop: Pose) -> tuple[Pose | None, int]:
+def similarity(
+    seen_m: NDArray[np.float64], mapped_m: NDArray[np.float64], crop: Pose, *, near_m: float
+) -> tuple[Pose | None, int]:
     """Return the pose of a view by RANSAC, and how many matches agree with it; None for fewer than four.
 
     Matches are (right, up) of the middles of the view and of a crop, shape (M, 2).
 
     >>> crop = Pose(easting_m=100.0, northing_m=50.0, yaw_deg=90.0)
     >>> seen_m = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 40.0], [-40.0, 0.0], [0.0, -40.0]])
-    >>> pose, inliers = similarity(seen_m, seen_m + np.array([[0.0, 16.0]] * 4 + [[60.0, 0.0]]), crop)
+    >>> pose, inliers = similarity(seen_m, seen_m + np.array([[0.0, 16.0]] * 4 + [[60.0, 0.0]]), crop, near_m=8.0)
     >>> round(pose.easting_m, 3), round(pose.northing_m, 3), round(pose.yaw_deg, 3), inliers
     (116.0, 50.0, 90.0, 4)
     """
     if len(seen_m) < LEAST:
         return None, 0
     matrix, agrees = cv2.estimateAffinePartial2D(
-        seen_m, mapped_m, method=cv2.RANSAC, ransacReprojThreshold=NEAR_M, maxIters=_TRIES, confidence=0.999
+        seen_m, mapped_m, method=cv2.RANSAC, ransacReprojThreshold=near_m, maxIters=_TRIES, confidence=0.999
     )
     inliers = 0 if matrix is None else int(np.count_nonzero(agrees))
     if inliers < LEAST:

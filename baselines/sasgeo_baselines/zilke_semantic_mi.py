@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.shift_matcher import ShiftMatcher
-from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlaps, Region, ShiftPlan
+from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlaps, Region
 
 # Where several classes hold in a cell the first is its label: what is small or thin before what covers ground.
 LABELS: Final = (
@@ -20,7 +20,6 @@ LABELS: Final = (
 )
 REST: Final = "rest"  # known cells without a label
 NAMES: Final = (*(group[0] for group in LABELS), REST)
-LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 _NOTHING: Final = 1e-9
 
 
@@ -49,7 +48,8 @@ class ZilkeSemanticMi(ShiftMatcher):
             "views of few labels say little; no confidence"
         ),
     )
-    plan = ShiftPlan(coarse_m=6.0, fine_m=3.0)
+    open_numbers = {"coarse_m": (4.0, 6.0, 8.0), "least_share": (0.25, 0.5)}
+    chosen = {"coarse_m": 6.0, "least_share": 0.5}
 
     def chart_of(self, region: Region) -> Chart:
         """Return the labels of the map, one to a known cell."""
@@ -90,7 +90,7 @@ class ZilkeSemanticMi(ShiftMatcher):
         both = _entropy(joint.reshape(-1, *overlaps.places))
         view, mapped = _entropy(joint.sum(axis=1)), _entropy(joint.sum(axis=0))
         found = np.where(both > _NOTHING, (view + mapped) / np.maximum(both, _NOTHING), 1.0)
-        return np.where(share >= LEAST_SHARE, found, -np.inf).astype(np.float32)
+        return np.where(share >= self.numbers["least_share"], found, -np.inf).astype(np.float32)
 
 
 def _entropy(shares: NDArray[np.float32]) -> NDArray[np.float32]:

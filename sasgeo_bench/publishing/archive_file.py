@@ -8,7 +8,7 @@ scored again. Figures, pictures and tables for other programs are left out, too:
 import json
 import re
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -306,11 +306,17 @@ def unpack(folder: Path, into: Path) -> Unpacked:
         return Unpacked(root=into, tasks=tasks, runs=tuple(_lay_runs(tables["runs"], answers, asked, into)))
 
 
-def read_stored_predictions(folder: Path, matcher: str) -> list[Prediction]:
-    """Read the answers of one matcher from stored results; raise `StoreError` if damaged or without any."""
+def read_stored_predictions(folder: Path, matcher: str, *, queries: Collection[str] | None = None) -> list[Prediction]:
+    """Read the answers of one matcher, to some queries or all, from stored results.
+
+    Raise `StoreError` if the results are damaged or hold none.
+    """
     with sound(folder):
         table = _read_predictions(folder, _read_runs(folder))
-        found = predictions_of(table.filter(pc.equal(table[MATCHER], matcher)))
+        table = table.filter(pc.equal(table[MATCHER], matcher))
+        if queries is not None:
+            table = table.filter(pc.is_in(table["query_id"], pa.array(sorted(queries), pa.string())))
+        found = predictions_of(table)
     if not found:
         message = f"{folder} holds no answer of {matcher!r}: board.json names its matchers"
         raise StoreError(message)

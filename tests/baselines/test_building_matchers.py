@@ -15,7 +15,6 @@ from sasgeo_baselines.ouyang_shape_votes import OuyangShapeVotes, credibility
 from sasgeo_baselines.vojir_instance_rays import (
     LEAST_SPREAD,
     RAYS,
-    START_M,
     WAVES,
     Profiles,
     VojirInstanceRays,
@@ -140,7 +139,7 @@ def test_waves_do_not_turn_with_a_view_and_differences_say_by_how_much(quarter, 
     )
     np.testing.assert_allclose(one.magnitudes(), other.magnitudes(), atol=0.01)
     assert one.magnitudes().shape == (1, 3 * WAVES)
-    found = differences(one, other, np.arange(RAYS))[0]
+    found = differences(one, other, np.arange(RAYS), blur=5)[0]
     assert found.argmin() == 90 * quarter
     assert found.min() < 0.02
 
@@ -152,23 +151,23 @@ def test_rays_that_are_left_out_change_nothing_and_too_few_say_nothing():
     whole[90:110, 40:50] = PRESENT  # a house that the view cannot see
     half, full = (cast(cells, np.array([[100.0, 100.0]]), RAYS, cell_m=1.0) for cells in (states, whole))
     faithful, left_out = (
-        differences(*(Profiles.of(rays, censors=censors) for rays in (half, full)), np.array([0]))[0, 0]
+        differences(*(Profiles.of(rays, censors=censors) for rays in (half, full)), np.array([0]), blur=5)[0, 0]
         for censors in (False, True)
     )
     assert left_out < 0.02 < faithful
     blind = cast(np.full_like(states, UNKNOWN), np.array([[100.0, 100.0]]), RAYS, cell_m=1.0)
     seen = Profiles.of(blind, censors=True)
-    assert differences(seen, Profiles.of(full, censors=True), np.array([0]))[0, 0] == np.inf
+    assert differences(seen, Profiles.of(full, censors=True), np.array([0]), blur=5)[0, 0] == np.inf
 
 
 def test_rays_begin_in_the_open():
     states = np.full((64, 64), PRESENT, dtype=np.uint8)
-    assert open_ground(states, cell_m=1.0) is None
+    assert open_ground(states, cell_m=1.0, within_m=16.0) is None
     states[:, 58:] = ABSENT  # beyond the reach of the middle: the nearest of it
-    assert open_ground(states, cell_m=1.0)[0] == 58.5
+    assert open_ground(states, cell_m=1.0, within_m=16.0)[0] == 58.5
     states[20:41, 20:41] = ABSENT
-    assert open_ground(states, cell_m=1.0).tolist() == [30.5, 30.5]
-    assert np.hypot(*(open_ground(states, cell_m=1.0) - 32.0)) <= START_M
+    assert open_ground(states, cell_m=1.0, within_m=16.0).tolist() == [30.5, 30.5]
+    assert np.hypot(*(open_ground(states, cell_m=1.0, within_m=16.0) - 32.0)) <= 16.0
 
 
 def test_a_hidden_half_is_survived_if_its_rays_are_left_out(made, region, seen):

@@ -8,8 +8,8 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
-from sasgeo_baselines.stfm_centroids import NEIGHBOURS, Patterns, StfmCentroids, clear_m
-from sasgeo_baselines.triangle_rsim import RATIO, TriangleRsim, Triangles, shapes_of
+from sasgeo_baselines.stfm_centroids import Patterns, StfmCentroids, clear_m
+from sasgeo_baselines.triangle_rsim import TriangleRsim, Triangles, differences, shapes_of
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import WITHHELD, check_match
@@ -121,7 +121,7 @@ def test_a_triangle_by_hand():
     places_m, area_m2 = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 30.0]]), np.array([100.0, 200.0, 100.0])
     found = Triangles.of(places_m, area_m2)
     assert found.corners.tolist() == [[1, 2, 0]]
-    ratios, log_areas = found.shape[0, :2] * RATIO, found.shape[0, 3:5]
+    ratios, log_areas = found.shape[0, :2], found.shape[0, 3:5]
     assert ratios.tolist() == pytest.approx([0.6, 0.8])
     assert log_areas.tolist() == pytest.approx([np.log(2.0), 0.0])
 
@@ -142,10 +142,10 @@ def test_triangles_do_not_depend_on_heading_or_order(yaw_deg, seed, order):
 def test_a_mirror_image_and_another_size_are_not_alike():
     places_m, area_m2 = np.array([[0.0, 0.0], [40.0, 0.0], [0.0, 30.0]]), np.full(3, 100.0)
     corners = np.array([[1, 2, 0]])
-    own = shapes_of(places_m, area_m2, corners)
+    own, may_differ = shapes_of(places_m, area_m2, corners), differences(ratio=0.15, log_area=1.0)
     for other_m in (places_m * (-1, 1), places_m * 1.25):
-        assert np.linalg.norm(own - shapes_of(other_m, area_m2, corners)) > 1
-    assert np.linalg.norm(own - shapes_of(places_m * 1.05, area_m2, corners)) < 1
+        assert np.linalg.norm((own - shapes_of(other_m, area_m2, corners)) / may_differ) > 1
+    assert np.linalg.norm((own - shapes_of(places_m * 1.05, area_m2, corners)) / may_differ) < 1
 
 
 def test_houses_on_one_line_make_triangles_of_neighbours_and_two_make_none():
@@ -158,11 +158,11 @@ def test_a_pattern_by_hand():
     """Four houses around one and a junction beyond: houses come first, the nearest before; all turns are quarters."""
     places_m = np.array([[0.0, 0.0], [0.0, 10.0], [20.0, 0.0], [0.0, -30.0], [-40.0, 0.0], [0.0, 50.0]])
     house, junction = INDEX["building patch"], INDEX["mask intersection"]
-    found = Patterns.of(places_m, np.array([house] * 5 + [junction]))
+    found = Patterns.of(places_m, np.array([house] * 5 + [junction]), neighbours=5)
     assert junction < house  # so that it comes first in the order of labels
     assert found.corners_m[0, 1:].tolist() == [places_m[at].tolist() for at in (5, 1, 2, 3, 4)]
     assert found.reach_m[0] == 50.0
-    ratio, cosine, sine = np.split(found.vector[0, : 3 * NEIGHBOURS], 3)
+    ratio, cosine, sine = np.split(found.vector[0, : 3 * 5], 3)
     assert ratio.tolist() == pytest.approx([1.0, 0.2, 0.4, 0.6, 0.8])
     assert (2 * cosine).tolist() == pytest.approx([0.0, 1.0, 0.0, 0.0, 0.0], abs=1e-9)
     assert (2 * sine).tolist() == pytest.approx([1.0, 0.0, 1.0, 1.0, 1.0], abs=1e-9)
@@ -172,7 +172,7 @@ def test_patterns_with_another_label_are_1_apart():
     places_m = np.random.default_rng(0).uniform(-50, 50, (6, 2))
     kinds = np.full((2, 6), INDEX["building patch"])
     kinds[1, np.argmax(np.hypot(*(places_m - places_m[0]).T))] = INDEX["water patch"]  # the last in either order
-    one, other = (Patterns.of(places_m, kind).vector[0] for kind in kinds)
+    one, other = (Patterns.of(places_m, kind, neighbours=5).vector[0] for kind in kinds)
     assert np.linalg.norm(one - other) == pytest.approx(1.0)
 
 
@@ -181,7 +181,7 @@ def test_patterns_do_not_depend_on_heading_and_scale(yaw_deg, scale, seed):
     rng = np.random.default_rng(seed)
     places_m, kind = rng.uniform(-60, 60, (9, 2)), rng.integers(0, 3, 9)
     here = Pose(easting_m=1000.0, northing_m=50.0, yaw_deg=yaw_deg, scale=scale)
-    one, other = Patterns.of(places_m, kind), Patterns.of(here.to_map(places_m), kind)
+    one, other = (Patterns.of(at_m, kind, neighbours=5) for at_m in (places_m, here.to_map(places_m)))
     np.testing.assert_allclose(other.vector, one.vector, atol=1e-6)
     np.testing.assert_allclose(other.reach_m, scale * one.reach_m)
 

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from sasgeo_baselines.object_matcher import Pairs, Sight, fitted
-from sasgeo_baselines.spatial_graph_clique import AGREE_M, SpatialGraphClique, largest_clique
+from sasgeo_baselines.spatial_graph_clique import SpatialGraphClique, largest_clique
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.sasgeo.nodes import INDEX, MOST_ARMS, Nodes
@@ -71,16 +71,18 @@ def test_a_fit_is_exact_and_does_not_depend_on_order(yaw_deg, count):
 def test_a_clique_never_shrinks_when_pairs_are_added(count, seed):
     rng = np.random.default_rng(seed)
     seen_m = rng.uniform(0, 60, (count, 2))
-    mapped_m = seen_m + rng.uniform(-AGREE_M, AGREE_M, (count, 2))
+    mapped_m = seen_m + rng.uniform(-5.0, 5.0, (count, 2))
     owner = rng.integers(0, max(1, count), (count, 2))
-    sizes = [len(largest_clique(seen_m[:part], mapped_m[:part], owner[:part])) for part in range(count + 1)]
+    sizes = [
+        len(largest_clique(seen_m[:part], mapped_m[:part], owner[:part], agree_m=5.0)) for part in range(count + 1)
+    ]
     assert sizes == sorted(sizes)
 
 
 def test_an_object_belongs_to_one_pair_of_a_clique():
     seen_m = np.array([[0.0, 0.0], [0.0, 0.0], [40.0, 0.0]])
     mapped_m = seen_m + np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 0.0]])
-    found = largest_clique(seen_m, mapped_m, np.array([[0, 0], [0, 1], [1, 2]]))
+    found = largest_clique(seen_m, mapped_m, np.array([[0, 0], [0, 1], [1, 2]]), agree_m=5.0)
     assert len(found) == 2
     assert 2 in found
 

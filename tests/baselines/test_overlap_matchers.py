@@ -159,7 +159,7 @@ def test_phase_correlation_ignores_a_constant_and_the_contrast_of_the_map():
 def test_signed_distances_are_truncated_and_even_where_nothing_is_known():
     present, known = np.zeros((1, 100), dtype=bool), np.ones((1, 100), dtype=bool)
     present[0, :50], known[0, 90:] = True, False
-    found = signed(present, known, 2.0)[0]
+    found = signed(present, known, 2.0, reach_m=16.0)[0]
     assert found[:42].min() == 255
     assert found[58:90].max() == 0
     assert found[95] == round(float(found[:90].mean()))

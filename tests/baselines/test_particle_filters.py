@@ -125,7 +125,7 @@ def test_distance_maps_of_a_large_map_are_coarser_and_agree(region):
 @pytest.mark.parametrize("heading", range(4))
 def test_a_view_is_described_as_the_map_is_under_it(heading, made, region):
     stride, at = 6, 13  # a place every 24 m
-    rows = [polar.map_rows(strip, stride=stride) for strip in polar.padded_strips(region, stride=stride)]
+    rows = list(polar.described(region, stride=stride))
     place = {"easting_m": 1000.0 + at * 24.0, "northing_m": 9000.0 - at * 24.0}
     seen = made.view_of(region, Pose(**place, yaw_deg=90.0 * heading), size_cells=200)
     found = polar.view_descriptor(seen)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sasgeo_baselines.embedding import DIMENSIONS, NUMBERS, STRIDE, Embedding, Ground, north_up
 from sasgeo_baselines.lcm_balanced import LcmBalanced
-from sasgeo_baselines.polar import CELL_M, map_rows, padded_strips, view_descriptor
+from sasgeo_baselines.polar import CELL_M, described, view_descriptor
 from sasgeo_baselines.sues_multi_height import SuesMultiHeight
 from sasgeo_baselines.u1652_instance_retrieval import U1652InstanceRetrieval
 
@@ -63,10 +63,10 @@ def seen_from(made, region, pose):
 
 
 def test_a_tile_on_the_lattice_is_what_the_gallery_has_there(region, ground):
-    strips = list(padded_strips(region, stride=STRIDE))
+    rows = list(described(region, stride=STRIDE))
     row, col = 8, 5
     place = Pose(easting_m=1000.0 + col * STRIDE * CELL_M, northing_m=9000.0 - row * STRIDE * CELL_M, yaw_deg=0.0)
-    np.testing.assert_allclose(ground.tiles([place])[0], map_rows(strips[row], stride=STRIDE)[col], atol=0.003)
+    np.testing.assert_allclose(ground.tiles([place])[0], rows[row][col], atol=0.003)
 
 
 def test_a_tile_at_a_pose_is_what_a_view_from_there_shows(made, region, ground):

@@ -249,8 +249,8 @@ def test_view_and_map_are_drawn_alike(made, region):
 
 def test_features_of_view_and_map_lie_where_the_pose_puts_them(made, region):
     pose = Pose(easting_m=1200.0, northing_m=8800.0, yaw_deg=0.0)
-    seen = view_features(Drawing.of_view(made.view_of(region, pose, size_cells=200), 1.0), region.grid)
-    mapped = map_features(Drawing.of_map(region), region.grid)
+    seen = view_features(Drawing.of_view(made.view_of(region, pose, size_cells=200), 1.0), region.grid, per_m2=0.02)
+    mapped = map_features(Drawing.of_map(region), region.grid, per_m2=0.02)
     away_m = np.linalg.norm(pose.to_map(seen.points)[:, None] - mapped.points[None], axis=2).min(axis=1)
     assert len(seen) > 100
     assert (away_m < 1.5).mean() > 0.7

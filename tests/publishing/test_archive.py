@@ -124,6 +124,8 @@ def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
     for name in ("counts", "random", "prior_centre", "oracle_pose", "fft_vote"):
         found = {item.query_id: item for item in read_stored_predictions(folder, name)}
         assert found == {key: replace(item, matcher_s=None) for key, item in board.predictions[name].items()}
+    one = next(iter(board.predictions["random"]))
+    assert [item.query_id for item in read_stored_predictions(folder, "random", queries={one})] == [one]
     with pytest.raises(StoreError, match="holds no answer of 'nobody'"):
         read_stored_predictions(folder, "nobody")
     learned = pq.read_table(folder / "runs.parquet")["learned"].to_pylist()

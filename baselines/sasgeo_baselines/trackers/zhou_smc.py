@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.polar import CELL_M, map_rows, padded_strips, turned, view_descriptor
+from sasgeo_baselines.polar import CELL_M, described, turned, view_descriptor
 from sasgeo_baselines.trackers.particles import Floats, Noise, ParticleFilter, Particles
 
 YAWS: Final = 8  # headings for which the map has embeddings
@@ -85,8 +85,8 @@ class Table:
         weights = np.concatenate([turned(embedding.mapped, yaw, yaws=YAWS) for yaw in range(YAWS)], axis=1)
         shift = np.concatenate([embedding.mapped_mean @ embedding.mapped] * YAWS)
         rows = []
-        for strip in padded_strips(region, stride=stride):
-            found = map_rows(strip, stride=stride) @ weights - shift
+        for row in described(region, stride=stride):
+            found = row @ weights - shift
             rows.append(found.reshape(-1, YAWS, DIMENSIONS).astype(np.float16))
         mean = np.mean([row.mean(axis=(0, 1), dtype=np.float32) for row in rows], axis=0)
         values = np.stack([np.rint(unit(row - mean) * _FULL).astype(np.int8) for row in rows])

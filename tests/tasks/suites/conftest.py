@@ -3,7 +3,7 @@
 
 import datetime as dt
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 
 import geopandas as gpd
@@ -72,11 +72,19 @@ class Carried:
     sites: tuple[Site, ...]
     seeds: Seeds
     edit: Edit | None
+    drafts: dict[tuple[int, Variant], Draft] = field(init=False, default_factory=dict)
 
     def draw(self, site: Site, variant: Variant) -> Draft:
         """One draft, as `draw.Drawer` asks for it."""
         seeds = self.seeds.under("site", site.index)
         return self.suite.draw(Shot(scene=self.scene, site=site, variant=variant, seeds=seeds))
+
+    def drawn(self, site: Site, variant: Variant) -> Draft:
+        """The same, drawn once for all tests."""
+        key = (site.index, variant)
+        if key not in self.drafts:
+            self.drafts[key] = self.draw(site, variant)
+        return self.drafts[key]
 
     def control(self, variant: Variant) -> Variant:
         """The control whose view has the same size."""

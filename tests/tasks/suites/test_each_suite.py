@@ -62,7 +62,7 @@ def stresses(made, role="stress"):
 def test_the_same_seed_gives_the_same_draft(carried, name):
     made = carried(name)
     for variant in made.suite.variants:
-        assert same_drafts(made.draw(made.sites[0], variant), made.draw(made.sites[0], variant))
+        assert same_drafts(made.draw(made.sites[0], variant), made.drawn(made.sites[0], variant))
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -78,7 +78,7 @@ def test_another_seed_gives_other_errors_of_perception(carried, name):
 def test_views_have_the_size_and_cells_their_variant_says(carried, name):
     made = carried(name)
     for variant in made.suite.variants:
-        evidence = made.draw(made.sites[-1], variant).evidence
+        evidence = made.drawn(made.sites[-1], variant).evidence
         assert evidence.shape == (variant.view_cells, variant.view_cells)
         assert evidence.cell_size_m == variant.cell_size_m
         assert evidence.classes == made.scene.map.classes
@@ -89,7 +89,7 @@ def test_the_view_of_a_falsifier_is_that_of_its_control(carried, name):
     made = carried(name)
     for variant in stresses(made, "falsifier"):
         for site in made.sites:
-            draft, control = made.draw(site, variant), made.draw(site, made.control(variant))
+            draft, control = made.drawn(site, variant), made.drawn(site, made.control(variant))
             if variant.kind == ALL_UNKNOWN:
                 assert (draft.evidence.cells == UNKNOWN).all()
                 continue
@@ -106,7 +106,7 @@ def test_where_the_stress_lies_elsewhere_the_view_is_that_of_the_control(carried
     made = carried(name)
     for variant in stresses(made):
         for site in made.sites:
-            draft, control = made.draw(site, variant), made.draw(site, made.control(variant))
+            draft, control = made.drawn(site, variant), made.drawn(site, made.control(variant))
             np.testing.assert_array_equal(draft.evidence.cells, control.evidence.cells)
             if control.vectors is not None:
                 assert same_vectors(draft.vectors, control.vectors)
@@ -117,7 +117,7 @@ def test_where_the_stress_lies_in_the_view_it_differs_from_the_control(carried, 
     made = carried(name)
     for variant in stresses(made):
         for site in made.sites:
-            draft, control = made.draw(site, variant), made.draw(site, made.control(variant))
+            draft, control = made.drawn(site, variant), made.drawn(site, made.control(variant))
             # In a small view a few years may leave everything as it was; the draft says so then.
             is_still = variant.view_cells < 192 and draft.measured.get("changed_share") == 0
             assert (draft.evidence.cells != control.evidence.cells).any() != is_still
@@ -133,7 +133,7 @@ def test_what_is_measured_of_a_stress_grows_with_its_strength(carried, name):
             (item for item in stresses(made) if item.kind == kind and item.view_cells == 192),
             key=lambda item: item.strength,
         )
-        steps = [np.mean([made.draw(site, item).measured[GROWS[name]] for site in made.sites]) for item in rungs]
+        steps = [np.mean([made.drawn(site, item).measured[GROWS[name]] for site in made.sites]) for item in rungs]
         assert steps[0] > 0 or name == "season"
         assert np.all(np.diff(steps) > 0) or (name == "season" and max(steps) < 1e-3)
         grew += len(steps) > 1
@@ -145,7 +145,7 @@ def test_as_much_is_unknown_as_the_strength_says_and_the_rest_is_as_in_the_contr
     made = carried(name)
     for variant in stresses(made):
         for site in made.sites:
-            seen, control = (made.draw(site, item).evidence for item in (variant, made.control(variant)))
+            seen, control = (made.drawn(site, item).evidence for item in (variant, made.control(variant)))
             is_left = seen.cells != UNKNOWN
             np.testing.assert_array_equal(seen.cells[is_left], control.cells[is_left])
             was_known = control.cells != UNKNOWN
@@ -161,7 +161,7 @@ def test_a_warp_bends_cells_and_vectors_by_one_field(carried):
     made = carried("local-warp")
     for variant in stresses(made):
         for site in made.sites:
-            draft, control = made.draw(site, variant), made.draw(site, made.control(variant))
+            draft, control = made.drawn(site, variant), made.drawn(site, made.control(variant))
             assert draft.measured["rms_m"] == pytest.approx(variant.strength)
             assert draft.vectors["class"].tolist() == control.vectors["class"].tolist()
             still = bent(control.vectors, np.zeros((2, *draft.evidence.shape)), 1.0)
@@ -174,7 +174,7 @@ def test_as_much_of_the_map_has_changed_as_the_truth_says(carried, name, kind):
     for variant in stresses(made):
         assert variant.kind == kind
         for site in made.sites:
-            draft = made.draw(site, variant)
+            draft = made.drawn(site, variant)
             assert draft.changed_share == draft.measured["changed_share"]
             assert 0 <= draft.changed_share <= 1
 
@@ -199,7 +199,7 @@ def test_about_as_many_houses_appear_as_growth_says(carried):
     made = carried("growth")
     for variant in stresses(made):
         if variant.view_cells == 192 and variant.strength <= 1:
-            found = [made.draw(site, variant).measured["new_per_old_area"] for site in made.sites]
+            found = [made.drawn(site, variant).measured["new_per_old_area"] for site in made.sites]
             assert np.mean(found) == pytest.approx(variant.strength, rel=0.45)
 
 
@@ -208,7 +208,7 @@ def test_better_perception_errs_less_and_none_of_the_controls_errs(carried):
     for site in made.sites:
         for variant in stresses(made, "control"):
             perfect = made.scene.world.view(site.pose, size_cells=variant.view_cells, cell_size_m=1.0)
-            np.testing.assert_array_equal(made.draw(site, variant).evidence.cells, perfect.cells)
+            np.testing.assert_array_equal(made.drawn(site, variant).evidence.cells, perfect.cells)
 
 
 def test_perception_is_that_of_the_site_and_the_view_alone(carried):
@@ -218,7 +218,7 @@ def test_perception_is_that_of_the_site_and_the_view_alone(carried):
     rng = made.seeds.under("site", site.index).rng("perception", 192, 1.0)
     view = made.scene.world.view(site.pose, size_cells=192, cell_size_m=1.0)
     expected = Perception(error_factor=1.0)(view, rng)
-    np.testing.assert_array_equal(made.draw(site, stresses(made, "control")[1]).evidence.cells, expected.cells)
+    np.testing.assert_array_equal(made.drawn(site, stresses(made, "control")[1]).evidence.cells, expected.cells)
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -226,7 +226,7 @@ def test_a_place_is_absent_only_where_the_kind_says_so(carried, name):
     made = carried(name)
     absent = {"outside", "wrong place", "corrupted view", "R1 truth removed"}
     for variant in made.suite.variants:
-        draft = made.draw(made.sites[0], variant)
+        draft = made.drawn(made.sites[0], variant)
         assert draft.is_present == (variant.kind not in absent)
         assert draft.has_pose == (variant.kind != "wrong place")
         assert draft.is_removed == variant.kind.startswith("R1")
@@ -239,7 +239,7 @@ def test_a_place_is_absent_only_where_the_kind_says_so(carried, name):
 def test_a_season_is_said_in_the_falsifier_too(carried):
     made = carried("season")
     for variant in made.suite.variants:
-        said = made.draw(made.sites[0], variant).season
+        said = made.drawn(made.sites[0], variant).season
         assert said == ("" if variant.role == "control" else variant.kind)
 
 
@@ -258,7 +258,7 @@ def test_mirroring_leaves_stable_classes_and_amounts_as_they_were(carried):
     moved = {0.4: ("green", "farmland"), 1.0: ("green", "farmland", "parking", "field_boundary", "building")}
     for variant in stresses(made):
         for site in made.sites:
-            seen, control = (made.draw(site, item).evidence for item in (variant, made.control(variant)))
+            seen, control = (made.drawn(site, item).evidence for item in (variant, made.control(variant)))
             for layer in seen.classes:
                 assert (seen.layer(layer) == 1).sum() == (control.layer(layer) == 1).sum()
                 if layer not in moved[variant.strength]:
@@ -307,7 +307,7 @@ def test_without_priors_the_views_are_the_same_and_with_them_the_scale_is_said_a
     made = carried("no-priors")
     drawn_sigma = made.suite.card.group.scale_sigma
     for variant in made.suite.variants:
-        group = made.draw(made.sites[0], variant).group
+        group = made.drawn(made.sites[0], variant).group
         if variant.role == "stress":
             assert group is None
             continue
@@ -320,14 +320,14 @@ def test_a_view_of_a_wrong_place_is_taken_in_the_other_region_at_about_the_same_
     made = carried("absent")
     wrong = next(item for item in stresses(made) if item.kind == "wrong place")
     for site in made.sites:
-        assert abs(made.draw(site, wrong).measured["density"] - site.density) < 0.1
+        assert abs(made.drawn(site, wrong).measured["density"] - site.density) < 0.1
 
 
 def test_a_corrupted_view_keeps_its_amounts_and_loses_its_place(carried):
     made = carried("absent")
     broken = next(item for item in stresses(made) if item.kind == "corrupted view")
     for site in made.sites:
-        seen, control = (made.draw(site, item).evidence for item in (broken, made.control(broken)))
+        seen, control = (made.drawn(site, item).evidence for item in (broken, made.control(broken)))
         assert (seen.cells == 1).sum() == (control.cells == 1).sum()
         assert (seen.cells != control.cells).any()
 
@@ -363,7 +363,7 @@ def test_a_feature_poor_view_is_of_a_real_place_of_the_block_with_next_to_nothin
     poor = next(item for item in stresses(made) if item.kind == "feature-poor")
     bounds = {block.id: block.bounds_m for block in made.scene.blocks}
     for site in made.sites:
-        draft = made.draw(site, poor)
+        draft = made.drawn(site, poor)
         assert draft.is_present
         assert draft.measured["is_real_place"] == 1
         pose = draft.pose
@@ -375,7 +375,7 @@ def test_a_feature_poor_view_is_of_a_real_place_of_the_block_with_next_to_nothin
         perfect = made.scene.world.view(pose, size_cells=192, cell_size_m=1.0)
         assert drawn_share(perfect) < 0.01
         assert drawn_share(draft.evidence) < 0.02  # with what perception sees that is not there
-        assert drawn_share(made.draw(site, made.control(poor)).evidence) > 0.02
+        assert drawn_share(made.drawn(site, made.control(poor)).evidence) > 0.02
 
 
 def test_where_all_of_a_block_has_something_the_site_itself_is_seen_without_it(carried):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base of systems whose sources leave numbers open: values that are tried on train places, and the best of them."""
+"""Base of systems whose sources leave numbers open: the values that are tried on train places, and those in use."""
 
 from collections.abc import Mapping, Sequence
 from itertools import product
@@ -13,7 +13,7 @@ MOST_TRIALS: Final = 6  # settings of a system: the same for all
 class Tunable:
     """A system with open numbers, each with the values that are tried; the settings are all combinations of them.
 
-    `chosen` are the values that found most views of train places: `docs/results/open-numbers.md` says how.
+    `chosen` are the values in use. `benchmarks/open_numbers.py` asks all settings about the same views of train places.
 
     Parameters
     ----------

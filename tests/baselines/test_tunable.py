@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open numbers: as many trials for one system as for any other, and one rule that chooses."""
+
+import json
+from dataclasses import replace
+
+import pytest
+from sasgeo_baselines.schmidt_segcorr import SchmidtSegcorr
+from sasgeo_baselines.tunable import MOST_TRIALS
+
+from benchmarks import open_numbers
+
+SYSTEMS = open_numbers.systems()
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_each_system_has_as_many_settings_as_any_other_and_is_made_with_those_in_use(name):
+    kind = SYSTEMS[name]
+    assert len(kind.settings()) == MOST_TRIALS
+    assert dict(kind.chosen) in kind.settings()
+    assert kind().numbers == dict(kind.chosen)
+    other = next(one for one in kind.settings() if one != dict(kind.chosen))
+    assert kind(**other).numbers == other
+
+
+@pytest.fixture
+def trials():
+    """Made-up trials of two systems: the last setting finds most."""
+    return [
+        open_numbers.Trial(
+            system=name, setting=json.dumps(one), views=64, right=20 + at, median_m=30.0 - at, view_s=0.5
+        )
+        for name in ("brm_grid", "polar_vsc")
+        for at, one in enumerate(SYSTEMS[name].settings())
+    ]
+
+
+def test_trials_are_read_back_each_once_in_the_order_of_settings(trials, tmp_path):
+    path = tmp_path / "trials.csv"
+    open_numbers.write_trials(path, [*reversed(trials), replace(trials[0], right=63), trials[0]])
+    assert open_numbers.read_trials(path) == trials
+
+
+def test_most_views_choose_then_the_median_error_then_the_order(trials):
+    own = trials[:6]
+    assert open_numbers.best(own) == own[-1]
+    same = [replace(trial, right=20, median_m=9.0) for trial in own]
+    assert open_numbers.best(same) == same[0]
+    assert open_numbers.best([*same, replace(own[2], right=20, median_m=8.0)]).median_m == 8.0
+
+
+def test_the_table_has_a_row_for_each_system_and_marks_what_is_chosen(trials):
+    table = list(open_numbers.lines(trials))
+    assert [row.split("|")[1].strip() for row in table[2:]] == ["`brm_grid`", "`polar_vsc`"]
+    assert all("24, **25** of 64" in row for row in table[2:])
+
+
+def test_a_number_that_is_not_open_is_refused():
+    with pytest.raises(TypeError, match="no open number 'sharpness', it has least_share, coarse_m"):
+        SchmidtSegcorr(sharpness=2.0)

@@ -21,7 +21,7 @@ import pandas as pd
 from sasgeo_bench.publishing.archive_file import read_stored_predictions, unpack_tasks
 from sasgeo_bench.scoring.contestants import read_scored_task
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.flights import score_flights
+from sasgeo_bench.scoring.flights import view_frame
 from sasgeo_bench.scoring.intervals import percentile_interval
 
 RIGHT_M, LOST_M, LOST_FOR_M = 25.0, 100.0, 500.0
@@ -76,13 +76,14 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
         for matcher in matchers:
             mine = {item.query_id: item for item in read_stored_predictions(folder, matcher, queries=asked)}
             for task in tasks:
-                answers = {head.query_id: mine[head.query_id] for head in task.heads if head.query_id in mine}
-                scored = score_flights(task.heads, task.truths, answers)
-                about = scored.flights.set_index("query_id")[["place", "role", "kind", "strength"]]
-                for name, part in scored.views.groupby("sequence_id"):
+                heads = sorted(task.heads, key=lambda head: head.query_id)  # by flight, then by time
+                truths = {truth.query_id: truth for truth in task.truths}
+                views = view_frame(heads, [truths[head.query_id] for head in heads], mine)
+                for name, part in views.groupby("sequence_id"):
                     columns = (part[key].to_numpy() for key in ("distance_m", "error_m", "is_accepted"))
-                    found = kept(*columns)
-                    row = about.loc[name].to_dict() | {"matcher": matcher, "flight": name}
+                    found, truth = kept(*columns), truths[part["query_id"].iloc[0]]
+                    row = {key: getattr(truth, key) for key in ("role", "kind", "strength")}
+                    row |= {"place": part["place"].iloc[0], "matcher": matcher, "flight": name}
                     rows.append(row | {"found": found.is_found, "kept_m": found.kept_m, "lost": found.is_lost})
     return pd.DataFrame(rows)
 

@@ -303,19 +303,21 @@ def unpack(folder: Path, into: Path) -> Unpacked:
         tasks = tuple(_lay_tasks(tables, into))
         asked = dict(zip(*(tables["queries"][name].to_pylist() for name in ("query_id", ASKED)), strict=True))
         answers = _read_predictions(folder, tables["runs"])
+        check_predictions(answers)
         return Unpacked(root=into, tasks=tasks, runs=tuple(_lay_runs(tables["runs"], answers, asked, into)))
 
 
 def read_stored_predictions(folder: Path, matcher: str, *, queries: Collection[str] | None = None) -> list[Prediction]:
     """Read the answers of one matcher, to some queries or all, from stored results.
 
-    Raise `StoreError` if the results are damaged or hold none.
+    Raise `StoreError` if these answers are damaged, or the results hold none.
     """
     with sound(folder):
         table = _read_predictions(folder, _read_runs(folder))
         table = table.filter(pc.equal(table[MATCHER], matcher))
         if queries is not None:
             table = table.filter(pc.is_in(table["query_id"], pa.array(sorted(queries), pa.string())))
+        check_predictions(table)
         found = predictions_of(table)
     if not found:
         message = f"{folder} holds no answer of {matcher!r}: board.json names its matchers"
@@ -395,7 +397,7 @@ def _learned_name(training: TrainingRecord | None) -> str:
 
 
 def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
-    """Read all answers, in the order of the runs; the former layout has a file for each matcher."""
+    """Read all answers, unchecked, in the order of the runs; the former layout has a file for each matcher."""
     rows = runs.select(["contestant", "rows", "about"]).to_pylist()
     if (folder / PREDICTIONS).is_file():
         table = read_table(folder / PREDICTIONS, mend=_MEND)
@@ -404,7 +406,6 @@ def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
         tables = [read_table(folder / FORMER_PREDICTIONS / f"{stem}.parquet", mend=_MEND) for stem in files.values()]
         matchers = [name for name, part in zip(files, tables, strict=True) for _ in range(len(part))]
         table = pa.concat_tables(tables).append_column(MATCHER, pa.array(matchers, pa.string()))
-    check_predictions(table)
     is_whole = sum(row["rows"] for row in rows) == len(table)  # first: anybody may say how many there are
     if not is_whole or table[MATCHER].to_pylist() != [row["contestant"] for row in rows for _ in range(row["rows"])]:
         message = f"{RUNS} does not tell the {len(table)} answers of {PREDICTIONS}"

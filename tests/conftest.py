@@ -254,6 +254,17 @@ def few_figures() -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def plain_site(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sites have blank figures of places and of rates, the dearest of a site: for tests that are about the rest."""
+
+    def blank(path: Path, **_: object) -> None:
+        path.write_text('<svg xmlns="http://www.w3.org/2000/svg" width="90pt" height="45pt"/>', encoding="utf-8")
+
+    for name in ("draw_places", "draw_rates"):
+        monkeypatch.setattr(f"sasgeo_bench.publishing.build.{name}", blank)
+
+
 @pytest.fixture(scope="module")
 def few_controls() -> Iterator[None]:
     """Pipelines draw their controls at one site of one town: what these find is tested beside their suite."""

@@ -277,7 +277,7 @@ def told(words: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
     return int(leaving.value.code or 0), said.getvalue()
 
 
-@pytest.mark.usefixtures("few_figures")
+@pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("document", WALKS)
 def test_the_commands_of_a_document_do_what_they_say(
     document: str, reader: Path, monkeypatch: pytest.MonkeyPatch

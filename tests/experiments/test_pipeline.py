@@ -37,6 +37,7 @@ title = "Small"
 split = "crossfit"
 regions = ["town-suburb"]
 matchers = ["random", "prior_centre"]
+draws = 100
 
 [[task]]
 suites = ["clean"]
@@ -415,6 +416,7 @@ title = "Taught"
 split = "crossfit"
 regions = ["town-suburb", "town-agricultural"]
 matchers = ["learners:Counts", "learners:Oracle", "prior_centre"]
+draws = 100
 
 [[task]]
 suites = ["clean"]

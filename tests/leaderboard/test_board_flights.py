@@ -106,6 +106,7 @@ def test_a_flight_is_shown_with_a_map_for_each_tracker(out):
     assert cv2.imread(str(path)).shape[1] > 700
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_the_page_of_a_suite_has_its_table_figures_and_flight(out):
     publish(out / "boards" / "mine", tell=quiet, root=out)
     (page,) = (out / "boards" / "mine" / "site").glob(f"suite*{SUITE}*.html")

@@ -151,11 +151,12 @@ def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, as
     changes = {} if prediction == "answer" else {"prediction": prediction}
     said = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}
     case, about = case_at(root, *asked, **said, **changes)
-    first, again = (case_pixels(read_picture(case, root, about)) for _ in range(2))
+    picture = read_picture(case, root, about)
+    first, again = case_pixels(picture), case_pixels(read_picture(case, root, about))
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
     assert fitted(first, CASE_BYTES) == fitted(again, CASE_BYTES)
-    text = "\n".join(read_picture(case, root, about).lines)
+    text = "\n".join(picture.lines)
     assert "P(false) sure: 0.25, accepted" in text
     assert "margin (an order, no probability): 0.5\n" in text
     assert ("margin_nats: 1.25 nat" in text) == (prediction == "answer")

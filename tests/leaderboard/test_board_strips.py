@@ -84,6 +84,7 @@ def test_a_board_on_pictures_has_a_strip_of_the_matcher_that_finds_most(board):
     assert cv2.imread(str(path)).shape[1] > 800
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_the_strip_stands_on_the_first_page_with_its_attribution(board):
     publish(board, tell=print, root=board.parents[1])
     page = (board / "site" / "index.html").read_text(encoding="utf-8")

@@ -761,6 +761,14 @@ def both(out, tmp_path):
     return [tmp_path / "good.parquet", tmp_path / "bad.parquet"]
 
 
+@pytest.fixture(scope="module")
+def alone(built, tmp_path_factory):
+    """The board of the good file alone."""
+    folder = tmp_path_factory.mktemp("alone")
+    submission(built, folder / "good.parquet", change=lambda row, _: replace(row, diagnostics={"told": 1.0}))
+    return board_of(built, folder / "good.parquet", board=folder / "board")
+
+
 CONTRAST = Contrast(name="which", first="good", second="bad", suites=("clean",))
 
 
@@ -775,8 +783,7 @@ CONTRAST = Contrast(name="which", first="good", second="bad", suites=("clean",))
         ("query_id", "0" * 24, "the id of a query"),
     ],
 )
-def test_answers_that_are_none_cost_their_author_alone(out, both, column, value, why):
-    alone = board_of(out, both[0])
+def test_answers_that_are_none_cost_their_author_alone(out, both, alone, column, value, why):
     rewrite(both[1], column, value)
     board = board_of(out, *both, contrasts=[CONTRAST])
     assert [entry.name for entry in board.entries] == ["good"]
@@ -815,9 +822,8 @@ def fails_with(monkeypatch, name, is_bad):
     ],
 )
 def test_a_mistake_of_ours_costs_the_contestant_it_is_about_and_the_log_says_where(
-    out, both, monkeypatch, step, is_bad
+    out, both, alone, monkeypatch, step, is_bad
 ):
-    alone = board_of(out, both[0])
     fails_with(monkeypatch, step, is_bad)
     board = board_of(out, *both, contrasts=[CONTRAST])
     assert board.failures.found == {"bad": "KeyError: 'a mistake of ours' (mine.failures.log says where)"}

@@ -22,6 +22,7 @@ from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard import board as board_module
 from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
+from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.publishing import archive, archive_file
 from sasgeo_bench.publishing.archive import laid_out, pack_board, score_all, stored_settings
@@ -72,6 +73,13 @@ def kept(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     return board, plan, out / "results" / "kept", lines
 
 
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Boards of stored results have no figures and no pictures: for tests that are about their tables."""
+    for name in ("figures_extra", "pictures_extra"):
+        monkeypatch.setattr(archive, name, lambda *_, **__: Extra())
+
+
 def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path):
     _, plan, folder, _ = kept
     code, _, err = program("score", "--predictions", folder, "--truth", folder, "--name", "again", "--out", tmp_path)
@@ -97,6 +105,7 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
     assert f"pictures of 1 of 2 tasks: {tmp_path / 'out' / 'tasks'} lacks the views of the rest" in lines
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_stored_results_keep_the_version_of_the_maps_they_were_asked_on(kept, tmp_path, monkeypatch):
     _, _, folder, _ = kept
     monkeypatch.setattr(board_module, "DATA_VERSION", 99)
@@ -136,6 +145,7 @@ def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
     assert read_settings(folder)["dropped"] == ""
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_stored_results_are_scored_without_a_region(kept, program, tmp_path):
     _, _, folder, _ = kept
     towns = pq.read_table(folder / "tasks.parquet", columns=["region_json"])["region_json"].to_pylist()
@@ -165,6 +175,7 @@ def test_what_is_too_large_is_stored_without_headings_or_refused_and_the_old_one
     assert [path.name for path in tmp_path.iterdir() if path.suffix != ".lock"] == ["kept"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
     board, plan, folder, _ = kept
     most = sum(path.stat().st_size for path in folder.iterdir()) - 1
@@ -176,6 +187,7 @@ def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
         pd.testing.assert_frame_equal(first, pd.read_parquet(tmp_path / "out" / "boards" / "again" / f"{name}.parquet"))
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_stored_again_nothing_but_the_board_changes(kept, program, tmp_path):
     board, plan, folder, _ = kept
     program("score", "--predictions", folder, "--name", "kept", "--results", tmp_path / "same", "--out", tmp_path)
@@ -377,6 +389,7 @@ def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replace
         pack_board(kept[0], request_of(kept[1]), former)
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_publishing_stored_results_draws_their_figures_and_leaves_them_as_they_are(kept, tmp_path):
     _, plan, folder, _ = kept
     before, lines = contents_of(folder), []
@@ -393,6 +406,7 @@ def test_publishing_stored_results_draws_their_figures_and_leaves_them_as_they_a
     assert not [line for line in lines if "differ from those" in line]
 
 
+@pytest.mark.usefixtures("undrawn", "plain_site")
 def test_publishing_stored_results_whose_tables_are_of_another_version_says_so(own, tmp_path):
     table = read_frame(own / "leaderboard.parquet", mend="")
     table.assign(value=0.5).to_parquet(own / "leaderboard.parquet")
@@ -601,6 +615,7 @@ def test_stored_results_hold_their_own_tasks_and_stand_alone(kept, tmp_path):
     assert [item.name for item in stored_settings([folder]).contrasts] == ["nothing"]
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_answers_of_ones_own_are_scored_beside_stored_results(kept, program, tmp_path):
     _, _, folder, _ = kept
     answers = pq.read_table(folder / "predictions.parquet")

@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from tests.handmade import (
     many_rows,
     put_board,
     put_pictures,
+    verdict,
 )
 
 KILLED = """
@@ -123,6 +125,14 @@ def pages(site):
 @pytest.fixture
 def own(board, tmp_path):
     return Path(shutil.copytree(board, tmp_path / "mine"))
+
+
+@pytest.fixture
+def few(tmp_path):
+    """A board of one's own with two rows and no figures: for tests that are about whole sites and their folders."""
+    folder = put_board(tmp_path / "mine", table=many_rows(2))
+    (folder / "figures").mkdir(exist_ok=True)
+    return folder
 
 
 def test_a_site_has_every_page_and_each_leads_only_to_what_is_there(site, pages):
@@ -271,6 +281,7 @@ def test_stored_results_make_the_same_pages(board, site, tmp_path):
     assert contents(stored / "site") == contents(site)
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_a_board_with_its_site_in_it_is_still_a_board_that_can_be_replaced(own):
     publish(own, tell=quiet)
     assert (own / "site" / "index.html").is_file()
@@ -280,6 +291,7 @@ def test_a_board_with_its_site_in_it_is_still_a_board_that_can_be_replaced(own):
 
 
 @pytest.mark.parametrize("count", [1, 40])
+@pytest.mark.usefixtures("plain_site")
 def test_a_board_of_few_or_many_rows_has_a_page_for_each(tmp_path, count):
     put_board(tmp_path / "mine", table=many_rows(count))
     written = publish(tmp_path / "mine", tell=quiet)
@@ -297,6 +309,7 @@ def test_a_board_of_500_rows_stays_small(tmp_path):
     assert written.site_bytes < site_files.MOST_BYTES
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_a_board_without_a_row_says_so(tmp_path):
     put_board(tmp_path / "mine", tasks=[], split=None)
     pages = read(publish(tmp_path / "mine", tell=quiet).folder)
@@ -305,9 +318,15 @@ def test_a_board_without_a_row_says_so(tmp_path):
     assert pages.keys() & {"rejection.html", "figures.html", "failures.html"} == set()
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_a_failed_control_is_told_where_it_cannot_be_overlooked(tmp_path):
     def box_of(name, tested):
-        full_board(tmp_path / name, shares={"graph": 0.9, "weak": 0.2}, holds=False, tested=tested)
+        put_board(
+            tmp_path / name,
+            table=many_rows(2),
+            entries=[entry_of("graph")],
+            verdicts=[replace(verdict(holds=False), matcher=tested)],
+        )
         page = read(publish(tmp_path / name, tell=quiet).folder)["index.html"]
         parts = zip(page.found, page.texts, strict=True)
         kinds = ((said.get("class"), text) for (_, said), (_, text) in parts)
@@ -321,6 +340,7 @@ def test_a_failed_control_is_told_where_it_cannot_be_overlooked(tmp_path):
     assert "Controls: 0 of 1 held. Do not trust the rows of graph:" in text
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path):
     table = many_rows(2).assign(suite="my-suite", prior_group="my-group")
     tasks = [{"suite": "my-suite", "region": "my-town"}]
@@ -338,33 +358,35 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
 # Bad input
 
 
-def test_interrupted_the_old_site_stays_whole_and_the_next_takes_its_place(own):
-    publish(own, tell=quiet)
-    before = contents(own / "site")
-    changed = json.loads((own / "board.json").read_text(encoding="utf-8")) | {"draws": 4321}
-    (own / "board.json").write_text(json.dumps(changed), encoding="utf-8")
+@pytest.mark.usefixtures("plain_site")
+def test_interrupted_the_old_site_stays_whole_and_the_next_takes_its_place(few):
+    publish(few, tell=quiet)
+    before = contents(few / "site")
+    changed = json.loads((few / "board.json").read_text(encoding="utf-8")) | {"draws": 4321}
+    (few / "board.json").write_text(json.dumps(changed), encoding="utf-8")
     root = Path(__file__).parents[2]
-    killed = subprocess.run([sys.executable, "-c", KILLED, str(own)], cwd=root, check=False)  # noqa: S603 - our own
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(few)], cwd=root, check=False)  # noqa: S603 - our own
     assert killed.returncode == -signal.SIGKILL
-    assert contents(own / "site") == before
-    assert (own / ".site.partial").is_dir()
-    check_board(own, scorer_version=changed["scorer_version"])
-    publish(own, tell=quiet)
-    assert b"4321 draws" in contents(own / "site")["index.html"]
-    assert not (own / ".site.partial").exists()
+    assert contents(few / "site") == before
+    assert (few / ".site.partial").is_dir()
+    check_board(few, scorer_version=changed["scorer_version"])
+    publish(few, tell=quiet)
+    assert b"4321 draws" in contents(few / "site")["index.html"]
+    assert not (few / ".site.partial").exists()
 
 
-def test_a_full_disk_is_one_line_and_the_old_site_stays(own, monkeypatch):
-    publish(own, tell=quiet)
-    before = contents(own / "site")
+@pytest.mark.usefixtures("plain_site")
+def test_a_full_disk_is_one_line_and_the_old_site_stays(few, monkeypatch):
+    publish(few, tell=quiet)
+    before = contents(few / "site")
 
     def fill(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(site_files, "_put", fill)
     with pytest.raises(StoreError, match=r"site cannot be written \(No space left on device\): check .* as it was"):
-        publish(own, tell=quiet)
-    assert contents(own / "site") == before
+        publish(few, tell=quiet)
+    assert contents(few / "site") == before
 
 
 def test_what_is_no_site_is_not_replaced(own, tmp_path):
@@ -526,42 +548,44 @@ def test_a_figure_that_is_no_plain_svg_is_refused(own, mistake, text, fault):
     assert fault in mistake("publish", "--board", own)
 
 
-def test_files_of_ones_own_in_an_older_site_are_never_lost(own, mistake, tmp_path):
+@pytest.mark.usefixtures("plain_site")
+def test_files_of_ones_own_in_an_older_site_are_never_lost(few, mistake, tmp_path):
     target = tmp_path / "public"
-    publish(own, target, tell=quiet)
+    publish(few, target, tell=quiet)
     said = json.loads((target / "site.json").read_text(encoding="utf-8"))
     assert {*said["files"], "site.json"} == contents(target).keys()
-    publish(own, target, tell=quiet)
+    publish(few, target, tell=quiet)
     (target / ".git").mkdir()
     (target / ".git" / "HEAD").touch()
     (target / "CNAME").touch()
     lost = "2 files (.git/HEAD, CNAME) that would be lost and are not part of a site: move that away"
-    assert lost in mistake("publish", "--board", own, "--into", target)
+    assert lost in mistake("publish", "--board", few, "--into", target)
     del said["files"]
     (target / "site.json").write_text(json.dumps(said), encoding="utf-8")
-    assert lost in mistake("publish", "--board", own, "--into", target)
+    assert lost in mistake("publish", "--board", few, "--into", target)
     shutil.rmtree(target / ".git")
     (target / "CNAME").unlink()
-    publish(own, target, tell=quiet)
-    publish(own, tell=quiet)
-    (own / "site" / "CNAME").touch()
-    (own / "figures" / "notes.txt").touch()
+    publish(few, target, tell=quiet)
+    publish(few, tell=quiet)
+    (few / "site" / "CNAME").touch()
+    (few / "figures" / "notes.txt").touch()
     with pytest.raises(StoreError, match=r"1 file \(figures/notes.txt\) that would be lost"):
-        check_board(own, scorer_version=json.loads((own / "board.json").read_text(encoding="utf-8"))["scorer_version"])
-    (own / "figures" / "notes.txt").unlink()
+        check_board(few, scorer_version=json.loads((few / "board.json").read_text(encoding="utf-8"))["scorer_version"])
+    (few / "figures" / "notes.txt").unlink()
     with pytest.raises(StoreError, match=r"1 file \(CNAME\) that would be lost"):
-        check_board(own, scorer_version=json.loads((own / "board.json").read_text(encoding="utf-8"))["scorer_version"])
+        check_board(few, scorer_version=json.loads((few / "board.json").read_text(encoding="utf-8"))["scorer_version"])
 
 
-def test_a_site_is_written_where_a_link_leads(own, mistake, tmp_path):
+@pytest.mark.usefixtures("plain_site")
+def test_a_site_is_written_where_a_link_leads(few, mistake, tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    publish(own, tmp_path / "link", tell=quiet)
+    publish(few, tmp_path / "link", tell=quiet)
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "real" / "index.html").is_file()
     (tmp_path / "one").symlink_to(tmp_path / "one")
-    assert "leads in a circle" in mistake("publish", "--board", own, "--into", tmp_path / "one")
-    assert "is the board itself" in mistake("publish", "--board", own, "--into", own / "figures" / "deep")
+    assert "leads in a circle" in mistake("publish", "--board", few, "--into", tmp_path / "one")
+    assert "is the board itself" in mistake("publish", "--board", few, "--into", few / "figures" / "deep")
 
 
 def test_a_table_that_is_no_leaderboard_is_one_line(own, mistake):

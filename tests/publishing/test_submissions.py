@@ -41,7 +41,7 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split
 from tests.threaded import threaded
 
-pytestmark = pytest.mark.usefixtures("few_figures")
+pytestmark = pytest.mark.usefixtures("without_drawings")
 
 CARD = {
     "name": "mine",
@@ -542,6 +542,7 @@ def test_who_was_taught_by_a_test_place_is_set_apart(copied, stored, tmp_path, t
     assert (f"mine: set apart, {why}" in lines) == (why is not None)
 
 
+@pytest.mark.usefixtures("plain_site")
 def test_one_command_publishes_stored_results_and_submissions(copied, stored, program, tmp_path):
     words = (
         "publish",

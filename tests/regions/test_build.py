@@ -43,6 +43,23 @@ def built(out: Path, spec, **options: object):
     return plan, build_region(plan, tell=lambda _: None)
 
 
+@pytest.fixture(scope="module")
+def built_once(tmp_path_factory):
+    """A root with the small region in it; read it, do not write to it."""
+    out = tmp_path_factory.mktemp("small")
+    built(out, small())
+    return out
+
+
+@pytest.fixture
+def there(built_once, tmp_path):
+    """The folder of the small region, built in the test's own root; and its manifest."""
+    shutil.copytree(built_once, tmp_path, dirs_exist_ok=True)
+    plan = plan_build(small(), out=tmp_path)
+    assert plan.is_current
+    return plan, read_manifest(plan.folder)
+
+
 @pytest.mark.parametrize("town", TOWNS)
 def test_a_town_becomes_a_whole_region(town, tmp_path):
     plan, manifest = built(tmp_path, spec_of(town))
@@ -57,9 +74,9 @@ def test_a_town_becomes_a_whole_region(town, tmp_path):
     assert {"intersection", "building"} <= set(region.graph.nodes["kind"])
 
 
-def test_what_lies_beyond_the_town_is_unknown_not_absent(tmp_path):
-    _, manifest = built(tmp_path, spec_of("town-industrial"))
-    region = read_region(tmp_path / "regions" / "town-industrial")
+def test_what_lies_beyond_the_town_is_unknown_not_absent(tmp_path, lay_towns):
+    folder = lay_towns(tmp_path, "town-industrial") / "regions" / "town-industrial"
+    manifest, region = read_manifest(folder), read_region(folder)
     outside = (region.layers == OUTSIDE).all(axis=0)
     assert 0.18 < outside.mean() < 0.24  # the town is 2048 m wide, the region 2304 m
     assert abs(1 - outside.mean() - manifest.coverage.share) < 0.002
@@ -79,8 +96,8 @@ def test_layers_that_are_read_as_bits_hold_the_same_cells_and_a_damaged_file_is_
         read_bits(path)
 
 
-def test_layers_may_be_read_when_they_are_first_used_or_never(tmp_path):
-    plan, _ = built(tmp_path, small())
+def test_layers_may_be_read_when_they_are_first_used_or_never(there):
+    plan, _ = there
     whole, late, never = (read_region(plan.folder, with_layers=now) for now in (True, False, False))
     for name in whole.classes:
         np.testing.assert_array_equal(late.layer(name), whole.layer(name))
@@ -96,8 +113,8 @@ def test_layers_may_be_read_when_they_are_first_used_or_never(tmp_path):
             read()
 
 
-def test_every_file_carries_the_attribution(tmp_path):
-    plan, manifest = built(tmp_path, small())
+def test_every_file_carries_the_attribution(there):
+    plan, manifest = there
     words = "(c) OpenStreetMap contributors, ODbL"
     assert manifest.attribution == words
     with rasterio.open(plan.folder / "layers.tif") as layers:
@@ -107,8 +124,8 @@ def test_every_file_carries_the_attribution(tmp_path):
         assert words.encode() in (plan.folder / f"{name}.parquet").read_bytes()
 
 
-def test_the_tables_open_with_pandas_and_geopandas_alone(tmp_path):
-    plan, manifest = built(tmp_path, small())
+def test_the_tables_open_with_pandas_and_geopandas_alone(there):
+    plan, manifest = there
     features = gpd.read_parquet(plan.folder / "features.parquet")
     assert features.crs.to_epsg() == manifest.epsg
     edges = pd.read_parquet(plan.folder / "edges.parquet")
@@ -116,8 +133,8 @@ def test_the_tables_open_with_pandas_and_geopandas_alone(tmp_path):
     assert edges["source"].isin(nodes["id"]).all()
 
 
-def test_a_second_build_is_skipped_and_says_so(tmp_path):
-    plan, _ = built(tmp_path, small())
+def test_a_second_build_is_skipped_and_says_so(there, tmp_path):
+    plan, _ = there
     stamp = (plan.folder / "region.json").stat().st_mtime_ns
     told: list[str] = []
     build_region(plan_build(small(), out=tmp_path), tell=told.append)
@@ -125,24 +142,25 @@ def test_a_second_build_is_skipped_and_says_so(tmp_path):
     assert (plan.folder / "region.json").stat().st_mtime_ns == stamp
 
 
-def test_a_changed_region_file_or_a_lost_layer_is_built_again(tmp_path):
-    plan, _ = built(tmp_path, small())
+def test_a_changed_region_file_or_a_lost_layer_is_built_again(there, tmp_path):
+    plan, _ = there
     assert not plan_build(small(cell_size_m=2.0), out=tmp_path).is_current
     assert plan_build(small(), out=tmp_path).is_current
     (plan.folder / "layers.tif").unlink()
     assert not plan_build(small(), out=tmp_path).is_current
 
 
-def test_the_same_inputs_give_the_same_bytes(tmp_path):
-    first, _ = built(tmp_path / "a", small())
+def test_the_same_inputs_give_the_same_bytes(there, tmp_path):
+    first, _ = there
     second, _ = built(tmp_path / "b", small())
     for name in FILES:
         assert (first.folder / name).read_bytes() == (second.folder / name).read_bytes(), name
 
 
-def test_an_older_date_has_a_folder_of_its_own(tmp_path):
+def test_an_older_date_has_a_folder_of_its_own(there, tmp_path):
     old, _ = built(tmp_path, small(), date=dt.date(2014, 1, 1))
-    new, _ = built(tmp_path, small(), date=dt.date(2025, 1, 1))
+    new, _ = there
+    assert plan_build(small(), out=tmp_path, date=dt.date(2025, 1, 1)).is_current
     assert (old.folder.name, new.folder.name) == ("town-suburb@2014-01-01", "town-suburb")
     assert read_manifest(old.folder).fingerprint != read_manifest(new.folder).fingerprint
 
@@ -164,8 +182,8 @@ def test_halving_the_cell_changes_what_is_drawn_by_little(tmp_path):
     np.testing.assert_allclose(coarse[drawn], fine[drawn], rtol=0.05)
 
 
-def test_a_failure_on_the_way_leaves_the_old_region_as_it_was(tmp_path, monkeypatch):
-    plan, manifest = built(tmp_path, small())
+def test_a_failure_on_the_way_leaves_the_old_region_as_it_was(there, tmp_path, monkeypatch):
+    plan, manifest = there
 
     def no_space(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
@@ -188,8 +206,8 @@ def test_an_interrupt_leaves_nothing_half_written(tmp_path, monkeypatch):
     assert [path.name for path in (tmp_path / "regions").iterdir() if not path.name.endswith(".lock")] == []
 
 
-def test_a_build_killed_between_its_two_renames_is_taken_up(tmp_path):
-    plan, _ = built(tmp_path, small())
+def test_a_build_killed_between_its_two_renames_is_taken_up(there, tmp_path):
+    plan, _ = there
     plan.folder.rename(plan.folder.parent / ".town-suburb.replaced")
     (plan.folder.parent / ".town-suburb.partial").mkdir()
     built(tmp_path, small(cell_size_m=2.0))
@@ -217,8 +235,8 @@ def test_bounds_beyond_the_extract_say_what_it_covers(tmp_path):
     assert not plan.folder.exists()
 
 
-def test_a_manifest_of_another_schema_is_refused_and_built_again(tmp_path):
-    plan, _ = built(tmp_path, small())
+def test_a_manifest_of_another_schema_is_refused_and_built_again(there, tmp_path):
+    plan, _ = there
     path = plan.folder / "region.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"schema_version": 0}))
     with pytest.raises(StoreError, match="schema version 0"):
@@ -230,8 +248,8 @@ def test_a_manifest_of_another_schema_is_refused_and_built_again(tmp_path):
     assert manifest.schema_version == 1
 
 
-def test_a_manifest_without_a_file_of_a_region_is_refused(tmp_path):
-    plan, _ = built(tmp_path, small())
+def test_a_manifest_without_a_file_of_a_region_is_refused(there):
+    plan, _ = there
     path = plan.folder / "region.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"files": {}}))
     with pytest.raises(StoreError, match=r"is damaged \(its files lack layers.tif\): build the region again"):
@@ -246,8 +264,8 @@ def test_a_damaged_manifest_is_told_in_one_line(content, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_verify_names_what_differs(tmp_path):
-    plan, _ = built(tmp_path, small())
+def test_verify_names_what_differs(there):
+    plan, _ = there
     with (plan.folder / "edges.parquet").open("r+b") as file:
         file.write(b"????")
     (plan.folder / "nodes.parquet").unlink()

@@ -315,7 +315,7 @@ def drawn(place: tuple[list[Any], list[Any]]) -> list[Row]:
     return lines + [area(100 + i, "building", 9 * x, 9 * y, 9 * x + 8, 9 * y + 5) for i, (x, y) in enumerate(place[1])]
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(place=places_drawn, random=st.randoms(use_true_random=False))
 def test_the_order_of_the_features_does_not_matter(place: tuple[list[Any], list[Any]], random: Any) -> None:
     rows = drawn(place)
@@ -325,7 +325,7 @@ def test_the_order_of_the_features_does_not_matter(place: tuple[list[Any], list[
 
 # Diagonals of the lattice turn by 45 deg exactly: what the last bits decide is no property of the map.
 @patch("sasgeo_bench.regions.graph.BEND_TURN_DEG", 40.0)
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(place=places_drawn, east=st.integers(-9, 9), north=st.integers(-9, 9))
 def test_moving_the_map_moves_the_nodes_and_nothing_else(
     place: tuple[list[Any], list[Any]], east: int, north: int
@@ -336,7 +336,7 @@ def test_moving_the_map_moves_the_nodes_and_nothing_else(
     assert back == unordered(build_graph(here), lambda x, y: (x, y), 0)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(place=places_drawn)
 def test_turning_the_map_turns_the_bearings_and_nothing_else(place: tuple[list[Any], list[Any]]) -> None:
     # Without waterways: of two equal samples of a bend the line's direction picks one. The village has bends.
@@ -347,7 +347,7 @@ def test_turning_the_map_turns_the_bearings_and_nothing_else(place: tuple[list[A
     assert unordered(turned, lambda x, y: (x, y), 0) == unordered(build_graph(here), lambda x, y: (y, -x), 90)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=20, deadline=None)
 @given(place=places_drawn)
 def test_edges_join_two_nodes_and_measure_the_way_no_shorter_than_the_straight_line(
     place: tuple[list[Any], list[Any]],

@@ -2,6 +2,7 @@
 """Evidence of pictures: made at other places than it was learned from, once, and a fault costs its picture alone."""
 
 import json
+import shutil
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -49,10 +50,10 @@ def with_pictures(query, truth, at):
     )
 
 
-@pytest.fixture
-def pictured(tmp_path, lay_towns, monkeypatch):
-    """Tasks of four pictures in each of two towns, in out/ of the working folder."""
-    out = tmp_path / "out"
+@pytest.fixture(scope="module")
+def drawn_once(tmp_path_factory, lay_towns):
+    """A root with tasks of four pictures in each of two towns, and their folders in it."""
+    out = tmp_path_factory.mktemp("pictured") / "out"
     lay_towns(out, *TOWNS)
     wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=1, seed=4, out=out, may_be_fewer=True)
     folders = []
@@ -64,10 +65,18 @@ def pictured(tmp_path, lay_towns, monkeypatch):
         pairs = [with_pictures(*pair, at) for at, pair in enumerate(plain)]
         kept = {name: about[name] for name in ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites")}
         own = kept | {"suite": "aerial", "region": request.region.id}
-        folders.append(put_task(pairs, own, {"seed": 4}, out=out, tell=silent).folder)
+        folders.append(put_task(pairs, own, {"seed": 4}, out=out, tell=silent).folder.relative_to(out))
+    return out, folders
+
+
+@pytest.fixture
+def pictured(tmp_path, drawn_once, monkeypatch):
+    """These tasks, in an out/ of the test's own below the working folder."""
+    drawn, folders = drawn_once
+    out = Path(shutil.copytree(drawn, tmp_path / "out"))
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
     monkeypatch.chdir(tmp_path)
-    return tuple(folders)
+    return tuple(out / folder for folder in folders)
 
 
 def wanted(folders, spec, **changes):

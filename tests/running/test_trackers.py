@@ -14,7 +14,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks import flight_choice, task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -25,7 +25,7 @@ PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the 
 
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory, lay_towns):
-    """A task of three flights, and the trackers beside it."""
+    """A task of three short flights, and the trackers beside it."""
     root = tmp_path_factory.mktemp("flights")
     lay_towns(root / "out", TOWN)
     wanted = Wanted(
@@ -37,8 +37,10 @@ def flown(tmp_path_factory, lay_towns):
         out=root / "out",
         may_be_fewer=True,
     )
-    for request in plan_requests(wanted, tell=lambda _: None):
-        make_tasks(request, tell=lambda _: None)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
+        for request in plan_requests(wanted, tell=lambda _: None):
+            make_tasks(request, tell=lambda _: None)
     shutil.copy(Path(__file__).with_name("wayward.py"), root / "wayward.py")
     return root
 

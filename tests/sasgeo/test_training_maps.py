@@ -66,15 +66,24 @@ def test_views_without_a_map_of_their_day_are_dropped_and_none_left_is_said(tiny
         moved(seen(tiny, "triesen@2015-07-27"), regions)
 
 
+def near(tiny, count=3):
+    """Views of known place whose prior is a disc about it, small beside the map."""
+    return [
+        (replace(query, prior=replace(query.prior, radius_m=100.0, center_m=(pose.easting_m, pose.northing_m))), truth)
+        for query, truth in zip(tiny.queries, tiny.truths, strict=True)
+        if query.suite == "clean" and query.track == "localization" and query.evidence.shape[0] == 192
+        for pose in [truth.pose]
+    ][:count]
+
+
 def test_an_arm_that_learns_from_maps_of_the_day_keeps_the_rates_of_ageing_set_by_hand(tiny):
     name = tiny.queries[0].region
     regions = {name: tiny.region, f"{name}@2000-01-01": tiny.region}
     pairs = [
         (replace(query, region=f"{name}@2000-01-01", observed_on=tiny.region.manifest.extract.date), truth)
-        for query, truth in zip(tiny.queries, tiny.truths, strict=True)
-        if query.suite == "clean" and query.track == "localization" and query.evidence.shape[0] == 192
+        for query, truth in near(tiny, 2)
     ]
-    training = Training(regions=regions, pairs=pairs[:2])
+    training = Training(regions=regions, pairs=pairs)
     one, other = (ScorerModel.from_text(arm().learn(training)) for arm in (SasgeoFresh, SasgeoFreshAgeless))
     hand = ScorerModel.by_hand(one.classes)
     for model in (one, other):
@@ -82,15 +91,6 @@ def test_an_arm_that_learns_from_maps_of_the_day_keeps_the_rates_of_ageing_set_b
             assert fitted.vanish_per_year == pytest.approx(start.vanish_per_year, rel=1e-3)
             assert fitted.appear_per_year == pytest.approx(start.appear_per_year, rel=1e-3)
     assert one == other  # they differ only where a map is old
-
-
-def near(tiny, count=3):
-    """Views of known place whose prior is a disc."""
-    return [
-        (query, truth)
-        for query, truth in zip(tiny.queries, tiny.truths, strict=True)
-        if query.suite == "clean" and query.track == "localization" and query.evidence.shape[0] == 192
-    ][:count]
 
 
 def test_parts_of_a_large_map_teach_what_the_whole_map_does(tiny, monkeypatch):
@@ -103,12 +103,7 @@ def test_parts_of_a_large_map_teach_what_the_whole_map_does(tiny, monkeypatch):
 
 def test_each_view_of_a_large_map_has_a_part_that_holds_its_prior(tiny):
     name = tiny.queries[0].region
-    small = [
-        (replace(query, prior=replace(query.prior, radius_m=100.0, center_m=(pose.easting_m, pose.northing_m))), truth)
-        for query, truth in near(tiny)
-        for pose in [truth.pose]
-    ]
-    views, regions = around_views({name: small}, {name: tiny.region}, most_values=1)
+    views, regions = around_views({name: near(tiny)}, {name: tiny.region}, most_values=1)
     assert [len(some) for some in views.values()] == [1, 1, 1]
     for own, [(query, truth)] in views.items():
         part, grid = regions[own], tiny.region.grid

@@ -189,9 +189,9 @@ def test_holm_is_over_all_that_were_registered():
     better, worse = errors(0.62), errors(0.58)
     tables = {"with": scores(better, blocks=60), "without": scores(worse, blocks=60)}
     alone = hold_contrasts([CONTRAST], tables, {}, draws=400)[0]
-    many = hold_contrasts([replace(CONTRAST, name=str(at)) for at in range(4)], tables, {}, draws=400)
-    assert many[0].p_holm == pytest.approx(min(1.0, 4 * alone.p_holm))
-    assert tuple(contrast_frame(many).columns) == COLUMNS
+    both = hold_contrasts([replace(CONTRAST, name=name) for name in "ab"], tables, {}, draws=400)
+    assert both[0].p_holm == pytest.approx(min(1.0, 2 * alone.p_holm))
+    assert tuple(contrast_frame(both).columns) == COLUMNS
 
 
 def test_an_unknown_method_is_refused_by_name():

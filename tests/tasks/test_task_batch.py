@@ -31,11 +31,17 @@ def queries_of(drawn):
     }
 
 
-def test_two_processes_draw_the_queries_that_one_draws(tmp_path, lay_towns):
-    for name in ("one", "two"):
+def test_two_processes_draw_the_queries_that_one_draws_and_tell_what_a_region_lacks(tmp_path, lay_towns):
+    found, few = {}, Choice(views_cells=(96,))
+    for name, jobs in (("one", 1), ("two", 2)):
         lay_towns(tmp_path / name, *TOWNS)
-    one = list(carry_out(wanted(tmp_path / "one", "clean")))
-    two = list(carry_out(wanted(tmp_path / "two", "clean"), jobs=2))
+        lacking = wanted(tmp_path / name, "grade-separation", regions=TOWNS[:1])
+        found[name] = list(carry_out([*lacking, *wanted(tmp_path / name, "clean", choice=few)], jobs=jobs))
+        refused = found[name].pop(0)
+        assert refused.folders == ()
+        assert "town-suburb cannot carry suite 'grade-separation': no bridge" in refused.lack
+        assert all(item.folders and item.lack is None for item in found[name])
+    one, two = found["one"], found["two"]
     assert [item.lines[-1].partition(" in ")[0] for item in one] == [
         item.lines[-1].partition(" in ")[0] for item in two
     ]
@@ -44,15 +50,9 @@ def test_two_processes_draw_the_queries_that_one_draws(tmp_path, lay_towns):
     ]
     assert len(hashes[0]) == 2
     assert hashes[0] == hashes[1]
-    again = list(carry_out(wanted(tmp_path / "two", "clean"), jobs=2))
+    again = list(carry_out(wanted(tmp_path / "two", "clean", choice=few)))
     assert [item.folders for item in again] == [item.folders for item in two]
     assert not any(item.lines for item in again)
-
-
-def test_what_a_region_lacks_is_told_beside_what_others_give(tmp_path, lay_towns):
-    lay_towns(tmp_path, "town-suburb", "town-grid")
-    drawn = list(carry_out(wanted(tmp_path, "season", regions=("town-suburb", "town-grid")), jobs=2))
-    assert [bool(item.folders) for item in drawn] == [item.lack is None for item in drawn]
 
 
 def test_what_is_left_out_changes_no_other_query(tmp_path, lay_towns):

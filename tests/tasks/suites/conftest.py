@@ -26,7 +26,7 @@ from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, Variant
 from sasgeo_bench.tasks.suites.flight_image import FlightImageSuite
-from sasgeo_bench.tasks.suites.flight_plots import changed, changes_of
+from sasgeo_bench.tasks.suites.flight_plots import ChangedMapSuite, changed, changes_of
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
 
@@ -56,7 +56,8 @@ TOWN_OF = {
 # One overpass, little room for wide views; the others get as many as are asked for.
 SITES = {"grade-separation": 1, "no-priors": 3}
 MOST_SITES = 4
-PICTURES = 3  # of a flight: its first views
+PICTURES = 2  # of a flight: its first views
+FLOWN_CELLS = 96  # side of the views of other flights, but where maps change
 MAIN_REACH_M = 144.0  # half a diagonal of a view of 192 m at its largest scale
 
 TownOf = Callable[..., Region]
@@ -109,13 +110,15 @@ def _view_reach_m(suite: Suite) -> float:
 
 
 @pytest.fixture(scope="session")
-def town(tmp_path_factory) -> TownOf:
+def town(tmp_path_factory, lay_towns) -> TownOf:
     """A town by its name, one of `SIDES_M` behind it for another size; each is built once."""
     out = tmp_path_factory.mktemp("towns")
 
     @cache
     def built(name: str, date: dt.date | None = None) -> Region:
         plain_name, _, size = name.partition(" ")
+        if not size and date is None:
+            return read_region(lay_towns(out, name) / "regions" / name)
         spec = read_region_file(find_region_file(plain_name))
         if size:
             side_m, town_m = SIDES_M[size]
@@ -235,6 +238,8 @@ def flown(scene, town, edited) -> Callable[[str], Flown]:
         suite = replace(suite, variants=suite.usable(over))
         if suite.is_pictured:
             suite = _low(suite)
+        elif not isinstance(suite, ChangedMapSuite):  # its maps change as far as views of full size reach
+            suite = replace(suite, variants=tuple(replace(item, view_cells=FLOWN_CELLS) for item in suite.variants))
         seeds = Seeds(root=1, names=(over.map.region, name))
         airspace = Airspace(
             region=town(where), scene=over, suite=suite, split=split, seeds=seeds, group=suite.card.group

@@ -77,7 +77,7 @@ test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built
 
 test-torch: $(STAMP) ## install the extra [torch] of the baselines and run the tests that need it; a PyTorch in .venv is kept
 	$(PIP) install --quiet --no-build-isolation -e 'baselines[torch]'
-	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(addprefix tests/baselines/test_,unet.py deep_retrieval.py image_matchers.py) $(ARGS)
+	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(addprefix tests/baselines/test_,unet.py deep_retrieval.py image_matchers.py orienternet.py) $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)

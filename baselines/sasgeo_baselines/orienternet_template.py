@@ -311,9 +311,9 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         needs=("training",),
         limits=(
             "Needs the extra [torch]; scale is 1; places to 4 m; the posterior takes for granted that the place is "
-            "searched, and is too sure where training saw few places; no sequence, no weights by what lasts; a "
-            "detector's own confidence is not read; the same learned text on one machine and thread, others may round "
-            "differently"
+            "searched, and is calibrated on no other places than it learned from; no sequence, no weights by what "
+            "lasts; a detector's own confidence is not read; the same learned text on one machine and thread, others "
+            "may round differently"
         ),
     )
 

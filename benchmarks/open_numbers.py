@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sasgeo_baselines.tunable import MOST_TRIALS, Tunable
+from sasgeo_baselines.tunable import Tunable
 
 import sasgeo_bench as sgb
 from sasgeo_bench.sasgeo.variants import Sasgeo
@@ -197,7 +197,7 @@ def main() -> None:
     todo = [
         (kind, name, numbers)
         for name, kind in systems().items()
-        for numbers in kind.settings()[:MOST_TRIALS]
+        for numbers in kind.settings()
         if (name, json.dumps(numbers)) not in done
     ]
     with ProcessPoolExecutor(options.jobs) as pool:

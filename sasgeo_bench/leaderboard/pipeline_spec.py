@@ -121,11 +121,11 @@ class TaskSpec(Document):
     """Suites that are drawn alike; several of these make up a pipeline.
 
     `prior` is that of each suite unless given; `matchers` are those that are asked and `regions` those that are drawn,
-    all of the file unless given.
-    `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where they are empty: fewer variants
-    at more sites say more. Each variant is drawn with each of `detectors`. Suites of pictures name `segmenters` from
-    `list-segmenters`: each makes evidence of all pictures, which is asked, learned from and compared as a suite of its
-    own. With `+shares` after its name it is recalibrated by the shares of the classes on the map.
+    all of the file unless given. `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where
+    they are empty: fewer variants at more sites say more. Each variant is drawn with each of `detectors`. Suites of
+    pictures name `segmenters` from `list-segmenters`: each makes evidence of all pictures, which is asked, learned from
+    and compared as a suite of its own. With `+shares` after its name it is recalibrated by the shares of the classes on
+    the map.
 
     >>> TaskSpec(suites=["aerial"], sites=2, segmenters=["pixel_forest"]).asked
     ['aerial+pixel_forest']

@@ -85,6 +85,8 @@ def test_what_a_tracker_learnt_reaches_every_step(task, tasks, tmp_path):
     lessons = {item.diagnostics["lessons"] for rows in flights.values() for item in rows}
     (count,) = lessons
     assert 0 < count <= len(task_files.read_ids(train))
+    untaught = run_of(task, tmp_path, "Taught")
+    assert {item.diagnostics["lessons"] for rows in untaught.values() for item in rows} == {-1.0}
 
 
 @pytest.mark.parametrize("name", ["sasgeo_track", "lsvl_belief"])

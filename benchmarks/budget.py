@@ -6,7 +6,8 @@
 Prints a table in Markdown: seconds to index a map, what the index takes of memory for each km2, the largest memory of
 the process, the seconds of an answer by the clock (median and 95 %) and of the processor, and the energy of an answer
 where the machine counts it (all of its package, so that a machine with other work says too much); else "-". Systems are
-untaught: what is learned changes no cost. Without --matcher all systems are measured. Views are those of
+untaught: what is learned changes no cost; one that cannot answer without training is not measured. Without --matcher
+all systems with open numbers are measured. Views are those of
 `open_numbers.py`.
 """
 
@@ -20,6 +21,8 @@ import numpy as np
 
 import sasgeo_bench as sgb
 from benchmarks.open_numbers import drawn, systems
+from sasgeo_bench.errors import MatchError, SasgeoError
+from sasgeo_bench.matching.plugins import check_names
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.task_rows import query_bytes
 
@@ -59,12 +62,12 @@ def read_joules(counters: Path = COUNTERS) -> float | None:
 
 
 def cost_of(spec: str, region: Path, blobs: list[bytes]) -> Cost:
-    """Ask one system; raise `RuntimeError` with its words where it fails."""
+    """Ask one system; raise `MatchError` with its words where it fails."""
     with Worker(spec=spec, reach=Reach(readable=[region.resolve()], hidden=[]), limits=LIMITS) as worker:
         ready = worker.prepare(region)
         if ready.status != "ok":
             message = f"{spec}: {ready.message}"
-            raise RuntimeError(message)
+            raise MatchError(message)
         worker.match(blobs[0], top_k=10)  # what is made at the first question
         before = read_joules()
         replies = [worker.match(blob, top_k=10) for blob in blobs]
@@ -72,7 +75,7 @@ def cost_of(spec: str, region: Path, blobs: list[bytes]) -> Cost:
         failed = next((reply for reply in replies if reply.status != "ok"), None)
         if failed is not None:
             message = f"{spec}: {failed.message}"
-            raise RuntimeError(message)
+            raise MatchError(message)
         is_counted = before is not None and after is not None and after >= before  # a counter begins again at 0
         return Cost(
             index_s=ready.seconds or 0.0,
@@ -99,17 +102,31 @@ def lines(costs: dict[str, Cost], km2: float) -> Iterator[str]:
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("out/open-numbers"))
-    parser.add_argument("--matcher", action="append", default=[])
+    parser.add_argument("--out", type=Path, default=Path("out/open-numbers"), help="folder of maps and views")
+    parser.add_argument("--matcher", action="append", default=[], help="name from list-matchers; may be repeated")
     options = parser.parse_args()
+    try:
+        measure(options.out, options.matcher or list(systems()))
+    except SasgeoError as error:
+        parser.error(str(error))
+
+
+def measure(out: Path, names: list[str]) -> None:
+    """Measure systems one by one; those that fail are told below the table."""
+    check_names(matchers=names, rejectors=[])
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
-    blobs = [query_bytes(query) for query, _ in drawn(options.out)[PLACE][:ASKED]]
-    region = options.out / "regions" / PLACE
+    blobs = [query_bytes(query) for query, _ in drawn(out)[PLACE][:ASKED]]
+    region = out / "regions" / PLACE
     west_m, south_m, east_m, north_m = sgb.read_region(region, with_layers=False).grid.bounds_m
     km2 = (east_m - west_m) * (north_m - south_m) / 1e6
-    costs = {name: cost_of(name, region, blobs) for name in options.matcher or systems()}
+    costs, failed = {}, []
+    for name in names:
+        try:
+            costs[name] = cost_of(name, region, blobs)
+        except MatchError as error:
+            failed.append(f"not measured: {error}")
     print(f"{PLACE}, {km2:.1f} km2, {len(blobs)} views, one core, {LIMITS.memory_bytes / 1e9:.0f} GB\n")
-    print(*lines(costs, km2), sep="\n")
+    print(*lines(costs, km2), *failed, sep="\n")
 
 
 if __name__ == "__main__":

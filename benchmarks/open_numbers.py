@@ -28,6 +28,7 @@ import numpy as np
 from sasgeo_baselines.tunable import Tunable
 
 import sasgeo_bench as sgb
+from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.sasgeo.variants import Sasgeo
 from sasgeo_bench.search.plan import Plan
 
@@ -138,22 +139,27 @@ def best(trials: Sequence[Trial]) -> Trial:
 
 
 def read_trials(path: Path) -> list[Trial]:
-    """Read trials, each once, in the order of systems and of their settings."""
-    if not path.is_file():
-        return []
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = {(row["system"], row["setting"]): row for row in csv.DictReader(file)}
-    found = [
-        Trial(
-            system=row["system"],
-            setting=row["setting"],
-            views=int(row["views"]),
-            right=int(row["right"]),
-            median_m=float(row["median_m"]),
-            view_s=float(row["view_s"]),
-        )
-        for row in rows.values()
-    ]
+    """Read trials, each once, in the order of systems and of their settings; raise `StoreError` if there are none."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = {(row["system"], row["setting"]): row for row in csv.DictReader(file)}
+        found = [
+            Trial(
+                system=row["system"],
+                setting=row["setting"],
+                views=int(row["views"]),
+                right=int(row["right"]),
+                median_m=float(row["median_m"]),
+                view_s=float(row["view_s"]),
+            )
+            for row in rows.values()
+        ]
+        is_whole = bool(found) and all(trial.numbers for trial in found)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        is_whole = False
+    if not is_whole:
+        message = f"{path} holds no trials, or is damaged: move it away, and run with --out"
+        raise StoreError(message)
     order = {(name, json.dumps(one)): at for name, kind in systems().items() for at, one in enumerate(kind.settings())}
     return sorted(found, key=lambda trial: (trial.system, order.get((trial.system, trial.setting), len(order))))
 
@@ -183,16 +189,26 @@ def lines(trials: Sequence[Trial]) -> Iterator[str]:
 def main() -> None:
     """Draw, ask and store; or print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--out", type=Path, default=Path("out/open-numbers"))
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--out", type=Path, default=Path("out/open-numbers"), help="folder of maps, views and trials")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--table", type=Path, help="print the table of stored trials, and stop")
     options = parser.parse_args()
-    if options.table is not None:
-        print(*lines(read_trials(options.table)), sep="\n")
-        return
-    path = options.out / "trials.csv"
-    asked = drawn(options.out)
-    trials = read_trials(path)
+    if options.jobs < 1:
+        parser.error(f"--jobs is {options.jobs}, expected 1 at least")
+    try:
+        if options.table is not None:
+            print(*lines(read_trials(options.table)), sep="\n")
+        else:
+            try_all(options.out, jobs=options.jobs)
+    except SasgeoError as error:
+        parser.error(str(error))
+
+
+def try_all(out: Path, *, jobs: int) -> None:
+    """Ask what is left, store each trial, and print the table."""
+    path = out / "trials.csv"
+    trials = read_trials(path) if path.exists() else []  # a file that is none is told before anything is drawn
+    asked = drawn(out)
     done = {(trial.system, trial.setting) for trial in trials}
     todo = [
         (kind, name, numbers)
@@ -200,8 +216,8 @@ def main() -> None:
         for numbers in kind.settings()
         if (name, json.dumps(numbers)) not in done
     ]
-    with ProcessPoolExecutor(options.jobs) as pool:
-        for trial in pool.map(partial(tried, options.out, asked), *zip(*todo, strict=True)) if todo else ():
+    with ProcessPoolExecutor(jobs) as pool:
+        for trial in pool.map(partial(tried, out, asked), *zip(*todo, strict=True)) if todo else ():
             trials.append(trial)
             write_trials(path, trials)
             print(f"{trial.system} {trial.setting}: {trial.right} of {trial.views}, {trial.view_s:.2f} s a view")

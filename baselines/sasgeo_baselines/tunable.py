@@ -18,7 +18,7 @@ class Tunable:
     Parameters
     ----------
     **numbers : float
-        Values of open numbers in place of the chosen ones.
+        Values of open numbers in place of the chosen ones: any, as long as the system makes sense of it.
 
     Raises
     ------

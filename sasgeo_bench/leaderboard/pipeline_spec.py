@@ -339,6 +339,20 @@ class PipelineFile(NamedDocument):
         return self
 
     @model_validator(mode="after")
+    def _draws_what_it_names(self) -> Self:
+        named = [name for task in self.task for name in task.regions]
+        strange = next((name for name in named if self.regions and name not in self.regions), None)
+        if strange is not None:
+            message = f"a [[task]] draws {strange!r}, which is not among 'regions': name it there, too"
+            raise ValueError(message)
+        is_all_drawn = any(not task.regions for task in self.task)
+        idle = next((name for name in self.regions if self.task and not is_all_drawn and name not in named), None)
+        if idle is not None:
+            message = f"region {idle!r} is drawn by no [[task]]: leave it out, or name it in one"
+            raise ValueError(message)
+        return self
+
+    @model_validator(mode="after")
     def _asks_whom_it_names(self) -> Self:
         for task in self.task:
             if task.prior is not None:
@@ -346,10 +360,6 @@ class PipelineFile(NamedDocument):
             strange = next((name for name in task.matchers if name not in self.matchers), None)
             if strange is not None:
                 message = f"a [[task]] asks {strange!r}, which is not among 'matchers': name it there, too"
-                raise ValueError(message)
-            strange = next((name for name in task.regions if name not in (self.regions or task.regions)), None)
-            if strange is not None:
-                message = f"a [[task]] draws {strange!r}, which is not among 'regions': name it there, too"
                 raise ValueError(message)
         oracles = [] if self.learning is None else self.learning.oracles
         strange = next((name for name in oracles if name not in self.matchers), None)

@@ -8,7 +8,7 @@ import pytest
 from sasgeo_baselines.schmidt_segcorr import SchmidtSegcorr
 from sasgeo_baselines.tunable import MOST_TRIALS
 
-from benchmarks import open_numbers
+from benchmarks import budget, open_numbers
 
 SYSTEMS = open_numbers.systems()
 
@@ -39,6 +39,30 @@ def test_trials_are_read_back_each_once_in_the_order_of_settings(trials, tmp_pat
     path = tmp_path / "trials.csv"
     open_numbers.write_trials(path, [*reversed(trials), replace(trials[0], right=63), trials[0]])
     assert open_numbers.read_trials(path) == trials
+
+
+@pytest.mark.parametrize(
+    "content",
+    [None, b"", b"\xff\xfe\x00", b"a,b\n1,2\n", b"system,setting,views,right,median_m,view_s\nbrm_grid,3,64\n"],
+)
+def test_a_file_that_holds_no_trials_is_told_in_one_line(content, tmp_path, monkeypatch, capsys):
+    path = tmp_path / "trials.csv"
+    if content is not None:
+        path.write_bytes(content)
+    monkeypatch.setattr("sys.argv", ["open_numbers.py", "--table", str(path)])
+    with pytest.raises(SystemExit) as ended:
+        open_numbers.main()
+    assert ended.value.code == 2
+    assert f"{path} holds no trials, or is damaged: move it away" in capsys.readouterr().err
+
+
+def test_a_system_that_nobody_knows_is_told_before_anything_is_drawn(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["budget.py", "--out", str(tmp_path / "out"), "--matcher", "nope"])
+    with pytest.raises(SystemExit) as ended:
+        budget.main()
+    assert ended.value.code == 2
+    assert "there is no matcher 'nope'" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_most_views_choose_then_the_median_error_then_the_order(trials):

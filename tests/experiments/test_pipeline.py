@@ -292,6 +292,13 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ),
         ({"sites = 1": 'sites = 1\nregions = ["town-grid", "town-grid"]'}, "region 'town-grid' is listed twice"),
         (
+            {
+                'regions = ["town-suburb"]': 'regions = ["town-suburb", "atlantis"]',
+                "sites = 1": 'sites = 1\nregions = ["town-suburb"]',
+            },
+            "region 'atlantis' is drawn by no",
+        ),
+        (
             {"[[contrast]]": '[[contrast]]\ndetectors = ["measured"]'},
             "counts views of measured alone, and its suites",
         ),

@@ -12,6 +12,7 @@ import typer
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.matching.results import SOUND
 from sasgeo_bench.running import runner
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import merge_runs
@@ -20,7 +21,6 @@ from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks.split import Split, find_split, list_split_files
 from sasgeo_bench.tasks.task_files import read_asked, read_task
 
-_SOUND: Final = frozenset({"ok", "refused", "not applicable"})  # statuses of a matcher that works
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
 
@@ -135,7 +135,7 @@ def run_command(options: RunOptions) -> None:
         report = run(**vars(options) | {"say": lines.append, "tell": tell, "progress": progress})
     for line in lines:
         say(line)
-    if report.counts and not report.counts.keys() & _SOUND:
+    if report.counts and not report.counts.keys() & SOUND:
         tell(f"no query was answered, so the command ends with status {CONTESTANT_FAILED}; the rows are kept")
         raise typer.Exit(CONTESTANT_FAILED)
 

@@ -10,6 +10,7 @@ from sasgeo_bench.geometry.pose import Pose
 
 Status = Literal["ok", "timeout", "crash", "invalid", "refused", "not applicable"]
 STATUSES: Final[tuple[Status, ...]] = get_args(Status)
+SOUND: Final[frozenset[Status]] = frozenset({"ok", "refused", "not applicable"})  # of a matcher that works
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

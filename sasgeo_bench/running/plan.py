@@ -3,6 +3,7 @@
 
 import hashlib
 import json
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, field, replace
@@ -14,7 +15,7 @@ from sasgeo_bench.matching.follower import follower_record
 from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, read_learned
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_points
-from sasgeo_bench.matching.results import STATUSES, Status, matcher_hash
+from sasgeo_bench.matching.results import SOUND, STATUSES, Status, matcher_hash
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
@@ -76,9 +77,10 @@ class RunPart:
     """One task of a run: its folder of rows, its map, its truths, and its pending queries.
 
     `about` is the content of `task.json`; `asked` gives the hash that the row of each pending query carries
-    (`task_rows.asked_under`); `aside` counts rows of earlier queries, of other training, or of other imagery. `imagery`
-    is the hash of rendered imagery that the matcher looks at, `follower` says how a matcher of single views is asked
-    about flights (`follower.follower_record`), and `key` what its rows are tied to.
+    (`task_rows.asked_under`); `failed` counts rows by status of queries that were asked in vain and are not pending;
+    `aside` counts rows of earlier queries, of other training, or of other imagery. `imagery` is the hash of rendered
+    imagery that the matcher looks at, `follower` says how a matcher of single views is asked about flights
+    (`follower.follower_record`), and `key` what its rows are tied to.
     """
 
     task: Path
@@ -90,6 +92,7 @@ class RunPart:
     asked: Mapping[str, str]
     done: int
     aside: int
+    failed: Mapping[str, int] = field(default_factory=dict)
     imagery: str | None = None
     follower: Mapping[str, Any] | None = None
     key: str | None = None
@@ -366,8 +369,9 @@ def _part(
     index, count = request.shard
     unit_of = unit_of_task(about)
     own = [name for name in asked if _shard_of(unit_of(name), count) == index - 1][: request.limit]
-    done = {tie.query_id for tie in ties if tie.status not in request.again and tie.answers(asked)}
-    left = whole_units(own, done, unit_of)
+    statuses = {tie.query_id: tie.status for tie in ties if tie.status not in request.again and tie.answers(asked)}
+    left = whole_units(own, statuses.keys(), unit_of)
+    failed = Counter(statuses[name] for name in set(own) - set(left) if statuses[name] not in SOUND)
     return RunPart(
         task=task,
         about=about,
@@ -377,6 +381,7 @@ def _part(
         left=left,
         asked={name: asked[name] for name in left},
         done=len(own) - len(left),
+        failed=failed,
         aside=len({(tie.query_id, tie.asked) for tie in ties if not tie.answers(asked)}),
         imagery=imagery,
         follower=follower,

@@ -3,6 +3,7 @@
 
 import logging
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -158,13 +159,16 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
 
 
 def _tell_state(plan: RunPlan, tell: Tell) -> None:
-    """Report the finished tasks, by name if they are few, and how many rows answer other queries."""
+    """Report the finished tasks, by name if they are few, what failed in them, and how many rows answer other queries."""
     whole = [part for part in plan.parts if not part.left]
     if len(whole) > MOST_LINES:
         tell(f"{plan.card.name}: nothing left in {len(whole)} of {len(plan.parts)} tasks")
     else:
         for part in whole:
             tell(f"{part.folder}: nothing left, {part.done} done")
+    for status, count in sorted(sum((Counter(part.failed) for part in plan.parts), Counter()).items()):
+        rows = counted(count, "earlier query", "earlier queries")
+        tell(f"{plan.card.name}: {rows} ended as {status}; --again {status} asks again")
     aside = sum(part.aside for part in plan.parts)
     if aside:
         others = "" if plan.training_set is None else ", or of other learning"

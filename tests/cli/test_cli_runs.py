@@ -226,6 +226,11 @@ def test_a_run_without_a_sound_row_ends_with_a_status_that_a_script_sees(program
     assert len(prediction_files.read_ties(out.parent / told.strip())) == len(ids)
     again = program("run", "--matcher", "faulty:RaisesInPrepare", "--tasks", TASK)
     assert again[0] == 0, again[2]  # nothing was left to ask
+    assert f": {len(ids)} earlier queries ended as crash; --again crash asks again\n" in again[2]
+    assert (
+        f": {len(ids)} crash"
+        in program("run", "--matcher", "faulty:RaisesInPrepare", "--tasks", TASK, "--again", "crash")[2]
+    )
 
 
 def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_folder, ids, monkeypatch) -> None:

@@ -41,14 +41,14 @@ Asked = dict[str, list[tuple[sgb.Query, sgb.Truth]]]  # by place
 
 
 class TunedSasgeo(Tunable, Sasgeo):
-    """The scorer with numbers of its search that the paper leaves open; the rest of it is learned."""
+    """The scorer with the number of its search that the paper leaves open; the rest of it is learned."""
 
-    open_numbers = {"cells": (12, 16, 24), "spread": (2.0, 2.5)}
-    chosen = {"cells": Plan().cells, "spread": Plan().spread}
+    open_numbers = {"cells": (12, 16, 24)}
+    chosen = {"cells": Plan().cells}
 
     def __init__(self, **numbers: float) -> None:
         super().__init__(**numbers)
-        Sasgeo.__init__(self, Plan(cells=int(self.numbers["cells"]), spread=self.numbers["spread"]))
+        Sasgeo.__init__(self, Plan(cells=int(self.numbers["cells"])))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

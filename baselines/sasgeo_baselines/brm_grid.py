@@ -181,7 +181,7 @@ class BrmGrid(PlaceMatcher[Sight]):
         "windows": (25, 50, 100),  # whose masks are compared
         "yaw_step_deg": (5.0, 10.0),  # between headings of the grid
     }
-    chosen = {"windows": 50, "yaw_step_deg": 10.0}
+    chosen = {"windows": 100, "yaw_step_deg": 5.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Measure ratios of a map, and keep its buildings."""

@@ -30,6 +30,7 @@ class LcmBalanced(EmbeddingMatcher):
         tracks=("retrieval", "localization"),
         limits=f"Nearly blind to directions within a tile, and so to the heading that it answers; {LIMITS}",
     )
+    chosen = {"penalty": 1e-4, "epochs": 15}
     copies = COPIES
     made_up = COPIES
     several_deg = SEVERAL_DEG

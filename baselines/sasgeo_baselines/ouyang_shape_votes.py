@@ -59,7 +59,7 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
     )
 
     open_numbers = {"windows": (25, 50, 100), "bandwidth_m": (8.0, 12.0)}  # the most alike; of the mean shift of votes
-    chosen = {"windows": 50, "bandwidth_m": 12.0}
+    chosen = {"windows": 50, "bandwidth_m": 8.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Index buildings and windows."""

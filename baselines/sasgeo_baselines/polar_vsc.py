@@ -173,7 +173,7 @@ class PolarVsc(PlaceMatcher[Sight]):
         "alpha": (0.001, 0.01, 0.05),  # of the test, for each ring
         "patch_m": (4.0, 8.0),  # ground that counts as one observation; a ring is 8 m wide
     }
-    chosen = {"alpha": 0.01, "patch_m": 8.0}
+    chosen = {"alpha": 0.001, "patch_m": 8.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the map."""

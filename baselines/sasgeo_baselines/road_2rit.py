@@ -160,7 +160,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         "turn_deg": (10.0, 20.0, 30.0),  # of a road: that of a mask bends within a road's width of a junction
         "slack_m": (5.0, 8.0),  # of a length, or two standard deviations of the scale if that is more
     }
-    chosen = {"turn_deg": 20.0, "slack_m": 5.0}
+    chosen = {"turn_deg": 30.0, "slack_m": 8.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read junctions and roads of the map."""

@@ -269,7 +269,7 @@ class PopovRoadplane(Tunable):
         "least_share": (0.2, 0.3, 0.4),
         "least_gain": (0.02, 0.05),
     }
-    chosen = {"least_share": 0.3, "least_gain": 0.05}
+    chosen = {"least_share": 0.2, "least_gain": 0.02}
 
     def __init__(self, inner: Matcher | None = None, **numbers: float) -> None:
         super().__init__(**numbers)

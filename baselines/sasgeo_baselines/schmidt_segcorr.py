@@ -42,7 +42,7 @@ class SchmidtSegcorr(ShiftMatcher):
         "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
         "coarse_m": (4.0, 6.0),
     }
-    chosen = {"least_share": 0.5, "coarse_m": 4.0}
+    chosen = {"least_share": 0.75, "coarse_m": 6.0}
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the degree of each class, then where each is known, then where any is."""

@@ -154,7 +154,7 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         "neighbours": (4, 5, 6),  # of an object, the nearest: few enough to lie within a small view around most objects
         "matches": (10, 30),  # mapped objects for a seen one, the most alike first
     }
-    chosen = {"neighbours": 5, "matches": 10}
+    chosen = {"neighbours": 4, "matches": 30}
 
     def __init__(self, **numbers: float) -> None:
         super().__init__(**numbers)

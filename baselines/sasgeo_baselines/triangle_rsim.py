@@ -162,7 +162,7 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
         "ratio": (0.1, 0.15, 0.25),  # difference of two ratios of sides, alone, that may be
         "log_area": (0.5, 1.0),  # the same of the logarithm of a ratio of building areas: masks merge and cut houses
     }
-    chosen = {"ratio": 0.15, "log_area": 1.0}
+    chosen = {"ratio": 0.1, "log_area": 1.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read the buildings of the map and their triangles."""

@@ -48,7 +48,7 @@ class UbevTemplate(ShiftMatcher):
         "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
         "coarse_m": (4.0, 6.0),
     }
-    chosen = {"least_share": 0.5, "coarse_m": 4.0}
+    chosen = {"least_share": 0.75, "coarse_m": 4.0}
     yaw_step_deg = YAW_STEP_DEG
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:

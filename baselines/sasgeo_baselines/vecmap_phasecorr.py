@@ -49,7 +49,7 @@ class VecmapPhasecorr(ShiftMatcher):
     )
 
     open_numbers = {"reach_m": (8.0, 16.0, 32.0), "coarse_m": (4.0, 6.0)}  # where distances are truncated; cells
-    chosen = {"reach_m": 16.0, "coarse_m": 4.0}
+    chosen = {"reach_m": 8.0, "coarse_m": 6.0}
 
     def chart_of(self, region: Region) -> Chart:
         """Return the signed distances of the map as degrees: 1 deep within a class, 0 far from it."""

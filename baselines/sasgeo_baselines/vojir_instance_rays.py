@@ -199,7 +199,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         "start_m": (0.0, 8.0, 16.0),  # from the middle of a view: rays of 80 m from there lie within a view of 192 m
         "blur": (1, 5),  # rays over which a boundary is spread: a degree off, it still overlaps
     }
-    chosen = {"start_m": 16.0, "blur": 5}
+    chosen = {"start_m": 0.0, "blur": 5}
 
     def __init__(self, *, censors: bool = False, **numbers: float) -> None:
         super().__init__(**numbers)

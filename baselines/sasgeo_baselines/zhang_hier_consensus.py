@@ -160,7 +160,7 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
         "stride": (6, 8),  # cells between two crops: a view is at most 17 or 23 m off the middle of one
         "near_m": (6.0, 8.0, 12.0),  # of a match from where the similarity puts it; the side of a patch is 8 m
     }
-    chosen = {"stride": 6, "near_m": 8.0}
+    chosen = {"stride": 6, "near_m": 12.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the crops of the map."""

@@ -49,7 +49,7 @@ class ZilkeSemanticMi(ShiftMatcher):
         ),
     )
     open_numbers = {"coarse_m": (4.0, 6.0, 8.0), "least_share": (0.25, 0.5)}
-    chosen = {"coarse_m": 6.0, "least_share": 0.5}
+    chosen = {"coarse_m": 6.0, "least_share": 0.25}
 
     def chart_of(self, region: Region) -> Chart:
         """Return the labels of the map, one to a known cell."""

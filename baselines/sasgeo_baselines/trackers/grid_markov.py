@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`grid_markov`: a histogram filter over place and heading; `grid_markov_still`, the same without diffusion."""
 
+from dataclasses import replace
 from typing import Final
 
 import sasgeo_bench as sgb
@@ -17,16 +18,19 @@ SOURCE: Final = (
     "without the increment (linear, headings on a circle), the log-likelihood of the view is added, the sum normalised"
 )
 OURS: Final = (
-    "The likelihood: log-likelihood ratios of classes and cells by hand-set rates in place of a learned one, times a "
-    f"temper of {TEMPER:g}, fitted to made-up towns, since neighbouring cells agree and views share ground; a share of "
+    "The likelihood: log-likelihood ratios of classes and cells by rates set by hand in place of a learned one, of any "
+    f"map as if it were of the day of the view, times a temper of {TEMPER:g}, fitted to made-up towns, since "
+    "neighbouring cells agree and views share ground; a share of "
     f"{DOUBT:g} of views that say nothing; a window that follows the belief, with cells of 4 to 32 m and 72 or 36 "
     "headings; 1 km and 90 degrees where the odometer lost its way; the estimate is the mean of what lies within 25 m "
     f"of the place with the most mass, accepted if that mass is at least {LEAST:g}"
 )
 LIMITS: Final = (
     "Scale 1 alone; errors of neighbouring increments count as independent; nothing finds a drone again that was "
-    "carried where the belief does not reach; rates are not fitted"
+    "carried where the belief does not reach; rates are not fitted, so it is weaker than a learned likelihood where "
+    "detector or map differ from them"
 )
+TRAINED_ON: Final = ("four made-up towns that are in no split (benchmarks/fit_grid_trackers.py)",)
 
 
 class GridMarkov(GridFilter):
@@ -34,13 +38,14 @@ class GridMarkov(GridFilter):
 
     card = sgb.MatcherCard(
         name="grid_markov",
-        version="1",
+        version="2",
         title="Histogram filter over place and heading",
         source=SOURCE,
         ours=f"Diffusion by the covariance of each increment, which the released code leaves out. {OURS}",
         licence="Apache-2.0",
         tracks=("sequence",),
         limits=LIMITS,
+        trained_on=TRAINED_ON,
     )
     temper = TEMPER
     doubt = DOUBT
@@ -49,12 +54,15 @@ class GridMarkov(GridFilter):
         """Read a map by hand-set rates."""
         del learned
         self._field = sgb.prepare_levels(sgb.map_by_hand(region, cell_size_m=CELL_M))
-        self._classes, self._map_date = region.classes, region.manifest.extract.date
+        self._classes = region.classes
         return self._field.grid
 
     def logs(self, query: sgb.Query, belief: sgb.GridBelief) -> Floats:
-        """Return tempered sums of log-likelihood ratios over classes and cells."""
-        template = sgb.view_by_hand(query, self._classes, map_date=self._map_date)
+        """Return tempered sums of log-likelihood ratios over classes and cells.
+
+        OrienterNet knows neither the date of a map nor the season, so both are those of the view.
+        """
+        template = sgb.view_by_hand(replace(query, season=""), self._classes, map_date=query.observed_on)
         return sgb.surface_logs(self._field, template, belief, temper=self.temper)
 
 
@@ -63,12 +71,13 @@ class GridMarkovStill(GridMarkov):
 
     card = sgb.MatcherCard(
         name="grid_markov_still",
-        version="1",
+        version="2",
         title="Histogram filter over place and heading, without diffusion",
         source=f"{SOURCE}; without diffusion, as its released code",
         ours=OURS,
         licence="Apache-2.0",
         tracks=("sequence",),
         limits=f"Trusts every increment but for what interpolation blurs. {LIMITS}",
+        trained_on=TRAINED_ON,
     )
     diffuses = False

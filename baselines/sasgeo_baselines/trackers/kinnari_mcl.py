@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.trackers.particles import NEAR_M, Floats, Noise, ParticleFilter, Particles
+from sasgeo_baselines.trackers.particles import NEAR_M, TRAINED_ON, Floats, Noise, ParticleFilter, Particles
 
 GROUPS: Final = (
     ("building", "parking"),
@@ -190,20 +190,24 @@ class KinnariMcl(ParticleFilter):
         title="Monte Carlo localisation by the peak of the correlation",
         source="Kinnari, Verdoja and Kyrki, arXiv 2103.14381, 2021, by its abstract",
         ours=(
-            "The source's: correlation with the map around each particle; a weight that follows how the correlation "
-            "peaks, not its value; Monte Carlo localisation. Ours: occupancy of five groups of classes in cells of "
+            "The source's: correlation with the map around each particle; a measure of how good the surface of "
+            "correlation is; Monte Carlo localisation. Ours: views are metric and seen from above already, so that "
+            "nothing is rectified; occupancy of five groups of classes in cells of "
             "12 m for grey values, on 16 x 16 cells; zero-mean normalised correlation at 5 x 5 shifts; log-likelihood "
-            "ratio by a logistic regression on correlation and peak, fitted to made-up towns, times 0.5 since views "
+            "ratio by a logistic regression on the correlation and how it peaks (weights 7.0 and 3.5, so that the "
+            "value counts too; a weight by the value alone is not registered), times 0.5 since views "
             "overlap; 20,000 to 5,000 particles, resampled below half of effective ones; noise of 3 m and 1 degree; "
-            "increments and covariances of an odometer; a fix is accepted where the particles are spread by 25 m or "
-            "less"
+            "increments and covariances of an odometer, 1 km and 90 degrees where it lost its way; a fix is accepted "
+            "where the particles are spread by 25 m or less"
         ),
         licence="Apache-2.0",
         tracks=("sequence",),
+        trained_on=TRAINED_ON,
         limits=(
-            "The ratio is fitted to made-up towns that are in no split, whose maps are of the day of the flight; a "
-            "cell counts as far as all groups are known in it; views beyond 96 m to each side are cut; what is even, "
-            "such as forest, correlates with nothing; once it follows a wrong place it stays there"
+            "The ratio is fitted to towns whose maps are of the day of the flight; a cell counts as far as all groups "
+            "are known in it in the view, while ground that the map does not know counts as empty; views beyond 96 m "
+            "to each side are cut; what is even, such as forest, correlates with nothing; once it follows a wrong "
+            "place it stays there"
         ),
     )
     count = COUNT

@@ -91,7 +91,7 @@ class LsvlBelief(GridFilter):
     card = sgb.MatcherCard(
         name="lsvl_belief",
         version="1",
-        title="sgb.GridBelief by descriptors on a grid, with a fitted likelihood",
+        title="Belief on a grid by descriptors, with a fitted likelihood",
         source=(
             "LSVL (Kinnari, Renzulli, Verdoja and Kyrki, arXiv 2212.03581): descriptors of a grid over the map, a "
             "likelihood fitted to distances of matches and of others, a belief over place and heading"
@@ -100,8 +100,9 @@ class LsvlBelief(GridFilter):
             "The descriptor: square roots of the shares of the classes in 4 x 4 parts of the view, of the map in discs "
             "as large as a part around cells of 16 m, at 36 headings (theirs is learned of pictures); the distance, "
             "root mean square over parts and classes known on both sides; the ratio of two histograms of 24 bins, "
-            f"made to fall; a temper of {TEMPER:g} for views that share ground; a share of {DOUBT:g} of views that say "
-            "nothing; diffusion by the covariance of each increment, 1 km and 90 degrees where the odometer lost its "
+            f"made to fall, times {TEMPER:g}, fitted together with the share of views that say nothing, {DOUBT:g}, "
+            "which bounds what a view says; where training is given the ratio is fitted to it, and these two stay; "
+            "diffusion by the covariance of each increment, 1 km and 90 degrees where the odometer lost its "
             f"way; an estimate is accepted if {LEAST:g} of the belief lies within 25 m"
         ),
         licence="Apache-2.0",

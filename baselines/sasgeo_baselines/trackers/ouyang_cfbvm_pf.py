@@ -8,7 +8,7 @@ import numpy as np
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.building_votes import REACH_M, Seen, Town, headings, mixture_of
-from sasgeo_baselines.trackers.particles import Floats, Noise, ParticleFilter, Particles
+from sasgeo_baselines.trackers.particles import TRAINED_ON, Floats, Noise, ParticleFilter, Particles
 
 # Likelihood of any other place, where a perfect vote adds 1. `benchmarks/fit_particle_filters.py --floors` tries 1 to
 # 0.01 on made-up towns: 0.03 and 0.01 keep most views within 25 m, 0.83 of 1,126, and the larger trusts votes less.
@@ -28,23 +28,30 @@ class OuyangCfbvmPf(ParticleFilter):
         name="ouyang_cfbvm_pf",
         version="1",
         title="Coarse-to-fine building matching and a particle filter",
-        source="Ouyang et al., Defence Technology 34(4), 2024: its abstract, and a public account of the coarse stage",
+        source=(
+            "Ouyang et al., Defence Technology 34(4), 2024: its abstract, its released filter, and a public account of "
+            "the coarse stage"
+        ),
         ours=(
             "The source's: windows of a vector map by the building area in six rings, shapes of buildings matched in "
             "them, votes for a translation, a Gaussian mixture as likelihood, fewer particles as they gather, an "
-            "indicator of credibility that suppresses fixes. Ours, since the abstract does not say: 50 windows by "
-            "z-scores, at places 24 m apart within 2.5 spreads of the particles; eight numbers of a shape; mutual best "
-            "pairs with a correlation above 0.9; mean shift of 12 m; heights of votes x correlation over a floor of "
-            "0.03; 20,000 to 1,000 particles; credibility = mass of the heaviest cluster x (1 - spread / spread at the "
-            "start), above 0.6 for 3 views. Buildings are patches of the raster on both sides; headings 8 degrees "
-            "apart are tried within two standard deviations of the particles, where the source has a compass"
+            "indicator of credibility that suppresses fixes; noise of 3.3 m along each axis (there added to steps of "
+            "true positions, here on top of the odometer's covariance; 1 km and 90 degrees where it lost its way). "
+            "Ours, since the abstract does not say: 50 windows by z-scores, at places 24 m apart within 2.5 spreads "
+            "of the particles; eight numbers of a shape; mutual best pairs with a correlation above 0.9; mean shift "
+            "of 12 m; heights of votes x correlation over a floor of 0.03, chosen on made-up towns; 20,000 to 1,000 "
+            "particles; credibility = mass of the heaviest cluster x (1 - spread / spread at the start), above 0.6 "
+            "for 3 views. Buildings are patches of the raster on both sides; headings 8 degrees apart are tried "
+            "within two standard deviations of the particles, where the source has a compass"
         ),
         licence="Apache-2.0",
         tracks=("sequence",),
+        trained_on=TRAINED_ON,
         limits=(
-            "Blind where no whole building is in a view; errors of a detector change shapes, so that a right pair "
-            "seldom correlates above 0.9; houses that are alike vote for each other's places, and where all are, as "
-            "in a planned quarter, it finds nothing; with an unknown heading it tries 45"
+            "Blind where no whole building is in a view; ground that the map does not know counts as empty; errors of "
+            "a detector change shapes, so that a right pair seldom correlates above 0.9; houses that are alike vote "
+            "for each other's places, and where all are, as in a planned quarter, it finds nothing; with an unknown "
+            "heading it tries 45"
         ),
     )
     count = COUNT

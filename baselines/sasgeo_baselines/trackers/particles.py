@@ -18,6 +18,7 @@ Floats = NDArray[np.float64]
 NEAR_M: Final = 25.0  # the confidence of a fix is the weight of particles so near to it
 LOST_M: Final = 1000.0  # standard deviations of what is added where the odometer lost its way
 LOST_DEG: Final = 90.0
+TRAINED_ON: Final = ("six made-up towns that are in no split (benchmarks/fit_particle_filters.py)",)
 _FLOOR: Final = np.diag([1.0, 1.0, 0.25])  # m2, m2, deg2: added to a covariance, which equal particles would make 0
 _FULL_TURN: Final = 360.0
 _SCALES: Final = (0.5, 2.0)

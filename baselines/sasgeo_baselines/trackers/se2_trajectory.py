@@ -78,8 +78,8 @@ class Se2Trajectory(sgb.Follower):
         version="1",
         title="Path aligned as a whole, then smoothed",
         source=(
-            "NaviLoc (2025): SE(2) over a lattice that maximises the similarity summed along the path; Procrustes over "
-            "windows of 20 to 40 views with bounds; smoothing of odometry and clamped anchors"
+            "NaviLoc (2025, by its abstract): SE(2) over a lattice that maximises the similarity summed along the "
+            "path; Procrustes over windows of 20 to 40 views with bounds; smoothing of odometry and clamped anchors"
         ),
         ours=(
             f"Similarity is that of {ASKED}; instead of a lattice, each of these poses gives a place of the path to "

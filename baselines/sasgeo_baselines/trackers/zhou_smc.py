@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.polar import CELL_M, described, turned, view_descriptor
-from sasgeo_baselines.trackers.particles import Floats, Noise, ParticleFilter, Particles
+from sasgeo_baselines.trackers.particles import TRAINED_ON, Floats, Noise, ParticleFilter, Particles
 
 YAWS: Final = 8  # headings for which the map has embeddings
 DIMENSIONS: Final = 16
@@ -124,17 +124,19 @@ class ZhouSmc(ParticleFilter):
             "The source's: embeddings of 16 numbers, those of the map on a lattice with 8 headings, read by trilinear "
             "interpolation; weights (2 s - distance) / (2 s); 20,000 particles over what is known at the start; noise "
             "of 10 m and 5 degrees a view; particles beyond the map die; resampling below 2/3 of effective particles, "
-            "first without the lowest tenth while there are more than 5,000, then systematic; the weighted mean. Ours: "
-            "a linear embedding for the network (PCA, then CCA of views with errors against the map), of the occupancy "
-            "of 7 groups of classes in 8 rings and 16 sectors of 96 m and of their distances; unknown sectors count as "
-            "average; the mean embedding of the map is taken off both; the lattice is 12 m, and up to 24 m on a map of "
-            "470 km2; increments and covariances of an odometer; a fix is accepted where the particles are spread by "
-            "60 m or less"
+            "first without the lowest tenth while there are more than 5,000, then systematic; the weighted mean. "
+            "Ours: a linear embedding for the network (PCA, then CCA of views with errors against the map), of the "
+            "occupancy of 7 groups of classes in 8 rings and 16 sectors of 96 m and of their distances; unknown "
+            "sectors of a view count as average; the mean embedding of the map is taken off both; the lattice is 12 "
+            "m, and up to 24 m on a map of 470 km2; increments and covariances of an odometer, 1 km and 90 degrees "
+            "where it lost its way (there the last step is repeated); the scale of the view is not modulated; a fix "
+            "is accepted where the particles are spread by 60 m or less"
         ),
         licence="Apache-2.0",
         tracks=("sequence",),
+        trained_on=TRAINED_ON,
         limits=(
-            "The embedding is fitted to made-up towns that are in no split; views beyond 96 m to each side are cut; "
+            "Ground that the map does not know counts as empty; views beyond 96 m to each side are cut; "
             "a linear weight prefers a place little, and the noise of 10 m a view bounds the precision, so that it "
             "takes 1 km and more to find a place in a disc of 500 m; scale is ignored; the source rejects nothing"
         ),

@@ -110,18 +110,28 @@ class Sight:
 class AnyvislocPipeline(PlaceMatcher[Sight]):
     """The five most similar tiles, and the one in which most local features agree on a similarity."""
 
+    open_numbers = {
+        "ratio": (0.75, 0.85, 0.95),  # of the nearest to the second nearest feature
+        "per_m2": (0.01, 0.02),  # features: one for about 10 x 10 or 7 x 7 m, as houses have corners
+    }
+    chosen = {"ratio": 0.85, "per_m2": 0.02}
+
     card = MatcherCard(
         name="anyvisloc_pipeline",
         version="1",
         title="Tiles by a global descriptor, local features, most inliers",
         source=(
-            "AnyVisLoc, CVPR 2026 Findings: a gallery of tiles with half cover, blocks of the size of the footprint; "
-            "the top 5 by retrieval are matched locally, and the candidate with most inliers gives the pose"
+            "Exploring the best way for UAV visual localization under Low-altitude Multi-view Observation Condition: "
+            "a Benchmark (AnyVisLoc, arXiv 2503.10692, CVPR 2026 Findings): a gallery of tiles with half cover, "
+            "blocks of the size of the footprint; the top 5 by retrieval are matched locally, and the candidate with "
+            "most inliers gives the pose; its modes of a prior are whatever a query tells here"
         ),
         ours=(
             "On class layers: the descriptor is the root of each class's share in a square of the view's side, north "
             "up, half a side apart, by Euclidean distance; view and map are drawn in greys by class, in cells of the "
-            "map, and matched by ORB with a ratio test (0.85); a similarity by RANSAC (five matches within 3 m at "
+            "map, and matched one way by ORB with a ratio test ("
+            f"{chosen['ratio']:g}), a feature for each {1 / chosen['per_m2']:g} m2; "
+            "a similarity by RANSAC (five matches within 3 m at "
             "least) in place of PnP, as a plane has no depth; it is dropped where heading or scale are beyond 2.5 "
             "standard deviations of the prior and some slack, or the place is not allowed. Tiles without a similarity "
             "answer with their middle and the prior's heading, behind all others"
@@ -134,12 +144,6 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
             "diagnostic, is its only confidence; no sequence, no weights by what lasts"
         ),
     )
-
-    open_numbers = {
-        "ratio": (0.75, 0.85, 0.95),  # of the nearest to the second nearest feature
-        "per_m2": (0.01, 0.02),  # features: one for about 10 x 10 or 7 x 7 m, as houses have corners
-    }
-    chosen = {"ratio": 0.85, "per_m2": 0.02}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Sum the classes of the map, and find its features."""

@@ -126,7 +126,7 @@ def grid_shares(evidence: Evidence, yaw_deg: float) -> Floats:
 
 
 def headings_deg(prior: Prior, step_deg: float) -> list[float]:
-    """Return headings to try within two standard deviations, or all around, at most a step apart."""
+    """Return headings to try within 2.5 standard deviations, or all around, at most a step apart."""
     turns = turns_of(replace(prior, scale_sigma=0.0), spread=SPREAD, step=float(np.radians(step_deg)))
     return [base.yaw_deg + 90.0 * quarter for base in turns.bases for quarter in range(turns.quarters)]
 
@@ -153,6 +153,12 @@ class Sight:
 class BrmGrid(PlaceMatcher[Sight]):
     """Building ratios name the best windows, overlap of masks the pose."""
 
+    open_numbers = {
+        "windows": (25, 50, 100),  # whose masks are compared
+        "yaw_step_deg": (5.0, 10.0),  # between headings of the grid
+    }
+    chosen = {"windows": 100, "yaw_step_deg": 5.0}
+
     card = MatcherCard(
         name="brm_grid",
         version="1",
@@ -163,8 +169,10 @@ class BrmGrid(PlaceMatcher[Sight]):
         ),
         ours=(
             "All numbers: a north-up grid of 4 x 4 parts of 32 m and six rings of 16 m, at places 24 m apart; mean "
-            "squared difference of z-scores over the map, at the best of headings 10 degrees apart within two standard "
-            "deviations of the prior; the best 50 windows within the prior; then, within 20 m of each, intersection "
+            "squared difference of z-scores over the map, at the best of headings "
+            f"{chosen['yaw_step_deg']:g} degrees apart within 2.5 standard deviations of the prior; the best "
+            f"{chosen['windows']:g} "
+            "windows within the prior; then, within 20 m of each, intersection "
             "over union of the masks of buildings in cells of 4 m and headings 3 degrees apart, which is the score. "
             "Candidates of retrieval are compared by their masks alone. No odometry: each view stands alone"
         ),
@@ -176,12 +184,6 @@ class BrmGrid(PlaceMatcher[Sight]):
             "empty; scale is 1; no confidence"
         ),
     )
-
-    open_numbers = {
-        "windows": (25, 50, 100),  # whose masks are compared
-        "yaw_step_deg": (5.0, 10.0),  # between headings of the grid
-    }
-    chosen = {"windows": 100, "yaw_step_deg": 5.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Measure ratios of a map, and keep its buildings."""

@@ -169,7 +169,7 @@ def mixture_of(votes: Floats, *, bandwidth_m: float = BANDWIDTH_M) -> Mixture:
 
 
 def headings(yaw_deg: float, sigma_deg: float) -> Floats:
-    """Return headings to try, 8 degrees apart within two standard deviations; all around where nothing is known.
+    """Return headings to try, 8 degrees apart within 2.5 standard deviations; all around where nothing is known.
 
     >>> headings(10.0, 2.0).tolist(), headings(10.0, 6.0).tolist(), len(headings(0.0, 104.0))
     ([10.0], [2.0, 10.0, 18.0], 45)

@@ -76,25 +76,34 @@ class Matched(Mode):
 class LiuObjectGraph(PlaceMatcher[Objects]):
     """Similarity of nodes after averaging along the edges, partners by Sinkhorn's iteration, pose by RANSAC."""
 
+    open_numbers = {
+        "step_m": (24.0, 32.0),  # of tiles: a view is at most 17 or 23 m off the middle of one
+        "slack": (0.3, 0.5, 0.7),  # similarity below which an object rather has no partner
+    }
+    chosen = {"step_m": 24.0, "slack": 0.3}
+
     card = MatcherCard(
         name="liu_object_graph",
         version="1",
         title="Object graphs of view and tiles, matched by Sinkhorn's iteration",
         source=(
-            "Liu, Ren and Chen, Object-aware graph matching network for cross-domain remote sensing image localization "
-            "(arXiv 2511.02489), by its abstract and released code for graphs: objects as nodes of a complete graph, "
-            "edges of 0.6 complete IoU of boxes, 0.2 for the same class and 0.3 cosine of features, without loops; "
-            "boxes are features, too; graph attention, similarity of nodes across graphs, retrieval of tiles by it"
+            "Liu, Ren and Chen, Object-aware graph matching network for cross-domain remote sensing image "
+            "localization (Chinese Journal of Aeronautics 2026, arXiv 2511.02489), by its abstract and released code "
+            "for graphs: objects as nodes of a complete graph, edges of 0.6 complete IoU of boxes, 0.2 for the same "
+            "class and 0.3 cosine of features, without loops; boxes are features, too; graph attention, similarity of "
+            "nodes across graphs, retrieval of tiles by it"
         ),
         ours=(
             "Nothing is learned. Objects are the nodes of the SASGeo scorer's graph, without ends of roads and bends; "
             "features are kind, logarithm of area and degree; boxes are squares of the same area, laid along the line "
             "between two so that headings do not matter; attention is a softmax of ten times the edges, and three "
             "rounds each average a node with what it attends to; a node keeps its features of all rounds. Tiles every "
-            "24 m, headings 15 degrees apart within two standard deviations of the prior; of more than 1500 tiles "
+            f"{chosen['step_m']:g} m, "
+            "headings 15 degrees apart within 2.5 standard deviations of the prior; of more than 1500 tiles "
             "those whose counts of kinds are most like the view's; similarity is the cosine of features times a "
             "Gaussian of the distance of places in the tile (24 m); for the 64 best, 20 iterations of Sinkhorn with a "
-            "slack bin at 0.5; the score is the sum of matched similarities over the larger number of objects; the "
+            f"slack bin at {chosen['slack']:g}; "
+            "the score is the sum of matched similarities over the larger number of objects; the "
             "pose a weighted least-squares fit of the matches within 8 m of the best of 200 fits of three, or the tile "
             "itself"
         ),
@@ -102,16 +111,10 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
         tracks=("retrieval", "localization"),
         limits=(
             "Blind where fewer than three whole objects are seen: its authors say that tiles of few objects do not "
-            "suit it; objects that the view could not show are left out, by what is known of it; no cells, no "
-            "elongation, scale 1, no sequence, no weights by what lasts, no rejection"
+            "suit it; objects that the view could not show are left out as partners, but their neighbours hear of "
+            "them; no cells, no elongation, scale 1, no sequence, no weights by what lasts, no rejection"
         ),
     )
-
-    open_numbers = {
-        "step_m": (24.0, 32.0),  # of tiles: a view is at most 17 or 23 m off the middle of one
-        "slack": (0.3, 0.5, 0.7),  # similarity below which an object rather has no partner
-    }
-    chosen = {"step_m": 24.0, "slack": 0.3}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read the nodes of the map."""

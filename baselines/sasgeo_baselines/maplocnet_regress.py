@@ -80,20 +80,26 @@ class Sight:
 class MaplocnetRegress(PlaceMatcher[Sight]):
     """Highest cell of a coarse surface, moved by a residual that is linear in the scores around it."""
 
+    open_numbers = {"penalty": (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)}  # of squared coefficients
+    chosen = {"penalty": 100.0}
+
     card = MatcherCard(
         name="maplocnet_regress",
         version="1",
         title="Control: a pose regressed from a coarse surface of scores",
         source=(
-            "MapLocNet, 2024, as reviews describe it: from coarse to fine the pose is regressed, not searched for, and "
-            "there is no posterior"
+            "Wu et al., MapLocNet: Coarse-to-Fine Feature Registration for Visual Re-Localization in Navigation Maps, "
+            "arXiv 2407.08561, for cars and from street level, as reviews describe it: from coarse to fine the pose "
+            "is regressed, not searched for, and there is no posterior"
         ),
         ours=(
             "The coarse stage is a surface of three-state votes over the cells known on both sides (cells of 16 m, "
-            "headings 10 degrees apart within two standard deviations of the prior), its highest cell the first pose; "
+            "headings 10 degrees apart within 2.5 standard deviations of the prior), its highest cell the first pose; "
             "the fine stage a ridge regression of the residual (east, north, heading) from the 5 x 5 cells at three "
             "headings around it, in their standard deviations, learned from the highest cells near true places of "
-            "training that are at most 1.5 cells or steps off, each turned by right angles; at most one cell and one "
+            "training that are at most 1.5 cells or steps off, each turned by right angles (penalty "
+            f"{chosen['penalty']:g}); "
+            "at most one cell and one "
             "step. Untaught it answers with the highest cell"
         ),
         licence="Apache-2.0",
@@ -103,9 +109,6 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
             "residual only corrects the highest cell; scale is 1; no sequence, no weights by what lasts"
         ),
     )
-
-    open_numbers = {"penalty": (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)}  # of squared coefficients
-    chosen = {"penalty": 100.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read the map and the coefficients."""

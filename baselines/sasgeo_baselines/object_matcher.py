@@ -23,15 +23,17 @@ from sasgeo_bench import (
     Query,
     Region,
     rotation,
+    thinned,
     turns_of,
 )
 
 FEWEST: Final = 3  # objects of a view that can be told from chance
 CELL_M: Final = 8.0  # of votes
+PEAKS_APART_M: Final = 25.0  # neighbouring cells and headings of one place are one peak
 # Ends of roads are gaps of perception more often than ends; bends of rivers lie nowhere in particular.
 LEFT_OUT: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.name.endswith(("dead_end", "river_bend")))
 _WINDOW: Final = 3  # cells a side that vote together
-_EACH: Final = 8  # peaks of a heading
+_EACH: Final = 24  # peaks of a heading, before neighbours are left out
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -114,9 +116,9 @@ class Pairs:
         return np.asarray(self.mapped_m - self.seen_m @ rotation(yaw_deg).T)
 
     def peaks(self, disc: Disc, yaws_deg: list[float], *, count: int) -> list[Mode]:
-        """Return up to `count` poses that most pairs vote for, best first."""
+        """Return up to `count` poses that most pairs vote for, best first, `PEAKS_APART_M` from each other."""
         found = [mode for yaw_deg in yaws_deg for mode in self._peaks(disc, yaw_deg)]
-        return sorted(found, key=lambda mode: -mode.score)[:count]
+        return thinned(sorted(found, key=lambda mode: -mode.score), PEAKS_APART_M)[:count]
 
     def _peaks(self, disc: Disc, yaw_deg: float) -> Iterator[Mode]:
         """Yield the best places of one heading."""

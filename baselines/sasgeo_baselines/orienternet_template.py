@@ -302,9 +302,10 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         ours=(
             "No street picture: what is encoded are the three-state class layers of the view, and class layers of the "
             "map in cells of 4 m, each against its usual share, by two kernels of 3 x 3 beside a linear layer, to 8 "
-            "channels; sharper for views that know more cells; headings that move the rim by 6 m, of the prior's two "
-            "standard deviations; taught with places within 384 m, and turned, mirrored and partly hidden views; modes "
-            "25 m apart, confidence the posterior within 25 m of the first"
+            "channels; sharper for views that know more cells; headings that move the rim by 6 m, of 2.5 standard "
+            "deviations of the prior; taught among the 96 x 96 places of a square of 384 m, and turned, mirrored and "
+            "partly hidden views; modes 25 m apart, confidence the posterior within 25 m of the first; no prior of "
+            "places from the map, and no mean and covariance"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -33,6 +33,9 @@ class Component(Mode):
 class OuyangShapeVotes(PlaceMatcher[Sight]):
     """Components of the mixture of votes of a single view."""
 
+    open_numbers = {"windows": (25, 50, 100), "bandwidth_m": (8.0, 12.0)}  # the most alike; of the mean shift of votes
+    chosen = {"windows": 50, "bandwidth_m": 8.0}
+
     card = MatcherCard(
         name="ouyang_shape_votes",
         version="1",
@@ -41,11 +44,14 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
         ours=(
             "The source's: windows of a vector map by the building area in six rings, shapes of buildings matched in "
             "them, votes for a translation, a Gaussian mixture of them, an indicator of credibility. Ours is what "
-            "the abstract does not say, as in the tracker ouyang_cfbvm_pf: 50 windows by z-scores, at places 24 m "
+            "the abstract does not say, as in the tracker ouyang_cfbvm_pf: "
+            f"{chosen['windows']:g} windows by z-scores, "
+            "at places 24 m "
             "apart within the prior; eight numbers of a shape; mutual best pairs with a correlation above 0.9; mean "
-            "shift of 12 m; heights of votes x correlation. The components are the answer, the height is the score, "
+            f"shift of {chosen['bandwidth_m']:g} m; "
+            "heights of votes x correlation. The components are the answer, the height is the score, "
             "and credibility = share of the heights that the first has x (1 - spread of the mixture / radius of "
-            "the prior) is a diagnostic. Headings 8 degrees apart are tried within two standard deviations of the "
+            "the prior) is a diagnostic. Headings 8 degrees apart are tried within 2.5 standard deviations of the "
             "prior, where the source has a compass. Buildings are patches of the raster on both sides"
         ),
         licence="Apache-2.0",
@@ -57,9 +63,6 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
             "rings; headings are as coarse as they are tried, scale is 1"
         ),
     )
-
-    open_numbers = {"windows": (25, 50, 100), "bandwidth_m": (8.0, 12.0)}  # the most alike; of the mean shift of votes
-    chosen = {"windows": 50, "bandwidth_m": 8.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Index buildings and windows."""

@@ -24,7 +24,7 @@ from sasgeo_bench import (
 )
 
 MOST_PLACES: Final = 10  # poses of one answer
-SPREAD: Final = 2.0  # standard deviations of the prior's heading that are tried
+SPREAD: Final = 2.5  # standard deviations of the prior's heading that are tried: as many as the scorer's
 AROUND_M: Final = 24.0  # a view may lie so far from its candidate
 
 View = TypeVar("View")

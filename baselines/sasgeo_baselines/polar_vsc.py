@@ -140,22 +140,29 @@ class Sight:
 class PolarVsc(PlaceMatcher[Sight]):
     """Two stages: rings with the heading marginalised, gated by a test; then sectors."""
 
+    open_numbers = {
+        "alpha": (0.001, 0.01, 0.05),  # of the test, for each ring
+        "patch_m": (4.0, 8.0),  # ground that counts as one observation; a ring is 8 m wide
+    }
+    chosen = {"alpha": 0.001, "patch_m": 8.0}
+
     card = MatcherCard(
         name="polar_vsc",
         version="1",
         title="Visual semantic context: rings, a Kolmogorov-Smirnov gate, sectors",
         source=(
-            "Visual semantic context, NAVIGATION 71(1), navi.634, by its abstract: semantics in polar bins; a first "
-            "stage marginalises the heading and searches places coarsely, a Kolmogorov-Smirnov test rejects unlikely "
-            "ones, a second stage refines place and heading"
+            "Visual semantic context, NAVIGATION 71(1), navi.634, by its abstract, shown in numerical experiments: "
+            "semantics in polar bins; a first stage marginalises the heading and searches places coarsely, a "
+            "Kolmogorov-Smirnov test rejects unlikely ones, a second stage refines place and heading"
         ),
         ours=(
             "All numbers and measures: 7 groups of classes in 12 rings and 36 sectors of a disc of 96 m in radius; "
-            "places 16 m apart; a two-sample test of the groups in each ring at alpha 0.01, in which each patch of 8 m "
-            "counts as one observation, with the asymptotic distribution; places where fewer rings pass than at the "
+            "places 16 m apart; a two-sample test of the groups in each ring at alpha "
+            f"{chosen['alpha']:g}, in which each patch of {chosen['patch_m']:g} m counts as one observation, with the "
+            "asymptotic distribution; places where a smaller share of rings passes than at the "
             "best place are dropped, so that an answer remains where no place passes in all; the 200 nearest of the "
             "rest by squared differences of rings; then the circular correlation of sectors, less the mean shares of "
-            "the map, at headings within two standard deviations of the prior, with a parabola between sectors; then "
+            "the map, at headings within 2.5 standard deviations of the prior, with a parabola between sectors; then "
             "the best place in steps of 4 m around the best 16. ks_share, the share of rings that pass at the answer, "
             "and ks_p, the least p-value, are diagnostics, which the rejector ks_gate reads"
         ),
@@ -168,12 +175,6 @@ class PolarVsc(PlaceMatcher[Sight]):
             "scale is 1, no confidence"
         ),
     )
-
-    open_numbers = {
-        "alpha": (0.001, 0.01, 0.05),  # of the test, for each ring
-        "patch_m": (4.0, 8.0),  # ground that counts as one observation; a ring is 8 m wide
-    }
-    chosen = {"alpha": 0.001, "patch_m": 8.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the map."""

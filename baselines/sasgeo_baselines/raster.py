@@ -112,7 +112,7 @@ UNKNOWN_IS_ABSENT: Final = (
     "whose last variant alone ignores it"
 )
 LIMITS: Final = (
-    "headings and scales beyond two standard deviations are not searched; candidates that share a place within 24 m "
+    "headings and scales beyond 2.5 standard deviations are not searched; candidates that share a place within 24 m "
     "cannot be told apart; no confidence; withholds only where everything is unknown"
 )
 
@@ -185,7 +185,7 @@ class FullUnknown(RasterMatcher):
 
     card = MatcherCard(
         name="full_unknown",
-        version="1",
+        version="2",
         title="The paper's full model: stability, graph descriptor, unknown ignored",
         source=SOURCE.format(variant=5),
         ours=(
@@ -204,7 +204,7 @@ class RasterGraph(RasterMatcher):
 
     card = MatcherCard(
         name="raster_graph",
-        version="1",
+        version="2",
         title="Raster matching and graph descriptor",
         source=SOURCE.format(variant=3),
         ours=f"{OURS}; {GRAPH}; {UNKNOWN_IS_ABSENT}",
@@ -220,7 +220,7 @@ class RasterGraphStability(RasterMatcher):
 
     card = MatcherCard(
         name="raster_graph_stability",
-        version="1",
+        version="2",
         title="Stability-weighted raster matching and graph descriptor",
         source=SOURCE.format(variant=4),
         ours=f"{OURS}; {GRAPH}; {STABLE}; {UNKNOWN_IS_ABSENT}",
@@ -236,7 +236,7 @@ class RasterUniform(RasterMatcher):
 
     card = MatcherCard(
         name="raster_uniform",
-        version="2",
+        version="3",
         title="Raster matching with uniform weights",
         source=SOURCE.format(variant=2),
         ours=f"{OURS}; {UNKNOWN_IS_ABSENT}",

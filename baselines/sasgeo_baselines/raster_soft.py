@@ -78,7 +78,7 @@ class RasterSoft(DenseMatcher):
 
     card = MatcherCard(
         name="raster_soft",
-        version="1",
+        version="2",
         title="Covariance of probabilities and map",
         source="Zero-mean correlation of templates; Eqs. 7-8 of the SASGeo paper (Trukhina and Vashkelis), first order",
         ours=(
@@ -90,7 +90,7 @@ class RasterSoft(DenseMatcher):
         tracks=("retrieval", "localization"),
         limits=(
             "How common a class is in the view says nothing, a view that one class fills has none of it; no graph, no "
-            "ages, nothing learned; headings and scales beyond two standard deviations are not searched; candidates "
+            "ages, nothing learned; headings and scales beyond 2.5 standard deviations are not searched; candidates "
             "that share a place within 24 m cannot be told apart; no confidence"
         ),
     )

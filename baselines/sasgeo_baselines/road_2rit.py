@@ -26,7 +26,8 @@ from sasgeo_bench import (
     thinned,
 )
 
-LENGTH_M: Final = (20.0, 230.0)  # of a pair: past one junction, and up to the diagonal of a view
+LENGTH_M: Final = (20.0, 230.0)  # of a pair: past one junction, and as far as two of a view of 192 m usually lie
+LONGER_M: Final = 8.0  # of a length, or two standard deviations of the scale if that is more
 MOST_PAIRS: Final = 150  # of a view, the longest first: they give the best heading
 FIRST_POINTS: Final = 60  # seen points of the first test
 TESTED: Final = 600  # poses of the second test: all seen points, and the mapped ones
@@ -35,7 +36,6 @@ TWICE_M: Final = 6.0  # of poses this near to each other only the best is fitted
 APART_M: Final = 25.0
 JUNCTIONS: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.name.endswith("intersection"))
 _ARMS: Final = 3  # of a junction, at least
-_SAME_ARMS: Final = 2  # of a junction, at least
 _LEAST_POINTS: Final = 20  # along roads of a view
 
 
@@ -91,8 +91,8 @@ class Tuples:
         return type(self)(ends_m=self.ends_m[:, ::-1], length_m=self.length_m, arms_deg=arms_deg)
 
 
-def same_arms(ours_deg: Floats, theirs_deg: Floats, *, turn_deg: float) -> Bools:
-    """Return which junctions may be the same by the bearings of their roads: all agree but one, at least two.
+def same_arms(ours_deg: Floats, theirs_deg: Floats, *, turn_deg: float, least: int) -> Bools:
+    """Return which junctions may be the same by the bearings of their roads: at least `least` of them agree.
 
     Parameters
     ----------
@@ -102,19 +102,20 @@ def same_arms(ours_deg: Floats, theirs_deg: Floats, *, turn_deg: float) -> Bools
         Those of others.
     turn_deg : float
         By which two bearings of one road may differ.
+    least : int
+        Number of roads of one junction that have one of the other.
 
     Examples
     --------
     >>> crossing = np.array([0.0, 90.0, 180.0, 270.0])
     >>> others = np.array([[80.0, 170.0, 281.0], [45.0, 170.0, 281.0], [45.0, 135.0, 270.0]])
-    >>> same_arms(crossing, others, turn_deg=20.0).tolist()
+    >>> same_arms(crossing, others, turn_deg=20.0, least=2).tolist()
     [True, True, False]
     """
     off_deg = np.abs(np.mod(theirs_deg[:, :, None] - ours_deg + 180.0, 360.0) - 180.0)
     agrees = off_deg <= turn_deg  # never of a NaN
     common = np.minimum(agrees.any(axis=1).sum(axis=1), agrees.any(axis=2).sum(axis=1))
-    fewer = np.minimum(np.isfinite(ours_deg).sum(), np.isfinite(theirs_deg).sum(axis=1))
-    return np.asarray(common >= np.maximum(fewer - 1, _SAME_ARMS))
+    return np.asarray(common >= least)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,6 +130,12 @@ class RoadSight:
 class Road2Rit(PlaceMatcher[RoadSight]):
     """Tuples of two junctions with tangents give poses; the roads around decide between them."""
 
+    open_numbers = {
+        "turn_deg": (10.0, 20.0, 30.0),  # of a road: that of a mask bends within a road's width of a junction
+        "bearings": (1, 2),  # that agree at each end: a detector misses roads at junctions, and adds some
+    }
+    chosen = {"turn_deg": 30.0, "bearings": 1}
+
     card = MatcherCard(
         name="road_2rit",
         version="1",
@@ -140,27 +147,23 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         ),
         ours=(
             "Junctions and the bearings of their roads are those of the SASGeo scorer's graph. Tuples of 20 to 230 m "
-            "match where lengths agree within 5 m (or two standard deviations of the scale) and, at both ends, all "
-            "bearings but one and at least two agree within 20 degrees, counted from the axis of the pair; the 150 "
-            "longest tuples of a view are looked up. A match gives a rigid pose instead of a homography, since views "
-            "are metric. Poses that the prior allows are tested on 60 seen points of roads; the best 600 by the share "
-            "of seen points within 5 m of a mapped road, less the share of mapped points in the known part of the view "
-            "that no seen road is near; the best 24 are fitted to the roads by ICP and tested again. Roads are the "
-            "middle lines of masks on both sides, of a view its vectors if it has any"
+            "match where lengths agree within 8 m (or two standard deviations of the scale) and, at both ends, of the "
+            f"bearings at least {chosen['bearings']:g} agree within {chosen['turn_deg']:g} degrees, counted from the "
+            "axis of the pair (a condition that missed roads leave true); the 150 longest tuples of a view are looked "
+            "up. A match gives a rigid pose instead of a homography, since views are metric. Poses that the prior "
+            "allows are tested on 60 seen points of roads; the best 600 by the share of seen points within 5 m of a "
+            "mapped road, less the share of mapped points in the known part of the view that no seen road is near; "
+            "the best 24, 6 m apart, are fitted to the roads by ICP and tested again. Roads are the middle lines of "
+            "masks on both sides, of a view its vectors if it has any"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=(
-            "Blind where fewer than two whole junctions of three roads are seen; roads alone count, buildings and "
+            "Roads are major and minor ones and paths; blind where any of the three is unknown all over, or fewer than "
+            "two whole junctions of three roads are seen; roads alone count, buildings and "
             "ground do not; scale is 1; no tilt; no sequence, no weights by what lasts; no confidence but the score"
         ),
     )
-
-    open_numbers = {
-        "turn_deg": (10.0, 20.0, 30.0),  # of a road: that of a mask bends within a road's width of a junction
-        "slack_m": (5.0, 8.0),  # of a length, or two standard deviations of the scale if that is more
-    }
-    chosen = {"turn_deg": 30.0, "slack_m": 8.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read junctions and roads of the map."""
@@ -194,8 +197,9 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         return np.concatenate([np.zeros((0, 3)), *self._hypotheses(view, disc)])
 
     def _hypotheses(self, view: RoadSight, disc: Disc) -> Iterator[Floats]:
+        turn_deg, bearings = self.numbers["turn_deg"], int(self.numbers["bearings"])
         for kind, ours in view.pairs.items():
-            slack_m = np.maximum(self.numbers["slack_m"], 2.0 * view.prior.scale_sigma * ours.length_m)
+            slack_m = np.maximum(LONGER_M, 2.0 * view.prior.scale_sigma * ours.length_m)
             for row in range(len(ours.length_m))[: -MOST_PAIRS - 1 : -1]:
                 low, high = ours.length_m[row] - slack_m[row], ours.length_m[row] + slack_m[row]
                 once = self._pairs[kind].some(slice(*np.searchsorted(self._pairs[kind].length_m, [low, high])))
@@ -203,7 +207,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
                     poses = rigid_poses(np.broadcast_to(ours.ends_m[row], theirs.ends_m.shape), theirs.ends_m)
                     may = np.flatnonzero(allowed(poses, view.prior, disc))
                     for end, own_deg in enumerate(ours.arms_deg[row]):
-                        may = may[same_arms(own_deg, theirs.arms_deg[may, end], turn_deg=self.numbers["turn_deg"])]
+                        may = may[same_arms(own_deg, theirs.arms_deg[may, end], turn_deg=turn_deg, least=bearings)]
                     yield poses[may]
 
     def _tested(self, view: RoadSight, poses: Floats, disc: Disc) -> list[Mode]:

@@ -238,6 +238,13 @@ def straightened(query: Query, matrix: Floats) -> Query:
 class PopovRoadplane(Tunable):
     """A matcher before which views are straightened by the borders of roads around its first answers."""
 
+    open_numbers = {
+        # Of seen borders that lie on mapped ones, and their gain: in a dense town chance alone gives a share of 0.15.
+        "least_share": (0.2, 0.3, 0.4),
+        "least_gain": (0.02, 0.05),
+    }
+    chosen = {"least_share": 0.2, "least_gain": 0.02}
+
     card = MatcherCard(
         name="popov_roadplane",
         version="1",
@@ -252,8 +259,9 @@ class PopovRoadplane(Tunable):
             "A front end of `schmidt_segcorr`, made of that idea: from each of its first three answers, borders of "
             "seen roads are drawn to mapped ones that face the same way by ICP, 24 rounds from 20 to 4 m, point to "
             "line, for a homography of eight parameters with a prior (0.15 for place, heading and scale, 0.05 for "
-            "shear, 0.2 for perspective, in halves of the view). Where the best lays at least 0.3 of the borders "
-            "within 3 m, and 0.05 more than before, the view is moved by it, less the similarity in it, and matched "
+            "shear, 0.2 for perspective, in halves of the view). Where the best lays at least "
+            f"{chosen['least_share']:g} of the borders within 3 m, and {chosen['least_gain']:g} more than before, "
+            " the view is moved by it, less the similarity in it, and matched "
             "again around that answer; what is found comes first if it scores higher"
         ),
         licence="Apache-2.0",
@@ -263,13 +271,6 @@ class PopovRoadplane(Tunable):
             "only, so no relief; borders of a map are drawn by its rules for widths; else as the matcher behind it"
         ),
     )
-
-    open_numbers = {
-        # Of seen borders that lie on mapped ones, and their gain: in a dense town chance alone gives a share of 0.15.
-        "least_share": (0.2, 0.3, 0.4),
-        "least_gain": (0.02, 0.05),
-    }
-    chosen = {"least_share": 0.2, "least_gain": 0.02}
 
     def __init__(self, inner: Matcher | None = None, **numbers: float) -> None:
         super().__init__(**numbers)

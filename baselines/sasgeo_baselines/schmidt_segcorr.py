@@ -16,6 +16,12 @@ LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
 class SchmidtSegcorr(ShiftMatcher):
     """Mean over classes of intersection over union, at every place and heading."""
 
+    open_numbers = {
+        "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
+        "coarse_m": (4.0, 6.0),
+    }
+    chosen = {"least_share": 0.75, "coarse_m": 6.0}
+
     card = MatcherCard(
         name="schmidt_segcorr",
         version="1",
@@ -26,9 +32,10 @@ class SchmidtSegcorr(ShiftMatcher):
         ),
         ours=(
             "All but that idea: intersection over union of each class, weighed by the detector's confidence where the "
-            "view has one, over cells known on both sides; the mean over the classes that view or map hold there; the "
-            "map in cells of 4 m, then 2 m, headings in steps of 3, then 0.75 degrees, of the prior's two standard "
-            "deviations; scale 1; no filter"
+            "view has one, over cells known on both sides; the mean over the classes that view or map hold there; a "
+            f"place of which the map knows less than {chosen['least_share']:g} of what the view knows has no score; "
+            f"the map in cells of {chosen['coarse_m']:g} m, then half as wide, headings in steps of 3, then 0.75 "
+            "degrees, of 2.5 standard deviations of the prior; no fit between cells; scale 1; no filter"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
@@ -37,12 +44,6 @@ class SchmidtSegcorr(ShiftMatcher):
             "left out of both sides; thin classes overlap little where they lie a few metres off; no confidence"
         ),
     )
-
-    open_numbers = {
-        "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
-        "coarse_m": (4.0, 6.0),
-    }
-    chosen = {"least_share": 0.75, "coarse_m": 6.0}
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the degree of each class, then where each is known, then where any is."""

@@ -14,12 +14,13 @@ from sasgeo_bench import Chart, Disc, Evidence, Mode, Overlaps, Pose, Query, Reg
 class ShiftMatcher(PlaceMatcher[ShiftSearch]):
     """A matcher of single views by a score of their overlaps with the map; a subclass says which."""
 
+    coarse_m: float = 4.0  # where it is no open number
     yaw_step_deg: float = 3.0
 
     @property
     def plan(self) -> ShiftPlan:
-        """Return the settings of the search: its coarse cells are an open number, the fine ones half as wide."""
-        coarse_m = self.numbers["coarse_m"]
+        """Return the settings of the search: the fine cells are half as wide as the coarse ones."""
+        coarse_m = self.numbers.get("coarse_m", self.coarse_m)
         return ShiftPlan(coarse_m=coarse_m, fine_m=coarse_m / 2, yaw_step_deg=self.yaw_step_deg)
 
     def chart_of(self, region: Region) -> Chart:

@@ -8,7 +8,7 @@ import networkx as nx  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
 
 from sasgeo_baselines.object_matcher import Floats, Ints, ObjectMatcher, Pairs, Sight, fitted
-from sasgeo_bench import Disc, MatcherCard, Mode, thinned
+from sasgeo_bench import Disc, MatcherCard, Mode, Pose, thinned
 
 YAW_STEP_DEG: Final = 5.0
 TRIED: Final = 24  # peaks
@@ -20,20 +20,30 @@ APART_M: Final = 25.0
 class SpatialGraphClique(ObjectMatcher):
     """Maximum clique of the graph of correspondences; its size is the score."""
 
+    open_numbers = {
+        "agree_m": (3.0, 5.0, 8.0),  # two distances that may be the same
+        "near_m": (10.0, 14.0),  # of a peak of votes: pairs whose votes lie so near are looked at together
+    }
+    chosen = {"agree_m": 8.0, "near_m": 14.0}
+
     card = MatcherCard(
         name="spatial_graph_clique",
         version="1",
         title="Maximum clique of objects with the same distances",
         source=(
-            "Graph-theoretic localization by landmarks, arXiv 2306.03641, as its abstract describes it: a graph of "
-            "correspondences whose edges join those that keep distances, and its maximum clique"
+            "Matsuzaki, Koide, Oishi, Yokozuka and Banno, Single-Shot Global Localization via Graph-Theoretic "
+            "Correspondence Matching, arXiv 2306.03641, as its abstract describes it: instances in a segmented picture "
+            "and in a labelled 3D point cloud, joined by the maximum clique of their correspondences; shown on "
+            "simulated towns, not from the air"
         ),
         ours=(
-            "Objects are the nodes of the SASGeo scorer's graph, correspondences those of one kind; distances agree "
-            "within 5 m. The graph of all correspondences of a map is too large, so poses that many pairs vote for "
-            "(cells of 8 m, headings 5 degrees apart within two standard deviations of the prior) are looked at one by "
-            "one: at each of the best 24 the 60 pairs nearest to it. The clique's pose is the least-squares fit of its "
-            "pairs; its score is its size, and of two of a size the one that fits better"
+            "Objects are the nodes of the SASGeo scorer's graph, correspondences those of one kind, which agree if "
+            f"they keep distances within {chosen['agree_m']:g} m. The graph of all correspondences of a map is too "
+            "large, so poses that many pairs vote for (cells of 8 m, headings 5 degrees apart within 2.5 standard "
+            "deviations of the prior) are looked at one by one: at each of the best 24 that lie 25 m apart the 60 "
+            f"pairs nearest to it, within {chosen['near_m']:g} m, and once more around the pose that they give. The "
+            "clique's pose is the least-squares fit of its pairs; its score is its size, and of two of a size the one "
+            "that fits better"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
@@ -44,26 +54,26 @@ class SpatialGraphClique(ObjectMatcher):
         ),
     )
 
-    open_numbers = {
-        "agree_m": (3.0, 5.0, 8.0),  # two distances that may be the same
-        "near_m": (10.0, 14.0),  # of a peak of votes: pairs whose votes lie so near are looked at together
-    }
-    chosen = {"agree_m": 8.0, "near_m": 14.0}
-
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses of the largest cliques."""
         pairs = Pairs.of_kind(view, self.mapped.nodes, self.within(view, disc))
         found = []
         for peak in pairs.peaks(disc, view.yaws_deg(YAW_STEP_DEG), count=TRIED):
-            near = _around(pairs, peak, self.numbers["near_m"])
-            places_m, owner = (pairs.seen_m[near], pairs.mapped_m[near]), owners(pairs, near)
-            clique = near[largest_clique(*places_m, owner, agree_m=self.numbers["agree_m"])]
-            if len(clique) < FEWEST:
-                continue
-            pose, error_m = fitted(pairs.seen_m[clique], pairs.mapped_m[clique])
-            if view.allows(pose, disc):
-                found.append(Mode(pose=pose, score=len(clique) + 0.5 / (1.0 + error_m)))
+            mode = self._at(pairs, peak.pose)
+            mode = mode and self._at(pairs, mode.pose)  # once more: a peak is up to half a step of the heading off
+            if mode is not None and view.allows(mode.pose, disc):
+                found.append(mode)
         return thinned(sorted(found, key=lambda mode: -mode.score), APART_M)[:count]
+
+    def _at(self, pairs: Pairs, pose: Pose) -> Mode | None:
+        """Return the pose of the largest clique of pairs near a pose; None if they are fewer than three."""
+        near = _around(pairs, pose, self.numbers["near_m"])
+        places_m, owner = (pairs.seen_m[near], pairs.mapped_m[near]), owners(pairs, near)
+        clique = near[largest_clique(*places_m, owner, agree_m=self.numbers["agree_m"])]
+        if len(clique) < FEWEST:
+            return None
+        fit, error_m = fitted(pairs.seen_m[clique], pairs.mapped_m[clique])
+        return Mode(pose=fit, score=len(clique) + 0.5 / (1.0 + error_m))
 
     def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
         """Return the size of the largest clique."""
@@ -71,9 +81,9 @@ class SpatialGraphClique(ObjectMatcher):
         return {"inliers": float(int(found[0].score))}
 
 
-def _around(pairs: Pairs, peak: Mode, near_m: float) -> Ints:
-    """Return rows of the pairs that vote for a place near a peak, the nearest first."""
-    away_m = np.hypot(*(pairs.places_m(peak.pose.yaw_deg) - (peak.pose.easting_m, peak.pose.northing_m)).T)
+def _around(pairs: Pairs, pose: Pose, near_m: float) -> Ints:
+    """Return rows of the pairs that vote for a place near a pose, the nearest first."""
+    away_m = np.hypot(*(pairs.places_m(pose.yaw_deg) - (pose.easting_m, pose.northing_m)).T)
     near = np.flatnonzero(away_m <= near_m)
     return np.asarray(near[np.argsort(away_m[near], kind="stable")[:MOST_PAIRS]], dtype=np.int64)
 

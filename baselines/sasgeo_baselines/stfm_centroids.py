@@ -31,6 +31,7 @@ from sasgeo_bench import (
 WIDEST_M: Final = 30.0  # radius of an object: a view cuts wider ones
 TRIED: Final = 24  # poses that most matches vote for
 APART_M: Final = 25.0
+OF_OBJECTS: Final = frozenset(name for kind in NODE_KINDS for name in kind.classes)  # classes
 _LABEL: Final = float(np.sqrt(0.5))  # so that two labels that differ are 1 apart, as the greatest ratio and 0 are
 
 
@@ -92,7 +93,9 @@ class Patterns:
 
 
 def clear_m(evidence: Evidence, places_m: Floats) -> Floats:
-    """Return how far places of a view lie from the nearest ground that it does not know, or from its border, (N,).
+    """Return how far places of a view lie from ground where objects may be hidden, or from its border, shape (N,).
+
+    Ground is hidden where a class that objects are made of is unknown, unless the view does not read that class at all.
 
     Examples
     --------
@@ -100,7 +103,9 @@ def clear_m(evidence: Evidence, places_m: Floats) -> Floats:
     >>> clear_m(view, np.array([[0.5, 0.5], [40.5, 0.5]])).tolist()
     [50.0, 10.0]
     """
-    known = np.pad((evidence.cells != UNKNOWN).all(axis=0), 1).astype(np.uint8)
+    layers = (evidence.layer(name) != UNKNOWN for name in evidence.classes if name in OF_OBJECTS)
+    read = [known for known in layers if known.any()]
+    known = np.pad(np.all(read, axis=0) if read else np.zeros(evidence.shape, dtype=bool), 1).astype(np.uint8)
     away = cv2.distanceTransform(known, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1] * evidence.cell_size_m
     rows, cols = evidence.shape
     row, col = np.clip(view_grid(evidence).to_cells(places_m), 0, (rows - 1, cols - 1)).T
@@ -122,6 +127,12 @@ class PatternSight(Sight):
 class StfmCentroids(PlaceMatcher[PatternSight]):
     """Objects match by the pattern of their neighbours; matches vote for poses."""
 
+    open_numbers = {
+        "neighbours": (4, 5, 6),  # of an object, the nearest: few enough to lie within a small view around most objects
+        "matches": (10, 30),  # mapped objects for a seen one, the most alike first
+    }
+    chosen = {"neighbours": 4, "matches": 30}
+
     card = MatcherCard(
         name="stfm_centroids",
         version="1",
@@ -134,10 +145,14 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         ),
         ours=(
             "Objects are the nodes of the SASGeo scorer's graph, up to 30 m in radius, of kinds that the view shows: "
-            "neighbours the five nearest, in the order of label and distance; a ratio is that to the farthest of them, "
+            "neighbours the "
+            f"{chosen['neighbours']:g} nearest, "
+            "in the order of label and distance; a ratio is that to the farthest of them, "
             "an angle that from the neighbour before, as half of its cosine and sine, a label 0 or 1. The source "
-            "compares whole pictures; here each seen object, if its neighbours all lie nearer than the border of the "
-            "known view, votes with its ten nearest objects of the map of its own label, by the rigid pose that lays "
+            "compares whole pictures; here each seen object, if its neighbours all lie nearer than the border of what "
+            "the view knows of the classes of objects, votes with its "
+            f"{chosen['matches']:g} most alike "
+            "objects of the map of its own label, by the rigid pose that lays "
             "both patterns on each other and with the weight 1 / (1 + distance). The score is the weight of the votes "
             "that agree within 12 m and 8 degrees"
         ),
@@ -149,12 +164,6 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
             "verify; scale is not asked, the pose has scale 1; no sequence, no weights by what lasts"
         ),
     )
-
-    open_numbers = {
-        "neighbours": (4, 5, 6),  # of an object, the nearest: few enough to lie within a small view around most objects
-        "matches": (10, 30),  # mapped objects for a seen one, the most alike first
-    }
-    chosen = {"neighbours": 4, "matches": 30}
 
     def __init__(self, **numbers: float) -> None:
         super().__init__(**numbers)

@@ -132,20 +132,31 @@ class BuildingSight(Sight):
 class TriangleRsim(PlaceMatcher[BuildingSight]):
     """Like triangles vote for poses; the overlap of all buildings decides between them."""
 
+    open_numbers = {
+        "ratio": (0.1, 0.15, 0.25),  # difference of two ratios of sides, alone, that may be
+        "log_area": (0.5, 1.0),  # the same of the logarithm of a ratio of building areas: masks merge and cut houses
+    }
+    chosen = {"ratio": 0.1, "log_area": 1.0}
+
     card = MatcherCard(
         name="triangle_rsim",
         version="1",
         title="Triangles of building centres",
         source=(
-            "RSIM: A Rotation and Scale Invariant Map Matching Method for UAV Visual Geolocalization (IEEE JSTARS "
-            "2025), as described in public: patterns of triangles of any three building centres, which do not depend "
-            "on rotation and scale, of buildings found in the view and in a vector map"
+            "Liu et al., RSIM: A Rotation and Scale Invariant Map Matching Method for UAV Visual Geolocalization "
+            "(IEEE JSTARS 2025), as described in public: patterns of triangles of any three building centres, which "
+            "do not depend on rotation and scale, of buildings found in the view and in a vector map"
         ),
         ours=(
             "Buildings are the nodes of the SASGeo scorer's graph. Triangles: Delaunay, and each building with any two "
-            "of its five nearest, sides up to 150 m. Two are alike by ratios of sides (0.15), the longest side (15 %, "
-            "since scale is known), ratios of the buildings' areas (a factor of e) and sense of rotation, as one "
-            "distance in a KD-tree, nearly equal sides in any order. Each match votes for a rigid pose, with the more "
+            "of its five nearest, sides up to 150 m. Two are alike by ratios of sides ("
+            f"{chosen['ratio']:g}), "
+            "the longest side (15 %, "
+            "since scale is known), ratios of the buildings' areas (their logarithms "
+            f"within {chosen['log_area']:g}) "
+            "and sense of rotation, as one "
+            "distance in a KD-tree, nearly equal sides in any order. Of the mapped triangles like a seen one the 100 "
+            "most alike vote, 30,000 in all at most, each for a rigid pose, with the more "
             "weight the rarer its triangle; the 24 poses with most votes (12 m, 8 degrees) are fitted to buildings "
             "within 10 m and ranked by intersection over union of the building cells known on both sides"
         ),
@@ -157,12 +168,6 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
             "no weights by what lasts; the overlap is its only confidence"
         ),
     )
-
-    open_numbers = {
-        "ratio": (0.1, 0.15, 0.25),  # difference of two ratios of sides, alone, that may be
-        "log_area": (0.5, 1.0),  # the same of the logarithm of a ratio of building areas: masks merge and cut houses
-    }
-    chosen = {"ratio": 0.1, "log_area": 1.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Read the buildings of the map and their triangles."""

@@ -13,8 +13,8 @@ MOST_TRIALS: Final = 6  # settings of a system: the same for all
 class Tunable:
     """A system with open numbers, each with the values that are tried; the settings are all combinations of them.
 
-    `chosen` are the values in use: of all settings those that found most in `benchmarks/open_numbers.py`, which asks all
-    systems about the same views of train places.
+    `chosen` are the values in use: of all settings those that found most in `benchmarks/open_numbers.py`, which asks
+    all systems about the same views of train places.
 
     Parameters
     ----------

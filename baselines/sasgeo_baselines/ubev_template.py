@@ -20,20 +20,29 @@ LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
 class UbevTemplate(ShiftMatcher):
     """Mean overlap of ground layers and of the layer of buildings, which is matched once for each height of roofs."""
 
+    open_numbers = {
+        "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
+        "coarse_m": (4.0, 6.0),
+    }
+    chosen = {"least_share": 0.75, "coarse_m": 4.0}
+
     card = MatcherCard(
         name="ubev_template",
         version="1",
         title="Templates of ground and roof layers, matched separately",
         source=(
-            "U-BEV, 2023, as its abstract describes it: the ground is seen in several layers of height, and the result "
-            "is matched with a map by templates"
+            "Boscolo Camiletto et al., U-BEV: Height-aware Bird's-Eye-View Segmentation and Neural Map-based "
+            "Relocalization, arXiv 2310.13766, as its abstract describes it, for cars and from street level: the "
+            "ground is seen in several layers of height, and the result is matched with a map by templates"
         ),
         ours=(
             "Heights are hypotheses, as neither view nor map tells them: roofs at 0, 5 and 15 % of the camera's "
             "height lean outwards from the middle of the view, so that the layer of buildings is drawn inwards by as "
             "much to lie on footprints. Each layer is a template by itself (intersection over union of a class over "
             "cells known on both sides); those of buildings are averaged to one class, then all classes of view or "
-            "map; cells of 4 m, then 2 m, headings 4, then 1 degree apart within two standard deviations"
+            f"map; a place of which the map knows less than {chosen['least_share']:g} of what the view knows has no "
+            f"score; cells of {chosen['coarse_m']:g} m, then half as wide, headings 4, then 1 degree apart within 2.5 "
+            "standard deviations"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
@@ -44,11 +53,6 @@ class UbevTemplate(ShiftMatcher):
         ),
     )
 
-    open_numbers = {
-        "least_share": (0.25, 0.5, 0.75),  # of the view's known cells that the map must know
-        "coarse_m": (4.0, 6.0),
-    }
-    chosen = {"least_share": 0.75, "coarse_m": 4.0}
     yaw_step_deg = YAW_STEP_DEG
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:

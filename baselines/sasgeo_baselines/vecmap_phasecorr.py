@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`vecmap_phasecorr`: phase-only correlation of weighted signed distances, class by class (VecMapLocNet)."""
+"""`vecmap_phasecorr`: whitened correlation of weighted signed distances, class by class (VecMapLocNet)."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -25,31 +25,36 @@ _NOTHING: Final = 1e-12
 class VecmapPhasecorr(ShiftMatcher):
     """Sum over classes of whitened correlations, at every place and heading."""
 
+    open_numbers = {
+        "reach_m": (8.0, 16.0, 32.0),  # where distances are truncated
+        "whitening": (0.5, 1.0),  # exponent of the modulus that a spectrum is divided by: 1 is phase alone
+    }
+    chosen = {"reach_m": 8.0, "whitening": 0.5}
+
     card = MatcherCard(
         name="vecmap_phasecorr",
         version="1",
-        title="Phase correlation of signed distances, class by class",
+        title="Whitened correlation of signed distances, class by class",
         source=(
             "Wang et al., VecMapLocNet, ISPRS Journal 225, 2025: weighted map elements and a matcher in the Fourier "
             "domain without parameters, as its abstract describes them"
         ),
         ours=(
-            "Channels are signed distances to the rim of each class, truncated at 16 m, of view and map, in place of "
-            "two learned encoders; the cross-power spectrum of each class over its modulus, times a Gaussian of one "
-            "cell; a class weighs by how far its own correlation stands out at true places of training, in standard "
-            "deviations of the places within 150 m, 1 without training; the map in cells of 4 m, then 2 m, headings in "
-            "steps of 3, then 0.75 degrees, of the prior's two standard deviations"
+            f"Channels are signed distances to the rim of each class, truncated at {chosen['reach_m']:g} m, of view "
+            "and map, in place of two learned encoders; the cross-power spectrum of each class over its modulus to "
+            f"the power {chosen['whitening']:g} (1 is phase alone), times a Gaussian of one cell; a class weighs by "
+            "how far its own correlation stands out at true places of training, in standard deviations of the places "
+            "within 150 m, 1 without training; the map in cells of 4 m, then 2 m, headings in steps of 3, then 0.75 "
+            "degrees, of 2.5 standard deviations of the prior"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=(
             "The source has three degrees of freedom: scale is 1; no sequence, weights are static, no rejection; what "
-            "is unknown has the mean distance of its class; no confidence"
+            "is unknown has the mean distance of its class, and beyond the map all classes count as far away; that "
+            "spectra are whitened is ours, not known of the source; no confidence"
         ),
     )
-
-    open_numbers = {"reach_m": (8.0, 16.0, 32.0), "coarse_m": (4.0, 6.0)}  # where distances are truncated; cells
-    chosen = {"reach_m": 8.0, "coarse_m": 6.0}
 
     def chart_of(self, region: Region) -> Chart:
         """Return the signed distances of the map as degrees: 1 deep within a class, 0 far from it."""
@@ -88,7 +93,7 @@ class VecmapPhasecorr(ShiftMatcher):
     def score(self, overlaps: Overlaps, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the weighted sum of phase correlations."""
         weights = [self.weights.get(name, 1.0) for name in names]
-        return phases(overlaps, weights)
+        return phases(overlaps, weights, whitening=self.numbers["whitening"])
 
     def learn(self, training: Training) -> str:
         """Return weights by how far each class stands out at the true places of views, as JSON."""
@@ -115,7 +120,8 @@ class VecmapPhasecorr(ShiftMatcher):
             """Note the leads in place of a score."""
             middle = overlaps.places[0] // 2
             for at, name in enumerate(names):
-                scores = phases(overlaps, [float(other == at) for other in range(len(names))])
+                alone = [float(other == at) for other in range(len(names))]
+                scores = phases(overlaps, alone, whitening=self.numbers["whitening"])
                 near = scores[middle - 1 : middle + 2, middle - 1 : middle + 2].max()
                 found[name] = float((near - scores.mean()) / max(float(scores.std()), _NOTHING))
             return np.zeros(overlaps.places, dtype=np.float32)
@@ -134,15 +140,17 @@ def _weights(saved: dict[str, float]) -> dict[str, float]:
     return sound(dict(saved), is_sound=all(0 <= weight < np.inf for weight in saved.values()))
 
 
-def phases(overlaps: Overlaps, weights: Sequence[float]) -> NDArray[np.float32]:
+def phases(overlaps: Overlaps, weights: Sequence[float], *, whitening: float) -> NDArray[np.float32]:
     """Return the sum of whitened correlations of like channels by their weights, at each place.
+
+    Spectra are divided by a power of their modulus: with 0 it is plain correlation, with 1 phase alone.
 
     A constant that is added to a channel of the map changes nothing where the view sums to 0:
 
     >>> rng = np.random.default_rng(0)
     >>> town = rng.random((1, 12, 12)).astype(np.float32)
     >>> seen = town[:, 3:8, 4:9] - town[:, 3:8, 4:9].mean()
-    >>> found = phases(Overlaps.of(seen, town, places=(8, 8)), [1.0])
+    >>> found = phases(Overlaps.of(seen, town, places=(8, 8)), [1.0], whitening=1.0)
     >>> np.unravel_index(int(found.argmax()), found.shape)
     (np.int64(3), np.int64(4))
     """
@@ -150,7 +158,8 @@ def phases(overlaps: Overlaps, weights: Sequence[float]) -> NDArray[np.float32]:
     for at, weight in enumerate(weights):
         if weight > 0:
             cross = overlaps.cross(at, at)
-            total += np.float32(weight) * cross / np.maximum(np.abs(cross), np.float32(_NOTHING))
+            modulus = np.maximum(np.abs(cross), np.float32(_NOTHING))
+            total += np.float32(weight) * cross / modulus ** np.float32(whitening)
     return overlaps.back(np.asarray(total * lowpass(len(total))))
 
 

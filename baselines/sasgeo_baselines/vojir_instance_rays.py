@@ -34,7 +34,7 @@ INDEXED: Final = 120  # rays of places of the index: three times as fast, and en
 WAVES: Final = 32  # of each signal
 STEP_M: Final = 10.0  # between places
 MOST_PLACES: Final = 400_000  # on a larger map they lie further apart
-SHORTLIST: Final = 200
+BLUR: Final = 5  # rays over which a boundary is spread: a degree off, it still overlaps
 REFINED: Final = 12  # places that are refined
 STEPS_M: Final = (5.0, 2.5)  # of a place, one after the other
 WEIGHTS: Final = (1.0, 1.0, 1.0)  # of range, boundary and hit
@@ -73,10 +73,6 @@ class Profiles:
         """Read rays; those that end where nothing is known are left out, or taken for such without a hit."""
         judged = ~rays.is_censored if censors else np.ones(rays.is_censored.shape, dtype=bool)
         return cls(values=signals(rays), is_judged=judged)
-
-    def every(self, step: int) -> Self:
-        """Return each `step`-th ray."""
-        return type(self)(values=self.values[..., ::step], is_judged=self.is_judged[:, ::step])
 
     def compared(self, blur: int) -> Floats:
         """Return the signals as they are compared: boundaries are spread over `blur` rays, all are weighed."""
@@ -164,6 +160,12 @@ class Sight:
 class VojirInstanceRays(PlaceMatcher[Sight]):
     """Nearest places by waves of rays, then the turn and the place by the rays themselves."""
 
+    open_numbers = {
+        "start_m": (0.0, 8.0, 16.0),  # from the middle of a view: rays of 80 m from there lie within a view of 192 m
+        "shortlist": (200, 1000),  # places whose rays are compared
+    }
+    chosen = {"start_m": 16.0, "shortlist": 1000}
+
     card = MatcherCard(
         name="vojir_instance_rays",
         version="1",
@@ -174,32 +176,28 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
             "looked up among places rendered from a map"
         ),
         ours=(
-            "All but that idea, carried over to views from above: 360 rays of 80 m through the patches of buildings, "
-            "from the most open ground within 16 m of the middle of a view, and from open ground 10 m apart on a map, "
-            "not from its roads; of each ray the logarithm of its range, whether the next one meets another "
-            "building or none, and whether it meets any. For the network, magnitudes of the first 32 waves of each (of "
-            "120 rays in steps of 2 m on the map), divided by their spread over training places, or over the map "
-            "without training; of the 200 nearest the mean absolute differences at each turn within two standard "
-            "deviations of the prior, boundaries spread over 5 rays, all three weighing the same; the best 12 are "
-            "moved in steps of 5, then 2.5 m. Minus the difference is the score. By default rays that end where "
-            "nothing is known count as such without a hit; the flag `censors` of the class leaves them out"
+            "All but that idea, carried over to views from above: 360 rays of 80 m (a view of 192 m shows no more) "
+            f"through the patches of buildings, from the most open ground within {chosen['start_m']:g} m of the middle "
+            "of a view, and from open ground 10 m apart on a map, not from its roads; of each ray the logarithm of "
+            "its range, whether the next one meets another building or none, and whether it meets any. For the "
+            "network, magnitudes of the first 32 waves of each (of 120 rays, in steps of 2 m on the map), divided by "
+            f"their spread over training places, or over the map without training; of the {chosen['shortlist']:g} "
+            "nearest the mean absolute differences at each turn within 2.5 standard deviations of the prior, "
+            "boundaries spread over 5 rays, all three weighing the same; the best 12 are moved in steps of 5, then "
+            "2.5 m. Minus the difference is the score. By default rays that end where nothing is known count as such "
+            "without a hit; the flag `censors` of the class leaves them out"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=(
-            "The source sees walls from a street, here a view sees roofs. Withheld where no ray meets a building; all "
-            "else of a map says nothing; what lies behind the first building is not compared, so that one that is "
-            "missed or made up changes all rays through it; in narrow yards a place of the lattice, up to 7 m off, "
-            "already sees other walls; occlusion, and the edge of a view of less than 192 m, look like open "
+            "The source sees walls from a street, here a view sees roofs. Buildings that touch are one patch, so that "
+            "the boundary between them, which the source learns from, is not seen. Withheld where no ray meets a "
+            "building; all else of a map says nothing; what lies behind the first building is not compared, so that "
+            "one that is missed or made up changes all rays through it; in narrow yards a place of the lattice, up to "
+            "7 m off, already sees other walls; occlusion, and the edge of a view of less than 192 m, look like open "
             "ground; scale is 1, no confidence"
         ),
     )
-
-    open_numbers = {
-        "start_m": (0.0, 8.0, 16.0),  # from the middle of a view: rays of 80 m from there lie within a view of 192 m
-        "blur": (1, 5),  # rays over which a boundary is spread: a degree off, it still overlaps
-    }
-    chosen = {"start_m": 0.0, "blur": 5}
 
     def __init__(self, *, censors: bool = False, **numbers: float) -> None:
         super().__init__(**numbers)
@@ -236,14 +234,15 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
             return None
         profile = Profiles.of(rays, censors=self.censors)
         start_m = (start - np.array(seen.shape[::-1]) / 2) * (seen.cell_size_m, -seen.cell_size_m)
-        waves = profile.every(RAYS // INDEXED).magnitudes()[0]
+        few = cast(seen.layer(CLASS), start[None], INDEXED, cell_m=seen.cell_size_m)  # as on the map, for boundaries
+        waves = Profiles.of(few, censors=self.censors).magnitudes()[0]
         return Sight(profile=profile, waves=waves, start_m=start_m, prior=query.prior)
 
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses with the least differences, from places with similar waves."""
         near = np.flatnonzero(disc.wider(float(np.hypot(*view.start_m)) + STEP_M).holds(self._places_m))
         away = np.square(self._waves[near] - view.waves / self._spread).sum(axis=1)
-        shortlist = near[np.argsort(away, kind="stable")[:SHORTLIST]]
+        shortlist = near[np.argsort(away, kind="stable")[: int(self.numbers["shortlist"])]]
         best = thinned(_ranked(self._turned(view, self._places_m[shortlist]), disc.wider(STEP_M)), APART_M)
         refined = self._refined(view, best[: max(REFINED, count)])
         return thinned(_ranked(refined, disc.wider(STEPS_M[0])), APART_M)[:count]
@@ -259,7 +258,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         """Return the best pose whose rays begin at each place; minus infinity is the score of one that is not known."""
         turns = turns_within(view.prior, RAYS)
         mapped = Profiles.of(self._map.rays(places_m, RAYS), censors=self.censors)
-        found = differences(view.profile, mapped, turns, blur=int(self.numbers["blur"]))
+        found = differences(view.profile, mapped, turns, blur=BLUR)
         best = found.argmin(axis=1)
         yaws_deg, least = turns[best] * (360.0 / RAYS), found[np.arange(len(found)), best]
         modes = []

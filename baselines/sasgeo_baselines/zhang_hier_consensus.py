@@ -128,6 +128,12 @@ class Agreed(Mode):
 class ZhangHierConsensus(PlaceMatcher[Seen]):
     """Retrieval by one descriptor of the view, and a similarity from patches of the crop that was found."""
 
+    open_numbers = {
+        "stride": (6, 8),  # cells between two crops: a view is at most 17 or 23 m off the middle of one
+        "near_m": (6.0, 8.0, 12.0),  # of a match from where the similarity puts it; the side of a patch is 8 m
+    }
+    chosen = {"stride": 6, "near_m": 12.0}
+
     card = MatcherCard(
         name="zhang_hier_consensus",
         version="1",
@@ -139,11 +145,12 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
         ),
         ours=(
             "Class layers in place of learned features. Crops every 24 m by a descriptor of rings and sectors, "
-            "standardised over the map, at headings 22.5 degrees apart within two standard deviations of the prior; "
+            "standardised over the map, at headings 22.5 degrees apart within 2.5 standard deviations of the prior; "
             "patches of 8 x 8 cells by shares and mean distances (to 32 m) of the classes, standardised over a crop "
             "that is turned by the heading and 48 m wider than the view on all sides; in place of the convolutions two "
             "rounds of consensus, each of which adds the mean of the eight neighbours at equal offsets; a similarity "
-            "within 8 m of at least four matches; no keypoints. The first crop gives the first answer, as in the "
+            f"within {chosen['near_m']:g} m "
+            "of at least four matches; no keypoints. The first crop gives the first answer, as in the "
             "source, and those after it further ones; without a similarity that the prior allows, the answer is the "
             "crop. Score and margin are those of retrieval; inliers and inlier_ratio, those of the first answer, are "
             "diagnostics"
@@ -155,12 +162,6 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
             "as absent in retrieval. No graph, no sequence, no weights by what lasts; its source has no rejection"
         ),
     )
-
-    open_numbers = {
-        "stride": (6, 8),  # cells between two crops: a view is at most 17 or 23 m off the middle of one
-        "near_m": (6.0, 8.0, 12.0),  # of a match from where the similarity puts it; the side of a patch is 8 m
-    }
-    chosen = {"stride": 6, "near_m": 12.0}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the crops of the map."""

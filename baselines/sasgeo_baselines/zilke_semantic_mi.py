@@ -26,6 +26,9 @@ _NOTHING: Final = 1e-9
 class ZilkeSemanticMi(ShiftMatcher):
     """Normalized mutual information over the joint histogram of labels, at every place and heading."""
 
+    open_numbers = {"coarse_m": (4.0, 6.0, 8.0), "least_share": (0.25, 0.5)}
+    chosen = {"coarse_m": 6.0, "least_share": 0.25}
+
     card = MatcherCard(
         name="zilke_semantic_mi",
         version="1",
@@ -37,9 +40,11 @@ class ZilkeSemanticMi(ShiftMatcher):
         ),
         ours=(
             "All but that idea: five groups of classes and the rest are the labels of a cell; (H(view) + H(map)) / "
-            "H(view, map) of the cells known on both sides, from correlations of all pairs of labels; which label of "
-            "the view belongs to which of the map is not assumed; the map in cells of 6 m, then 3 m, headings in steps "
-            "of 3, then 0.75 degrees, of the prior's two standard deviations; scale 1; no filter"
+            "H(view, map) of the cells with a label, or known, on both sides, from correlations of all pairs of "
+            "labels; which label of the view belongs to which of the map is not assumed; a place of which the map "
+            f"knows less than {chosen['least_share']:g} of what the view knows has no score; the map in cells of "
+            f"{chosen['coarse_m']:g} m, then half as wide, headings in steps of 3, then 0.75 degrees, of 2.5 standard "
+            "deviations of the prior; scale 1; no filter"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
@@ -48,8 +53,6 @@ class ZilkeSemanticMi(ShiftMatcher):
             "views of few labels say little; no confidence"
         ),
     )
-    open_numbers = {"coarse_m": (4.0, 6.0, 8.0), "least_share": (0.25, 0.5)}
-    chosen = {"coarse_m": 6.0, "least_share": 0.25}
 
     def chart_of(self, region: Region) -> Chart:
         """Return the labels of the map, one to a known cell."""

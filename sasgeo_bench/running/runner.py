@@ -159,7 +159,7 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
 
 
 def _tell_state(plan: RunPlan, tell: Tell) -> None:
-    """Report the finished tasks, by name if they are few, what failed in them, and how many rows answer other queries."""
+    """Report the finished tasks, by name if they are few, failures, and how many rows answer other queries."""
     whole = [part for part in plan.parts if not part.left]
     if len(whole) > MOST_LINES:
         tell(f"{plan.card.name}: nothing left in {len(whole)} of {len(plan.parts)} tasks")

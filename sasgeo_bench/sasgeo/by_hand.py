@@ -39,8 +39,8 @@ def view_by_hand(query: Query, classes: Sequence[str], *, map_date: dt.date) -> 
 
     A score is a sum over classes and cells of log-likelihood ratios of the view with and without the map, in nats, each
     times the area of its cell in m2. Cells are far from independent, so scores need a factor (a temper) to be
-    likelihoods of the whole view, and a bound on what a view says if a filter shall survive its errors. Unknown cells count 0, and so do cells near a seen line that are seen without
-    it: a line mapped there may be the same.
+    likelihoods of the whole view, and a bound on what a view says if a filter shall survive its errors. Unknown cells
+    count 0, and so do cells near a seen line that are seen without it: a line mapped there may be the same.
 
     Parameters
     ----------

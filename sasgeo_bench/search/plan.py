@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 
+SPREAD: Final = 2.5  # standard deviations of heading and scale that every search covers: one normal prior in 80 is off
+
 
 @dataclass(frozen=True, kw_only=True)
 class Plan:
@@ -27,7 +29,7 @@ class Plan:
     cells: int = 16
     beam: tuple[int, ...] = (160, 48, 16, 8, 6)
     each: int = 2
-    spread: float = 2.5
+    spread: float = SPREAD
     apart_m: float = 25.0
     around_m: float = 24.0
     threads: int = 1

@@ -19,7 +19,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, inverse
 from sasgeo_bench.search.chart import Chart
 from sasgeo_bench.search.field import between, warped
-from sasgeo_bench.search.plan import Disc, Mode, place_m, thinned, turns_of
+from sasgeo_bench.search.plan import SPREAD, Disc, Mode, place_m, thinned, turns_of
 
 Spectra = NDArray[np.complexfloating]
 
@@ -40,7 +40,7 @@ class ShiftPlan:
     coarse_m: float = 4.0
     fine_m: float = 2.0
     yaw_step_deg: float = 3.0
-    spread: float = 2.0
+    spread: float = SPREAD
     apart_m: float = 25.0
     around_m: float = 24.0
     refined: int = 8

@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.search.chart import Chart
-from sasgeo_bench.search.plan import Disc, Mode, place_m, thinned
+from sasgeo_bench.search.plan import SPREAD, Disc, Mode, place_m, thinned
 from sasgeo_bench.search.view import NOWHERE, Patch, Samples, View
 from sasgeo_bench.search.votes import ByPlanes, ByRows
 
 _FEW: Final = 32  # places a side: more cost less by transforms of planes
 _TILE: Final = 256  # places a side of a tile: larger ones take more memory and save no time
 _NOTHING: Final = 1e-6  # known cells: less is rounding of the transform
-_SPREAD: Final = 2.0  # searched standard deviations of heading and scale
 _MARGIN_M: Final = 12.0  # a mode may move so far while it is refined
 _WIDEN: Final = 0.05  # its scale may exceed the searched ones by so much
 _ROUNDS: Final = 8  # of steps of one size
@@ -82,13 +81,13 @@ class _Votes:
 
 def turns(prior: Prior, plan: VotePlan) -> tuple[Pose, ...]:
     """Return headings and scales to search, as poses at the origin."""
-    scales = [1 + offset for offset in _steps(min(_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
+    scales = [1 + offset for offset in _steps(min(SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
     yaws_deg = _yaws_deg(prior, plan)
     return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws_deg)
 
 
 def _is_any_heading(prior: Prior) -> bool:
-    return prior.yaw_sigma_deg is None or _SPREAD * prior.yaw_sigma_deg >= 180  # noqa: PLR2004
+    return prior.yaw_sigma_deg is None or SPREAD * prior.yaw_sigma_deg >= 180  # noqa: PLR2004
 
 
 def _yaws_deg(prior: Prior, plan: VotePlan) -> list[float]:
@@ -96,7 +95,7 @@ def _yaws_deg(prior: Prior, plan: VotePlan) -> list[float]:
     if prior.yaw_deg is None or prior.yaw_sigma_deg is None or _is_any_heading(prior):
         count = 4 * math.ceil(90 / plan.yaw_step_deg)
         return [360 * index / count for index in range(count)]
-    return [prior.yaw_deg + offset for offset in _steps(_SPREAD * prior.yaw_sigma_deg, plan.yaw_step_deg)]
+    return [prior.yaw_deg + offset for offset in _steps(SPREAD * prior.yaw_sigma_deg, plan.yaw_step_deg)]
 
 
 def _steps(reach: float, step: float) -> list[float]:

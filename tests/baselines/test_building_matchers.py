@@ -203,9 +203,9 @@ def test_components_are_the_answer_and_their_heights_the_scores(made, region, se
     votes = Town.of(region).votes(Seen.of(seen), disc, yaws_deg=headings(HERE.yaw_deg, 1.0))
     inside = votes[np.hypot(*(votes[:, :2] - PRIOR.center_m).T) <= PRIOR.radius_m + 12.0]
     mixture = mixture_of(inside)
-    assert answer.scores[0] == mixture.height[0]
-    assert [answer.poses[0].easting_m, answer.poses[0].northing_m] == mixture.place_m[0].tolist()
-    assert answer.diagnostics["credibility"] == credibility(mixture, PRIOR.radius_m)
+    assert answer.scores[0] == pytest.approx(mixture.height[0])
+    assert [answer.poses[0].easting_m, answer.poses[0].northing_m] == pytest.approx(mixture.place_m[0].tolist())
+    assert answer.diagnostics["credibility"] == pytest.approx(credibility(mixture, PRIOR.radius_m))
     assert 0 < answer.diagnostics["credibility"] < 1
 
 

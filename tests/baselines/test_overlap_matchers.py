@@ -148,12 +148,14 @@ def test_phase_correlation_ignores_a_constant_and_the_contrast_of_the_map():
     rng = np.random.default_rng(0)
     town = rng.random((2, 40, 40)).astype(np.float32)
     seen = town[:, 11:31, 7:27] - town[:, 11:31, 7:27].mean(axis=(1, 2), keepdims=True)
-    found = phases(Overlaps.of(seen, town, places=(21, 21)), [1.0, 1.0])
+    found = phases(Overlaps.of(seen, town, places=(21, 21)), [1.0, 1.0], whitening=1.0)
     assert np.unravel_index(int(found.argmax()), found.shape) == (11, 7)
-    darker = phases(Overlaps.of(seen, np.float32(0.5) * town, places=(21, 21)), [1.0, 1.0])
+    darker = phases(Overlaps.of(seen, np.float32(0.5) * town, places=(21, 21)), [1.0, 1.0], whitening=1.0)
     np.testing.assert_allclose(darker, found, atol=1e-5)
-    alone = phases(Overlaps.of(seen, town, places=(21, 21)), [1.0, 0.0])
-    np.testing.assert_allclose(alone, phases(Overlaps.of(seen[:1], town[:1], places=(21, 21)), [1.0]), atol=1e-6)
+    alone = phases(Overlaps.of(seen, town, places=(21, 21)), [1.0, 0.0], whitening=1.0)
+    np.testing.assert_allclose(
+        alone, phases(Overlaps.of(seen[:1], town[:1], places=(21, 21)), [1.0], whitening=1.0), atol=1e-6
+    )
 
 
 def test_signed_distances_are_truncated_and_even_where_nothing_is_known():

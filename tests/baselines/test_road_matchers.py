@@ -158,8 +158,10 @@ def test_a_tuple_by_hand():
 @given(st.lists(st.integers(0, 359), min_size=3, max_size=5), st.integers(0, 359))
 def test_junctions_are_the_same_from_wherever_bearings_count(arms_deg, turn_deg):
     ours, theirs = np.array(arms_deg, dtype=float), np.array([[0.0, 90.0, 200.0, np.nan]])
-    assert same_arms(ours, theirs, turn_deg=20.0) == same_arms(ours + turn_deg, theirs + turn_deg, turn_deg=20.0)
-    assert same_arms(ours, ours[None], turn_deg=20.0).all()
+    assert same_arms(ours, theirs, turn_deg=20.0, least=2) == same_arms(
+        ours + turn_deg, theirs + turn_deg, turn_deg=20.0, least=2
+    )
+    assert same_arms(ours, ours[None], turn_deg=20.0, least=2).all()
 
 
 def test_votes_that_agree_make_a_crowd_and_the_heaviest_is_first():

@@ -42,7 +42,7 @@ class OuyangCfbvmPf(ParticleFilter):
             "of 12 m; heights of votes x correlation over a floor of 0.03, chosen on made-up towns; 20,000 to 1,000 "
             "particles; credibility = mass of the heaviest cluster x (1 - spread / spread at the start), above 0.6 "
             "for 3 views. Buildings are patches of the raster on both sides; headings 8 degrees apart are tried "
-            "within two standard deviations of the particles, where the source has a compass"
+            "within 2.5 standard deviations of the particles, where the source has a compass"
         ),
         licence="Apache-2.0",
         tracks=("sequence",),

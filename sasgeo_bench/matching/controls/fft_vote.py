@@ -162,17 +162,18 @@ class FftVote(DenseMatcher):
 
     card = MatcherCard(
         name="fft_vote",
-        version="2",
+        version="3",
         title="Exhaustive three-state voting by FFT",
         source="Template voting of OrienterNet (Sarlin et al., CVPR 2023), on the scores of the SASGeo paper, Eqs. 7-8",
         ours=(
             "One vote a class and cell in place of learned features; division by the cells known on both sides; "
-            "scale; half of the view must be on the map; coarse cells of 4 m (8 m beyond 5 km2), then local search"
+            "scale; half of the view must be on the map; modes by their mean votes in place of a softmax and a "
+            "covariance; coarse cells of 4 m (8 m beyond 5 km2), then local search"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=(
-            "No class weighs more than another and nothing is learnt; headings and scales beyond two standard "
+            "No class weighs more than another and nothing is learnt; headings and scales beyond 2.5 standard "
             "deviations are not searched; candidates that share a place within 24 m cannot be told apart; no confidence"
         ),
     )

@@ -169,12 +169,11 @@ class BrmGrid(PlaceMatcher[Sight]):
         ),
         ours=(
             "All numbers: a north-up grid of 4 x 4 parts of 32 m and six rings of 16 m, at places 24 m apart; mean "
-            "squared difference of z-scores over the map, at the best of headings "
-            f"{chosen['yaw_step_deg']:g} degrees apart within 2.5 standard deviations of the prior; the best "
-            f"{chosen['windows']:g} "
-            "windows within the prior; then, within 20 m of each, intersection "
-            "over union of the masks of buildings in cells of 4 m and headings 3 degrees apart, which is the score. "
-            "Candidates of retrieval are compared by their masks alone. No odometry: each view stands alone"
+            f"squared difference of z-scores over the map, at the best of headings {chosen['yaw_step_deg']:g} degrees "
+            f"apart within 2.5 standard deviations of the prior; the best {chosen['windows']:g} windows within the "
+            "prior; then, within 20 m of each, intersection over union of the masks of buildings in cells of 4 m and "
+            "headings 3 degrees apart, which is the score. Candidates of retrieval are compared by their masks alone. "
+            "No odometry: each view stands alone"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -98,14 +98,12 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
             "features are kind, logarithm of area and degree; boxes are squares of the same area, laid along the line "
             "between two so that headings do not matter; attention is a softmax of ten times the edges, and three "
             "rounds each average a node with what it attends to; a node keeps its features of all rounds. Tiles every "
-            f"{chosen['step_m']:g} m, "
-            "headings 15 degrees apart within 2.5 standard deviations of the prior; of more than 1500 tiles "
-            "those whose counts of kinds are most like the view's; similarity is the cosine of features times a "
-            "Gaussian of the distance of places in the tile (24 m); for the 64 best, 20 iterations of Sinkhorn with a "
-            f"slack bin at {chosen['slack']:g}; "
-            "the score is the sum of matched similarities over the larger number of objects; the "
-            "pose a weighted least-squares fit of the matches within 8 m of the best of 200 fits of three, or the tile "
-            "itself"
+            f"{chosen['step_m']:g} m, headings 15 degrees apart within 2.5 standard deviations of the prior; of more "
+            "than 1500 tiles those whose counts of kinds are most like the view's; similarity is the cosine of "
+            "features times a Gaussian of the distance of places in the tile (24 m); for the 64 best, 20 iterations "
+            f"of Sinkhorn with a slack bin at {chosen['slack']:g}; the score is the sum of matched similarities over "
+            "the larger number of objects; the pose a weighted least-squares fit of the matches within 8 m of the "
+            "best of 200 fits of three, or the tile itself"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -98,9 +98,7 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
             "the fine stage a ridge regression of the residual (east, north, heading) from the 5 x 5 cells at three "
             "headings around it, in their standard deviations, learned from the highest cells near true places of "
             "training that are at most 1.5 cells or steps off, each turned by right angles (penalty "
-            f"{chosen['penalty']:g}); "
-            "at most one cell and one "
-            "step. Untaught it answers with the highest cell"
+            f"{chosen['penalty']:g}); at most one cell and one step. Untaught it answers with the highest cell"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -43,16 +43,14 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
         source="Ouyang et al., Defence Technology 34(4), 2024: its abstract, and a public account of the coarse stage",
         ours=(
             "The source's: windows of a vector map by the building area in six rings, shapes of buildings matched in "
-            "them, votes for a translation, a Gaussian mixture of them, an indicator of credibility. Ours is what "
-            "the abstract does not say, as in the tracker ouyang_cfbvm_pf: "
-            f"{chosen['windows']:g} windows by z-scores, "
-            "at places 24 m "
-            "apart within the prior; eight numbers of a shape; mutual best pairs with a correlation above 0.9; mean "
-            f"shift of {chosen['bandwidth_m']:g} m; "
-            "heights of votes x correlation. The components are the answer, the height is the score, "
-            "and credibility = share of the heights that the first has x (1 - spread of the mixture / radius of "
-            "the prior) is a diagnostic. Headings 8 degrees apart are tried within 2.5 standard deviations of the "
-            "prior, where the source has a compass. Buildings are patches of the raster on both sides"
+            "them, votes for a translation, a Gaussian mixture of them, an indicator of credibility. Ours is what the "
+            f"abstract does not say, as in the tracker ouyang_cfbvm_pf: {chosen['windows']:g} windows by z-scores, at "
+            "places 24 m apart within the prior; eight numbers of a shape; mutual best pairs with a correlation above "
+            f"0.9; mean shift of {chosen['bandwidth_m']:g} m; heights of votes x correlation. The components are the "
+            "answer, the height is the score, and credibility = share of the heights that the first has x (1 - spread "
+            "of the mixture / radius of the prior) is a diagnostic. Headings 8 degrees apart are tried within 2.5 "
+            "standard deviations of the prior, where the source has a compass. Buildings are patches of the raster on "
+            "both sides"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -157,14 +157,14 @@ class PolarVsc(PlaceMatcher[Sight]):
         ),
         ours=(
             "All numbers and measures: 7 groups of classes in 12 rings and 36 sectors of a disc of 96 m in radius; "
-            "places 16 m apart; a two-sample test of the groups in each ring at alpha "
-            f"{chosen['alpha']:g}, in which each patch of {chosen['patch_m']:g} m counts as one observation, with the "
-            "asymptotic distribution; places where a smaller share of rings passes than at the "
-            "best place are dropped, so that an answer remains where no place passes in all; the 200 nearest of the "
-            "rest by squared differences of rings; then the circular correlation of sectors, less the mean shares of "
-            "the map, at headings within 2.5 standard deviations of the prior, with a parabola between sectors; then "
-            "the best place in steps of 4 m around the best 16. ks_share, the share of rings that pass at the answer, "
-            "and ks_p, the least p-value, are diagnostics, which the rejector ks_gate reads"
+            f"places 16 m apart; a two-sample test of the groups in each ring at alpha {chosen['alpha']:g}, in which "
+            f"each patch of {chosen['patch_m']:g} m counts as one observation, with the asymptotic distribution; "
+            "places where a smaller share of rings passes than at the best place are dropped, so that an answer "
+            "remains where no place passes in all; the 200 nearest of the rest by squared differences of rings; then "
+            "the circular correlation of sectors, less the mean shares of the map, at headings within 2.5 standard "
+            "deviations of the prior, with a parabola between sectors; then the best place in steps of 4 m around the "
+            "best 16. ks_share, the share of rings that pass at the answer, and ks_p, the least p-value, are "
+            "diagnostics, which the rejector ks_gate reads"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

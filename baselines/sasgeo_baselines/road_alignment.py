@@ -260,9 +260,9 @@ class PopovRoadplane(Tunable):
             "seen roads are drawn to mapped ones that face the same way by ICP, 24 rounds from 20 to 4 m, point to "
             "line, for a homography of eight parameters with a prior (0.15 for place, heading and scale, 0.05 for "
             "shear, 0.2 for perspective, in halves of the view). Where the best lays at least "
-            f"{chosen['least_share']:g} of the borders within 3 m, and {chosen['least_gain']:g} more than before, "
-            " the view is moved by it, less the similarity in it, and matched "
-            "again around that answer; what is found comes first if it scores higher"
+            f"{chosen['least_share']:g} of the borders within 3 m, and {chosen['least_gain']:g} more than before,  the "
+            "view is moved by it, less the similarity in it, and matched again around that answer; what is found "
+            "comes first if it scores higher"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

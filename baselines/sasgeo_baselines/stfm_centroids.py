@@ -145,16 +145,13 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         ),
         ours=(
             "Objects are the nodes of the SASGeo scorer's graph, up to 30 m in radius, of kinds that the view shows: "
-            "neighbours the "
-            f"{chosen['neighbours']:g} nearest, "
-            "in the order of label and distance; a ratio is that to the farthest of them, "
-            "an angle that from the neighbour before, as half of its cosine and sine, a label 0 or 1. The source "
-            "compares whole pictures; here each seen object, if its neighbours all lie nearer than the border of what "
-            "the view knows of the classes of objects, votes with its "
-            f"{chosen['matches']:g} most alike "
-            "objects of the map of its own label, by the rigid pose that lays "
-            "both patterns on each other and with the weight 1 / (1 + distance). The score is the weight of the votes "
-            "that agree within 12 m and 8 degrees"
+            f"neighbours the {chosen['neighbours']:g} nearest, in the order of label and distance; a ratio is that to "
+            "the farthest of them, an angle that from the neighbour before, as half of its cosine and sine, a label 0 "
+            "or 1. The source compares whole pictures; here each seen object, if its neighbours all lie nearer than "
+            f"the border of what the view knows of the classes of objects, votes with its {chosen['matches']:g} most "
+            "alike objects of the map of its own label, by the rigid pose that lays both patterns on each other and "
+            "with the weight 1 / (1 + distance). The score is the weight of the votes that agree within 12 m and 8 "
+            "degrees"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -148,17 +148,14 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
             "do not depend on rotation and scale, of buildings found in the view and in a vector map"
         ),
         ours=(
-            "Buildings are the nodes of the SASGeo scorer's graph. Triangles: Delaunay, and each building with any two "
-            "of its five nearest, sides up to 150 m. Two are alike by ratios of sides ("
-            f"{chosen['ratio']:g}), "
-            "the longest side (15 %, "
-            "since scale is known), ratios of the buildings' areas (their logarithms "
-            f"within {chosen['log_area']:g}) "
-            "and sense of rotation, as one "
-            "distance in a KD-tree, nearly equal sides in any order. Of the mapped triangles like a seen one the 100 "
-            "most alike vote, 30,000 in all at most, each for a rigid pose, with the more "
-            "weight the rarer its triangle; the 24 poses with most votes (12 m, 8 degrees) are fitted to buildings "
-            "within 10 m and ranked by intersection over union of the building cells known on both sides"
+            "Buildings are the nodes of the SASGeo scorer's graph. Triangles: Delaunay, and each building with any "
+            f"two of its five nearest, sides up to 150 m. Two are alike by ratios of sides ({chosen['ratio']:g}), the "
+            "longest side (15 %, since scale is known), ratios of the buildings' areas (their logarithms within "
+            f"{chosen['log_area']:g}) and sense of rotation, as one distance in a KD-tree, nearly equal sides in any "
+            "order. Of the mapped triangles like a seen one the 100 most alike vote, 30,000 in all at most, each for "
+            "a rigid pose, with the more weight the rarer its triangle; the 24 poses with most votes (12 m, 8 "
+            "degrees) are fitted to buildings within 10 m and ranked by intersection over union of the building cells "
+            "known on both sides"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

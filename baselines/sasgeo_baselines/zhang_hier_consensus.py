@@ -147,13 +147,12 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
             "Class layers in place of learned features. Crops every 24 m by a descriptor of rings and sectors, "
             "standardised over the map, at headings 22.5 degrees apart within 2.5 standard deviations of the prior; "
             "patches of 8 x 8 cells by shares and mean distances (to 32 m) of the classes, standardised over a crop "
-            "that is turned by the heading and 48 m wider than the view on all sides; in place of the convolutions two "
-            "rounds of consensus, each of which adds the mean of the eight neighbours at equal offsets; a similarity "
-            f"within {chosen['near_m']:g} m "
-            "of at least four matches; no keypoints. The first crop gives the first answer, as in the "
-            "source, and those after it further ones; without a similarity that the prior allows, the answer is the "
-            "crop. Score and margin are those of retrieval; inliers and inlier_ratio, those of the first answer, are "
-            "diagnostics"
+            "that is turned by the heading and 48 m wider than the view on all sides; in place of the convolutions "
+            "two rounds of consensus, each of which adds the mean of the eight neighbours at equal offsets; a "
+            f"similarity within {chosen['near_m']:g} m of at least four matches; no keypoints. The first crop gives "
+            "the first answer, as in the source, and those after it further ones; without a similarity that the prior "
+            "allows, the answer is the crop. Score and margin are those of retrieval; inliers and inlier_ratio, those "
+            "of the first answer, are diagnostics"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

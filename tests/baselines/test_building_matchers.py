@@ -129,6 +129,24 @@ def test_rays_of_a_lattice_are_those_of_its_places(region):
     assert again.is_censored.any()  # beyond the map nothing is known
 
 
+def test_the_waves_of_a_view_are_those_of_the_map_at_its_place(made, region):
+    """Boundaries between rays depend on how many there are: both sides count them between as many."""
+    matcher = VojirInstanceRays(start_m=0.0)
+    matcher.prepare(region, None)
+    places_m, mapped = next(matcher._described(BuildingMap.of(region), 40.0))
+    rows = np.flatnonzero(mapped.any(axis=1))[:30]
+    off = []
+    for at in rows:
+        pose = Pose(easting_m=float(places_m[at, 0]), northing_m=float(places_m[at, 1]), yaw_deg=0.0)
+        sight = matcher.look(made.query_of(made.view_of(region, pose, size_cells=192), PRIOR))
+        if sight is not None:
+            off.append(
+                np.abs(sight.waves - mapped[at])[WAVES : 2 * WAVES].mean() / mapped[rows, WAVES : 2 * WAVES].mean()
+            )
+    assert len(off) > 10
+    assert np.median(off) < 0.35
+
+
 @given(quarter=st.integers(0, 3), censors=st.booleans())
 def test_waves_do_not_turn_with_a_view_and_differences_say_by_how_much(quarter, censors):
     states = yard()
@@ -201,11 +219,12 @@ def test_components_are_the_answer_and_their_heights_the_scores(made, region, se
     answer = matcher.match(made.query_of(seen, known), top_k=5)
     disc = Disc(center_m=PRIOR.center_m, radius_m=PRIOR.radius_m)
     votes = Town.of(region).votes(Seen.of(seen), disc, yaws_deg=headings(HERE.yaw_deg, 1.0))
-    inside = votes[np.hypot(*(votes[:, :2] - PRIOR.center_m).T) <= PRIOR.radius_m + 12.0]
-    mixture = mixture_of(inside)
-    assert answer.scores[0] == pytest.approx(mixture.height[0])
-    assert [answer.poses[0].easting_m, answer.poses[0].northing_m] == pytest.approx(mixture.place_m[0].tolist())
-    assert answer.diagnostics["credibility"] == pytest.approx(credibility(mixture, PRIOR.radius_m))
+    bandwidth_m = matcher.numbers["bandwidth_m"]
+    inside = votes[np.hypot(*(votes[:, :2] - PRIOR.center_m).T) <= PRIOR.radius_m + bandwidth_m]
+    mixture = mixture_of(inside, bandwidth_m=bandwidth_m)
+    assert answer.scores[0] == mixture.height[0]
+    assert [answer.poses[0].easting_m, answer.poses[0].northing_m] == mixture.place_m[0].tolist()
+    assert answer.diagnostics["credibility"] == credibility(mixture, PRIOR.radius_m)
     assert 0 < answer.diagnostics["credibility"] < 1
 
 

@@ -13,7 +13,7 @@ from sasgeo_baselines.triangle_rsim import TriangleRsim, Triangles, differences,
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import WITHHELD, check_match
-from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.sasgeo.nodes import INDEX
 from sasgeo_bench.tasks.vectors import as_features, vector_table
@@ -196,3 +196,14 @@ def test_an_object_whose_neighbours_may_be_out_of_sight_says_nothing(query, regi
     assert right_m.min() > 60 - VIEW / 2
     clear = clear_m(hidden(query, slice(60)).evidence, np.array([[0.0, 0.0]]))
     assert clear.tolist() == pytest.approx([28.0], abs=1.0)
+
+
+def test_a_class_that_a_view_does_not_read_and_one_of_no_object_hide_nothing():
+    cells = np.zeros((3, 100, 100), dtype=np.uint8)
+    cells[1] = UNKNOWN  # buildings, which the detector does not read
+    cells[2, :, :50] = UNKNOWN  # no object is made of bridges
+    view = Evidence(classes=("road_minor", "building", "bridge"), cells=cells, cell_size_m=1.0)
+    assert clear_m(view, np.array([[0.5, 0.5]])).tolist() == [50.0]
+    hiding = cells.copy()
+    hiding[0, :, :50] = UNKNOWN
+    assert clear_m(view.replace(hiding), np.array([[20.5, 0.5]])).tolist() == pytest.approx([21.0], abs=1.0)

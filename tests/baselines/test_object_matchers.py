@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sasgeo_baselines.object_matcher import Pairs, Sight, fitted
 from sasgeo_baselines.spatial_graph_clique import SpatialGraphClique, largest_clique
+from scipy.spatial.distance import pdist
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.sasgeo.nodes import INDEX, MOST_ARMS, Nodes
@@ -45,6 +46,16 @@ def test_votes_peak_at_the_true_pose():
     best = pairs.peaks(DISC, [67.0, 77.0, 87.0], count=1)[0].pose
     assert best.yaw_deg == 77.0
     assert np.hypot(best.easting_m - HERE.easting_m, best.northing_m - HERE.northing_m) < 12
+
+
+def test_peaks_lie_apart_so_that_no_place_takes_the_turn_of_another():
+    seen = nodes(scattered(12))
+    town = nodes(np.concatenate([HERE.to_map(seen.places_m), np.array(PRIOR.center_m) + scattered(40, half_m=200.0)]))
+    pairs = Pairs.of_kind(Sight(nodes=seen, prior=PRIOR), town, np.arange(len(town)))
+    peaks = pairs.peaks(DISC, [67.0, 72.0, 77.0, 82.0, 87.0], count=12)
+    places_m = np.array([(mode.pose.easting_m, mode.pose.northing_m) for mode in peaks])
+    assert len(peaks) > 6
+    assert pdist(places_m).min() >= 25.0
 
 
 def test_only_objects_of_one_kind_pair_and_a_rare_kind_weighs_more():

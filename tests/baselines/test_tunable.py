@@ -35,6 +35,15 @@ def test_the_values_in_use_are_those_that_found_most_in_the_stored_trials():
     ]
 
 
+@pytest.mark.parametrize("name", sorted(set(SYSTEMS) - {"sasgeo"}))
+def test_the_card_of_a_system_states_the_values_in_use(name):
+    kind = SYSTEMS[name]
+    own = {"stride": 4.0 * kind.chosen.get("stride", 0), "per_m2": 1 / kind.chosen.get("per_m2", 1)}  # in other units
+    assert [f"{own.get(each, value):g}" in kind.card.ours for each, value in kind.chosen.items()] == [True] * len(
+        kind.chosen
+    )
+
+
 def test_the_page_shows_the_stored_trials():
     page = (STORED.parents[1] / "concepts" / "systems.md").read_text(encoding="utf-8")
     assert "\n".join(open_numbers.lines(open_numbers.read_trials(STORED))) in page

@@ -192,13 +192,12 @@ class KinnariMcl(ParticleFilter):
         ours=(
             "The source's: correlation with the map around each particle; a measure of how good the surface of "
             "correlation is; Monte Carlo localisation. Ours: views are metric and seen from above already, so that "
-            "nothing is rectified; occupancy of five groups of classes in cells of "
-            "12 m for grey values, on 16 x 16 cells; zero-mean normalised correlation at 5 x 5 shifts; log-likelihood "
-            "ratio by a logistic regression on the correlation and how it peaks (weights 7.0 and 3.5, so that the "
-            "value counts too; a weight by the value alone is not registered), times 0.5 since views "
-            "overlap; 20,000 to 5,000 particles, resampled below half of effective ones; noise of 3 m and 1 degree; "
-            "increments and covariances of an odometer, 1 km and 90 degrees where it lost its way; a fix is accepted "
-            "where the particles are spread by 25 m or less"
+            "nothing is rectified; occupancy of five groups of classes in cells of 12 m for grey values, on 16 x 16 "
+            "cells; zero-mean normalised correlation at 5 x 5 shifts; log-likelihood ratio by a logistic regression "
+            "on the correlation and how it peaks (weights 7.0 and 3.5, so that the value counts too; a weight by the "
+            "value alone is not registered), times 0.5 since views overlap; 20,000 to 5,000 particles, resampled "
+            "below half of effective ones; noise of 3 m and 1 degree; increments and covariances of an odometer, 1 km "
+            "and 90 degrees where it lost its way; a fix is accepted where the particles are spread by 25 m or less"
         ),
         licence="Apache-2.0",
         tracks=("sequence",),

@@ -129,10 +129,11 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         ours=(
             "On class layers: the descriptor is the root of each class's share in a square of the view's side, north "
             "up, half a side apart, by Euclidean distance; view and map are drawn in greys by class, in cells of the "
-            f"map, and matched one way by ORB with a ratio test ({chosen['ratio']:g}), a feature for each {1 / chosen['per_m2']:g} m2; a similarity by RANSAC (five matches within 3 m at least) in place of PnP, as a "
-            "plane has no depth; it is dropped where heading or scale are beyond 2.5 standard deviations of the prior "
-            "and some slack, or the place is not allowed. Tiles without a similarity answer with their middle and the "
-            "prior's heading, behind all others"
+            f"map, and matched one way by ORB with a ratio test ({chosen['ratio']:g}), a feature for each "
+            f"{1 / chosen['per_m2']:g} m2; a similarity by RANSAC (five matches within 3 m at least) in place of PnP, "
+            "as a plane has no depth; it is dropped where heading or scale are beyond 2.5 standard deviations of the "
+            "prior and some slack, or the place is not allowed. Tiles without a similarity answer with their middle "
+            "and the prior's heading, behind all others"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

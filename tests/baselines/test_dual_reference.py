@@ -7,7 +7,16 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sasgeo_baselines.image.hu_dual_reference import SHARES, HuDualReference, HuImageryOnly, HuMapOnly, centred
+from sasgeo_baselines.image import hu_dual_reference
+from sasgeo_baselines.image.hu_dual_reference import (
+    MOST_LESSONS,
+    SHARES,
+    HuDualReference,
+    HuImageryOnly,
+    HuMapOnly,
+    centred,
+    lessons,
+)
 
 import sasgeo_bench as sgb
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence, LayerBits, observe
@@ -43,6 +52,14 @@ def test_the_sum_finds_what_either_reference_shows(region, window, seen):
         assert off_m(matcher.match(query, top_k=1).poses[0]) < 5.0
 
 
+def test_an_answer_tells_how_many_references_counted(region, window, seen):
+    matcher = prepared(HuDualReference, region)
+    both = query_of(picture(window, TRUTH), evidence=seen(TRUTH))
+    on_map, on_imagery = replace(both, frames=()), query_of(picture(window, TRUTH))
+    told = [matcher.match(query, top_k=1).diagnostics["parts"] for query in (both, on_map, on_imagery)]
+    assert told == [2.0, 1.0, 1.0]
+
+
 def test_a_half_looks_at_its_own_reference_alone(region, window, seen):
     query = query_of(picture(window, TRUTH), evidence=seen(ELSEWHERE))
     on_map, on_imagery = (prepared(kind, region).match(query, top_k=1).poses[0] for kind in (HuMapOnly, HuImageryOnly))
@@ -50,6 +67,21 @@ def test_a_half_looks_at_its_own_reference_alone(region, window, seen):
     assert off_m(on_imagery, TRUTH) < 5.0
     for learned, best in (('{"share": 0.0}', on_map), ('{"share": 1.0}', on_imagery)):
         assert prepared(HuDualReference, region, learned).match(query, top_k=1).poses[0] == best
+
+
+def test_a_half_neither_learns_nor_reads_the_other(region, window, seen, monkeypatch):
+    """Parts of a region that are missing here would raise."""
+    assert [isinstance(kind(), sgb.Learner) for kind in (HuDualReference, HuMapOnly, HuImageryOnly)] == [
+        True,
+        False,
+        False,
+    ]
+    query = query_of(picture(window, TRUTH), evidence=seen(TRUTH))
+    of_imagery = SimpleNamespace(grid=region.grid, classes=region.classes, imagery=region.imagery)
+    assert off_m(prepared(HuImageryOnly, of_imagery).match(query, top_k=1).poses[0]) < 5.0
+    monkeypatch.delattr(hu_dual_reference, "sight_of")
+    of_map = SimpleNamespace(grid=region.grid, classes=region.classes, known=region.known, layer=region.layer)
+    assert off_m(prepared(HuMapOnly, of_map).match(query, top_k=1).poses[0]) < 5.0
 
 
 def test_what_shows_nothing_is_withheld(region, window, seen):
@@ -80,6 +112,26 @@ def test_a_class_counts_the_same_however_rare_it_is():
     channels = centred(layers, known).channels
     assert np.allclose((channels**2).sum(axis=(1, 2)), 100)
     assert np.allclose(channels.sum(axis=(1, 2)), 0, atol=1e-4)
+
+
+def test_a_class_says_nothing_where_it_is_unknown_and_others_are_known():
+    """Buildings are unknown in the left half; on the right they are where water is."""
+    cells = np.zeros((2, 112, 112), dtype=np.uint8)
+    cells[:, ::8] = cells[:, 1::8] = sgb.PRESENT
+    cells[0, :, :56] = UNKNOWN
+    view = Evidence(classes=("building", "water"), cells=cells, cell_size_m=1.0)
+    drawn = hu_dual_reference._Drawn.of(query_of(NOISE, evidence=view), view.classes, gsd_m=2.0)
+    turned = drawn.turned(replace(TRUTH, yaw_deg=0.0, scale=1.0), 56)
+    assert turned.is_known.all()
+    assert not turned.channels[0, :, :28].any()
+    assert np.allclose(turned.channels[0, :, 28:], turned.channels[1, :, 28:])
+
+
+def test_lessons_are_pairs_with_pictures_taken_evenly():
+    shown, blind = (SimpleNamespace(track="localization", frames=frames) for frames in ((NOISE,), ()))
+    pairs = [(blind if at % 10 else shown, SimpleNamespace(pose=TRUTH)) for at in range(600)]
+    assert len(lessons(sgb.Training(regions={}, pairs=pairs))) == MOST_LESSONS
+    assert len(lessons(sgb.Training(regions={}, pairs=[pairs[0]] * 119))) == MOST_LESSONS
 
 
 @pytest.mark.parametrize("text", ["x", "{}", "null", '{"share": 3}', '{"share": NaN}'])

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sasgeo_baselines.polar_vsc import PolarVsc
 from sasgeo_baselines.rejectors import leads
 from sasgeo_baselines.rejectors.entropy import Entropy
 from sasgeo_baselines.rejectors.inliers import Inliers
@@ -23,6 +24,7 @@ from sasgeo_baselines.rejectors.nearest_score import NearestScore
 from sasgeo_baselines.rejectors.ratio_spread import RatioSpread
 from sasgeo_baselines.rejectors.score_ratio import ScoreRatio
 from sasgeo_baselines.rejectors.similarity_distribution import SimilarityDistribution
+from sasgeo_baselines.rejectors.statistical_uncertainty import StatisticalUncertainty
 from sasgeo_baselines.rejectors.sue import Sue
 from sklearn.isotonic import IsotonicRegression
 
@@ -35,7 +37,7 @@ PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.to
 REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.rejectors"]
 RULES = (
     *(Margin, MarginNms, Entropy, Inliers, KsGate, NearestScore, RatioSpread, ScoreRatio, SimilarityDistribution),
-    Sue,
+    *(StatisticalUncertainty, Sue),
 )
 LEARNERS = (IsotonicMargin, LogisticAll)
 WITHHELD = Prediction(query_id="withheld")
@@ -91,6 +93,10 @@ def test_every_rejector_is_registered() -> None:
     folder = Path(import_module("sasgeo_baselines.rejectors").__file__).parent
     files = {path.stem for path in folder.glob("*.py")} - {"__init__", "leads"}
     assert set(REGISTERED) == files == {rule.card.name for rule in (*RULES, *LEARNERS)}
+
+
+def test_the_card_of_the_gate_states_the_alpha_that_the_matcher_uses() -> None:
+    assert f"at alpha {PolarVsc.chosen['alpha']:g}, " in KsGate.card.ours
 
 
 @pytest.mark.parametrize("rule", [*RULES, *LEARNERS])
@@ -166,7 +172,7 @@ def test_a_larger_lead_is_a_smaller_number(rule, one, more) -> None:
 # Learnt
 
 
-@pytest.mark.parametrize("learner", LEARNERS)
+@pytest.mark.parametrize("learner", [*LEARNERS, Sue])
 def test_a_learner_says_that_it_must_be_fitted(learner) -> None:
     with pytest.raises(RuntimeError, match="fit"):
         learner().p_false([WITHHELD])

@@ -3,9 +3,9 @@
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -40,22 +40,25 @@ _STEP: Final = 2.0  # pixels at the edge of a view between two headings
 
 @dataclass(frozen=True, kw_only=True)
 class Reference:
-    """Map and imagery on one lattice: channels of classes, and directions of gradients where there is imagery."""
+    """Map and imagery on one lattice: channels of classes, and directions of gradients; None for a half without weight.
+
+    `pictured` is None where there is no imagery, too.
+    """
 
     grid: sgb.Grid
     classes: tuple[str, ...]
-    drawn: Stack
+    drawn: Stack | None
     pictured: Stack | None
 
     @classmethod
-    def of(cls, region: sgb.Region) -> "Reference":
-        """Read a map and its imagery in pixels of 2 m."""
+    def of(cls, region: sgb.Region, share: float) -> "Reference":
+        """Read a map and its imagery in pixels of 2 m, but not the half whose weight is 0; `share` is the imagery's."""
         factor = max(1, round(PIXEL_M / region.grid.cell_size_m))
         rows, cols = (-(-cells // factor) for cells in region.grid.shape)
         grid = replace(region.grid, cell_size_m=factor * region.grid.cell_size_m, rows=rows, cols=cols)
-        known = pooled(region.known(), factor) > 0.5  # noqa: PLR2004 - most of a pixel
-        layers = [pooled(region.layer(name) == sgb.PRESENT, factor) for name in region.classes]
-        return cls(grid=grid, classes=region.classes, drawn=centred(layers, known), pictured=_pictured(region, grid))
+        drawn = _mapped(region, factor) if share < 1 else None
+        pictured = _pictured(region, grid) if share > 0 else None
+        return cls(grid=grid, classes=region.classes, drawn=drawn, pictured=pictured)
 
 
 def pooled(mask: NDArray[np.bool_], factor: int) -> Planes:
@@ -70,14 +73,24 @@ def pooled(mask: NDArray[np.bool_], factor: int) -> Planes:
     return np.asarray(cv2.resize(wide, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def centred(layers: list[Planes], known: NDArray[np.bool_]) -> Stack:
-    """Return channels less their mean over what is known, 0 elsewhere; each as strong as any other where it varies."""
-    found = np.zeros((len(layers), *known.shape), dtype=np.float32)
-    for layer, into in zip(layers, found, strict=True):
-        values = layer[known]
+def centred(layers: list[Planes] | Planes, known: NDArray[np.bool_]) -> Stack:
+    """Return channels less their mean over what is known, 0 elsewhere; each as strong as any other where it varies.
+
+    `known` has shape (rows, cols), or (C, rows, cols) where classes are known at different places.
+    """
+    found = np.zeros((len(layers), *known.shape[-2:]), dtype=np.float32)
+    masks = np.broadcast_to(known, found.shape)
+    for layer, mask, into in zip(layers, masks, found, strict=True):
+        values = layer[mask]
         if len(values) and values.std() > 0:
-            into[known] = (values - values.mean()) / values.std()
-    return Stack(channels=found, is_known=known)
+            into[mask] = (values - values.mean()) / values.std()
+    return Stack(channels=found, is_known=np.asarray(masks.any(axis=0)))
+
+
+def _mapped(region: sgb.Region, factor: int) -> Stack:
+    """Return channels of the classes of the map, in pixels of `factor` cells a side."""
+    known = pooled(region.known(), factor) > 0.5  # noqa: PLR2004 - most of a pixel
+    return centred([pooled(region.layer(name) == sgb.PRESENT, factor) for name in region.classes], known)
 
 
 def _pictured(region: sgb.Region, grid: sgb.Grid) -> Stack | None:
@@ -97,70 +110,83 @@ def _pictured(region: sgb.Region, grid: sgb.Grid) -> Stack | None:
     return Stack(channels=np.stack([np.where(is_known, plane, 0) for plane in planes[:-1]]), is_known=is_known)
 
 
-class HuDualReference:
+class _HuReference:
     """Scores of the map and of the imagery, each in standard deviations, added at every pose."""
+
+    card: sgb.MatcherCard
+    share: float  # of the imagery
+
+    def __init__(self) -> None:
+        self._reference: Reference | None = None
+
+    def prepare(self, region: sgb.Region, learned: str | None) -> None:
+        """Read what has a weight: map, imagery or both."""
+        del learned
+        is_useless = "imagery" in self.card.needs and region.imagery is None
+        self._reference = None if is_useless else Reference.of(region, self.share)
+
+    def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
+        """Return the best poses, or rank the candidates by the best pose near each."""
+        pair = None if self._reference is None else _Pair.of(query, self._reference)
+        field = None if pair is None else pair.fields((self.share,))[0]
+        if pair is None or field is None:
+            return sgb.WITHHELD
+        diagnostics = {"peak": field.peak(), "parts": float(sum(part is not None for part in pair.parts))}
+        if query.track == "retrieval":
+            return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
+        modes = field.best(disc_of(query.prior), most=min(top_k, MOST_PLACES) + 1)
+        return answer_places(modes, top_k=min(top_k, MOST_PLACES), diagnostics=diagnostics)
+
+
+class HuDualReference(_HuReference):
+    """Map and imagery, by a share that is learned."""
 
     card = sgb.MatcherCard(
         name="hu_dual_reference",
-        version="1",
+        version="2",
         title="Map and imagery as one reference",
         source=(
             "Hu et al., Combining OpenStreetMap with Satellite Imagery to Enhance Cross-View Geo-Localization, Sensors "
             "25(1), 2024: a reference of two kinds, fused, as its abstract describes it; its query is a street view"
         ),
         ours=(
-            "All but the two references: the map's score is the correlation of class layers, the imagery's that of "
-            f"directions of gradients ({PICTURE}), in pixels of 2 m at every place, heading and scale within 2.5 "
-            "standard deviations; each less its mean over places, over its standard deviation; the share of the "
-            "imagery is that of seven that is right most often on training places, half without training"
+            "All but the two references: the map's score is the correlation of class layers, each over the cells where "
+            f"its class is known, the imagery's that of directions of gradients ({PICTURE}), in pixels of 2 m at every "
+            "place, heading and scale within 2.5 standard deviations; each less its mean over places, over its "
+            "standard deviation; the share of the imagery is that of seven that is right most often on training "
+            "places, half without training"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         needs=("image", "imagery"),
         limits=(
-            "Nothing of the source's network; no graph, no sequence, no weights by what lasts, no rejection; places no "
-            f"finer than 2 m; half of the view must be on the map; {LIMITS}"
+            "Nothing of the source's network; no posterior, and no gate by how much the map holds; no graph, no "
+            "sequence, no weights by what lasts, no rejection, no confidence; places no finer than 2 m; half of the "
+            "view must be on the map; one picture of the query; leaning roofs and relief are not modelled. Where the "
+            "picture is flat or shows less than a tenth of the view, the map alone decides; where no class varies, the "
+            "imagery alone: the diagnostic `parts` says how many counted"
         ),
     )
-    share: ClassVar[float | None] = None  # of the imagery; None: learned
-
-    def __init__(self) -> None:
-        self._reference: Reference | None = None
+    share = UNTAUGHT
 
     def prepare(self, region: sgb.Region, learned: str | None) -> None:
-        """Read map, imagery, and the share of the imagery."""
-        is_useless = "imagery" in self.card.needs and region.imagery is None
-        self._reference = None if is_useless else Reference.of(region)
-        taught = UNTAUGHT if learned is None else read_learned(self.card.name, learned, _share)
-        self._share = taught if self.share is None else self.share
-
-    def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
-        """Return the best poses, or rank the candidates by the best pose near each."""
-        pair = None if self._reference is None else _Pair.of(query, self._reference)
-        field = None if pair is None else pair.fields((self._share,))[0]
-        if field is None:
-            return sgb.WITHHELD
-        diagnostics = {"peak": field.peak()}
-        if query.track == "retrieval":
-            return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
-        modes = field.best(disc_of(query.prior), most=min(top_k, MOST_PLACES) + 1)
-        return answer_places(modes, top_k=min(top_k, MOST_PLACES), diagnostics=diagnostics)
+        """Read the share of the imagery, then map and imagery."""
+        self.share = UNTAUGHT if learned is None else read_learned(self.card.name, learned, _share)
+        super().prepare(region, learned)
 
     def learn(self, training: sgb.Training) -> str:
         """Return the share of the imagery that is right most often; of equal ones the nearest to one half."""
-        pairs = [pair for pair in training.pairs if pair[0].track == "localization" and pair[1].pose is not None]
-        chosen = [pair for pair in pairs if pair[0].frames][:: max(1, len(pairs) // MOST_LESSONS)]
         right, at = dict.fromkeys(SHARES, 0), ""
-        for query, truth in sorted(chosen, key=lambda pair: pair[0].region):
+        for query, truth in sorted(lessons(training), key=lambda pair: pair[0].region):
             if query.region != at:
-                at, reference = query.region, Reference.of(training.regions[query.region])
+                at, reference = query.region, Reference.of(training.regions[query.region], UNTAUGHT)
             pair = _Pair.of(query, reference)
             for share, field in zip(SHARES, pair.fields(SHARES) if pair else (), strict=False):
                 right[share] += _is_right(field, query, truth)
         return json.dumps({"share": max(SHARES, key=lambda share: (right[share], -abs(share - UNTAUGHT)))})
 
 
-class HuMapOnly(HuDualReference):
+class HuMapOnly(_HuReference):
     """`hu_map_only`: the map alone."""
 
     share = 0.0
@@ -169,12 +195,15 @@ class HuMapOnly(HuDualReference):
         name="hu_map_only",
         title="Map alone, as one half of hu_dual_reference",
         needs=(),
-        ours="The map's half of `hu_dual_reference`: the correlation of class layers in pixels of 2 m",
+        ours=(
+            "The map's half of `hu_dual_reference`: the correlation of class layers in pixels of 2 m, each over the "
+            "cells where its class is known"
+        ),
         limits="One half of `hu_dual_reference`, to see what the other adds; no confidence",
     )
 
 
-class HuImageryOnly(HuDualReference):
+class HuImageryOnly(_HuReference):
     """`hu_imagery_only`: the imagery alone."""
 
     share = 1.0
@@ -185,6 +214,16 @@ class HuImageryOnly(HuDualReference):
         ours="The imagery's half of `hu_dual_reference`: the correlation of directions of gradients in pixels of 2 m",
         limits=f"One half of `hu_dual_reference`, to see what the other adds; {LIMITS}",
     )
+
+
+def lessons(training: sgb.Training) -> list[tuple[sgb.Query, sgb.Truth]]:
+    """Return at most `MOST_LESSONS` localization queries with pictures and poses, evenly from all of them."""
+    pairs = [
+        pair
+        for pair in training.pairs
+        if pair[0].track == "localization" and pair[0].frames and pair[1].pose is not None
+    ]
+    return pairs[:: max(1, -(-len(pairs) // MOST_LESSONS))]
 
 
 def _share(saved: dict[str, float]) -> float:
@@ -238,10 +277,10 @@ class _Pair:
         gsd_m = reference.grid.cell_size_m
         turns = turns_for(query, reach_m=side_of(query) / 2, step_m=_STEP * gsd_m)
         size_px = size_for(turns, side_of(query) / gsd_m)
-        sight = sight_of(query, gsd_m=gsd_m)
+        sight = sight_of(query, gsd_m=gsd_m) if reference.pictured else None
         laid = (
-            (reference.drawn, _Drawn.of(query, reference.classes, gsd_m=gsd_m)),
-            (reference.pictured, None if sight is None else _Pictured(sight=sight)),
+            (reference.drawn, _Drawn.of(query, reference.classes, gsd_m=gsd_m) if reference.drawn else None),
+            (reference.pictured, _Pictured(sight=sight) if sight else None),
         )
         found = [
             _Part(search=Search.of(stack, reference.grid, bounds, margin=size_px // 2), view=view, size_px=size_px)
@@ -291,7 +330,7 @@ class _Pictured:
 
 @dataclass(frozen=True, kw_only=True)
 class _Drawn:
-    """A view of classes: shares of each on pixels of the map, and where all are known."""
+    """A view of classes: shares of each on pixels of the map, and where each is known, both of shape (C, n, n)."""
 
     layers: Planes
     is_known: NDArray[np.bool_]
@@ -302,26 +341,25 @@ class _Drawn:
         seen = query.evidence
         size = max(1, round(side_of(query) / gsd_m))
         layers = np.zeros((len(classes), size, size), dtype=np.float32)
-        is_known = np.zeros((size, size), dtype=bool)
-        for name, into in zip(classes, layers, strict=True):
+        is_known = np.zeros(layers.shape, dtype=bool)
+        for at, name in enumerate(classes):
             if name in seen.classes:
                 cells = seen.layer(name)
-                into[:] = _resized(cells == sgb.PRESENT, size)
-                is_known |= _resized(cells != sgb.UNKNOWN, size) > 0.5  # noqa: PLR2004 - most of a pixel
-        return cls(layers=layers, is_known=is_known) if centred(list(layers), is_known).channels.any() else None
+                layers[at] = _resized(cells == sgb.PRESENT, size)
+                is_known[at] = _resized(cells != sgb.UNKNOWN, size) > 0.5  # noqa: PLR2004 - most of a pixel
+        return cls(layers=layers, is_known=is_known) if centred(layers, is_known).channels.any() else None
 
     def turned(self, turn: sgb.Pose, size_px: int) -> Stack:
         """Return the view north up, if its heading and scale are those of `turn`."""
         along, across = (how(math.radians(turn.yaw_deg)) / turn.scale for how in (math.cos, math.sin))
         turning = np.array([[along, across], [-across, along]])
-        shift = (len(self.is_known) - 1) / 2 - turning @ np.full(2, (size_px - 1) / 2)
+        shift = (self.layers.shape[-1] - 1) / 2 - turning @ np.full(2, (size_px - 1) / 2)
         matrix, how = np.column_stack([turning, shift]), cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        planes = [cv2.warpAffine(plane, matrix, (size_px, size_px), flags=how) for plane in self._planes()]
-        return centred([np.asarray(plane, dtype=np.float32) for plane in planes[:-1]], np.asarray(planes[-1]) > 0.5)  # noqa: PLR2004
-
-    def _planes(self) -> Iterator[Planes]:
-        yield from self.layers
-        yield self.is_known.astype(np.float32)
+        layers, is_known = (
+            np.array([cv2.warpAffine(plane, matrix, (size_px, size_px), flags=how) for plane in planes])
+            for planes in (self.layers, self.is_known.astype(np.float32))
+        )
+        return centred(layers, is_known > 0.5)  # noqa: PLR2004 - most of a pixel
 
 
 def _resized(mask: NDArray[np.bool_], size: int) -> Planes:

@@ -25,8 +25,8 @@ class Entropy:
         ),
         licence="Apache-2.0",
         limits=(
-            "Uncalibrated: the softmax has no fitted temperature; blind to the scale of the scores; the number of "
-            "candidates that a matcher gives moves it"
+            "Uncalibrated: the softmax has no fitted temperature; blind to the scale of the scores and so, "
+            "nearly, to the lead of the first; the number of candidates that a matcher gives moves it"
         ),
         is_calibrated=False,
     )

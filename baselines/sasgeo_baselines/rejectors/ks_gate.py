@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_baselines.polar_vsc import PolarVsc
 from sasgeo_baselines.rejectors.leads import with_withheld
 from sasgeo_bench import Prediction, RejectorCard
 
@@ -24,8 +25,8 @@ class KsGate:
         ),
         ours=(
             "The test as a rejector: 1 - (ks_share + ks_p) / 2 of the diagnostics of polar_vsc, which lies below 1/2 "
-            "where all rings pass at alpha 0.01, and above it where one fails; answers without them, those of other "
-            "matchers, say 1/2; withheld answers say 1"
+            f"where all rings pass at alpha {PolarVsc.chosen['alpha']:g}, and above it where one fails; answers "
+            "without them, those of other matchers, say 1/2; withheld answers say 1"
         ),
         licence="Apache-2.0",
         limits=(

@@ -91,14 +91,15 @@ def scores_of(prediction: Prediction) -> Values:
     return np.clip(np.array([score for _, score in prediction.candidates], dtype=np.float64), -MOST, MOST)
 
 
-def spread_m2(prediction: Prediction, *, most: int, far_m: float) -> float:
-    """Return the variance along an axis of the places of the first candidates, weighed by `softmax`, m2.
+def spread_m2(prediction: Prediction, *, slope: float, most: int, far_m: float) -> float:
+    """Return the variance along an axis of the places of the first candidates, m2; it is the mean of both axes.
 
-    It is the mean of both axes; an offset from the mean place counts as `far_m` at most.
+    A weight is the exponential of `slope` times the score; an offset from the mean place counts as `far_m` at most.
     """
-    chosen = prediction.candidates[:most]
-    places_m = np.array([_place(pose) for pose, _ in chosen])
-    shares = softmax(scores_of(prediction)[:most])
+    places_m = np.array([_place(pose) for pose, _ in prediction.candidates[:most]])
+    scores = scores_of(prediction)[:most]
+    weights = np.exp(slope * (scores - scores.max()))
+    shares = weights / weights.sum()
     away_m = np.abs(places_m - shares @ places_m)
     return float((shares @ np.square(np.minimum(away_m, far_m))).mean())
 

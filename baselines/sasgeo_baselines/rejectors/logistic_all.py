@@ -44,7 +44,10 @@ class LogisticAll:
             "kind only; withheld answers say 1 and are not learnt from"
         ),
         licence="Apache-2.0",
-        limits="Linear in its features; fitted for one matcher; as good as calibration is like the test",
+        limits=(
+            "Linear in its features, of which entropy is nearly blind to the lead of the first score; fitted for one "
+            "matcher; as good as calibration is like the test"
+        ),
     )
 
     def __init__(self) -> None:

@@ -47,5 +47,14 @@ class RatioSpread:
 
 
 def _doubt(item: Prediction) -> float:
-    gaps = 1 - ratios(scores_of(item)[:MOST])
-    return float(1 - np.sqrt(np.square(gaps).mean())) / 2 if len(gaps) else 1 / 2
+    return (1 - spread_of_ratios(scores_of(item))) / 2
+
+
+def spread_of_ratios(scores: NDArray[np.float64]) -> float:
+    """Return the root mean square of 1 less the ratios of the further scores to the first, 0..1; 0 for one score.
+
+    >>> spread_of_ratios(np.array([4.0, 3.0, 3.0])), spread_of_ratios(np.array([4.0, 4.0]))
+    (0.25, 0.0)
+    """
+    gaps = 1 - ratios(scores[:MOST])
+    return float(np.sqrt(np.square(gaps).mean())) if len(gaps) else 0.0

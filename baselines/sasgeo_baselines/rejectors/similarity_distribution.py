@@ -11,6 +11,7 @@ from sasgeo_baselines.rejectors.leads import scores_of, with_withheld
 from sasgeo_bench import Prediction, RejectorCard
 
 FEWEST: Final = 3  # candidates: of two, the rest has no spread
+_LEAST_SPREAD: Final = 0.01  # of the largest score in size: where the others tie, a small lead is no certainty
 
 
 class SimilarityDistribution:
@@ -18,7 +19,7 @@ class SimilarityDistribution:
 
     card = RejectorCard(
         name="similarity_distribution",
-        version="1",
+        version="2",
         title="Lead of the first score over the distribution of the others",
         source=(
             "Similarity Distribution of Miller, Milford, Hafez, Ramchurn and Ehsan, Through the Lens of Doubt, arXiv "
@@ -28,13 +29,13 @@ class SimilarityDistribution:
         ),
         ours=(
             "The formula, which the abstract does not give: d is the lead of the first score over the mean of the "
-            "others, over their standard deviation; 1 / (2 + d); a tie, or fewer than three candidates, says 1/2; "
-            "withheld answers say 1"
+            "others, over their standard deviation, which is at least a hundredth of the largest score in size; "
+            "1 / (2 + d); a tie, or fewer than three candidates, says 1/2; withheld answers say 1"
         ),
         licence="Apache-2.0",
         limits=(
             "Uncalibrated; others are the candidates that the matcher gives, the best places, not all of a map; their "
-            "number moves it"
+            "number moves it; where they nearly tie, scores need a meaningful zero"
         ),
         is_calibrated=False,
     )
@@ -48,10 +49,17 @@ class SimilarityDistribution:
 
 
 def _doubt(item: Prediction) -> float:
-    scores = scores_of(item)
+    return 1 / (2 + distinctness(scores_of(item)))
+
+
+def distinctness(scores: NDArray[np.float64]) -> float:
+    """Return the lead of the first score over the mean of the others, in their standard deviations; 0 for too few.
+
+    >>> distinctness(np.array([6.0, 3.0, 1.0])), round(distinctness(np.array([1.0, 0.99, 0.99])), 6)
+    (4.0, 1.0)
+    """
     if len(scores) < FEWEST:
-        return 1 / 2
-    scores = scores / max(float(np.abs(scores).max()), 1e-300)  # squares of large scores overflow
-    first, others = scores[0], scores[1:]
-    lead, spread = float(first - others.mean()), float(others.std())
-    return spread / (2 * spread + lead) if lead > 0 else 1 / 2
+        return 0.0
+    scaled = scores / max(float(np.abs(scores).max()), 1e-300)  # squares of large scores overflow
+    first, others = scaled[0], scaled[1:]
+    return max(float(first - others.mean()), 0.0) / max(float(others.std()), _LEAST_SPREAD)

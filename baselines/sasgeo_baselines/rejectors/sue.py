@@ -6,12 +6,16 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.metrics import roc_auc_score  # type: ignore[import-untyped, unused-ignore]
 
-from sasgeo_baselines.rejectors.leads import APART_M, spread_m2, with_withheld
+from sasgeo_baselines.rejectors.leads import APART_M, answered, scores_of, spread_m2, with_withheld
 from sasgeo_bench import Prediction, RejectorCard
 
 MOST: Final = 10  # candidates, as in the source
 FAR_M: Final = 500.0  # as in the source: what is further away counts as that far
+SLOPES: Final = (1.0, 3.0, 10.0, 30.0)  # per usual standard deviation of the first ten scores
+UNTAUGHT: Final = 10.0  # the slope where calibration knows one kind only
+_NEAR: Final = 1e-150  # a smaller spread is none, so that quotients stay finite
 
 
 class Sue:
@@ -19,37 +23,66 @@ class Sue:
 
     card = RejectorCard(
         name="sue",
-        version="1",
+        version="2",
         title="Spread of the places of the first ten candidates",
         source=(
             "SUE: Zaffar, Nan and Kooij, On the Estimation of Image-matching Uncertainty in Visual Place Recognition, "
             "CVPR 2024, and its published code: weighted variance of the places of the ten nearest references, mean of "
-            "both axes, offsets cut at 500 m, weights that fall exponentially with the distance of descriptors"
+            "both axes, offsets cut at 500 m, weights that fall exponentially with the distance of descriptors, by a "
+            "slope that is set by hand for each data set"
         ),
         ours=(
-            "Weights by a softmax of the scores over their standard deviation, in place of a slope that is chosen for "
-            "each data set; offsets cut on both sides; as many candidates as are given, if fewer than ten; v / (v + 25 "
-            "m squared), 25 m being the widest tolerance of the benchmark; one candidate alone has no spread and says "
-            "1/2; withheld answers say 1"
+            "Weights fall exponentially with the score's distance from the first; of the slopes "
+            f"{', '.join(f'{slope:g}' for slope in SLOPES)} for each usual standard deviation of the first ten scores "
+            "(the median over answers of calibration with any), the one that best tells false fixes there, by the area "
+            f"under the ROC curve, and {UNTAUGHT:g} where calibration knows one kind only; offsets cut on both sides; "
+            "as many candidates as are given, if fewer than ten; v / (v + 25 m squared), 25 m being the widest "
+            "tolerance of the benchmark; one candidate alone has no spread and says 1/2; withheld answers say 1"
         ),
         licence="Apache-2.0",
         limits=(
-            "Uncalibrated; measures the spacing of candidates, too: most matchers give none within 25 m of another, "
-            "and none beyond the disc of the prior"
+            "Uncalibrated: calibration chooses the slope alone; measures the spacing of candidates, too: most matchers "
+            "give none within 25 m of another, and none beyond the disc of the prior"
         ),
         is_calibrated=False,
     )
 
+    def __init__(self) -> None:
+        self.remark = ""
+        self._slope: float | None = None
+
     def fit(self, predictions: Sequence[Prediction], is_false: NDArray[np.bool_]) -> None:
-        """Do nothing."""
+        """Choose the slope."""
+        at = answered(predictions)
+        answers = [predictions[index] for index in at]
+        truth = np.asarray(is_false, dtype=bool)[at]
+        unit = _usual_spread(answers)
+        self.remark = ""
+        if truth.all() or not truth.any():
+            self._slope = UNTAUGHT / unit
+            self.remark = f"answers of calibration are of one kind only: the slope is {UNTAUGHT:g}, not chosen"
+            return
+        areas = [roc_auc_score(truth, [_doubt(item, slope / unit) for item in answers]) for slope in SLOPES]
+        self._slope = SLOPES[int(np.argmax(areas))] / unit
 
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
         """Return values that grow with the spread, shape (N,)."""
-        return with_withheld(predictions, lambda answers: np.array([_doubt(item) for item in answers]))
+        slope = self._slope
+        if slope is None:
+            message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
+            raise RuntimeError(message)
+        return with_withheld(predictions, lambda answers: np.array([_doubt(item, slope) for item in answers]))
 
 
-def _doubt(item: Prediction) -> float:
+def _usual_spread(answers: Sequence[Prediction]) -> float:
+    """Return the median of the standard deviations of the first scores, of answers with any; 1 if none has."""
+    spreads = np.array([scores_of(item)[:MOST].std() for item in answers])
+    some = spreads[spreads > _NEAR]
+    return float(np.median(some)) if len(some) else 1.0
+
+
+def _doubt(item: Prediction, slope: float) -> float:
     if len(item.candidates) == 1:
         return 1 / 2
-    variance_m2 = spread_m2(item, most=MOST, far_m=FAR_M)
+    variance_m2 = spread_m2(item, slope=slope, most=MOST, far_m=FAR_M)
     return variance_m2 / (variance_m2 + APART_M**2)

@@ -1,12 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Retrieval of map tiles by a learned embedding: locations are classes, the bottleneck before them is the feature."""
+"""Retrieval of map tiles by a learned embedding: a linear feature that tells locations apart, shared with views."""
 
 import base64
 import hashlib
 import json
-import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import groupby
 from typing import Any, Final, Self
@@ -22,6 +21,7 @@ from sasgeo_baselines.polar import (
     DEPTH,
     GROUPS,
     RADIUS_M,
+    RINGS,
     SECTORS,
     SIDE,
     described,
@@ -50,39 +50,51 @@ from sasgeo_bench import (
 STRIDE: Final = 6  # cells between two tiles of a gallery: 24 m, so that no place is farther than 17 m from one
 APART_M: Final = 25.0  # between two places of an answer
 YAW_STEP_DEG: Final = 7.5  # a third of a sector
-DIMENSIONS: Final = 128  # of the learned feature, as the recipe has it
 NUMBERS: Final = len(GROUPS) * DEPTH  # of a descriptor
 
-OTHERS: Final = 48  # locations of each training map besides those of views
-MOST_OTHERS: Final = 480  # of all: bounds memory and time
+OTHERS: Final = 400  # locations of each training map besides those of views
+MOST_ROWS: Final = 120_000  # descriptors of all these: bounds memory (220 MB) and time (a minute)
 MOST_VIEWS: Final = 1200  # of training
 NEAR_M: Final = 12.0  # a made-up view lies so far from its tile, as the middle of a real one from the lattice
 NEAR_DEG: Final = 4.0  # half a step of headings
-_FORMAT: Final = "sasgeo-baselines embedding 1"
+_FORMAT: Final = "sasgeo-baselines embedding 2"
 _QUARTERS: Final = 4
 _FULL: Final = 255.0
 _DIGITS: Final = 6  # of a cosine: equal tiles are equal
-_AT_ONCE: Final = 64  # tiles cut together: 16 MB
+_AT_ONCE: Final = 64  # tiles cut together: 16 MB; locations whose lessons are read together
 _SMALL: Final = 0.05  # standard deviation of a number of the descriptor that is noise
-_RATE: Final = 1e-3
+_NOTHING: Final = 1e-6  # of the largest ratio of scatters: a direction in which locations do not differ
 
-# Of the cards of all who learn an embedding.
-OURS: Final = (
-    "In place of networks for pictures: a descriptor of view and map alike (occupancy of 7 groups of classes in 8 "
-    "rings and 16 sectors of a disc of 96 m, and how much lies near them), and a linear bottleneck of 128 numbers in "
-    "front of the softmax (MLPClassifier of scikit-learn, 30 epochs). Locations are those of the views of training, "
-    "and up to 48 random ones of each of its maps, shown from within 12 m of their middle with errors drawn from those "
-    "of training's views. The gallery has a tile every 24 m, facing north; a view is turned north from each heading "
-    "that it may have, 7.5 degrees apart within two standard deviations of the prior. A candidate has a tile of its own"
-)
+
+def ours(chosen: Mapping[str, float]) -> str:
+    """Return what the cards of all who learn an embedding say, with their open numbers."""
+    return (
+        f"In place of networks for pictures: a descriptor of view and map alike (occupancy of {len(GROUPS)} groups of "
+        f"classes in {RINGS} rings and {SECTORS} sectors of a disc of {RADIUS_M:g} m, and how much lies near them). In "
+        f"place of a trained network before a softmax: a linear bottleneck of up to {chosen['size']:g} numbers, the "
+        "directions in which locations differ most for what differs within them (linear discriminants; "
+        f"{chosen['shrinkage']:g} of the mean variance within locations is added to that of each direction). A "
+        "bottleneck trained before a softmax over the locations of training ranked new locations worse than the plain "
+        "descriptor: it learned no distance for them. Locations are those of the views of training, and up to "
+        f"{OTHERS} random ones of each of its maps, fewer where their tiles and views would be more than "
+        f"{MOST_ROWS:,}; they are shown from within {NEAR_M:g} m of their middle with errors drawn from those of the "
+        "views of their map. The gallery has a tile every "
+        f"{STRIDE * CELL_M:g} m, facing north; a view is turned north from each heading that it may have, "
+        f"{YAW_STEP_DEG:g} degrees apart within {SPREAD:g} standard deviations of the prior. A candidate has a tile of "
+        "its own"
+    )
+
+
 LIMITS: Final = (
-    "Works on class layers until pictures are the query. Untaught it ranks by the cosine of the plain descriptor, less "
-    "its mean over the map. The answer is the middle of a tile, up to 17 m off; views are cut beyond 96 m from their "
-    "middle; what is unknown in a view counts as average, what is unknown on the map as empty; scale is 1; no "
-    "sequence, no weights by what lasts, no rejection, no confidence"
+    "Works on class layers, not on pictures. Untaught it ranks by the cosine of the plain descriptor, less its mean "
+    "over the map and divided by its spread there. The answer is the middle of a tile, up to "
+    f"{STRIDE * CELL_M / 2**0.5:.0f} m off; views are cut beyond {RADIUS_M:g} m from their middle; what is unknown in "
+    "a view counts as average, what is unknown on the map as empty; scale is 1; no sequence, no weights by what lasts, "
+    "no rejection, no confidence"
 )
 
 Rows = NDArray[np.float32]  # descriptors or features, shape (N, NUMBERS) or (N, F)
+Stored = NDArray[np.float16]  # the same where there are many
 
 
 def unit(rows: Rows) -> Rows:
@@ -149,39 +161,45 @@ class Ground:
 
 @dataclass(frozen=True, kw_only=True)
 class Embedding:
-    """Linear feature of a descriptor: (descriptor - mean) @ weights, of length 1; of the descriptor, without weights.
+    """Linear feature of a descriptor: (descriptor - mean) / spread @ weights, of length 1; weights are 1 if not given.
 
-    `mean` has shape (NUMBERS,), `weights` (NUMBERS, DIMENSIONS).
+    `mean` and `spread` have shape (NUMBERS,), `weights` (NUMBERS, F).
     """
 
     mean: Rows
+    spread: Rows
     weights: Rows | None = None
 
-    def features(self, descriptors: Rows) -> Rows:
-        """Return features of descriptors; what is unknown (NaN) counts as average."""
-        centred = np.nan_to_num(descriptors - self.mean)
-        return unit(centred if self.weights is None else centred @ self.weights)
+    def standard(self, descriptors: NDArray[np.floating]) -> Rows:
+        """Return standardised descriptors; what is unknown (NaN) counts as average."""
+        return np.asarray(np.nan_to_num((descriptors - self.mean) / self.spread), dtype=np.float32)
+
+    def features(self, descriptors: NDArray[np.floating]) -> Rows:
+        """Return features of descriptors."""
+        rows = self.standard(descriptors)
+        return unit(rows if self.weights is None else rows @ self.weights)
 
     def to_text(self) -> str:
         """Return it as JSON."""
         assert self.weights is not None  # noqa: S101 - nothing was learned otherwise
-        content = np.concatenate([self.mean[:, None], self.weights], axis=1).astype("<f2").tobytes()
+        content = np.column_stack([self.mean, self.spread, self.weights]).astype("<f2").tobytes()
         numbers = base64.b85encode(content).decode("ascii")
         return json.dumps({"format": _FORMAT, "crc32": zlib.crc32(content), "numbers": numbers})
 
     @classmethod
-    def read(cls, text: str, *, name: str) -> Self:
+    def read(cls, text: str, *, name: str) -> "Embedding":
         """Read a learned text for the matcher `name`; raise one line if it is damaged."""
 
-        def read(saved: dict[str, Any]) -> NDArray[np.float32]:
+        def read(saved: dict[str, Any]) -> Embedding:
             """Return all numbers."""
             content = base64.b85decode(saved["numbers"])
-            numbers = np.frombuffer(content, dtype="<f2").astype(np.float32).reshape(NUMBERS, 1 + DIMENSIONS)
+            numbers = np.frombuffer(content, dtype="<f2").astype(np.float32).reshape(NUMBERS, -1)
+            found = Embedding(mean=numbers[:, 0], spread=numbers[:, 1], weights=numbers[:, 2:])
             is_whole = saved["format"] == _FORMAT and saved["crc32"] == zlib.crc32(content)
-            return sound(numbers, is_sound=is_whole and bool(np.isfinite(numbers).all()))
+            is_sound = numbers.shape[1] > 2 and bool(np.isfinite(numbers).all() and (found.spread > 0).all())  # noqa: PLR2004
+            return sound(found, is_sound=is_whole and is_sound)
 
-        numbers = read_learned(name, text, read)
-        return cls(mean=numbers[:, 0], weights=numbers[:, 1:])
+        return read_learned(name, text, read)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,15 +207,15 @@ class Gallery:
     """Places of a map, shape (N, 2), and features of the tiles around them, north up, shape (N, F)."""
 
     places_m: NDArray[np.float64]
-    features: NDArray[np.float16]
+    features: Stored
 
     @classmethod
-    def of(cls, grid: Grid, rows: NDArray[np.float16], embedding: Embedding) -> Self:
+    def of(cls, grid: Grid, rows: Stored, embedding: Embedding) -> Self:
         """Embed the descriptors of a map, shape (rows, cols, NUMBERS)."""
-        features = [embedding.features(row.astype(np.float32)).astype(np.float16) for row in rows]
+        features = [embedding.features(row).astype(np.float16) for row in rows]
         return cls(places_m=places_m(grid, rows.shape[:2], stride=STRIDE), features=np.concatenate(features))
 
-    def within(self, disc: Disc) -> tuple[NDArray[np.float64], NDArray[np.float16]]:
+    def within(self, disc: Disc) -> tuple[NDArray[np.float64], Stored]:
         """Return the places within a disc, shape (N, 2), and their features."""
         inside = disc.holds(self.places_m)
         return self.places_m[inside], self.features[inside]
@@ -220,8 +238,8 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
     others = OTHERS
     several_deg: tuple[float, ...] = (0.0,)  # turns of the copies of a view whose mean is its feature
 
-    open_numbers = {"penalty": (1e-4, 1e-3, 1e-2), "epochs": (15, 30)}  # of squared weights; of training
-    chosen = {"penalty": 1e-3, "epochs": 30}
+    open_numbers = {"shrinkage": (0.1, 0.3, 0.9), "size": (64, 128)}  # of the scatter within locations; of features
+    chosen = {"shrinkage": 0.3, "size": 128}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the map, by the plain descriptor if nothing was learned."""
@@ -229,7 +247,7 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         self._classes = region.classes
         self._ground = Ground.of(region)
         rows = np.stack([row.astype(np.float16) for row in described(region, stride=STRIDE)])
-        self._embedding = taught or Embedding(mean=rows.mean(axis=(0, 1), dtype=np.float32))
+        self._embedding = taught or _plain(rows)
         self._gallery = Gallery.of(region.grid, rows, self._embedding)
 
     def look(self, query: Query) -> Sight | None:
@@ -298,24 +316,22 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         """Return the embedding of the locations of training, as JSON."""
         pairs = [pair for pair in training.pairs if pair[0].track == "localization" and pair[1].pose is not None]
         chosen = sorted(pairs[:: -(-len(pairs) // MOST_VIEWS) or 1], key=lambda pair: pair[0].region)
-        lessons: list[Lessons] = []
-        others = min(self.others, MOST_OTHERS // max(1, len({query.region for query, _ in chosen})))
+        shown = self.copies + len(self.heights) * self.made_up
+        others = min(self.others, MOST_ROWS // (shown * max(1, len({query.region for query, _ in chosen}))))
+        lessons: list[Stored] = []
         for name, some in groupby(chosen, key=lambda pair: pair[0].region):
-            region, rng = training.regions[name], _rng(name)
+            region = training.regions[name]
             ground = Ground.of(region)
-            lessons.extend(self._of_views(ground, list(some)))
-            lessons.extend(self._of_others(ground, region.grid, others, rng))
+            seen = list(self._of_views(ground, list(some)))
+            errors = np.concatenate([lesson.errors for lesson in seen])
+            lessons.extend(lesson.rows for lesson in seen)
+            lessons.extend(self._of_others(ground, region.grid, others, errors, _rng(name)))
         if len(lessons) < 2:  # noqa: PLR2004 - two classes
             message = f"{self.card.name}: training shows {len(lessons)} locations, expected two at least"
             raise ValueError(message)
-        return fitted(
-            lessons,
-            _rng(self.card.name),
-            penalty=self.numbers["penalty"],
-            epochs=int(self.numbers["epochs"]),
-        ).to_text()
+        return fitted(lessons, shrinkage=self.numbers["shrinkage"], size=int(self.numbers["size"])).to_text()
 
-    def _of_views(self, ground: Ground, pairs: Sequence[tuple[Query, Truth]]) -> Iterator["Lessons"]:
+    def _of_views(self, ground: Ground, pairs: Sequence[tuple[Query, Truth]]) -> Iterator["Lesson"]:
         """Yield the lessons of each location that views of training show."""
         by_place: dict[tuple[float, float], list[tuple[Evidence, Pose]]] = {}
         for query, truth in pairs:
@@ -334,10 +350,12 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
             )
             level = self.heights.index(1.0) * len(shown) + np.arange(len(shown))
             errors = seen[level] - tiles[np.arange(len(shown)) % self.copies]
-            yield Lessons(tiles=tiles, views=seen, errors=errors, is_made_up=False)
+            yield Lesson(rows=np.concatenate([tiles, seen]).astype(np.float16), errors=errors.astype(np.float16))
 
-    def _of_others(self, ground: Ground, grid: Grid, count: int, rng: np.random.Generator) -> Iterator["Lessons"]:
-        """Yield the lessons of locations anywhere on a map, seen from near their middles without errors."""
+    def _of_others(
+        self, ground: Ground, grid: Grid, count: int, errors: Stored, rng: np.random.Generator
+    ) -> Iterator[Stored]:
+        """Yield the lessons of locations anywhere on a map, seen from near their middles with such errors."""
         west_m, south_m, east_m, north_m = grid.bounds_m
         for _ in range(count):
             place_m = rng.uniform((west_m, south_m), (east_m, north_m))
@@ -353,12 +371,9 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
                 for height in self.heights
                 for at in range(self.made_up)
             ]
-            yield Lessons(
-                tiles=ground.tiles(self._copied(pose)),
-                views=ground.tiles(views),
-                errors=np.zeros((0, NUMBERS), dtype=np.float32),
-                is_made_up=True,
-            )
+            tiles = ground.tiles(self._copied(pose))
+            seen = ground.tiles(views) + errors[rng.integers(len(errors), size=len(views))]
+            yield np.concatenate([tiles, np.clip(seen, 0.0, 1.0)]).astype(np.float16)
 
     def _turn_deg(self, at: int) -> float:
         """Return the heading of a copy; a view is shown at that of the copy of its number."""
@@ -374,47 +389,66 @@ def _from_height(evidence: Evidence, height: float) -> Evidence:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lessons:
-    """Descriptors of one location: its tile and copies of it, and views; made-up views are without errors so far.
+class Lesson:
+    """Descriptors of one location: its tile and copies of it, then views; and how views differ from the tile there."""
 
-    `errors` are differences between views and the tile from where they were taken.
+    rows: Stored
+    errors: Stored
+
+
+def fitted(locations: Sequence[Stored], *, shrinkage: float, size: int) -> Embedding:
+    """Return up to `size` linear discriminants of locations, each with the descriptors of its tiles and views.
+
+    They are the leading directions of the scatter of the means of locations over that within locations, to which
+    `shrinkage` of its mean variance is added in all directions. In features, what differs within locations has about
+    the same variance in each. The largest weight of a direction is positive.
     """
+    from scipy.linalg import eigh  # noqa: PLC0415 - slow to import, and only learning needs it
 
-    tiles: Rows
-    views: Rows
-    errors: Rows
-    is_made_up: bool
+    plain = _measured(locations)
+    within, middles, count = np.zeros((NUMBERS, NUMBERS)), [], 0
+    for rows, lengths in _together(locations):
+        table = plain.standard(rows)
+        means = np.add.reduceat(table, np.cumsum([0, *lengths[:-1]]), axis=0) / np.array(lengths)[:, None]
+        table -= np.repeat(means, lengths, axis=0)
+        within += table.T @ table
+        middles.append(means)
+        count += len(table)
+    within /= count
+    floor = max(shrinkage * float(np.trace(within)) / NUMBERS, _NOTHING)
+    between = np.cov(np.concatenate(middles), rowvar=False)
+    most = min(size, len(locations) - 1, NUMBERS)
+    ratios, directions = eigh(between, within + floor * np.eye(NUMBERS), subset_by_index=(NUMBERS - most, NUMBERS - 1))
+    kept = np.flatnonzero(ratios > _NOTHING * ratios[-1])[::-1] if ratios[-1] > 0 else np.array([most - 1])
+    weights = directions[:, kept]
+    weights *= np.where(np.take_along_axis(weights, np.abs(weights).argmax(axis=0)[None], axis=0) < 0, -1.0, 1.0)
+    return replace(plain, weights=weights.astype(np.float32))
 
 
-def fitted(lessons: Sequence[Lessons], rng: np.random.Generator, *, penalty: float, epochs: int) -> Embedding:
-    """Return the weights of a bottleneck before a softmax over locations: shared by tiles and views (instance loss)."""
-    from sklearn.exceptions import ConvergenceWarning  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415
-    from sklearn.neural_network import MLPClassifier  # type: ignore[import-untyped, unused-ignore]  # noqa: PLC0415
+def _together(locations: Sequence[Stored]) -> Iterator[tuple[Rows, list[int]]]:
+    """Yield the descriptors of some locations at a time, and how many each has."""
+    for first in range(0, len(locations), _AT_ONCE):
+        some = locations[first : first + _AT_ONCE]
+        yield np.concatenate(some).astype(np.float32), [len(rows) for rows in some]
 
-    errors = np.concatenate([lesson.errors for lesson in lessons])
-    rows, label = [], []
-    for at, lesson in enumerate(lessons):
-        views = lesson.views
-        if lesson.is_made_up and len(errors):
-            views = np.clip(views + errors[rng.integers(len(errors), size=len(views))], 0.0, 1.0)
-        rows += [lesson.tiles, views]
-        label += [at] * (len(lesson.tiles) + len(views))
-    table = np.concatenate(rows)
-    mean = np.nanmean(table, axis=0)
-    spread = np.maximum(np.nanstd(table, axis=0), _SMALL)
-    model = MLPClassifier(
-        hidden_layer_sizes=(DIMENSIONS,),
-        activation="identity",
-        alpha=penalty,
-        learning_rate_init=_RATE,
-        max_iter=epochs,
-        n_iter_no_change=epochs,
-        random_state=int(rng.integers(2**31)),
-    )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # it is stopped early on purpose
-        model.fit(np.nan_to_num((table - mean) / spread), label)
-    return Embedding(mean=mean.astype(np.float32), weights=(model.coefs_[0] / spread[:, None]).astype(np.float32))
+
+def _measured(locations: Sequence[Stored]) -> Embedding:
+    """Return the mean and spread of descriptors over what is known."""
+    known, total, squares = np.zeros((3, NUMBERS))
+    for rows, _ in _together(locations):
+        known += (~np.isnan(rows)).sum(axis=0)
+        total += np.nansum(rows, axis=0)
+        squares += np.nansum(np.square(rows), axis=0)
+    mean = total / known
+    spread = np.sqrt(np.maximum(squares / known - mean**2, _SMALL**2))
+    return Embedding(mean=mean.astype(np.float32), spread=spread.astype(np.float32))
+
+
+def _plain(rows: Stored) -> Embedding:
+    """Return the plain descriptor, standardised over a map, of whose places it has rows and columns."""
+    mean = rows.mean(axis=(0, 1), dtype=np.float32)
+    variance = np.mean([np.square(row - mean).mean(axis=0) for row in rows], axis=0)
+    return Embedding(mean=mean, spread=np.maximum(np.sqrt(variance), _SMALL).astype(np.float32))
 
 
 def _rng(name: str) -> np.random.Generator:

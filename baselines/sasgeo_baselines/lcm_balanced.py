@@ -3,7 +3,7 @@
 
 from typing import Final
 
-from sasgeo_baselines.embedding import LIMITS, OURS, EmbeddingMatcher
+from sasgeo_baselines.embedding import LIMITS, EmbeddingMatcher, ours
 from sasgeo_bench import MatcherCard
 
 COPIES: Final = 36  # 10 degrees from each other
@@ -22,15 +22,15 @@ class LcmBalanced(EmbeddingMatcher):
             "augmented until a class has as many as views from drones; the features of several queries are averaged"
         ),
         ours=(
-            "36 copies of the tile of a location, 10 degrees from each other, and as many views at the same headings, "
-            "so that the feature tells places and hardly headings. A question has one view: the several queries whose "
-            f"features are averaged are copies of it that are turned by -10, 0 and 10 degrees. {OURS}"
+            f"{COPIES} copies of the tile of a location, {360 / COPIES:g} degrees from each other, and as many views "
+            "at the same headings, so that the feature tells places and hardly headings. A question has one view: the "
+            "several queries whose features are averaged are copies of it that are turned by "
+            f"{', '.join(f'{turn_deg:g}' for turn_deg in SEVERAL_DEG)} degrees. {ours(EmbeddingMatcher.chosen)}"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
-        limits=f"Nearly blind to directions within a tile, and so to the heading that it answers; {LIMITS}",
+        limits=f"Nearly blind to directions within a tile, and so to the heading that it answers. {LIMITS}",
     )
-    chosen = {"penalty": 1e-4, "epochs": 15}
     copies = COPIES
     made_up = COPIES
     several_deg = SEVERAL_DEG

@@ -3,10 +3,11 @@
 
 from typing import Final
 
-from sasgeo_baselines.embedding import LIMITS, OURS, EmbeddingMatcher
+from sasgeo_baselines.embedding import LIMITS, EmbeddingMatcher, ours
 from sasgeo_bench import MatcherCard
 
-HEIGHTS: Final = (0.75, 1.0, 1.25, 1.5)  # 150, 200, 250 and 300 m over the second
+HEIGHTS: Final = (0.75, 1.0, 1.25, 1.5)  # as remembered: 150, 200, 250 and 300 m, over the second
+MADE_UP: Final = 2  # views of a random location at each height
 
 
 class SuesMultiHeight(EmbeddingMatcher):
@@ -21,15 +22,14 @@ class SuesMultiHeight(EmbeddingMatcher):
             "four heights, which are ranked by a feature that they share"
         ),
         ours=(
-            "The heights are 0.75, 1, 1.25 and 1.5 of that of the view, whose descriptor is read at four scales, as if "
-            "the height were not known. One tile, facing north, and its views at all heights, turned north, are the "
-            "lessons of a location; a random one has two views at each height. A question is asked at its own height. "
-            f"{OURS}"
+            f"The heights are {', '.join(f'{height:g}' for height in HEIGHTS)} of that of the view, whose descriptor "
+            "is read at as many scales, as if the height were not known. One tile, facing north, and its views at all "
+            f"heights, turned north, are the lessons of a location; a random one has {MADE_UP} views at each height. A "
+            f"question is asked at its own height. {ours(EmbeddingMatcher.chosen)}"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
-        limits=f"A feature that bears wrong heights tells less than one for the right height, which is known; {LIMITS}",
+        limits=f"A feature that bears wrong heights tells less than one for the right height, which is known. {LIMITS}",
     )
-    chosen = {"penalty": 1e-4, "epochs": 15}
     heights = HEIGHTS
-    made_up = 2
+    made_up = MADE_UP

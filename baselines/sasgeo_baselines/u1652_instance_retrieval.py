@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """`u1652_instance_retrieval`: tiles ranked by a feature learned with an instance loss (University-1652)."""
 
-from sasgeo_baselines.embedding import LIMITS, OURS, EmbeddingMatcher
+from sasgeo_baselines.embedding import LIMITS, EmbeddingMatcher, ours
 from sasgeo_bench import MatcherCard
 
 
@@ -17,8 +17,8 @@ class U1652InstanceRetrieval(EmbeddingMatcher):
             "from a satellite share a feature in front of one softmax (instance loss), and are ranked by its cosine"
         ),
         ours=(
-            "One tile, facing north, and its views, turned north, are the lessons of a location; a random one has 8 "
-            f"views. {OURS}"
+            "One tile, facing north, and its views, turned north, are the lessons of a location; a random one has "
+            f"{EmbeddingMatcher.made_up} views. {ours(EmbeddingMatcher.chosen)}"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from sasgeo_baselines.embedding import DIMENSIONS, NUMBERS, STRIDE, Embedding, Ground, north_up
+from sasgeo_baselines.embedding import NUMBERS, STRIDE, Embedding, Ground, fitted, north_up
 from sasgeo_baselines.lcm_balanced import LcmBalanced
 from sasgeo_baselines.polar import CELL_M, described, view_descriptor
 from sasgeo_baselines.sues_multi_height import SuesMultiHeight
@@ -85,14 +85,66 @@ def test_beyond_the_map_nothing_is(ground):
 
 
 def test_a_feature_by_hand():
-    """Of two numbers that differ from the mean by 3 and 4 one is doubled; what is unknown adds nothing."""
-    mean, weights = np.zeros(NUMBERS, dtype=np.float32), np.zeros((NUMBERS, DIMENSIONS), dtype=np.float32)
-    mean[:2], weights[0, 0], weights[1, 1] = 1.0, 2.0, 1.0
+    """Two numbers differ from the mean by 3 and 16, 3 and 8 spreads; one is doubled; what is unknown adds nothing."""
+    mean, spread, weights = np.zeros(NUMBERS), np.ones(NUMBERS), np.zeros((NUMBERS, 128))
+    mean[:2], spread[1], weights[0, 0], weights[1, 1] = 1.0, 2.0, 2.0, 1.0
     row = mean.copy()
-    row[:3] = 4.0, 9.0, np.nan
-    found = Embedding(mean=mean, weights=weights).features(row[None])[0]
+    row[:3] = 4.0, 17.0, np.nan
+    found = Embedding(mean=mean, spread=spread, weights=weights).features(row[None])[0]
     assert found[:3].tolist() == pytest.approx([0.6, 0.8, 0.0])
-    assert Embedding(mean=mean).features(mean[None]).any() == 0
+    plain = Embedding(mean=mean, spread=spread)
+    assert plain.features(row[None])[0, :3].tolist() == pytest.approx([3 / 73**0.5, 8 / 73**0.5, 0.0])
+    assert not plain.features(mean[None]).any()
+
+
+def lessons(rng, count):
+    """Made-up locations of nine descriptors each; in 20 directions these differ more than locations do."""
+    across = np.linalg.qr(np.random.default_rng(1).normal(size=(NUMBERS, 20)))[0].T
+    own = rng.normal(0.5, 0.1, (count, 1, NUMBERS)) + rng.normal(0.0, 2.0, (count, 9, len(across))) @ across
+    return list((own + rng.normal(0.0, 0.02, own.shape)).astype(np.float16))
+
+
+def test_taught_it_ranks_new_locations_better_than_untaught():
+    rng = np.random.default_rng(2)
+    known, new = lessons(rng, 150), np.stack(lessons(rng, 60))
+    taught = fitted(known, shrinkage=0.3, size=128)
+    plain = replace(taught, weights=None)
+    likest = [(made.features(new[:, 1]) @ made.features(new[:, 0]).T).argmax(axis=1) for made in (taught, plain)]
+    right_taught, right_plain = ((rows == np.arange(len(new))).sum() for rows in likest)
+    assert right_taught > 50
+    assert right_plain < 20
+
+
+@pytest.mark.parametrize(("shrinkage", "size"), [(0.1, 64), (0.9, 128)])
+def test_directions_are_discriminants_whose_signs_are_decided(shrinkage, size):
+    """Directions tell apart no more than the means of locations do, and of like variance within locations."""
+    known = lessons(np.random.default_rng(3), 70)
+    found = fitted(known, shrinkage=shrinkage, size=size)
+    assert found.weights.shape == (NUMBERS, min(size, len(known) - 1))
+    assert (found.weights.max(axis=0) == np.abs(found.weights).max(axis=0)).all()
+    parts = [found.standard(rows) for rows in known]
+    within = np.concatenate([rows - rows.mean(axis=0) for rows in parts])
+    shrunk = within.T @ within / len(within)
+    shrunk += shrinkage * np.trace(shrunk) / NUMBERS * np.eye(NUMBERS)
+    np.testing.assert_allclose(found.weights.T @ shrunk @ found.weights, np.eye(found.weights.shape[1]), atol=1e-3)
+    means = np.stack([rows.mean(axis=0) for rows in parts]) @ found.weights
+    between = np.cov(means, rowvar=False)
+    assert (np.diff(np.diag(between)) <= 1e-3).all()
+    assert np.abs(between - np.diag(np.diag(between))).max() < 1e-3 * between[0, 0]
+
+
+def test_locations_that_are_all_alike_teach_something_finite():
+    found = fitted([np.full((3, NUMBERS), 0.5, dtype=np.float16)] * 4, shrinkage=0.1, size=64)
+    assert np.isfinite(Embedding.read(found.to_text(), name="x").weights).all()
+
+
+@pytest.mark.parametrize("kind", MATCHERS)
+def test_a_card_names_the_numbers_in_use(kind):
+    size, shrinkage = (f"{kind.chosen[name]:g}" for name in ("size", "shrinkage"))
+    assert f"up to {size} numbers" in kind.card.ours
+    assert f"{shrinkage} of the mean variance" in kind.card.ours
+    assert len(kind.settings()) == 6
+    assert kind.chosen in kind.settings()
 
 
 @pytest.mark.parametrize("kind", MATCHERS)
@@ -109,7 +161,7 @@ def test_a_view_is_found_on_another_map_than_those_of_training(made, region, lea
 def test_the_same_training_gives_the_same_text_and_it_is_small(training, learned):
     for kind, text in learned.items():
         assert len(text.encode()) < MOST_LEARNED_BYTES / 3
-        assert Embedding.read(text, name="x").weights.shape == (NUMBERS, DIMENSIONS)
+        assert Embedding.read(text, name="x").weights.shape == (NUMBERS, 38)  # of 39 locations
         first, again = (small(kind, others=4).learn(training) for _ in range(2))
         assert first == again != text
 

@@ -29,7 +29,10 @@ class LcmBalanced(EmbeddingMatcher):
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
-        limits=f"Nearly blind to directions within a tile, and so to the heading that it answers. {LIMITS}",
+        limits=(
+            "Nearly blind to directions within a tile, and so to the heading that it answers: where that is known, "
+            f"it costs places. {LIMITS}"
+        ),
     )
     copies = COPIES
     made_up = COPIES

@@ -137,7 +137,7 @@ class Pairs:
         best = np.argpartition(-total, min(_EACH, len(total) - 1))[:_EACH]
         for at in sorted(best.tolist(), key=lambda at: (-total[at], at)):
             near = (np.abs(cells - (at % cols, at // cols)) <= _WINDOW // 2).all(axis=1)
-            if total[at] > 0:
+            if near.any():  # the filter leaves more than nothing where there is none
                 middle_m = np.average(places_m[near], axis=0, weights=weight[near])
                 pose = Pose(easting_m=float(middle_m[0]), northing_m=float(middle_m[1]), yaw_deg=yaw_deg)
                 yield Mode(pose=pose, score=float(total[at]))

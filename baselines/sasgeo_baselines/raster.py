@@ -112,8 +112,8 @@ UNKNOWN_IS_ABSENT: Final = (
     "whose last variant alone ignores it"
 )
 LIMITS: Final = (
-    "headings and scales beyond 2.5 standard deviations are not searched; candidates that share a place within 24 m "
-    "cannot be told apart; no confidence; withholds only where everything is unknown"
+    "headings beyond 2.5 and scales beyond two standard deviations are not searched; candidates that share a place "
+    "within 24 m cannot be told apart; no confidence; withholds only where everything is unknown"
 )
 
 

@@ -90,8 +90,8 @@ class RasterSoft(DenseMatcher):
         tracks=("retrieval", "localization"),
         limits=(
             "How common a class is in the view says nothing, a view that one class fills has none of it; no graph, no "
-            "ages, nothing learned; headings and scales beyond 2.5 standard deviations are not searched; candidates "
-            "that share a place within 24 m cannot be told apart; no confidence"
+            "ages, nothing learned; headings beyond 2.5 and scales beyond two standard deviations are not searched; "
+            "candidates that share a place within 24 m cannot be told apart; no confidence"
         ),
     )
 

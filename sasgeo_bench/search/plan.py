@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 
-SPREAD: Final = 2.5  # standard deviations of heading and scale that every search covers: one normal prior in 80 is off
+SPREAD: Final = 2.5  # standard deviations of the heading that every search covers: one normal prior in 80 is off
 
 
 @dataclass(frozen=True, kw_only=True)

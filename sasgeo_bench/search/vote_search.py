@@ -18,6 +18,7 @@ from sasgeo_bench.search.votes import ByPlanes, ByRows
 
 _FEW: Final = 32  # places a side: more cost less by transforms of planes
 _TILE: Final = 256  # places a side of a tile: larger ones take more memory and save no time
+_SCALE_SPREAD: Final = 2.0  # standard deviations of the scale: at 0.03 three scales, between which modes are refined
 _NOTHING: Final = 1e-6  # known cells: less is rounding of the transform
 _MARGIN_M: Final = 12.0  # a mode may move so far while it is refined
 _WIDEN: Final = 0.05  # its scale may exceed the searched ones by so much
@@ -81,7 +82,7 @@ class _Votes:
 
 def turns(prior: Prior, plan: VotePlan) -> tuple[Pose, ...]:
     """Return headings and scales to search, as poses at the origin."""
-    scales = [1 + offset for offset in _steps(min(SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
+    scales = [1 + offset for offset in _steps(min(_SCALE_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
     yaws_deg = _yaws_deg(prior, plan)
     return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws_deg)
 

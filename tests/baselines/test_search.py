@@ -133,7 +133,7 @@ def test_headings_at_right_angles_may_share_a_template(made, monkeypatch, candid
     assert shared.poses == alone.poses
     assert shared.scores == pytest.approx(alone.scores, abs=1e-6)
     # Cells on an edge, as many are at heading 0, go either way by rounding.
-    assert shared.diagnostics == pytest.approx(alone.diagnostics, rel=1e-3)
+    assert shared.diagnostics == pytest.approx(alone.diagnostics, rel=2e-3)
 
 
 def test_a_view_that_reaches_beyond_the_map_is_found(made) -> None:
@@ -189,11 +189,11 @@ def test_an_answer_is_withheld_where_nothing_was_seen_or_no_map_is_near(made, ma
     assert matcher.match(made.query_of(seen, far), top_k=5).poses == []
 
 
-def test_headings_and_scales_reach_two_standard_deviations() -> None:
+def test_headings_reach_as_far_as_in_all_searches_and_scales_two_standard_deviations() -> None:
     prior = Prior(center_m=None, radius_m=None, yaw_deg=350.0, yaw_sigma_deg=20.0, scale_sigma=0.03)
     tried = turns(prior, VotePlan())
     yaws = [float(wrap_deg(pose.yaw_deg - 350.0)) for pose in tried]
-    assert (min(yaws), max(yaws)) == pytest.approx((-40.0, 40.0))
+    assert (min(yaws), max(yaws)) == pytest.approx((-50.0, 50.0))
     assert {round(pose.scale, 2) for pose in tried} == {0.94, 1.0, 1.06}
     assert len(turns(replace(prior, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0), VotePlan())) == 120
 

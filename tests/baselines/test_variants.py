@@ -133,7 +133,7 @@ def ranks(made, variant, region, places, view: Evidence) -> dict[float, float]:
     """Score by easting."""
     matcher = variant()
     matcher.prepare(region, None)
-    north = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=1.0, scale_sigma=0.0)
+    north = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=0.8, scale_sigma=0.0)
     query = made.query_of(view, north, candidates=places)
     match = check_match(matcher.match(query, top_k=3), query, top_k=3)
     return {pose.easting_m: score for pose, score in zip(match.poses, match.scores, strict=True)}

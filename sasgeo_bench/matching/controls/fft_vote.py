@@ -173,8 +173,9 @@ class FftVote(DenseMatcher):
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),
         limits=(
-            "No class weighs more than another and nothing is learnt; headings and scales beyond 2.5 standard "
-            "deviations are not searched; candidates that share a place within 24 m cannot be told apart; no confidence"
+            "No class weighs more than another and nothing is learnt; headings beyond 2.5 and scales beyond two "
+            "standard deviations are not searched; candidates that share a place within 24 m cannot be told apart; no "
+            "confidence"
         ),
     )
 

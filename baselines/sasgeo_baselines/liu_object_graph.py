@@ -80,7 +80,7 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
         "step_m": (24.0, 32.0),  # of tiles: a view is at most 17 or 23 m off the middle of one
         "slack": (0.3, 0.5, 0.7),  # similarity below which an object rather has no partner
     }
-    chosen = {"step_m": 24.0, "slack": 0.3}
+    chosen = {"step_m": 24.0, "slack": 0.5}
 
     card = MatcherCard(
         name="liu_object_graph",

@@ -134,7 +134,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         "turn_deg": (10.0, 20.0, 30.0),  # of a road: that of a mask bends within a road's width of a junction
         "bearings": (1, 2),  # that agree at each end: a detector misses roads at junctions, and adds some
     }
-    chosen = {"turn_deg": 30.0, "bearings": 1}
+    chosen = {"turn_deg": 20.0, "bearings": 1}
 
     card = MatcherCard(
         name="road_2rit",

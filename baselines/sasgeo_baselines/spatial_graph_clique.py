@@ -24,7 +24,7 @@ class SpatialGraphClique(ObjectMatcher):
         "agree_m": (3.0, 5.0, 8.0),  # two distances that may be the same
         "near_m": (10.0, 14.0),  # of a peak of votes: pairs whose votes lie so near are looked at together
     }
-    chosen = {"agree_m": 8.0, "near_m": 14.0}
+    chosen = {"agree_m": 8.0, "near_m": 10.0}
 
     card = MatcherCard(
         name="spatial_graph_clique",

@@ -239,7 +239,7 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
     several_deg: tuple[float, ...] = (0.0,)  # turns of the copies of a view whose mean is its feature
 
     open_numbers = {"shrinkage": (0.1, 0.3, 0.9), "size": (64, 128)}  # of the scatter within locations; of features
-    chosen = {"shrinkage": 0.3, "size": 128}
+    chosen = {"shrinkage": 0.9, "size": 128}
 
     def read(self, region: Region, learned: str | None) -> None:
         """Describe the map, by the plain descriptor if nothing was learned."""

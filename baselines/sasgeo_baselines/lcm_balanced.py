@@ -13,6 +13,8 @@ SEVERAL_DEG: Final = (-10.0, 0.0, 10.0)
 class LcmBalanced(EmbeddingMatcher):
     """Classification of locations with as many turned tiles as views, and the mean feature of several queries."""
 
+    chosen = {"shrinkage": 0.1, "size": 128}
+
     card = MatcherCard(
         name="lcm_balanced",
         version="1",
@@ -25,7 +27,7 @@ class LcmBalanced(EmbeddingMatcher):
             f"{COPIES} copies of the tile of a location, {360 / COPIES:g} degrees from each other, and as many views "
             "at the same headings, so that the feature tells places and hardly headings. A question has one view: the "
             "several queries whose features are averaged are copies of it that are turned by "
-            f"{', '.join(f'{turn_deg:g}' for turn_deg in SEVERAL_DEG)} degrees. {ours(EmbeddingMatcher.chosen)}"
+            f"{', '.join(f'{turn_deg:g}' for turn_deg in SEVERAL_DEG)} degrees. {ours(chosen)}"
         ),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

@@ -206,7 +206,8 @@ def _junctions(vectors: "gpd.GeoDataFrame") -> Iterator[tuple[tuple[float, float
     nodes = build_graph(features).nodes
     chosen = nodes[(nodes["kind"] == "intersection").to_numpy() & (nodes["degree"] >= _FORK).to_numpy()]
     is_road = features["class"].isin(("road_major", "road_minor", "path_track")).to_numpy()
-    roads = shapely.union_all(features.geometry.to_numpy()[is_road])
+    is_line = shapely.get_dimensions(features.geometry.to_numpy()) == 1  # squares have no arms, and may be invalid
+    roads = shapely.union_all(features.geometry.to_numpy()[is_road & is_line])
     for place in chosen.geometry:
         rim = shapely.intersection(roads, place.buffer(ARM_M).exterior)
         away_m = shapely.get_coordinates(rim) - shapely.get_coordinates(place)

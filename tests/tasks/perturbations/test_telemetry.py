@@ -2,6 +2,7 @@
 """Messages of views: what arrives, in how many bytes, and what their budgets leave out."""
 
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from hypothesis import given
@@ -133,6 +134,14 @@ def test_a_junction_arrives_with_its_arms_and_nothing_else_is_known():
     assert set(np.unique(road)) == {PRESENT, UNKNOWN}
     rows, cols = np.nonzero(road == PRESENT)
     assert np.hypot(rows - 47.5, cols - 47.5).max() < 15
+
+
+def test_a_square_that_crosses_itself_is_no_arm_and_stops_nothing():
+    bow = shapely.Polygon([(-8, -8), (8, 8), (8, -8), (-8, 8)])
+    squares = vector_table([("path_track", 0, False, bow), ("path_track", 0, False, shapely.box(2, 2, 9, 9))])
+    with_squares = pd.concat([FORK, squares], ignore_index=True)
+    plain, found = (junctions(view_of(), table, budget_bytes=64) for table in (FORK, with_squares))
+    assert found.vectors.geometry.tolist() == plain.vectors.geometry.tolist()
 
 
 def test_junctions_that_do_not_fit_are_left_out_and_no_junction_shows_nothing():

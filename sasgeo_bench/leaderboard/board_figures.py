@@ -23,6 +23,7 @@ from sasgeo_bench.leaderboard.flight_plots import (
 )
 from sasgeo_bench.leaderboard.plot_tables import (
     ages_frame,
+    ranked_matchers,
     reliability_frame,
     risk_frame,
     shown_matchers,
@@ -94,7 +95,7 @@ def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (
         "the distribution of errors": lambda: _each(
             "errors", errors_frame(alone, board.table, shown), GROUP[1:], draw_errors, shown
         ),
-        "success against cost": lambda: _each("price", _priced(board, shown), GROUP[1:], draw_prices, shown),
+        "success against cost": lambda: _each("price", _priced(board), GROUP[1:], draw_prices, shown),
         "risk against coverage": lambda: _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
         "reliability": lambda: _each(
             "reliability",
@@ -145,9 +146,9 @@ def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
     return set(zip(rows["matcher"], rows["rejector"], strict=True))
 
 
-def _priced(board: Board, shown: Sequence[str]) -> pd.DataFrame:
-    """Return the matchers with some known cost."""
-    rows = price_frame(board.table, board.scores, shown)
+def _priced(board: Board) -> pd.DataFrame:
+    """Return the ranked matchers with some known cost, for who is cheap need not be among the few that are shown."""
+    rows = price_frame(board.table, board.scores, ranked_matchers(board.table))
     known: pd.DataFrame = rows[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
     return known
 

@@ -12,10 +12,12 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.decisions import Answers, equal_mass_bins, stanford
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import effective_count, wilson_share
+from sasgeo_bench.scoring.metrics import TRACKS, primary_of
 from sasgeo_bench.scoring.protection import ProtectionLevels
 from sasgeo_bench.scoring.rejection_rows import answers_of, mixtures_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_apart, is_unranked
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, primary_rows
+from sasgeo_bench.tasks.query import SEQUENCE
 
 MOST_MATCHERS: Final = 8  # more cannot be distinguished at a glance
 ARMS: Final = ("uniform", "hand", "oracle")  # parts of names of matchers that are shown with those of contrasts
@@ -27,28 +29,39 @@ MOST_M: Final = 1000.0  # what is more, or infinite, is drawn beyond
 BEYOND_M: Final = 1500.0
 
 
+def ranked_matchers(table: pd.DataFrame) -> list[str]:
+    """Return the matchers that are neither controls nor set apart, in the order of the table."""
+    return [name for name in dict.fromkeys(table.loc[~is_apart(table), "matcher"]) if not is_unranked(name)]
+
+
 def shown_matchers(table: pd.DataFrame, contrasts: Sequence[Contrast]) -> tuple[str, ...]:
     """Return the matchers that figures show, those of contrasts first, the second of each before the first.
 
     Controls and entries that are set apart are not shown. Of more than `MOST_MATCHERS` only those of contrasts are, or
-    the best without contrasts, and the `ARMS`.
+    without contrasts the best on single views and the best on flights, and the `ARMS`.
 
     >>> board = pd.DataFrame({"matcher": ["b", "a", "oracle_pose"], "rejector": "", "stratum": "all", "value": 0.5})
     >>> shown_matchers(board.assign(metric="success_25m"), [Contrast(name="x", first="b", second="a", suites=())])
     ('a', 'b')
     """
-    ranked = table.loc[~is_apart(table), "matcher"]
-    there = [name for name in dict.fromkeys(ranked) if not is_unranked(name)]
+    there = ranked_matchers(table)
     sides = [side.partition(" x ")[0] for item in contrasts for side in (item.second, item.first)]
     named = [name for name in dict.fromkeys(sides) if name in there]
     if len(there) <= MOST_MATCHERS:
         return tuple(dict.fromkeys((*named, *sorted(there))))
     if not named:
-        rows = table[(table["stratum"] == ALL) & table["metric"].isin(["success_25m", "recall_1"])]
-        means = rows.groupby("matcher")["value"].mean()
-        named = sorted(there, key=lambda name: (-means.get(name, 0.0), name))[:MOST_MATCHERS]
+        flown = primary_of(SEQUENCE).name
+        single = {primary_of(track).name for track in TRACKS} - {flown}
+        named = [*_best(table, there, single), *_best(table, there, {flown})]
     related = sorted(name for name in there if any(part in name for part in ARMS))
     return tuple(dict.fromkeys((*named, *related)))
+
+
+def _best(table: pd.DataFrame, there: Sequence[str], metrics: Collection[str]) -> list[str]:
+    """Return the matchers that are best by some metrics in the mean of all suites; who has none of them is left out."""
+    rows = table[(table["stratum"] == ALL) & table["metric"].isin(metrics)]
+    means = rows.groupby("matcher")["value"].mean()
+    return sorted((name for name in there if name in means), key=lambda name: (-means[name], name))[:MOST_MATCHERS]
 
 
 # --- success by what was done -----------------------------------------------------------------------------------------

@@ -174,7 +174,10 @@ def _cost_lines(chart: Axes, mine: pd.DataFrame, rejectors: Sequence[str]) -> No
 
 
 def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw accuracy against cost from `price_frame`, with the front that no other matcher beats."""
+    """Draw accuracy against cost from `price_frame`, with the front that no other matcher beats.
+
+    Those of `shown` have a look each; of the others, who are grey, those on the front have their name beside them.
+    """
     names = those_there(rows, shown)
     first = rows.iloc[0]
     axes = [(name, label) for name, label in _PRICES.items() if np.isfinite(rows[name].to_numpy(float)).any()]
@@ -185,7 +188,7 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median "
             "latency to the 95th percentile, all suites of the track. Grey line: the front, where no other matcher is "
             "both cheaper and "
-            f"better.{_left_out(rows)}"
+            f"better.{_others(rows, names)}{_left_out(rows)}"
         ),
         below="",
         columns=len(axes),
@@ -210,6 +213,12 @@ _PRICES: Final = {
 }
 
 
+def _others(rows: pd.DataFrame, names: Sequence[str]) -> str:
+    """Return how many are drawn in grey."""
+    count = len(rows) - len(names)
+    return f" Grey points: {counted(count, 'more matcher')}, named where on the front." if count else ""
+
+
 def _left_out(rows: pd.DataFrame) -> str:
     """Return the matchers without a point, because the cost of their answers is unknown."""
     lacking = [
@@ -224,6 +233,11 @@ def _prices(chart: Axes, rows: pd.DataFrame, names: Sequence[str], column: str) 
     cost, value = rows[column].to_numpy(float), rows["value"].to_numpy(float)
     front = rows[front_of(cost, value)].sort_values(column)
     chart.step(front[column], front["value"], where="post", color="#999999", lw=1.2)
+    others = rows[~rows["matcher"].isin(names) & np.isfinite(cost)]
+    chart.plot(others[column], others["value"], color="#999999", marker="o", ms=4, ls="", zorder=1)
+    for row in others[others["matcher"].isin(front["matcher"])].to_dict("records"):
+        at = (row[column], row["value"])
+        chart.annotate(row["matcher"], at, (3, 3), textcoords="offset points", fontsize=6.5, color="#555555")
     for number, name in enumerate(names):
         (row,) = rows[rows["matcher"] == name].to_dict("records")
         if not np.isfinite(row[column]):

@@ -204,6 +204,9 @@ def test_many_matchers_are_cut_to_those_of_contrasts_and_a_few_beside_them():
     assert best[:2] == ("sasgeo_oracle", "sasgeo_hand")
     assert len(best) == MOST_MATCHERS
     assert shown_matchers(table.head(3), contrasts) == ("m00", "m01", "m02")
+    flown = table.assign(metric="distance_within_25m", matcher="t" + table["matcher"]).iloc[:20]
+    both = shown_matchers(pd.concat([table, flown]), [])
+    assert both == (*best, *(f"tm{at:02d}" for at in range(19, 19 - MOST_MATCHERS, -1)))
 
 
 def test_bins_of_a_reliability_figure_make_up_the_calibration_error(board):

@@ -177,6 +177,10 @@ def test_prices_are_those_of_the_board_on_the_queries_that_all_were_asked(tmp_pa
     text = (tmp_path / "a.svg").read_text(encoding="utf-8")
     assert (tmp_path / "b.svg").read_text(encoding="utf-8") == text
     assert "latency of two; map of two." in " ".join(text.replace("\n", " ").split())
+    draw_prices(tmp_path / "c.svg", rows.assign(latency_s=[0.5, 0.1]), ["one"])
+    text = (tmp_path / "c.svg").read_text(encoding="utf-8")
+    assert "1 more matcher, named where on the front" in " ".join(text.replace("\n", " ").split())
+    assert text.count(">two<") == 1  # as cheap as can be; its map is of unknown size
 
 
 def test_recall_is_drawn_with_its_n_and_the_same_bytes_each_time(listed, tmp_path):

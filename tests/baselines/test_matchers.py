@@ -15,6 +15,7 @@ from sasgeo_baselines.map_density_prior import MapDensityPrior
 
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match
+from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
 
@@ -24,9 +25,12 @@ LIBRARY, BASELINES = (
     for path in (ROOT / "pyproject.toml", ROOT / "baselines" / "pyproject.toml")
 )
 NEEDS_TRAINING = ("orienternet_template",)  # and PyTorch: tests/baselines/test_orienternet.py
+# Yardsticks have tests of their own: tests/baselines/test_oracle_objects.py.
 # Those that look at pictures have nothing to look at on these towns: tests/baselines/test_image_matchers.py.
 REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in value} | {
-    name: value for name, value in BASELINES.items() if ".image." not in value and name not in NEEDS_TRAINING
+    name: value
+    for name, value in BASELINES.items()
+    if ".image." not in value and name not in NEEDS_TRAINING and not name.startswith(YARDSTICK)
 }
 VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
 DENSE = ("fft_vote", "raster_soft", "raster_uniform", *VARIANTS)

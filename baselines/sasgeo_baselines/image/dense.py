@@ -15,6 +15,7 @@ from sasgeo_baselines.global_descriptor import separate
 from sasgeo_baselines.image.sight import Sight, side_of, sight_of
 
 Planes = NDArray[np.float32]
+Spectra = NDArray[np.complex64]
 Bounds = tuple[int, int, int, int]  # first row and column, last row and column, excluded
 
 SPREAD: Final = 2.5  # standard deviations of heading and scale that are searched
@@ -131,14 +132,17 @@ class Question:
 
 @dataclass(frozen=True, kw_only=True)
 class Search:
-    """Spectra of a part of a map: `place` is the lattice of the places that are asked about."""
+    """Spectra of a part of a map: `place` is the lattice of the places that are asked about.
+
+    `channels` are the spectra of those channels that say anything in this part, by their number.
+    """
 
     place: sgb.Grid
     margin: int
     shape: tuple[int, int]
-    channels: NDArray[np.complex64]
-    energy: NDArray[np.complex64]
-    known: NDArray[np.complex64]
+    channels: dict[int, Spectra]
+    energy: Spectra
+    known: Spectra
     least_energy: float
 
     @classmethod
@@ -156,9 +160,9 @@ class Search:
             place=grid.window(top, left, bottom - top, right - left),
             margin=margin,
             shape=shape,
-            channels=fft.rfft2(channels, shape),
-            energy=fft.rfft2(energy, shape),
-            known=fft.rfft2(known, shape),
+            channels={at: _spectrum(channel, shape) for at, channel in enumerate(channels) if channel.any()},
+            energy=_spectrum(energy, shape),
+            known=_spectrum(known, shape),
             least_energy=_NOTHING * float(energy.mean()),
         )
 
@@ -168,16 +172,21 @@ class Search:
         weight, power = float(mask.sum()), float((view.channels**2).sum())
         if weight == 0 or power == 0:
             return np.full(self.place.shape, -np.inf, dtype=np.float32)
-        spectrum = np.conj(fft.rfft2(mask, self.shape))
+        spectrum = np.conj(_spectrum(mask, self.shape))
         energy, shared = self._at_places(self.energy * spectrum), self._at_places(self.known * spectrum)
-        product = self._at_places((self.channels * np.conj(fft.rfft2(view.channels, self.shape))).sum(axis=0))
+        summed = np.zeros_like(spectrum)
+        for at, mapped in self.channels.items():
+            if view.channels[at].any():
+                summed += mapped * np.conj(_spectrum(view.channels[at], self.shape))
+        product = self._at_places(summed)
         floor = max(self.least_energy * weight, 1e-12)
         cosine = np.where(energy > floor, product / np.sqrt(power * np.maximum(energy, floor)), 0.0)
         return np.where(shared >= _LEAST_SHARED * weight, cosine, -np.inf).astype(np.float32)
 
-    def _at_places(self, spectrum: NDArray[np.complex64]) -> Planes:
+    def _at_places(self, spectrum: Spectra) -> Planes:
         rows, cols = self.place.shape
-        return np.asarray(fft.irfft2(spectrum, self.shape)[:rows, :cols], dtype=np.float32)
+        along = fft.ifft(spectrum, axis=0)[:rows]  # the other rows are asked about by nobody
+        return np.asarray(fft.irfft(along, self.shape[1], axis=1)[:, :cols], dtype=np.float32)
 
     def field(self, turns: Sequence[sgb.Pose], views: Iterable[Stack]) -> Field:
         """Return the best of all headings and scales, each with its view, at every place; of equal ones the first."""
@@ -188,6 +197,11 @@ class Search:
             better = scores > best
             best[better], which[better] = scores[better], at
         return Field(grid=self.place, scores=best, which=which, turns=tuple(turns))
+
+
+def _spectrum(plane: Planes, shape: tuple[int, int]) -> Spectra:
+    """Return what `rfft2` gives of a plane with zeros beyond it, which are not transformed along the rows."""
+    return np.asarray(fft.fft(fft.rfft(plane, shape[1], axis=1), shape[0], axis=0))
 
 
 def size_for(turns: Sequence[sgb.Pose], side_cells: float) -> int:

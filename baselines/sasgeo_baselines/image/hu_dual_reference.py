@@ -34,6 +34,10 @@ SHARES: Final = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)  # of the imagery in the sum
 UNTAUGHT: Final = 0.5
 RIGHT_M: Final = 25.0
 MOST_LESSONS: Final = 60
+SLOW: Final = (
+    "more than a second a view, since every place is tried at every heading and scale: pixels of 3 m would take a "
+    "third of that and find as much on maps, but less in imagery"
+)
 _SAMPLED: Final = 8  # headings that tell the mean and the spread of scores
 _STEP: Final = 2.0  # pixels at the edge of a view between two headings
 
@@ -164,7 +168,8 @@ class HuDualReference(_HuReference):
             "sequence, no weights by what lasts, no rejection, no confidence; places no finer than 2 m; half of the "
             "view must be on the map; one picture of the query; leaning roofs and relief are not modelled. Where the "
             "picture is flat or shows less than a tenth of the view, the map alone decides; where no class varies, the "
-            "imagery alone: the diagnostic `parts` says how many counted"
+            "imagery alone: the diagnostic `parts` says how many counted; "
+            f"{SLOW}"
         ),
     )
     share = UNTAUGHT
@@ -199,7 +204,7 @@ class HuMapOnly(_HuReference):
             "The map's half of `hu_dual_reference`: the correlation of class layers in pixels of 2 m, each over the "
             "cells where its class is known"
         ),
-        limits="One half of `hu_dual_reference`, to see what the other adds; no confidence",
+        limits=f"One half of `hu_dual_reference`, to see what the other adds; no confidence; {SLOW}",
     )
 
 
@@ -212,7 +217,7 @@ class HuImageryOnly(_HuReference):
         name="hu_imagery_only",
         title="Imagery alone, as one half of hu_dual_reference",
         ours="The imagery's half of `hu_dual_reference`: the correlation of directions of gradients in pixels of 2 m",
-        limits=f"One half of `hu_dual_reference`, to see what the other adds; {LIMITS}",
+        limits=f"One half of `hu_dual_reference`, to see what the other adds; {SLOW}; {LIMITS}",
     )
 
 

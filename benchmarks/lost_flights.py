@@ -18,11 +18,14 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.leaderboard.board_files import read_scores
 from sasgeo_bench.publishing.archive_file import read_stored_predictions, unpack_tasks
 from sasgeo_bench.scoring.contestants import read_scored_task
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.flights import view_frame
 from sasgeo_bench.scoring.intervals import percentile_interval
+from sasgeo_bench.tasks.query import SEQUENCE
 
 RIGHT_M, LOST_M, LOST_FOR_M = 25.0, 100.0, 500.0
 RULE_OF_THREE = 3.0  # upper end of 95 % for a rate of which nothing was seen
@@ -66,9 +69,18 @@ def kept(distance_m: np.ndarray, error_m: np.ndarray, is_accepted: np.ndarray) -
 
 
 def flights_of(folder: Path, suite: str) -> pd.DataFrame:
-    """Return a row for each tracker and flight of a suite: what it was flown over, and how it was followed."""
+    """Return a row for each tracker and flight of a suite: what it was flown over, and how it was followed.
+
+    Raise `StoreError` if the folder holds no board, or the board no flights of that suite.
+    """
     rows = []
-    matchers = sorted(pd.read_parquet(folder / "scores.parquet").query("suite == @suite")["matcher"].unique())
+    scores = read_scores(folder)
+    flown = scores[scores["track"] == SEQUENCE]
+    matchers = sorted(flown.loc[flown["suite"] == suite, "matcher"].unique())
+    if not matchers:
+        there = ", ".join(sorted(flown["suite"].unique())) or "no suite of flights"
+        message = f"{folder} has no flights of suite {suite!r}: it has {there}"
+        raise StoreError(message)
     with tempfile.TemporaryDirectory() as scratch:
         folders = [path for path in unpack_tasks(folder, Path(scratch)) if path.parent.name == suite]
         tasks = [read_scored_task(path, Path(scratch) / "truth") for path in folders]
@@ -129,9 +141,11 @@ def main(words: Sequence[str] | None = None) -> None:
     parser.add_argument("board", type=Path)
     parser.add_argument("--suite", default="flight-real-age")
     options = parser.parse_args(words)
-    print(HEAD)
-    for line in lines(flights_of(options.board, options.suite)):
-        print(line)
+    try:
+        flights = flights_of(options.board, options.suite)
+    except SasgeoError as error:
+        parser.error(str(error))
+    print(HEAD, *lines(flights), sep="\n")
 
 
 if __name__ == "__main__":

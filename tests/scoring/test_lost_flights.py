@@ -54,3 +54,19 @@ def test_losses_are_counted_over_what_was_flown_and_none_leaves_room_for_three()
     assert rash.startswith("| rash | 5 | 8 | 100 | 20 | 4 | 20.0 | ")
     low, high = map(float, rash.split("|")[-2].split(" to "))
     assert 0 < low < 20 < high
+
+
+@pytest.mark.parametrize(
+    ("board", "suite", "fault"),
+    [
+        ("nowhere", "flight-real-age", "nowhere/scores.parquet cannot be read"),
+        ("docs/results/claims", "flight-real-age", "no flights of suite 'flight-real-age': it has no suite of flights"),
+        ("docs/results/countries", "flight-gap", "no flights of suite 'flight-gap': it has flight-real-age"),
+    ],
+)
+def test_what_holds_no_such_flights_is_told_in_one_line_before_anything_is_printed(board, suite, fault, capsys):
+    folder = Path(__file__).parents[2] / board
+    with pytest.raises(SystemExit):
+        PROGRAM["main"]([str(folder), "--suite", suite])
+    said = capsys.readouterr()
+    assert (said.out, fault in said.err) == ("", True)

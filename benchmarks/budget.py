@@ -22,7 +22,7 @@ import numpy as np
 import sasgeo_bench as sgb
 from benchmarks.open_numbers import drawn, systems
 from sasgeo_bench.errors import MatchError, SasgeoError
-from sasgeo_bench.matching.plugins import check_names
+from sasgeo_bench.matching.plugins import MATCHERS, check_names, list_entry_points
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.task_rows import query_bytes
 
@@ -114,6 +114,10 @@ def main() -> None:
 def measure(out: Path, names: list[str]) -> None:
     """Measure systems one by one; those that fail are told below the table."""
     check_names(matchers=names, rejectors=[])
+    stray = next((name for name in names if name not in list_entry_points(MATCHERS)), None)
+    if stray is not None:
+        message = f"{stray} is not among the matchers of list-matchers: name one of these, no tracker or module:Class"
+        raise MatchError(message)
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
     blobs = [query_bytes(query) for query, _ in drawn(out)[PLACE][:ASKED]]
     region = out / "regions" / PLACE

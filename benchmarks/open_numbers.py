@@ -14,6 +14,7 @@ second command prints a table.
 import argparse
 import csv
 import json
+import math
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -154,7 +155,7 @@ def read_trials(path: Path) -> list[Trial]:
             )
             for row in rows.values()
         ]
-        is_whole = bool(found) and all(trial.numbers for trial in found)
+        is_whole = bool(found) and all(map(_is_sound, found)) and _have_same_names(found)
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         is_whole = False
     if not is_whole:
@@ -162,6 +163,20 @@ def read_trials(path: Path) -> list[Trial]:
         raise StoreError(message)
     order = {(name, json.dumps(one)): at for name, kind in systems().items() for at, one in enumerate(kind.settings())}
     return sorted(found, key=lambda trial: (trial.system, order.get((trial.system, trial.setting), len(order))))
+
+
+def _is_sound(trial: Trial) -> bool:
+    """Return whether a trial could have been written by this program."""
+    numbers = trial.numbers.values()
+    is_number = all(isinstance(value, int | float) and math.isfinite(value) for value in numbers)
+    is_counted = 0 <= trial.right <= trial.views and math.isfinite(trial.median_m) and math.isfinite(trial.view_s)
+    return bool(numbers) and is_number and is_counted and trial.system.isidentifier()
+
+
+def _have_same_names(trials: Sequence[Trial]) -> bool:
+    """Return whether all settings of each system set the same numbers."""
+    names = {(trial.system, tuple(sorted(trial.numbers))) for trial in trials}
+    return len(names) == len({system for system, _ in names})
 
 
 def write_trials(path: Path, trials: Sequence[Trial]) -> None:

@@ -192,20 +192,21 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
 def field_of(region: Region) -> Field:
     """Return a map in cells of about `CELL_M`, which holds thin classes in part."""
     known = region.known()
-    grid = region.grid.coarsen(max(1, round(CELL_M / region.grid.cell_size_m)))
-    share = _shrunk(known, grid)
+    factor = max(1, round(CELL_M / region.grid.cell_size_m))
+    grid = region.grid.coarsen(factor)
+    share = _shrunk(known, factor)
     layers = np.zeros((len(region.classes), *grid.shape), dtype=np.uint8)
     for name, into in zip(region.classes, layers, strict=True):
-        into[:] = _shrunk((region.layer(name) == PRESENT) & known, grid)
+        into[:] = _shrunk((region.layer(name) == PRESENT) & known, factor)
     return Field(grid=grid, layers=layers, known=np.where(share > _FULL // 2, _FULL, 0).astype(np.uint8))
 
 
-def _shrunk(layer: NDArray[np.bool_], grid: Grid) -> NDArray[np.uint8]:
-    """Return the share of each cell of a coarser grid, 0..255."""
-    factor = -(-layer.shape[0] // grid.rows)
-    around = [(0, count * factor - size) for count, size in zip(grid.shape, layer.shape, strict=True)]
-    marked = np.pad(layer.astype(np.uint8) * np.uint8(_FULL), around)
-    return np.asarray(cv2.resize(marked, (grid.cols, grid.rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+def _shrunk(layer: NDArray[np.bool_], factor: int) -> NDArray[np.uint8]:
+    """Return the share of each cell of a grid that is coarser by a factor, 0..255."""
+    rows, cols = (-(-size // factor) for size in layer.shape)
+    marked = np.zeros((rows * factor, cols * factor), dtype=np.uint8)
+    marked[: layer.shape[0], : layer.shape[1]] = layer * np.uint8(_FULL)
+    return np.asarray(cv2.resize(marked, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def templates_of(seen: Evidence, classes: Sequence[str]) -> tuple[Template, Template]:

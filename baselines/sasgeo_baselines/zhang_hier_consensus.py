@@ -170,11 +170,11 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
         self._used = self._chart.used()
 
     def look(self, query: Query) -> Seen | None:
-        """Describe a view; None where it shares no class with the map."""
+        """Describe a view; None where it shares no class with the map, or holds no whole patch."""
         chart, evidence = self._chart, query.evidence
         shared = [name for name in chart.classes if name in evidence.classes and self._used[chart.classes.index(name)]]
         descriptor = view_descriptor(evidence)
-        if not shared or np.isnan(descriptor).all():
+        if not shared or np.isnan(descriptor).all() or min(evidence.shape) < SIDE:
             return None
         cells = evidence.cells[[evidence.classes.index(name) for name in shared]]
         return Seen(

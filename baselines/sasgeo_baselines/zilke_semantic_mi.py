@@ -66,9 +66,9 @@ class ZilkeSemanticMi(ShiftMatcher):
         return Chart(grid=region.grid, classes=NAMES, degree=degree, known=known.astype(np.uint8) * np.uint8(255))
 
     def shared(self, evidence: Evidence, chart: Chart) -> list[str]:
-        """Return all labels of the map."""
-        del evidence
-        return list(chart.classes)
+        """Return all labels of the map; none where no class of the view makes one."""
+        has_label = any(name in evidence.classes for group in LABELS for name in group)
+        return list(chart.classes) if has_label else []
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the labels of the view, one to a cell that is known in all classes or present in one."""

@@ -39,6 +39,7 @@ from sasgeo_bench.scoring.contestants import read_scored_task, rows_of_task, row
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
+from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.sensing.reference_imagery import render_place
 from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import RECALIBRATED, base_of
@@ -64,11 +65,13 @@ def run_pipeline(
     failed queries with their truths on the board. `private` is the board of a private seed of this pipeline, which the
     rows are compared with. `opened` is the day on which sealed places are opened, today unless given. Raise
     `ConfigError` if no region can carry any of the suites, or all that could be ranked is sealed; `StoreError` if the
-    board cannot be stored in `results`, before anything is done, or as `pack_board` does after the board is written.
+    board cannot be stored in `results`, or `ConfigError` if two rejectors share a name, before anything is done; and as
+    `pack_board` does after the board is written.
     """
     stored = None if results is None else results / plan.spec.id
     if stored is not None:
         check_results(stored, board_folder(plan))
+    rules_of(plan.spec.rejectors, plan.split)
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored, tell=tell)
     drawn = _draw(plan.requests, tell, jobs=plan.jobs)
     _render(plan, tell)

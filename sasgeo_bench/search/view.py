@@ -70,13 +70,13 @@ class View:
         return laid.reshape(-1, side, side)
 
     def samples(self, template: NDArray[np.float32], *, stride: int) -> "Samples":
-        """Return every `stride`-th cell of a template, with its place in the view."""
-        first = stride // 2
-        rows, cols = np.arange(first, self.grid.rows, stride), np.arange(first, self.grid.cols, stride)
+        """Return every `stride`-th cell of a template, one at least, with its place in the view."""
+        top, left = (min(stride // 2, count - 1) for count in self.grid.shape)
+        rows, cols = np.arange(top, self.grid.rows, stride), np.arange(left, self.grid.cols, stride)
         zeros = np.zeros(1, dtype=np.int64)
         up_m = self.grid.to_centres_m(np.column_stack((rows, zeros.repeat(len(rows)))))[:, 1]
         right_m = self.grid.to_centres_m(np.column_stack((zeros.repeat(len(cols)), cols)))[:, 0]
-        chosen = template[:, first::stride, first::stride]
+        chosen = template[:, top::stride, left::stride]
         counts = np.ascontiguousarray(chosen[-1])
         return Samples(
             up_m=up_m,

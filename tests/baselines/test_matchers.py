@@ -16,6 +16,7 @@ from sasgeo_baselines.map_density_prior import MapDensityPrior
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match
 from sasgeo_bench.matching.plugins import YARDSTICK
+from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
 
@@ -140,13 +141,29 @@ def test_a_damaged_learned_text_is_refused_in_one_line(name, text, region) -> No
         make(name).prepare(region, text)
 
 
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_no_candidates_have_no_answer_and_a_view_of_one_cell_is_borne(name, prepared, two) -> None:
+@pytest.mark.parametrize("name", [*SYSTEMS, *DENSE])
+def test_no_candidates_have_no_answer_and_views_of_few_cells_are_borne(name, prepared, two) -> None:
     asked = two[1]
     nobody = prepared(name).match(replace(asked, candidates=()), top_k=5)
     assert not check_match(nobody, replace(asked, candidates=()), top_k=5).poses
-    tiny = replace(asked, evidence=asked.evidence.replace(asked.evidence.cells[:, 96:97, 96:97].copy()))
-    check_match(prepared(name).match(tiny, top_k=5), tiny, top_k=5)
+    for rows in (1, 6):
+        tiny = replace(asked, evidence=asked.evidence.replace(asked.evidence.cells[:, 96 : 96 + rows, 96:97].copy()))
+        check_match(prepared(name).match(tiny, top_k=5), tiny, top_k=5)
+
+
+@pytest.mark.parametrize("name", [*SYSTEMS, *DENSE])
+def test_a_view_of_classes_that_no_map_has_is_withheld(name, prepared, two) -> None:
+    seen = two[0].evidence
+    strange = replace(two[0], evidence=Evidence(classes=("orchard",), cells=seen.cells[:1], cell_size_m=1.0))
+    assert not prepared(name).match(strange, top_k=5).poses
+
+
+@pytest.mark.parametrize("name", [name for name in REGISTERED if name not in {"graph_only", *OF_OBJECTS}])
+def test_a_map_of_three_rows_is_borne(name, made, two) -> None:
+    matcher, region = make(name), made.region_of(np.zeros((3, 3, 320), dtype=np.uint8))
+    matcher.prepare(region, None)
+    query = replace(two[0], prior=replace(two[0].prior, center_m=(1100.0, 8999.0)))
+    check_match(matcher.match(query, top_k=5), query, top_k=5)
 
 
 @pytest.mark.parametrize("name", DENSE)

@@ -13,6 +13,7 @@ from sasgeo_baselines.tunable import MOST_TRIALS
 from benchmarks import budget, open_numbers
 
 SYSTEMS = open_numbers.systems()
+HEAD = b"system,setting,views,right,median_m,view_s\n"
 STORED = Path(__file__).parents[2] / "docs" / "results" / "open-numbers.csv"
 
 
@@ -69,7 +70,13 @@ def test_trials_are_read_back_each_once_in_the_order_of_settings(trials, tmp_pat
 
 @pytest.mark.parametrize(
     "content",
-    [None, b"", b"\xff\xfe\x00", b"a,b\n1,2\n", b"system,setting,views,right,median_m,view_s\nbrm_grid,3,64\n"],
+    [
+        *(None, b"", b"\xff\xfe\x00", b"a,b\n1,2\n", HEAD + b"brm_grid,3,64\n"),
+        HEAD + b'a,"{""x"": 1}",64,5,9,1\na,"{""y"": 1}",64,5,9,1\n',  # two settings of other numbers
+        *(HEAD + b'a,"{""x"": %s}",64,5,9,1\n' % value for value in (b'""x""', b"[1]", b"NaN")),
+        *(HEAD + b'%s,"{""x"": 1}",64,%s,%s,1\n' % row for row in ((b"a|b", b"5", b"9"), (b"a", b"-1", b"9"))),
+        HEAD + b'a,"{""x"": 1}",64,5,nan,1\n',
+    ],
 )
 def test_a_file_that_holds_no_trials_is_told_in_one_line(content, tmp_path, monkeypatch, capsys):
     path = tmp_path / "trials.csv"
@@ -82,12 +89,20 @@ def test_a_file_that_holds_no_trials_is_told_in_one_line(content, tmp_path, monk
     assert f"{path} holds no trials, or is damaged: move it away" in capsys.readouterr().err
 
 
-def test_a_system_that_nobody_knows_is_told_before_anything_is_drawn(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("sys.argv", ["budget.py", "--out", str(tmp_path / "out"), "--matcher", "nope"])
+@pytest.mark.parametrize(
+    ("name", "fault"),
+    [
+        ("nope", "there is no matcher 'nope'"),
+        ("dead_reckoning", "dead_reckoning is not among the matchers of list-matchers"),
+        ("nothere:Class", "nothere:Class is not among the matchers of list-matchers"),
+    ],
+)
+def test_what_is_no_system_is_told_before_anything_is_drawn(name, fault, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("sys.argv", ["budget.py", "--out", str(tmp_path / "out"), "--matcher", name])
     with pytest.raises(SystemExit) as ended:
         budget.main()
     assert ended.value.code == 2
-    assert "there is no matcher 'nope'" in capsys.readouterr().err
+    assert fault in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

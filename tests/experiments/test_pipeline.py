@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from sasgeo_baselines.rejectors.margin import Margin
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError
@@ -559,6 +560,18 @@ def test_a_matcher_that_nobody_has_is_refused_before_anything_is_made(tmp_path, 
     spec = parse_toml(TEXT.replace(f'"{old}"', f'"{new}"'), PipelineFile, source="small.toml")
     with pytest.raises(MatchError, match=f"there is no matcher '{new}', did you mean '{old}'"):
         plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+    assert not (tmp_path / "out").exists()
+
+
+class MarginToo(Margin):
+    """Another rejector of the same name."""
+
+
+def test_two_rejectors_of_one_name_are_refused_before_anything_is_drawn(tmp_path):
+    spec = small(**{"[[task]]": f'rejectors = ["margin", "{__name__}:MarginToo"]\n[[task]]'})
+    plan = plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+    with pytest.raises(ConfigError, match=r"^margin and .*:MarginToo are both named 'margin': rename one"):
+        run_pipeline(plan, tell=lambda _: None)
     assert not (tmp_path / "out").exists()
 
 

@@ -101,7 +101,7 @@ class DenseMatcher(ABC):
         if self._chart is None:
             message = f"{self.card.name}: call prepare() with a region before match()"
             raise RuntimeError(message)
-        if is_blind(query):
+        if is_blind(query) or set(query.evidence.classes).isdisjoint(self._chart.classes):
             return WITHHELD
         chart, view = self._chart, self._read(query.evidence, self._chart)
         search = VoteSearch(chart=chart, view=self._view(view, chart), prior=query.prior, plan=self.plan)

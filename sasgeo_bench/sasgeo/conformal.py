@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+import scipy  # its statistics are loaded where they are used: matchers start without them
 from numpy.typing import ArrayLike, NDArray
-from scipy import special, stats
+from scipy import special
 
 from sasgeo_bench.errors import ConfigError, ShapeError
 from sasgeo_bench.sasgeo.integrity import Diagnostic, Modes
@@ -44,7 +45,7 @@ def upper_rate(failures: float, trials: float, *, confidence: float = 0.95) -> f
     if not (0 <= failures <= trials < math.inf and 0 < confidence < 1):
         message = f"0 <= failures <= trials and 0 < confidence < 1, got {failures!r}, {trials!r} and {confidence!r}"
         raise ConfigError(message)
-    return 1.0 if failures == trials else float(stats.beta.ppf(confidence, failures + 1.0, trials - failures))
+    return 1.0 if failures == trials else float(scipy.stats.beta.ppf(confidence, failures + 1.0, trials - failures))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +111,7 @@ def risk_threshold(
     chance, false = _checked(p_false, is_false, alpha, delta, blocks)
     accepted, wrong = _below(chance, None), _below(chance, false)
     if blocks is None:
-        units, p_values = accepted, stats.binom.cdf(wrong, accepted, alpha)
+        units, p_values = accepted, scipy.stats.binom.cdf(wrong, accepted, alpha)
     else:
         units, p_values = _by_block(
             chance, false, np.unique(np.asarray(blocks, dtype=str), return_inverse=True)[1], alpha
@@ -163,7 +164,7 @@ def _by_block(
     mean = np.minimum(total / np.maximum(units, 1.0), alpha)
     # Hoeffding's tail by relative entropy, and Bentkus' by e times a binomial one: either holds, so the less.
     entropy = special.rel_entr(mean, alpha) + special.rel_entr(1.0 - mean, 1.0 - alpha)
-    tail = math.e * stats.binom.cdf(np.ceil(total - 1e-9), units, alpha)
+    tail = math.e * scipy.stats.binom.cdf(np.ceil(total - 1e-9), units, alpha)
     return units, np.minimum(np.exp(-units * entropy), tail)
 
 

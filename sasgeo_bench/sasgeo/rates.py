@@ -7,8 +7,9 @@ from typing import Final
 
 import cv2
 import numpy as np
+import scipy  # its optimizers are loaded where they are used: matchers that do not learn start without them
 from numpy.typing import NDArray
-from scipy import optimize, special
+from scipy import special
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -232,7 +233,7 @@ def _fitted(hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[n
 
     total = counts.sum()
     mapped = float(counts[..., :2].sum() / total) if total else hand.mapped
-    return _to_rates(optimize.minimize(loss, start, method="L-BFGS-B").x, mapped=mapped)
+    return _to_rates(scipy.optimize.minimize(loss, start, method="L-BFGS-B").x, mapped=mapped)
 
 
 def _chances(

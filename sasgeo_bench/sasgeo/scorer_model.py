@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Final, Self
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.sasgeo.graph_rules import GraphRules
@@ -71,7 +71,7 @@ def fit_scaling(
         return value, slope
 
     begin = np.log(np.broadcast_to(np.asarray(start, dtype=np.float64), rows.shape[1:]))
-    found = optimize.minimize(loss, begin, jac=True, method="L-BFGS-B")
+    found = scipy.optimize.minimize(loss, begin, jac=True, method="L-BFGS-B")
     return np.asarray(np.exp(found.x))
 
 

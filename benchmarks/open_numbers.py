@@ -16,7 +16,7 @@ import csv
 import json
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -29,9 +29,10 @@ import numpy as np
 from sasgeo_baselines.tunable import Tunable
 
 import sasgeo_bench as sgb
-from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.sasgeo.variants import Sasgeo
 from sasgeo_bench.search.plan import Plan
+from sasgeo_bench.texts import one_line
 
 HALVES = (("krems", "porto"), ("london", "vaduz"))  # towns on which systems were tried while they were built
 SUITES = {"clean": ("perception",), "local-warp": ("G1 tilt",)}
@@ -161,8 +162,13 @@ def read_trials(path: Path) -> list[Trial]:
     if not is_whole:
         message = f"{path} holds no trials, or is damaged: move it away, and run with --out"
         raise StoreError(message)
+    return sorted_trials(found)
+
+
+def sorted_trials(trials: Iterable[Trial]) -> list[Trial]:
+    """Return trials in the order of systems and of their settings."""
     order = {(name, json.dumps(one)): at for name, kind in systems().items() for at, one in enumerate(kind.settings())}
-    return sorted(found, key=lambda trial: (trial.system, order.get((trial.system, trial.setting), len(order))))
+    return sorted(trials, key=lambda trial: (trial.system, order.get((trial.system, trial.setting), len(order))))
 
 
 def _is_sound(trial: Trial) -> bool:
@@ -220,9 +226,13 @@ def main() -> None:
 
 
 def try_all(out: Path, *, jobs: int) -> None:
-    """Ask what is left, store each trial, and print the table."""
+    """Ask what is left, store each trial, and print the table; a system that fails costs its own trials alone."""
     path = out / "trials.csv"
-    trials = read_trials(path) if path.exists() else []  # a file that is none is told before anything is drawn
+    there = read_trials(path) if path.exists() else []  # a file that is none is told before anything is drawn
+    known = {(name, json.dumps(numbers)) for name, kind in systems().items() for numbers in kind.settings()}
+    trials = [trial for trial in there if (trial.system, trial.setting) in known]
+    if len(trials) < len(there):
+        print(f"{counted(len(there) - len(trials), 'stored trial')} left out: of numbers that are open no more")
     asked = drawn(out)
     done = {(trial.system, trial.setting) for trial in trials}
     todo = [
@@ -232,11 +242,23 @@ def try_all(out: Path, *, jobs: int) -> None:
         if (name, json.dumps(numbers)) not in done
     ]
     with ProcessPoolExecutor(jobs) as pool:
-        for trial in pool.map(partial(tried, out, asked), *zip(*todo, strict=True)) if todo else ():
+        for trial in pool.map(partial(_tried_or_told, out, asked), *zip(*todo, strict=True)) if todo else ():
+            if isinstance(trial, str):
+                print(trial)
+                continue
             trials.append(trial)
             write_trials(path, trials)
             print(f"{trial.system} {trial.setting}: {trial.right} of {trial.views}, {trial.view_s:.2f} s a view")
-    print(*lines(read_trials(path)), sep="\n")
+    left = {name for name, _ in known - {(trial.system, trial.setting) for trial in trials}}
+    print(*lines(sorted_trials(trial for trial in trials if trial.system not in left)), sep="\n")
+
+
+def _tried_or_told(out: Path, asked: Asked, kind: type[Tunable], system: str, numbers: dict[str, float]) -> Trial | str:
+    """Return a trial, or a line that says why there is none."""
+    try:
+        return tried(out, asked, kind, system, numbers)
+    except Exception as error:  # noqa: BLE001 - whatever a contestant does
+        return one_line(f"{system} {json.dumps(numbers)}: no trial ({type(error).__name__}: {error})")
 
 
 if __name__ == "__main__":

@@ -223,8 +223,8 @@ def check_learned(learned: object, *, most_bytes: int = MOST_LEARNED_BYTES) -> s
     except UnicodeEncodeError as error:
         message = "learn() returned a text that is no UTF-8, expected characters alone: write bytes as base64, say"
         raise MatchError(message) from error
-    if size > most_bytes:
-        message = f"learn() returned {size} bytes, expected at most {most_bytes}"
+    if not 0 < size <= most_bytes:  # a stored file of no bytes was emptied by somebody
+        message = f"learn() returned {size} bytes, expected 1 to {most_bytes}"
         raise MatchError(message)
     return learned
 

@@ -256,7 +256,8 @@ def _fit_and_apply(
     try:
         rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
         if some:
-            found[is_answered] = check_p_false(rejector.p_false(some), len(some))
+            count = len(some)  # whatever becomes of the list
+            found[is_answered] = check_p_false(rejector.p_false(some), count)
         remark = remark_of(rejector)
     except (Exception, SystemExit) as error:  # a plugin must not end the program
         message = f"rejector {rejector.card.name!r} failed ({message_of(error)}): mend it, or leave it out"

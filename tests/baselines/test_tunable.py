@@ -2,6 +2,7 @@
 """Open numbers: as many trials for one system as for any other, and one rule that chooses."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -104,6 +105,40 @@ def test_what_is_no_system_is_told_before_anything_is_drawn(name, fault, tmp_pat
     assert ended.value.code == 2
     assert fault in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+class Failing(SchmidtSegcorr):
+    """A system that cannot be asked with one of its settings."""
+
+    open_numbers = {"sharpness": (1.0, 2.0)}
+    chosen = {"sharpness": 1.0}
+
+    def __init__(self, **numbers):
+        if numbers.get("sharpness") == 2.0:
+            message = "too sharp"
+            raise ValueError(message)
+        super().__init__()
+
+
+def test_a_system_that_fails_costs_its_own_trials_and_old_settings_are_left_out(trials, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(open_numbers, "drawn", lambda _: {})
+    monkeypatch.setattr(open_numbers, "ProcessPoolExecutor", ThreadPoolExecutor)
+    monkeypatch.setattr(open_numbers, "systems", lambda: {"brm_grid": SYSTEMS["brm_grid"], "failing": Failing})
+    monkeypatch.setattr(open_numbers, "tried", lambda *asked: made_up(*asked[2:]))
+    open_numbers.write_trials(tmp_path / "trials.csv", trials)  # of polar_vsc, too, which is no system now
+    open_numbers.try_all(tmp_path, jobs=1)
+    said = capsys.readouterr().out
+    assert "6 stored trials left out: of numbers that are open no more" in said
+    assert 'failing {"sharpness": 2.0}: no trial (ValueError: too sharp)' in said
+    assert [line.split("|")[1].strip() for line in said.splitlines() if line.startswith("| `")] == ["`brm_grid`"]
+    stored = open_numbers.read_trials(tmp_path / "trials.csv")
+    assert [trial.system for trial in stored] == ["brm_grid"] * 6 + ["failing"]
+
+
+def made_up(kind, system, numbers):
+    """A trial of a system that can be made."""
+    kind(**numbers)
+    return open_numbers.Trial(system=system, setting=json.dumps(numbers), views=64, right=9, median_m=30.0, view_s=0.5)
 
 
 def test_most_views_choose_then_the_median_error_then_the_order(trials):

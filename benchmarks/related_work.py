@@ -49,7 +49,7 @@ PAPER = {
     "u1652_instance_retrieval": "University-1652",
     "sues_multi_height": "SUES-200",
     "lcm_balanced": "LCM 2021",
-    "dead_reckoning": "VINS-Mono (its odometry alone)",
+    "vio_dead_reckoning": "VINS-Mono (its odometry alone)",
     "sasgeo": "SASGeo",
 }
 TRACKS = {"ouyang_shape_votes": "ouyang_cfbvm_pf", "sasgeo": "sasgeo_track"}  # tracker of the same system

@@ -2,13 +2,15 @@
 """Choose the numbers that the sources of systems leave open: on train places, by one rule for all, ours included.
 
     .venv/bin/python benchmarks/open_numbers.py --out out/open-numbers --jobs 2
+    .venv/bin/python benchmarks/open_numbers.py --out out/open-numbers --matcher my-matcher
     .venv/bin/python benchmarks/open_numbers.py --table docs/results/open-numbers.csv
 
-The first command draws views of four towns that are on no board of systems, asks each system about them with each of
-its settings, six at most, and writes `trials.csv` into the folder; it resumes. What learns is asked about two towns
-after learning from the views of the other two. The setting that finds most views within 25 m is chosen; of several the
-one whose median error is less, no answer counting as the radius of the search; of several of these the first. The
-second command prints a table.
+The first command draws views of four towns that are on no board of systems (suite `clean` with errors of perception,
+and `local-warp` with tilt), asks each system of ours about them with each of its settings, six at most, and writes
+`trials.csv` into the folder; it resumes. The second does so for a matcher of yours, which is a `Tunable`. What learns
+is asked about two towns after learning from the views of the other two. The setting that finds most views within 25 m
+is chosen; of several the one whose median error is less, no answer counting as the radius of the search; of several of
+these the first. The third command prints a table.
 """
 
 import argparse
@@ -29,7 +31,7 @@ import numpy as np
 from sasgeo_baselines.tunable import Tunable
 
 import sasgeo_bench as sgb
-from sasgeo_bench.errors import SasgeoError, StoreError, counted
+from sasgeo_bench.errors import MatchError, SasgeoError, StoreError, counted
 from sasgeo_bench.sasgeo.variants import Sasgeo
 from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.texts import one_line
@@ -70,15 +72,20 @@ class Trial:
         return dict(json.loads(self.setting))
 
 
-def systems() -> dict[str, type[Tunable]]:
-    """Return all systems with open numbers by name."""
+def systems(names: Sequence[str] = ()) -> dict[str, type[Tunable]]:
+    """Return the systems of some names by name, all of ours without any; `MatchError` where one has no open numbers."""
     found: dict[str, type[Tunable]] = {"sasgeo": TunedSasgeo}
     for point in entry_points(group="sasgeo_bench.matchers"):
-        if point.value.startswith("sasgeo_baselines.") and not point.value.startswith("sasgeo_baselines.image."):
+        is_ours = point.value.startswith("sasgeo_baselines.") and not point.value.startswith("sasgeo_baselines.image.")
+        if point.name not in found and (point.name in names or (is_ours and not names)):
             kind = point.load()
             if isinstance(kind, type) and issubclass(kind, Tunable) and kind.open_numbers:
                 found[point.name] = kind
-    return dict(sorted(found.items()))
+    stray = next((name for name in names if name not in found), None)
+    if stray is not None:
+        message = f"{stray} is no installed matcher with open numbers: its class must be a Tunable that names some"
+        raise MatchError(message)
+    return dict(sorted((name, kind) for name, kind in found.items() if name in names or not names))
 
 
 def drawn(out: Path) -> Asked:
@@ -165,9 +172,13 @@ def read_trials(path: Path) -> list[Trial]:
     return sorted_trials(found)
 
 
-def sorted_trials(trials: Iterable[Trial]) -> list[Trial]:
-    """Return trials in the order of systems and of their settings."""
-    order = {(name, json.dumps(one)): at for name, kind in systems().items() for at, one in enumerate(kind.settings())}
+def sorted_trials(trials: Iterable[Trial], known: dict[str, type[Tunable]] | None = None) -> list[Trial]:
+    """Return trials in the order of systems and of the settings of `known` ones, ours unless given."""
+    order = {
+        (name, json.dumps(one)): at
+        for name, kind in (known or systems()).items()
+        for at, one in enumerate(kind.settings())
+    }
     return sorted(trials, key=lambda trial: (trial.system, order.get((trial.system, trial.setting), len(order))))
 
 
@@ -212,6 +223,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/open-numbers"), help="folder of maps, views and trials")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--matcher", action="append", default=[], help="name of a system; may be repeated")
     parser.add_argument("--table", type=Path, help="print the table of stored trials, and stop")
     options = parser.parse_args()
     if options.jobs < 1:
@@ -220,24 +232,24 @@ def main() -> None:
         if options.table is not None:
             print(*lines(read_trials(options.table)), sep="\n")
         else:
-            try_all(options.out, jobs=options.jobs)
+            try_all(options.out, systems(options.matcher), jobs=options.jobs)
     except SasgeoError as error:
         parser.error(str(error))
 
 
-def try_all(out: Path, *, jobs: int) -> None:
+def try_all(out: Path, asked_now: dict[str, type[Tunable]], *, jobs: int) -> None:
     """Ask what is left, store each trial, and print the table; a system that fails costs its own trials alone."""
     path = out / "trials.csv"
     there = read_trials(path) if path.exists() else []  # a file that is none is told before anything is drawn
-    known = {(name, json.dumps(numbers)) for name, kind in systems().items() for numbers in kind.settings()}
-    trials = [trial for trial in there if (trial.system, trial.setting) in known]
+    known = {(name, json.dumps(numbers)) for name, kind in asked_now.items() for numbers in kind.settings()}
+    trials = [trial for trial in there if trial.system not in asked_now or (trial.system, trial.setting) in known]
     if len(trials) < len(there):
         print(f"{counted(len(there) - len(trials), 'stored trial')} left out: of numbers that are open no more")
     asked = drawn(out)
     done = {(trial.system, trial.setting) for trial in trials}
     todo = [
         (kind, name, numbers)
-        for name, kind in systems().items()
+        for name, kind in asked_now.items()
         for numbers in kind.settings()
         if (name, json.dumps(numbers)) not in done
     ]
@@ -250,7 +262,8 @@ def try_all(out: Path, *, jobs: int) -> None:
             write_trials(path, trials)
             print(f"{trial.system} {trial.setting}: {trial.right} of {trial.views}, {trial.view_s:.2f} s a view")
     left = {name for name, _ in known - {(trial.system, trial.setting) for trial in trials}}
-    print(*lines(sorted_trials(trial for trial in trials if trial.system not in left)), sep="\n")
+    whole = (trial for trial in trials if trial.system in asked_now and trial.system not in left)
+    print(*lines(sorted_trials(whole, asked_now)), sep="\n")
 
 
 def _tried_or_told(out: Path, asked: Asked, kind: type[Tunable], system: str, numbers: dict[str, float]) -> Trial | str:

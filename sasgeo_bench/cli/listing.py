@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """List regions, suites, matchers, trackers, rejectors and segmenters; each command imports what it lists."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Annotated, Any
 
+import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table
+from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import RegionFolders
 from sasgeo_bench.matching.plugins import (
     MATCHERS,
@@ -15,7 +18,14 @@ from sasgeo_bench.matching.plugins import (
     SEGMENTERS,
     TRACKERS,
     list_entry_points,
+    load_matcher,
+    load_rejector,
+    load_segmenter,
+    load_tracker,
 )
+from sasgeo_bench.texts import plain
+
+Shown = Annotated[str | None, typer.Argument(help="show the card of one: a name of the list, or module:Class")]
 
 
 def list_regions_command(regions: RegionFolders = None) -> None:
@@ -45,33 +55,51 @@ def list_suites_command() -> None:
     print_table(table)
 
 
-def list_matchers_command() -> None:
-    """List the matchers that are installed, and where each comes from."""
-    _list("matcher", MATCHERS, {ORACLE: ("sasgeo-bench", "a control, given the truth")})
+def list_matchers_command(name: Shown = None) -> None:
+    """List the matchers that are installed, and where each comes from; or show the card of one."""
+    _list("matcher", MATCHERS, {ORACLE: ("sasgeo-bench", "a control, given the truth")}, name, load_matcher)
 
 
-def list_rejectors_command() -> None:
-    """List the rejectors that are installed, and where each comes from."""
-    _list("rejector", REJECTORS, {})
+def list_rejectors_command(name: Shown = None) -> None:
+    """List the rejectors that are installed, and where each comes from; or show the card of one."""
+    _list("rejector", REJECTORS, {}, name, load_rejector)
 
 
-def list_trackers_command() -> None:
-    """List the trackers that are installed, and where each comes from."""
-    _list("tracker", TRACKERS, {ORACLE: ("sasgeo-bench", "a control, given the truths")})
+def list_trackers_command(name: Shown = None) -> None:
+    """List the trackers that are installed, and where each comes from; or show the card of one."""
+    _list("tracker", TRACKERS, {ORACLE: ("sasgeo-bench", "a control, given the truths")}, name, load_tracker)
 
 
-def list_segmenters_command() -> None:
-    """List the segmenters that are installed, and where each comes from."""
-    _list("segmenter", SEGMENTERS, {ORACLE_SEGMENTER: ("sasgeo-bench", "a control, given the labels")})
+def list_segmenters_command(name: Shown = None) -> None:
+    """List the segmenters that are installed, and where each comes from; or show the card of one."""
+    own = {ORACLE_SEGMENTER: ("sasgeo-bench", "a control, given the labels")}
+    _list("segmenter", SEGMENTERS, own, name, load_segmenter)
 
 
-def _list(kind: str, group: str, own: Mapping[str, tuple[str, str]]) -> None:
-    """Print the entry points of a group, and what needs none."""
+def _list(
+    kind: str, group: str, own: Mapping[str, tuple[str, str]], name: str | None, load: Callable[[str], Any]
+) -> None:
+    """Print the entry points of a group and what needs none; or the card of the one of a name."""
+    if name is not None and name in own:
+        say(f"{name}: {own[name][1]}, and has no card")
+        return
+    if name is not None:
+        _show(load(name).card)
+        return
     rows = {
         name: (point.dist.name if point.dist is not None else "", point.value)
         for name, point in list_entry_points(group).items()
     }
     table = Table(kind, "package", "class", box=None, pad_edge=False)
-    for name, cells in sorted((rows | dict(own)).items()):
-        table.add_row(name, *cells)
+    for each, cells in sorted((rows | dict(own)).items()):
+        table.add_row(each, *cells)
     print_table(table)
+
+
+def _show(card: object) -> None:
+    """Print what a card says, a field after the other; what it leaves empty is left out."""
+    said = ((field.name.replace("_", " "), getattr(card, field.name)) for field in fields(card))  # type: ignore[arg-type]
+    for title, value in said:
+        text = ", ".join(value) if isinstance(value, tuple) else str(value)
+        if text:
+            say(f"{title}: {plain(text)}")

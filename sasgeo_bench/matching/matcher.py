@@ -224,7 +224,7 @@ def check_learned(learned: object, *, most_bytes: int = MOST_LEARNED_BYTES) -> s
         message = "learn() returned a text that is no UTF-8, expected characters alone: write bytes as base64, say"
         raise MatchError(message) from error
     if not 0 < size <= most_bytes:  # a stored file of no bytes was emptied by somebody
-        message = f"learn() returned {size} bytes, expected 1 to {most_bytes}"
+        message = f"learn() returned {size} bytes, expected {f'at most {most_bytes}' if size else 'a text'}"
         raise MatchError(message)
     return learned
 

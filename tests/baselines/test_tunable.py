@@ -12,6 +12,7 @@ from sasgeo_baselines.schmidt_segcorr import SchmidtSegcorr
 from sasgeo_baselines.tunable import MOST_TRIALS
 
 from benchmarks import budget, open_numbers
+from sasgeo_bench.errors import MatchError
 
 SYSTEMS = open_numbers.systems()
 HEAD = b"system,setting,views,right,median_m,view_s\n"
@@ -123,16 +124,23 @@ class Failing(SchmidtSegcorr):
 def test_a_system_that_fails_costs_its_own_trials_and_old_settings_are_left_out(trials, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(open_numbers, "drawn", lambda _: {})
     monkeypatch.setattr(open_numbers, "ProcessPoolExecutor", ThreadPoolExecutor)
-    monkeypatch.setattr(open_numbers, "systems", lambda: {"brm_grid": SYSTEMS["brm_grid"], "failing": Failing})
     monkeypatch.setattr(open_numbers, "tried", lambda *asked: made_up(*asked[2:]))
-    open_numbers.write_trials(tmp_path / "trials.csv", trials)  # of polar_vsc, too, which is no system now
-    open_numbers.try_all(tmp_path, jobs=1)
+    old = replace(trials[0], setting='{"pixel_m": 2.0}')
+    open_numbers.write_trials(tmp_path / "trials.csv", [*trials[6:], old])
+    open_numbers.try_all(tmp_path, {"brm_grid": SYSTEMS["brm_grid"], "failing": Failing}, jobs=1)
     said = capsys.readouterr().out
-    assert "6 stored trials left out: of numbers that are open no more" in said
+    assert "1 stored trial left out: of numbers that are open no more" in said
     assert 'failing {"sharpness": 2.0}: no trial (ValueError: too sharp)' in said
     assert [line.split("|")[1].strip() for line in said.splitlines() if line.startswith("| `")] == ["`brm_grid`"]
     stored = open_numbers.read_trials(tmp_path / "trials.csv")
-    assert [trial.system for trial in stored] == ["brm_grid"] * 6 + ["failing"]
+    assert [trial.system for trial in stored] == ["brm_grid"] * 6 + ["failing"] + ["polar_vsc"] * 6
+
+
+def test_others_may_try_a_system_of_theirs_and_hear_why_not():
+    assert set(open_numbers.systems(["brm_grid", "sasgeo"])) == {"brm_grid", "sasgeo"}
+    for name in ("random", "nobody"):
+        with pytest.raises(MatchError, match=f"^{name} is no installed matcher with open numbers"):
+            open_numbers.systems([name])
 
 
 def made_up(kind, system, numbers):

@@ -96,6 +96,30 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
     assert "oracle_pose" in {row[0] for row in rows}
 
 
+@pytest.mark.parametrize(
+    ("command", "name", "said"),
+    [
+        ("list-matchers", "road_2rit", "title: "),
+        ("list-trackers", "swapf", "source: "),
+        ("list-rejectors", "sue", "is calibrated: "),
+        ("list-segmenters", "colour_thresholds", "classes: "),
+        ("list-matchers", "oracle_pose", "oracle_pose: a control, given the truth, and has no card"),
+    ],
+)
+def test_the_card_of_one_is_shown_field_by_field(command, name, said, program) -> None:
+    code, told, err = program(command, name)
+    assert (code, err) == (0, "")
+    lines = told.splitlines()
+    assert lines[0].startswith(f"name: {name}" if len(lines) > 1 else said)
+    assert any(line.startswith(said) and len(line) > len(said) - 1 for line in lines)
+
+
+def test_a_card_that_nobody_has_is_told_in_one_line(program) -> None:
+    code, told, err = program("list-matchers", "road_2ri")
+    assert (code, told) == (2, "")
+    assert "there is no matcher 'road_2ri', did you mean 'road_2rit'" in err
+
+
 def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, monkeypatch) -> None:
     pip = tmp_path.parent / f"{tmp_path.name}-bin" / "pip"  # an environment may have been made without one
     pip.parent.mkdir()

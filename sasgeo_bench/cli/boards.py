@@ -12,7 +12,7 @@ from rich.table import Table
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, print_table, read_day, say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
@@ -235,6 +235,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
             raise ConfigError(message)
         check_day(opened, plan.seal, plan.seal.openings)
     if options.dry_run:
+        tell(f"reading the cards of {counted(len(plan.matchers), 'matcher')}: a second or two each")
         say(plan.to_text())
         return
     results, private = options.results, options.private

@@ -142,10 +142,8 @@ def _detectors(names: Sequence[str] | None) -> tuple[Detector, ...]:
 
 def _in_words(request: Request) -> str:
     suite = find_suite(request.suite)
-    queries = request.count * len(suite.variants) * len(suite.card.tracks)
-    queries *= len(suite.drawn_by(request.choice.detectors))
     named = "flights" if "sequence" in suite.card.tracks else "queries"  # the ground decides how many views one has
-    most = f"at most {request.count} sites, {queries} {named}"
+    most = f"at most {request.count} sites, {request.most} {named}"
     return f"{request.suite} on {request.region.id}: {most}, {_folder(request)}"
 
 

@@ -117,11 +117,12 @@ class PipelinePlan:
 
 @dataclass(frozen=True, kw_only=True)
 class _Lacking:
-    """A task to be drawn, and why."""
+    """A task to be drawn, why, and how many queries or flights it has at most."""
 
     suite: str
     region: str
     why: str
+    most: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,11 +139,19 @@ class _Stage:
         if self.lacking:
             reasons = Counter(item.why for item in self.lacking)
             causes = ", ".join(f"{count} {why}" for why, count in reasons.most_common())
-            state = f"{state}, {len(self.lacking)} to be drawn ({causes})"
+            state = f"{state}, {len(self.lacking)} to be drawn ({causes}), at most {_most(self.lacking)}"
         lines = [f"  {self.name}: {state}"]
         lines += [f"    to be drawn: {item.suite} on {item.region}" for item in self.lacking[:MOST_LINES]]
         more = len(self.lacking) - MOST_LINES
         return [*lines, f"    and {more} more"] if more > 0 else lines
+
+
+def _most(lacking: Sequence[_Lacking]) -> str:
+    """Return how many queries and flights some tasks have at most, in words."""
+    flights = sum(item.most for item in lacking if _is_of_flights(item.suite))
+    queries = sum(item.most for item in lacking) - flights
+    said = [counted(queries, "query", "queries")] if queries or not flights else []
+    return " and ".join([*said, *([counted(flights, "flight")] if flights else [])])
 
 
 def _stage(name: str, requests: Sequence[Request]) -> _Stage:
@@ -152,7 +161,7 @@ def _stage(name: str, requests: Sequence[Request]) -> _Stage:
         name=name,
         made=tuple(made for _, made in found if made is not None),
         lacking=tuple(
-            _Lacking(suite=request.suite, region=request.region.id, why=why_to_draw(request))
+            _Lacking(suite=request.suite, region=request.region.id, why=why_to_draw(request), most=request.most)
             for request, made in found
             if made is None
         ),
@@ -176,6 +185,7 @@ def _paper_stage(plan: PipelinePlan) -> _Stage:
                 suite=suite,
                 region=region_name(seed),
                 why="drawn otherwise or damaged" if there[suite, seed] else "not there yet",
+                most=paper.trials,
             )
             for (suite, seed), made in found.items()
             if made is None
@@ -201,7 +211,7 @@ def _run_lines(plan: PipelinePlan, stages: Sequence[_Stage], controls: _Stage) -
         ]
         run_folder = plan.out / "runs" / planned.card.name / planned.hash
         behind = sum(_count_rows(run_folder, item.suite, item.region) for item in lacking)
-        more = f", and what is drawn; {behind} answered there before" if lacking else ""
+        more = f", and at most {_most(lacking)} to be drawn; {behind} answered there before" if lacking else ""
         where = " (controls alone)" if own_stages == [controls] and len(stages) > 1 else ""
         lines.append(f"    {spec}{where}: {done} answered, {left} to ask{more}")
         lines += [f"      {one.name}: {line}" for one in runs for line in one.lines()]

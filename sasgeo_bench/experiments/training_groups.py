@@ -85,6 +85,10 @@ class TrainingGroups:
         for part in ("train", *_NOT_TRAINED) if is_holdout(self.split) else ():
             places = _places_of(part, requests, self.split)
             lines.append(f"    {part}: {named(places, 'place') if places else 'no place'}")
+        there = {place for item in requests for place in self.split.places_in(item.region.id)}
+        for half, other in () if is_holdout(self.split) else (HALVES, HALVES[::-1]):
+            if not any(self.split.half_of.get(place) == half for place in there):
+                lines.append(f"    half {half} has no place here: nobody learns for half {other}")
         if self.learning.oracles:
             lines.append(f"    {', '.join(self.learning.oracles)}: from {own}, never ranked")
         return lines

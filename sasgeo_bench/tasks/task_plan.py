@@ -51,6 +51,13 @@ class Request(Settings):
     split: Split
     elsewhere: RegionFile | None = None
 
+    @property
+    def most(self) -> int:
+        """Return how many queries, or flights, are drawn at most: a region may hold fewer sites."""
+        suite = find_suite(self.suite)
+        taken = [self.choice.takes(variant, track) for variant in suite.variants for track in suite.tracks(variant)]
+        return self.count * sum(taken) * len(suite.drawn_by(self.choice.detectors))
+
 
 @dataclass(frozen=True, kw_only=True)
 class Wanted(Settings):

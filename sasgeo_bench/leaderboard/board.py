@@ -87,8 +87,8 @@ class Board:
     """A board in memory: scored rows by matcher, without those of the controls, and the leaderboard.
 
     `with_calibration` also holds rows of the calibration places of a hold-out split, which no figure counts.
-    `remarks` are those of rejectors on their fits; `protection` has no row where no answer has a protection level,
-    `acceptance` none where no place is absent.
+    `remarks` are on the fits of rejectors and on where they are not applied; `protection` has no row where no answer
+    has a protection level, `acceptance` none where no place is absent.
     `judged` are the results of rejectors by matcher and rejector, `measured` the measurements of truths by query id,
     of flights those of their first view, `views` the rows of views of flights by matcher (`flights.view_frame`), and
     `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so

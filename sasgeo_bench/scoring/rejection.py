@@ -286,7 +286,7 @@ class RejectionTask:
 
 @dataclass(frozen=True, kw_only=True)
 class RejectionResult:
-    """Rows of `judge` by matcher and rejector, rows of the board, and the rejectors' remarks on their fits.
+    """Rows of `judge` by matcher and rejector, rows of the board, and remarks on fits and on what is not applied.
 
     `acceptance` are rows of `acceptance.acceptance_frame`, of rejectors that give chances.
     """
@@ -302,8 +302,8 @@ def evaluate_rejectors(
 ) -> RejectionResult:
     """Evaluate all rejectors on the answers of each entry; the number of processes does not affect the result.
 
-    Record rejectors that fail on an entry, and report those that do not apply to it. Raise the error of a rejector that
-    fails on every entry: it is at fault, not the answers.
+    Record rejectors that fail on an entry; those that do not apply to it are among the remarks. Raise the error of a
+    rejector that fails on every entry: it is at fault, not the answers.
     """
     judged: dict[tuple[str, str], pd.DataFrame] = {}
     rows: list[pd.DataFrame] = []
@@ -324,10 +324,12 @@ def evaluate_rejectors(
             judged[task.matcher, name] = frame
             rows.append(figures)
             accepted += [taken] if len(taken) else []  # columns of an empty one have no type
-            if not len(frame):
-                tell(f"{name} on {task.matcher}: not applied, {why_not(task.scores, is_taught=task.is_taught)}")
-            elif name != OWN:
+            if name != OWN and len(frame):
                 remarks += [f"{name} on {task.matcher}: {remark}" for remark in remarks_of(frame)]
+        idle = [name for name in task.rules if (task.matcher, name) in judged and not len(judged[task.matcher, name])]
+        if idle:
+            why = why_not(task.scores, is_taught=task.is_taught)
+            remarks.append(f"{', '.join(idle)} on {task.matcher}: not applied, {why}")
     for name, listed in errors.items():
         if name != OWN and len(listed) == len(tasks):
             raise listed[0]

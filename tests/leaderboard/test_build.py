@@ -266,8 +266,10 @@ def test_a_rejector_that_is_not_applied_says_why(out, split):
         predictions=[out / "runs" / "random"], root=out, board=out / "boards" / "mine", draws=200, split=split,
         rejectors=[f"{__name__}:Doubt"],
     )  # fmt: skip
-    make_board(request, tell=lines.append)
-    assert "doubt on random: not applied, no other place of the board calibrates" in lines
+    board = make_board(request, tell=lines.append)
+    why = "doubt on random: not applied, no other place of the board calibrates"
+    assert why in lines
+    assert why in board.remarks
     silent = pd.DataFrame({"is_answered": [False] * 2, "place": ["a", "b"]})
     assert why_not(silent) == "it has no answers to judge"
     half = pd.DataFrame({"is_answered": [False, True], "place": ["a", "b"]})

@@ -17,6 +17,7 @@ import argparse
 import csv
 import json
 import math
+import re
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -34,7 +35,7 @@ import sasgeo_bench as sgb
 from sasgeo_bench.errors import MatchError, SasgeoError, StoreError, counted
 from sasgeo_bench.sasgeo.variants import Sasgeo
 from sasgeo_bench.search.plan import Plan
-from sasgeo_bench.texts import one_line
+from sasgeo_bench.texts import NAME, one_line
 
 HALVES = (("krems", "porto"), ("london", "vaduz"))  # towns on which systems were tried while they were built
 SUITES = {"clean": ("perception",), "local-warp": ("G1 tilt",)}
@@ -187,7 +188,7 @@ def _is_sound(trial: Trial) -> bool:
     numbers = trial.numbers.values()
     is_number = all(isinstance(value, int | float) and math.isfinite(value) for value in numbers)
     is_counted = 0 <= trial.right <= trial.views and math.isfinite(trial.median_m) and math.isfinite(trial.view_s)
-    return bool(numbers) and is_number and is_counted and trial.system.isidentifier()
+    return bool(numbers) and is_number and is_counted and re.fullmatch(NAME, trial.system) is not None
 
 
 def _have_same_names(trials: Sequence[Trial]) -> bool:

@@ -69,9 +69,14 @@ class OracleObjects:
     inner: ClassVar[type[Matcher]]
     card: MatcherCard
 
+    def __init_subclass__(cls, *, inner: type[Matcher]) -> None:
+        """Name the matcher that answers."""
+        cls.inner, cls.card = inner, oracle_card(inner.card)
+
     def __init__(self) -> None:
         """Make the matcher that answers."""
         self._inner = self.inner()
+        self._poses: dict[str, Pose] = {}
 
     def learn(self, training: Training) -> str:
         """Keep the true pose of each query whose place is on the map."""
@@ -92,36 +97,21 @@ class OracleObjects:
         return self._inner.match(query, top_k=top_k)
 
 
-class OracleLiuObjectGraph(OracleObjects):
+class OracleLiuObjectGraph(OracleObjects, inner=LiuObjectGraph):
     """`liu_object_graph` with perfect objects."""
 
-    inner = LiuObjectGraph
-    card = oracle_card(inner.card)
 
-
-class OracleRoad2Rit(OracleObjects):
+class OracleRoad2Rit(OracleObjects, inner=Road2Rit):
     """`road_2rit` with perfect roads."""
 
-    inner = Road2Rit
-    card = oracle_card(inner.card)
 
-
-class OracleSpatialGraphClique(OracleObjects):
+class OracleSpatialGraphClique(OracleObjects, inner=SpatialGraphClique):
     """`spatial_graph_clique` with perfect objects."""
 
-    inner = SpatialGraphClique
-    card = oracle_card(inner.card)
 
-
-class OracleStfmCentroids(OracleObjects):
+class OracleStfmCentroids(OracleObjects, inner=StfmCentroids):
     """`stfm_centroids` with perfect objects."""
 
-    inner = StfmCentroids
-    card = oracle_card(inner.card)
 
-
-class OracleTriangleRsim(OracleObjects):
+class OracleTriangleRsim(OracleObjects, inner=TriangleRsim):
     """`triangle_rsim` with perfect buildings."""
-
-    inner = TriangleRsim
-    card = oracle_card(inner.card)

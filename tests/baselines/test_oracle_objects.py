@@ -75,6 +75,8 @@ def test_each_yardstick_is_of_a_matcher_and_says_that_it_knows_too_much():
 @pytest.mark.parametrize("name", YARDSTICKS)
 def test_untaught_it_answers_as_its_matcher_and_a_damaged_text_is_refused(name, region, pairs):
     matcher, plain = YARDSTICKS[name](), YARDSTICKS[name].inner()
+    with pytest.raises(RuntimeError, match="prepare"):
+        matcher.match(pairs[0][0], top_k=1)
     for one in (matcher, plain):
         one.prepare(region, None)
     query, _ = pairs[0]

@@ -107,20 +107,21 @@ class Votes:
         lists = tree.query_ball_point(at, 1.0)
         starts = np.cumsum([0, *(len(rows) for rows in lists[:-1])])
         total = np.add.reduceat(self.weight[np.concatenate(lists).astype(np.int64)], starts)
+        total = total.round(9)  # equal sums of unequal order tie
         kept: list[Crowd] = []
         middles: list[Floats] = []
-        for first in np.argsort(-total.round(9), kind="stable")[: _TRIED * count].tolist():
+        for first in np.argsort(-total, kind="stable")[: _TRIED * count].tolist():
             if all(np.linalg.norm(at[first] - other) > 1.0 for other in middles):
                 rows = np.array(sorted(lists[first]), dtype=np.int64)
-                kept.append(Crowd(mode=self._mean(rows), rows=rows))
+                kept.append(Crowd(mode=self._mean(rows, score=float(total[first])), rows=rows))
                 middles.append(at[first])
         return kept[:count]
 
-    def _mean(self, rows: Ints) -> Mode:
-        """Return the mean of poses, with the sum of their weights."""
+    def _mean(self, rows: Ints, *, score: float) -> Mode:
+        """Return the mean of poses, with a score."""
         weight = self.weight[rows]
         east_m, north_m = weight @ self.poses[rows, :2] / weight.sum()
         turn = complex(weight @ np.exp(1j * np.radians(self.poses[rows, 2])))
         yaw_deg = float(np.degrees(np.angle(turn)))
         pose = Pose(easting_m=float(east_m), northing_m=float(north_m), yaw_deg=yaw_deg)
-        return Mode(pose=pose, score=float(weight.sum()))
+        return Mode(pose=pose, score=score)

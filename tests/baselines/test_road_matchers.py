@@ -172,6 +172,16 @@ def test_votes_that_agree_make_a_crowd_and_the_heaviest_is_first():
     assert np.cos(np.radians(second.mode.pose.yaw_deg)) == pytest.approx(1.0)
 
 
+@given(st.lists(st.floats(0.1, 1.0), min_size=3, max_size=8), st.randoms(use_true_random=False))
+def test_crowds_of_the_same_weights_tie_in_whatever_order_they_are_summed(weights, random):
+    shuffled = [random.sample(weights, len(weights)) for _ in range(8)]
+    east_m = np.repeat(100.0 * np.arange(len(shuffled)), len(weights))
+    poses = np.column_stack([east_m, np.zeros((len(east_m), 2))])
+    scores = [crowd.mode.score for crowd in Votes.of(poses, np.concatenate(shuffled)).crowds(count=8)]
+    assert len(scores) == len(shuffled)
+    assert scores == sorted(scores, reverse=True)
+
+
 def test_agreement_of_roads_by_hand(made):
     """Of a road 100 m long and 5 m wide half is mapped; a mapped one beside it is not seen."""
     layers = np.zeros((3, 100, 100), dtype=np.uint8)

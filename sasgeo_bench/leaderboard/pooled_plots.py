@@ -235,9 +235,10 @@ def _prices(chart: Axes, rows: pd.DataFrame, names: Sequence[str], column: str) 
     chart.step(front[column], front["value"], where="post", color="#999999", lw=1.2)
     others = rows[~rows["matcher"].isin(names) & np.isfinite(cost)]
     chart.plot(others[column], others["value"], color="#999999", marker="o", ms=4, ls="", zorder=1)
-    for row in others[others["matcher"].isin(front["matcher"])].to_dict("records"):
-        at = (row[column], row["value"])
-        chart.annotate(row["matcher"], at, (3, 3), textcoords="offset points", fontsize=6.5, color="#555555")
+    named = others[others["matcher"].isin(front["matcher"])].sort_values(column)
+    for number, row in enumerate(named.to_dict("records")):
+        at, away = (row[column], row["value"]), (3, 3 if number % 2 else -9)  # names of neighbours lie apart
+        chart.annotate(row["matcher"], at, away, textcoords="offset points", fontsize=6.5, color="#555555")
     for number, name in enumerate(names):
         (row,) = rows[rows["matcher"] == name].to_dict("records")
         if not np.isfinite(row[column]):

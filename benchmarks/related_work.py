@@ -28,7 +28,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from benchmarks.sim_to_real import BLIND, estimate, line
+from benchmarks.sim_to_real import estimate, line
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.leaderboard.board_files import read_board as read_table
 from sasgeo_bench.leaderboard.board_files import read_scores
@@ -81,12 +81,14 @@ RULE = "|---|---:|---:|---:|---:|---:|---:|"
 
 
 def read_board(board: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return the scores of views and flights, with `hit`, and the rows of the leaderboard about rejection."""
+    """Return scores of views and flights, with `hit` and `is_control`, and the leaderboard's rows about rejection."""
     _, rows = read_table(board)
     scores = read_scores(board)
     scores = scores.reindex(columns=scores.columns.union([WAY]))  # a board without flights has none
     text = {name: scores[name].astype(str) for name in ("matcher", "place", "block", "pair_id", "role", "kind")}
-    scores = scores.assign(hit=(scores["position_error_m"] <= 25.0).astype(float), **text)  # noqa: PLR2004 - the radius
+    is_control = scores["matcher"].isin(rows.loc[rows["is_control"], "matcher"])
+    hit = (scores["position_error_m"] <= 25.0).astype(float)  # noqa: PLR2004 - the radius
+    scores = scores.assign(hit=hit, is_control=is_control, **text)
     wanted = {"metric": "auroc", "suite": "all suites", "stratum": "as drawn", "track": "localization"}
     wanted["prior_group"] = PRIOR
     return scores, rows[(rows[list(wanted)] == pd.Series(wanted)).all(axis=1)]
@@ -139,7 +141,8 @@ def rejection(rows: pd.DataFrame, matcher: str) -> str:
 def lines(scores: pd.DataFrame, rejectors: pd.DataFrame) -> Iterator[str]:
     """Yield the table: systems of the paper in its order, SASGeo last of them, then all others by name."""
     systems = {tracker: matcher for matcher, tracker in TRACKS.items()}
-    asked = sorted({systems.get(name, name) for name in set(scores["matcher"]) - set(BLIND)})
+    is_listed = ~scores["is_control"] | (scores["matcher"] == DEAD)
+    asked = sorted({systems.get(name, name) for name in scores.loc[is_listed, "matcher"].unique()})
     yield HEAD
     yield RULE
     for matcher in (*(name for name in PAPER if name in asked), *(name for name in asked if name not in PAPER)):

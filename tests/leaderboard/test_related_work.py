@@ -51,7 +51,7 @@ def test_the_own_confidence_of_a_system_comes_before_the_margin():
 def test_a_stored_board_has_a_row_for_each_system_and_no_control(board, system, column):
     head, _, *rows = related_work.lines(*related_work.read_board(RESULTS / board))
     cells = {row.split("`")[1]: row.split("|") for row in rows}
-    assert not {"random", "prior_centre", "oracle_pose"} & set(cells)
+    assert not {"random", "prior_centre", "oracle_pose", "prior_only"} & set(cells)
     assert all(len(row) == len(head.split("|")) for row in cells.values())
     assert cells[system][column].strip() != "-"
 

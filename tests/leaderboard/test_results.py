@@ -84,9 +84,16 @@ def table_of_losses():
     return {*program["HEAD"].splitlines(), *rows}
 
 
-def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures, table_of_losses):
+@pytest.fixture(scope="module")
+def table_of_systems():
+    """The lines that the program of the paper's table prints of the board of systems."""
+    program = runpy.run_path(str(RESULTS.parents[1] / "benchmarks" / "related_work.py"))
+    return set(program["lines"](*program["read_board"](RESULTS / "systems")))
+
+
+def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures, table_of_losses, table_of_systems):
     boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
-    boards |= tables_of_pictures | table_of_losses
+    boards |= tables_of_pictures | table_of_losses | table_of_systems
     for page in PAGES:
         if page.stem == SEGMENTERS.name:  # its tables are held as wholes, below
             continue

@@ -3,22 +3,24 @@
 
     .venv/bin/python -m benchmarks.related_work docs/results/systems
 
-Reads a board of `pipelines/systems.toml`. A cell is a share in percent, and in brackets how it differs (95 %) from what
-the same system does on the same places without the difficulty:
+Reads a board of `pipelines/systems.toml`. Cells are percent. Two columns are figures of the board with their intervals:
 
 - dense: views found within 25 m of suite `clean`, by detectors that err;
-- graph: views found where a place and its twin differ in their vectors alone, against the same without vectors;
+- rejection: how often a right answer is more confident than a false one (area under ROC; 50 is chance), by the system's
+  own confidence, or by `margin` where it has none; views of all suites with a disc of 500 m and a heading known to 20
+  degrees.
+
+The others are a share, what it is more or less than the same system has on the same places without the difficulty, and
+the interval of this difference (95 %):
+
+- graph: views found within 25 m where a place and its twin differ in their vectors alone, against the same without;
 - persistence: views found on a map ten years old, against the map of the day;
 - unknown: views found that are partly hidden (`occlusion`), against the whole view;
-- temporal: share of the way within 25 m on flights over maps of all ages, against dead reckoning on the same flights,
-  of which the interval of the share itself is given;
-- rejection: how often a right answer is more confident than a false one (area under ROC; 50 is chance; the brackets are
-  the interval of the figure itself), by the system's own confidence, or by `margin` where it has none; views of all
-  suites with a disc of 500 m and a heading known to 20 degrees.
+- temporal: share of the way within 25 m on flights over maps of all ages, against dead reckoning on the same flights.
 
-No answer is a miss. Intervals draw places, then blocks and sites in them; a difference that is seen at fewer than six
-places has an interval no narrower than that of Wilson's for views won and lost. `-` is not applicable, or too few to
-say.
+No answer is a miss. Intervals of differences draw places, then blocks and sites in them; one that is seen at fewer than
+six places is no narrower than Wilson's for views won and lost, and none reaches beyond what can be. `-` is not
+applicable, or too few to say.
 """
 
 import argparse
@@ -26,13 +28,15 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 
 from benchmarks.sim_to_real import estimate, line
-from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.leaderboard.board_files import MEND, check_shape, read_scores
 from sasgeo_bench.leaderboard.board_files import read_board as read_table
-from sasgeo_bench.leaderboard.board_files import read_scores
 from sasgeo_bench.scoring.intervals import LEAST_CLUSTERS, difference_interval, wilson_share
+from sasgeo_bench.texts import markdown_code
 
 PAPER = {
     "vojir_instance_rays": "Vojir 2020",
@@ -63,94 +67,127 @@ REJECTORS = ("own", "margin")  # the first that a system has
 
 @dataclass(frozen=True, slots=True)
 class Ability:
-    """A column: which stressed views show it, and whether their controls are what they are compared with."""
+    """A column of differences: which stressed views show it."""
 
     name: str
     is_shown: Callable[[pd.DataFrame], pd.Series]
-    is_compared: bool = True
 
 
 ABILITIES = (
-    Ability("Dense", lambda rows: rows["suite"] == "clean", is_compared=False),
     Ability("Graph", lambda rows: rows["suite"].isin(TWINS)),
     Ability("Persistence", lambda rows: (rows["suite"] == "real-age") & (rows["strength"] == 10)),  # noqa: PLR2004 - years
     Ability("Unknown", lambda rows: rows["suite"] == "occlusion"),
 )
+DENSE = {"metric": "within_25m", "suite": "clean", "stratum": "stress", "rejector": ""}
+REJECTION = {"metric": "auroc", "suite": "all suites", "stratum": "as drawn"}
 HEAD = "| Row of the paper, or system | Dense | Graph | Temporal | Persistence | Unknown | Rejection |"
 RULE = "|---|---:|---:|---:|---:|---:|---:|"
+TEXTS = ("block", "pair_id")
+NUMBERS = {"strength": np.inf, "view_cells": np.inf, "position_error_m": np.inf, WAY: 1.0}  # at most
 
 
 def read_board(board: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Return scores of views and flights, with `hit` and `is_control`, and the leaderboard's rows about rejection."""
+    """Return scores of views and flights, with `hit` and `is_control`, and the leaderboard's rows of two columns."""
     _, rows = read_table(board)
+    check_shape("leaderboard", rows)
     scores = read_scores(board)
     scores = scores.reindex(columns=scores.columns.union([WAY]))  # a board without flights has none
-    text = {name: scores[name].astype(str) for name in ("matcher", "place", "block", "pair_id", "role", "kind")}
+    text = ("matcher", "suite", "track", "kind", "role", "place", *TEXTS)
+    scores = scores.astype({name: object for name in text if name in scores})
+    check_shape("scores", scores)
+    check_columns(scores)
     is_control = scores["matcher"].isin(rows.loc[rows["is_control"], "matcher"])
     hit = (scores["position_error_m"] <= 25.0).astype(float)  # noqa: PLR2004 - the radius
-    scores = scores.assign(hit=hit, is_control=is_control, **text)
-    wanted = {"metric": "auroc", "suite": "all suites", "stratum": "as drawn", "track": "localization"}
-    wanted["prior_group"] = PRIOR
-    return scores, rows[(rows[list(wanted)] == pd.Series(wanted)).all(axis=1)]
+    own = (rows["track"] == "localization") & (rows["prior_group"] == PRIOR)
+    of_column = [(rows[list(wanted)] == pd.Series(wanted)).all(axis=1) for wanted in (DENSE, REJECTION)]
+    found = rows[own & np.logical_or(*of_column)]
+    if found.duplicated(["matcher", "metric", "rejector"]).any():
+        message = f"{board}: leaderboard.parquet says one figure twice: {MEND}"
+        raise StoreError(message)
+    return scores.assign(hit=hit, is_control=is_control), found
+
+
+def check_columns(scores: pd.DataFrame) -> None:
+    """Refuse scores whose columns, beyond those of any board, do not hold what the table needs.
+
+    A missing number is no answer.
+    """
+    if scores.empty:
+        message = f"scores.parquet holds no view and no flight: {MEND}"
+        raise StoreError(message)
+    for name in (*TEXTS, *NUMBERS):
+        if name not in scores:
+            message = f"scores.parquet has no column {name!r}: {MEND}"
+            raise StoreError(message)
+        values = scores[name]
+        if name in TEXTS:
+            is_right = values.map(lambda one: isinstance(one, str)).all()
+        else:
+            is_right = pd.api.types.is_numeric_dtype(values) and not ((values < 0) | (values > NUMBERS[name])).any()
+        if not is_right:
+            message = f"scores.parquet: {name} holds something else than it should, or nothing: {MEND}"
+            raise StoreError(message)
 
 
 def views_of(scores: pd.DataFrame, matcher: str, ability: Ability) -> pd.DataFrame:
-    """Return the views that show an ability, with `gain` over the control of the same site and size."""
+    """Return the views that show an ability, with `without`, what the controls of the same site and size have."""
     own = scores[(scores["matcher"] == matcher) & (scores["track"] == "localization") & scores["is_present"]]
     shown = own[(own["role"] == "stress") & ability.is_shown(own)]
-    if not ability.is_compared:
-        return shown.assign(gain=shown["hit"])
     site = ["suite", "pair_id", "view_cells"]
     control = own[own["role"] == "control"].groupby(site)["hit"].mean().rename("without")
-    found = shown.join(control, on=site, how="inner")
-    return found.assign(gain=found["hit"] - found["without"])
+    return shown.join(control, on=site, how="inner")
 
 
 def flights_of(scores: pd.DataFrame, tracker: str) -> pd.DataFrame:
-    """Return the flights of a tracker, with `gain` over dead reckoning on the same flight."""
+    """Return the flights of a tracker, with `without`, what dead reckoning has on the same flight."""
     flown = scores[(scores["track"] == SEQUENCE) & (scores["role"] != "falsifier")]
     bare = flown[flown["matcher"] == DEAD].set_index("query_id")[WAY].rename("without")
     own = flown[flown["matcher"] == tracker].join(bare, on="query_id", how="inner")
-    return own.assign(hit=own[WAY], gain=own[WAY] - (0.0 if tracker == DEAD else own["without"]))
+    return own.assign(hit=own[WAY])
 
 
-def cell(rows: pd.DataFrame, *, is_compared: bool) -> str:
-    """Return a share in percent and the interval of the difference, or of the share itself where none is compared."""
+def cell(rows: pd.DataFrame) -> str:
+    """Return a share, its difference from `without`, and the interval of this difference, in percent."""
+    rows = rows.dropna(subset=["hit", "without"])
     if rows.empty:
         return "-"
-    _, lo, hi = estimate(rows, rows["gain"])
-    places = rows.loc[rows["gain"] != 0, "place"].nunique()
-    if is_compared and places < LEAST_CLUSTERS:  # draws of so few say too little
-        won, lost = (rows["gain"].mul(sign).clip(lower=0).mean() for sign in (1, -1))
+    gain, least = rows["hit"] - rows["without"], -100 * rows["without"].mean()
+    value, lo, hi = estimate(rows, gain)
+    if rows.loc[gain != 0, "place"].nunique() < LEAST_CLUSTERS:  # draws of so few say too little
+        won, lost = (gain.mul(sign).clip(lower=0).mean() for sign in (1, -1))
         wide = difference_interval(*(wilson_share(share, rows["pair_id"].nunique()) for share in (won, lost)))
         lo, hi = min(lo, 100 * wide.lo), max(hi, 100 * wide.hi)
-    signed = f"{lo:+.0f} to {hi:+.0f}" if is_compared else f"{lo:.0f} to {hi:.0f}"
-    return f"{100 * rows['hit'].mean():.0f} ({signed})"
+    lo, hi = max(lo, least) + 0.0, min(hi, 100 + least)  # no "-0"
+    return f"{100 * rows['hit'].mean():.0f}, {value:+.0f} ({lo:+.0f} to {hi:+.0f})"
 
 
-def rejection(rows: pd.DataFrame, matcher: str) -> str:
-    """Return the area under ROC in percent and its interval, of a matcher's own confidence or else of `margin`."""
-    own = rows[(rows["matcher"] == matcher) & rows["value"].notna()].set_index("rejector")
-    name = next((name for name in REJECTORS if name in own.index), None)
+def figure(rows: pd.DataFrame, matcher: str, metric: str, rejectors: Sequence[str] = ("",)) -> str:
+    """Return a figure of the board and its interval in percent, of the first of some rejectors that has one."""
+    own = rows[(rows["matcher"] == matcher) & (rows["metric"] == metric)].set_index("rejector")
+    own = own[np.isfinite(own[["value", "lo", "hi"]]).all(axis=1)]
+    name = next((name for name in rejectors if name in own.index), None)
     if name is None:
         return "-"
-    row = own.loc[name]
-    return f"{100 * row['value']:.0f} ({100 * row['lo']:.0f} to {100 * row['hi']:.0f})"
+    value, lo, hi = (100 * own.loc[name, each] for each in ("value", "lo", "hi"))
+    return f"{value:.0f} ({lo:.0f} to {hi:.0f})"
 
 
-def lines(scores: pd.DataFrame, rejectors: pd.DataFrame) -> Iterator[str]:
+def lines(scores: pd.DataFrame, figures: pd.DataFrame) -> Iterator[str]:
     """Yield the table: systems of the paper in its order, SASGeo last of them, then all others by name."""
     systems = {tracker: matcher for matcher, tracker in TRACKS.items()}
-    is_listed = ~scores["is_control"] | (scores["matcher"] == DEAD)
-    asked = sorted({systems.get(name, name) for name in scores.loc[is_listed, "matcher"].unique()})
+    asked = set(scores.loc[~scores["is_control"] | (scores["matcher"] == DEAD), "matcher"])
+    listed = sorted({systems.get(name, name) for name in asked})
     yield HEAD
     yield RULE
-    for matcher in (*(name for name in PAPER if name in asked), *(name for name in asked if name not in PAPER)):
-        named = " and ".join(f"`{name}`" for name in (matcher, TRACKS.get(matcher)) if name)
-        cells = [cell(views_of(scores, matcher, each), is_compared=each.is_compared) for each in ABILITIES]
-        flown = cell(flights_of(scores, TRACKS.get(matcher, matcher)), is_compared=matcher != DEAD)
+    for matcher in (*(name for name in PAPER if name in listed), *(name for name in listed if name not in PAPER)):
+        tracker = TRACKS.get(matcher, matcher)
+        named = " and ".join(markdown_code(name) for name in dict.fromkeys((matcher, tracker)) if name in asked)
+        graph, *others = (cell(views_of(scores, matcher, each)) for each in ABILITIES)
+        flights = flights_of(scores, tracker)
+        flown = f"{100 * flights['hit'].mean():.0f}" if matcher == DEAD and len(flights) else cell(flights)
         name = f"{PAPER[matcher]}: {named}" if matcher in PAPER else named
-        yield line(name, *cells[:2], flown, *cells[2:], rejection(rejectors, matcher))
+        dense = figure(figures, matcher, DENSE["metric"])
+        yield line(name, dense, graph, flown, *others, figure(figures, matcher, REJECTION["metric"], REJECTORS))
 
 
 def main(words: Sequence[str] | None = None) -> None:

@@ -203,7 +203,7 @@ def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[]
         path = Path(id_or_path)
         if not path.is_file():
             known = {name: name for name in list_known()} | {
-                other.stem: str(other) for other in sorted(path.parent.glob("*.toml"))
+                other.stem: str(other) for other in sorted(path.parent.glob("*.toml")) if other.is_file()
             }
             message = f"there is no {noun} file {id_or_path}{_hint(path.stem, known)}: check the path"
             raise ConfigError(message)

@@ -44,6 +44,7 @@ LOST_M: Final = 600.0  # radius of the first search for another place
 _MOST_LOST_M: Final = 8000.0
 _WIDER: Final = 4.0  # the next search, where the one before found nothing
 _LIFE: Final = 20  # views for which another place is followed beside the belief
+_EXACT: Final = 1e-9  # m2 and deg2, added to an odometer's covariance: one that is exact has none
 _DOUBTS: Final = 3  # views in a row that fit better elsewhere
 _PROOF_NATS: Final = 6.0  # more evidence than the belief has
 _AROUND_M: Final = 450.0  # radius of the places that a view is held against
@@ -105,7 +106,8 @@ def increment_cost(step: Step, before: Pose, after: Pose) -> float:
     right_m, up_m = east_m * np.cos(turn) - north_m * np.sin(turn), east_m * np.sin(turn) + north_m * np.cos(turn)
     off_deg = float(wrap_deg(after.yaw_deg - before.yaw_deg - step.increment[2]))
     residual = np.array([right_m - step.increment[0], up_m - step.increment[1], off_deg])
-    return float(residual @ np.linalg.solve(np.reshape(step.covariance, (SIDE, SIDE)), residual))
+    covariance = np.reshape(step.covariance, (SIDE, SIDE)) + _EXACT * np.eye(SIDE)
+    return float(residual @ np.linalg.solve(covariance, residual))
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,10 @@ from dataclasses import dataclass, field
 from itertools import product
 from typing import TYPE_CHECKING, Final, Literal, Self
 
-from sasgeo_bench.errors import ConfigError, PoseError
+import numpy as np
+import shapely
+
+from sasgeo_bench.errors import ConfigError, PoseError, ShapeError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
@@ -34,6 +37,7 @@ PROFILE: Final[Detector] = "profile"  # the measured confusions of a segmenter, 
 PERCEIVED: Final[tuple[Detector, ...]] = (PUBLISHED, "measured", PROFILE)  # models, the first if none is chosen
 PAINTED: Final[tuple[Detector, ...]] = (RENDERED, "shifted")  # looks of rendered pictures, the first if none is chosen
 BY: Final = "+"  # between a suite of pictures and the segmenter that made its evidence
+_MOST_M: Final = 1e6  # of a view's vectors from its middle: no view is as large
 RECALIBRATED: Final = "+shares"  # after the segmenter: by the map's shares of the classes
 # Kinds of queries whose right score is known beforehand; the scorer knows them by these names.
 CONTROLS: Final = "controls"  # their suite
@@ -133,13 +137,14 @@ class Step:
         Right and up, metres, and the turn of the heading, degrees clockwise, in the axes of the view before. None for
         the first view, and where the odometer lost its way.
     covariance : tuple of float, optional
-        Of the increment as the odometer believes: 3 x 3, row by row, in m2, m deg and deg2; None without an increment.
+        Of the increment as the odometer believes: 3 x 3, row by row, in m2, m deg and deg2, 0 of one that is exact;
+        None without an increment.
 
     Raises
     ------
     PoseError
-        If a number is not finite, there are not three and nine of them, only one of the two is given, or a first view
-        has an increment.
+        If a number is not finite, there are not three and nine of them, only one of the two is given, a first view has
+        an increment, or the covariance is none: not symmetric, or with a negative variance in some direction.
 
     Examples
     --------
@@ -163,6 +168,16 @@ class Step:
                 f"neither, got {self!r}"
             )
             raise PoseError(message)
+        if self.covariance is not None and not _is_covariance(self.covariance):
+            message = f"a covariance is symmetric and positive semidefinite, got {self.covariance!r}"
+            raise PoseError(message)
+
+
+def _is_covariance(values: tuple[float, ...]) -> bool:
+    """Return whether nine numbers are a matrix that is symmetric and positive semidefinite, but for rounding."""
+    matrix = np.reshape(values, (3, 3))
+    slack = 1e-6 * float(np.abs(matrix).max())
+    return bool((np.abs(matrix - matrix.T) <= slack).all()) and float(np.linalg.eigvalsh(matrix).min()) >= -slack
 
 
 def view_id(sequence_id: str, frame: int) -> str:
@@ -209,6 +224,11 @@ class Query(_Question):
     step : Step, optional
         Where the query stands in a flight; None for a view alone. Only the first view of a flight has a prior of place
         and heading.
+
+    Raises
+    ------
+    ShapeError
+        If vectors lack a column, or a geometry is missing, empty, or has a coordinate beyond any view or not finite.
     """
 
     evidence: Evidence
@@ -218,6 +238,20 @@ class Query(_Question):
     vectors: "gpd.GeoDataFrame | None" = None
     frames: tuple[Frame, ...] = ()
     step: Step | None = None
+
+    def __post_init__(self) -> None:
+        """Check the vectors."""
+        if self.vectors is None or not len(self.vectors):
+            return
+        is_whole = all(name in self.vectors for name in ("class", "level", "is_bridge"))
+        shapes = self.vectors.geometry
+        has_shapes = not (shapes.isna() | shapes.is_empty).any()
+        if not (is_whole and has_shapes and (np.abs(shapely.get_coordinates(shapes)) <= _MOST_M).all()):
+            message = (
+                f"vectors of query {self.query_id!r} have columns class, level and is_bridge, and geometries with "
+                f"coordinates of at most {_MOST_M:g} m"
+            )
+            raise ShapeError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

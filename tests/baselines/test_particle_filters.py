@@ -208,3 +208,14 @@ def particles_at(pose):
     """One particle."""
     place_m = np.array([[pose.easting_m, pose.northing_m]])
     return Particles(place_m=place_m, yaw_deg=np.array([pose.yaw_deg]), scale=np.ones(1), weight=np.ones(1))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 3), (513, 5)], ids=lambda shape: f"{shape[0]} x {shape[1]}")
+@pytest.mark.parametrize("name", FILTERS)
+def test_a_map_of_any_size_is_read(name, shape, made, flight):
+    """Of 513 rows the last is alone in its strip and its block."""
+    tracker = FILTERS[name]()
+    tracker.count = 100
+    tracker.prepare(made.region_of(made.textured(5, 640)[:, : shape[0], : shape[1]].copy()), None)
+    views, _ = flight
+    assert len(fly(tracker, views[:2], PRIOR)) == 2

@@ -90,6 +90,8 @@ def test_the_cost_of_a_step_is_its_distance_from_what_the_odometer_says():
     found = increment_cost(step, Pose(easting_m=0.0, northing_m=0.0, yaw_deg=90.0), after)
     assert found == pytest.approx(2.0**2 + (1.0 / 0.5) ** 2)
     assert increment_cost(Step(sequence_id="f", frame=1), after, after) == 0.0
+    exact = replace(step, covariance=(0.0,) * 9)
+    assert increment_cost(exact, Pose(easting_m=0.0, northing_m=0.0, yaw_deg=90.0), after) > 1e6
 
 
 def test_it_is_refused_to_step_before_start(region):

@@ -29,12 +29,15 @@ TOWN = "town-grid"
 REACH_M = 144.0
 
 numbers = st.floats(allow_nan=False, allow_infinity=False)
+covariances = st.lists(st.floats(-1e3, 1e3), min_size=9, max_size=9).map(
+    lambda mixed: tuple((np.reshape(mixed, (3, 3)) @ np.reshape(mixed, (3, 3)).T).ravel().tolist())
+)
 known_steps = st.builds(
     Step,
     sequence_id=st.text(min_size=1, max_size=18),
     frame=st.integers(1, 2**31 - 1),
     increment=st.tuples(numbers, numbers, numbers),
-    covariance=st.tuples(*[numbers] * 9),
+    covariance=covariances,
 )
 unknown_steps = st.builds(Step, sequence_id=st.text(min_size=1), frame=st.integers(0, 99))
 
@@ -126,6 +129,18 @@ def test_a_step_that_is_not_whole_is_refused_with_what_was_given(changes):
         Step(**{"sequence_id": "f1", "frame": 1} | changes)
     assert "sequence_id='f1'" in str(told.value)
     assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize(
+    "covariance",
+    [
+        pytest.param((-1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0), id="negative"),
+        pytest.param((1.0, 0.5, 0, 0, 1.0, 0, 0, 0, 1.0), id="not symmetric"),
+    ],
+)
+def test_a_covariance_that_is_none_is_refused(covariance):
+    with pytest.raises(PoseError, match="a covariance is symmetric and positive semidefinite"):
+        Step(sequence_id="f1", frame=1, increment=(0.0, 50.0, 0.0), covariance=covariance)
 
 
 @pytest.mark.parametrize("column", ["frame", "increment_covariance"])

@@ -65,9 +65,11 @@ class DistanceMaps:
         for top in range(0, region.grid.rows, strip):
             above, below = min(reach, top), top + strip + reach
             labels = labels_of_map[top - above : below]
-            rows = slice(above + factor // 2, above + strip, factor)
+            # The middle of a block; of one that the map ends in, its last row or column.
+            rows = slice(above + min(factor // 2, region.grid.rows - top - 1), above + strip, factor)
+            cols = slice(min(factor // 2, region.grid.cols - 1), None, factor)
             for label, into in enumerate(distance[:, top // factor : (top + strip) // factor]):
-                far_px = _far(labels == label, cell_m)[rows, factor // 2 :: factor] / PX_M
+                far_px = _far(labels == label, cell_m)[rows, cols] / PX_M
                 part = np.rint(np.minimum(far_px / TRUNCATION, 1.0) * _STEPS).astype(np.uint8)
                 part = np.pad(part, [(0, into.shape[0] - part.shape[0]), (0, into.shape[1] - part.shape[1])], "edge")
                 into[:] = part

@@ -95,8 +95,8 @@ class Table:
     def at(self, place_m: Floats, yaw_deg: Floats) -> NDArray[np.float32]:
         """Return embeddings by trilinear interpolation, shape (N, DIMENSIONS); places beyond are moved to the edge."""
         rows, cols = self.values.shape[:2]
-        down = np.clip((self.corner_m[1] - place_m[:, 1]) / self.step_m, 0, rows - 1.001)
-        right = np.clip((place_m[:, 0] - self.corner_m[0]) / self.step_m, 0, cols - 1.001)
+        down = np.clip((self.corner_m[1] - place_m[:, 1]) / self.step_m, 0, rows - 1)
+        right = np.clip((place_m[:, 0] - self.corner_m[0]) / self.step_m, 0, cols - 1)
         turn = np.mod(yaw_deg, 360.0) * (YAWS / 360.0)
         low = [np.floor(part).astype(np.int64) for part in (down, right, turn)]
         part = [(value - whole).astype(np.float32) for value, whole in zip((down, right, turn), low, strict=True)]
@@ -104,6 +104,7 @@ class Table:
         flat = self.values.reshape(-1, DIMENSIONS)
         for corner in np.ndindex(2, 2, 2):
             row, col, yaw = (whole + step for whole, step in zip(low, corner, strict=True))
+            row, col = np.minimum(row, rows - 1), np.minimum(col, cols - 1)  # on the edge: its share is 0
             share = np.prod([near if step else 1 - near for near, step in zip(part, corner, strict=True)], axis=0)
             found += flat[(row * cols + col) * YAWS + yaw % YAWS] * (share / np.float32(_FULL))[:, None]
         return found

@@ -10,7 +10,8 @@ import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, Evidence, cell_offsets_m
 from sasgeo_bench.regions.graph import build_graph
@@ -18,6 +19,7 @@ from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, folded_share,
 from sasgeo_bench.tasks.suites.local_warp import bent
 from sasgeo_bench.tasks.suites.vectors import VECTOR_CLASSES, VectorNoise, perceive_vectors, smooth_shift
 from sasgeo_bench.tasks.vectors import as_features, instances_of_mask, vector_table
+from tests.made_up import query_of
 
 EXACT = VectorNoise(missed_share=0.0, gap_share=0.0, shift_m=0.0)
 EAST, NORTH = 5000.0, 7000.0
@@ -240,3 +242,24 @@ def test_bent_lines_lie_on_the_cells_of_the_bent_view(scene, yaw_deg, seed):
     if len(curved) > 60:
         assert np.mean(curved) > 0.85
         assert np.mean(curved) > np.mean(straight)
+
+
+@pytest.mark.filterwarnings("ignore:invalid value encountered in linestrings")  # of shapely, on what is damaged
+@pytest.mark.parametrize(
+    "damage",
+    [
+        pytest.param(lambda vectors: vectors.drop(columns="level"), id="no level"),
+        pytest.param(lambda vectors: vectors.set_geometry([None]), id="no geometry"),
+        pytest.param(lambda vectors: vectors.set_geometry([shapely.LineString()]), id="empty"),
+        pytest.param(lambda vectors: vectors.set_geometry([shapely.LineString([(0, np.nan), (1, 1)])]), id="nan"),
+        pytest.param(lambda vectors: vectors.set_geometry([shapely.Point(1e300, 0)]), id="far beyond any view"),
+    ],
+)
+def test_vectors_that_no_system_could_read_are_refused_with_the_query(damage):
+    seen = Evidence(classes=("road_minor",), cells=np.zeros((1, 4, 4), np.uint8), cell_size_m=1.0)
+    prior = Prior(center_m=(0.0, 0.0), radius_m=10.0, yaw_deg=0.0, yaw_sigma_deg=1.0, scale_sigma=0.0)
+    query = query_of(seen, prior)
+    sound = vector_table([("road_minor", 0, False, shapely.LineString([(0, 0), (1, 1)]))])
+    assert replace(query, vectors=sound).vectors is sound
+    with pytest.raises(ShapeError, match="vectors of query 'q' have columns class, level and is_bridge"):
+        replace(query, vectors=damage(sound))

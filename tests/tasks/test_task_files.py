@@ -53,10 +53,12 @@ shares = st.floats(0, 1)
 words = st.text(max_size=12)
 poses = st.builds(Pose, easting_m=metres, northing_m=metres, yaw_deg=st.floats(0, 359), scale=st.floats(0.5, 2))
 points = st.tuples(metres, metres)
+in_view = st.floats(-1e5, 1e5)
+corners = st.tuples(in_view, in_view)
 shapes = st.one_of(
-    st.builds(shapely.Point, points),
-    st.builds(shapely.LineString, st.lists(points, min_size=2, max_size=4)),
-    st.builds(lambda x, y: shapely.box(x, y, x + 1, y + 2), metres, metres),
+    st.builds(shapely.Point, corners),
+    st.builds(shapely.LineString, st.lists(corners, min_size=2, max_size=4)),
+    st.builds(lambda x, y: shapely.box(x, y, x + 1, y + 2), in_view, in_view),
 )
 
 

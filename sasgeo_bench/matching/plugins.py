@@ -3,6 +3,7 @@
 
 import difflib
 import importlib
+import sys
 import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
@@ -55,13 +56,19 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
 def _installed(group: str) -> list[EntryPoint]:
     """Return the entry points of a group, our own first."""
     try:
-        installed = entry_points(group=group)
+        installed = _read(group, tuple(sys.path))
     except Exception as error:
         message = (
             f"an installed package has entry points that cannot be read ({message_of(error)}): reinstall or remove it"
         )
         raise MatchError(message) from error
     return sorted(installed, key=lambda point: (_home(point) not in SHIPPED, _home(point), point.value))
+
+
+@lru_cache(maxsize=8)
+def _read(group: str, _: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Read the entry points of a group once for each list of places that packages are imported from."""
+    return tuple(entry_points(group=group))
 
 
 def _clash(first: EntryPoint, other: EntryPoint) -> str:

@@ -141,14 +141,13 @@ def views_of(scores: pd.DataFrame, matcher: str, ability: Ability) -> pd.DataFra
 def flights_of(scores: pd.DataFrame, tracker: str) -> pd.DataFrame:
     """Return the flights of a tracker, with `without`, what dead reckoning has on the same flight."""
     flown = scores[(scores["track"] == SEQUENCE) & (scores["role"] != "falsifier")]
-    bare = flown[flown["matcher"] == DEAD].set_index("query_id")[WAY].rename("without")
-    own = flown[flown["matcher"] == tracker].join(bare, on="query_id", how="inner")
-    return own.assign(hit=own[WAY])
+    flown = flown.assign(hit=flown[WAY].fillna(0.0))  # no answer is a miss
+    bare = flown[flown["matcher"] == DEAD].set_index("query_id")["hit"].rename("without")
+    return flown[flown["matcher"] == tracker].join(bare, on="query_id", how="inner")
 
 
 def cell(rows: pd.DataFrame) -> str:
     """Return a share, its difference from `without`, and the interval of this difference, in percent."""
-    rows = rows.dropna(subset=["hit", "without"])
     if rows.empty:
         return "-"
     gain, least = rows["hit"] - rows["without"], -100 * rows["without"].mean()

@@ -92,6 +92,19 @@ def test_columns_of_the_board_have_its_own_intervals():
     assert related_work.figure(figures, "sasgeo", "within_25m") == f"{value:.0f} ({lo:.0f} to {hi:.0f})"
 
 
+def test_a_flight_without_an_answer_counts_as_missed():
+    flights = [
+        {"query_id": query, "matcher": name, "track": "sequence", "role": "stress", related_work.WAY: way}
+        for query, name, way in [
+            ("a", "m", 0.8),
+            ("b", "m", None),
+            ("a", "dead_reckoning", 0.0),
+            ("b", "dead_reckoning", 0.0),
+        ]
+    ]
+    assert related_work.flights_of(pd.DataFrame(flights), "m")["hit"].tolist() == [0.8, 0.0]
+
+
 def damaged(folder, table, change):
     """A copy of a stored board with one table changed, but for its versions."""
     shutil.copytree(RESULTS / "systems-objects", folder)

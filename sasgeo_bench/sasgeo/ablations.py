@@ -25,6 +25,7 @@ class Switches:
     Unless it `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it
     `learns_from_old`, training views on an older map are moved to the map of their own day. `burns_vectors` reads the
     perceived vectors as a second raster view, so that an arm without a graph sees what one with a graph sees.
+    `is_levelled` reads where a class lies and not how much of it there is: see `raster.RasterView.levelled`.
     """
 
     weights: Weights = "fitted"
@@ -35,6 +36,7 @@ class Switches:
     knows_age: bool = True
     learns_from_old: bool = True
     burns_vectors: bool = False
+    is_levelled: bool = True
 
     @property
     def learns(self) -> bool:

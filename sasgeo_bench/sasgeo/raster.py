@@ -32,6 +32,9 @@ THIN: Final = frozenset(
 BRIDGE: Final = "bridge"
 REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
 DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
+LEVEL_M: Final = 48.0  # standard deviation of the ground that a class is compared with; from train places
+_STEPS: Final = 8  # coarse cells in it
+_LEAST: Final = 1e-6
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
@@ -172,6 +175,24 @@ def line_width_m(class_name: str) -> float:
     return float(np.median(widths_m)) if widths_m else 0.0
 
 
+def _around(layers: NDArray[np.float32], is_known: NDArray[np.float32], *, sigma: float) -> NDArray[np.float32]:
+    """Return the mean of known cells around each cell, shape (C, rows, cols), weighed by a Gaussian of some cells."""
+    rows, cols = layers.shape[1:]
+    step = max(1, round(sigma / _STEPS))  # a mean over tens of cells needs no fine ones
+    coarse = max(1, cols // step), max(1, rows // step)
+
+    def summed(layer: NDArray[np.float32]) -> NDArray[np.float32]:
+        small = cv2.resize(layer, coarse, interpolation=cv2.INTER_AREA)
+        spread = cv2.GaussianBlur(small, (0, 0), sigma / step, borderType=cv2.BORDER_CONSTANT)
+        return np.asarray(cv2.resize(spread, (cols, rows), interpolation=cv2.INTER_LINEAR), dtype=np.float32)
+
+    means = np.zeros_like(layers)
+    for mean, layer, known in zip(means, layers, is_known, strict=True):
+        if layer.any():
+            mean[:] = summed(layer) / np.maximum(summed(known), np.float32(_LEAST))
+    return means
+
+
 @dataclass(frozen=True, kw_only=True)
 class RasterView:
     """A view weighed by gains, in the classes of a map: factors of layers and of known cells, shape (C, rows, cols)."""
@@ -209,6 +230,19 @@ class RasterView:
             for at, layer in zip(active.tolist(), weights, strict=True):
                 row[at] += np.vdot(layer, warped(field.layers[at], to_map, frame.shape).astype(np.float32))
         return total / FULL
+
+    def levelled(self) -> Self:
+        """Return the view less the mean of each class around each cell, over known cells.
+
+        What is left says where a class lies, not how much of it there is: errors of a class hang together over tens of
+        metres, on the map as in the view, and would count once for each cell. Unknown cells still say nothing.
+        """
+        is_known = ((self.weights != 0) | (self.known != 0)).astype(np.float32)
+        sigma = LEVEL_M / self.cell_size_m
+        weights, known = (
+            layers - is_known * _around(layers, is_known, sigma=sigma) for layers in (self.weights, self.known)
+        )
+        return replace(self, weights=weights, known=known)
 
     def scaled(self, scaling: NDArray[np.float64]) -> Self:
         """Return the view with the score of each class scaled."""

@@ -240,6 +240,8 @@ class Reading:
             both = [name in drawn.classes for name in reader.region.classes]
             view = view.halved_with(RasterView.of(drawn, reader.region.classes, gains), both)
         view = view.times(np.float32(seen.cell_size_m**2))
+        if reader.switches.is_levelled:
+            view = view.levelled()
         if reader.rarity is None:
             return view
         return view.times(reader.rarity.weights(seen.cells, seen.classes, cell_size_m=seen.cell_size_m))

@@ -148,6 +148,10 @@ _FITTED: Final = (
     "log-likelihood ratios from rates of vanishing, appearing, seeing and mapping by class, how much being near a "
     "class is like being on it, and an exponent for each class by conditional logit; all learnt on train places"
 )
+_LEVELLED: Final = (
+    "each class less its mean over some 48 m of known cells, so that where it lies counts, and not how much of it "
+    "there is: errors of a class hang together"
+)
 _GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
 _GRAPH_FITTED: Final = _GRAPH.format(
     how="learnt from train places: the rules of nodes by their plain statistics at true and wrong poses, from views "
@@ -169,7 +173,7 @@ _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIM
 def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -> MatcherCard:
     return MatcherCard(
         name=name,
-        version="1",
+        version="2" if _LEVELLED in ours else "1",
         title=title,
         source=_SOURCE.format(what=what),
         ours="; ".join((_OURS, *ours)),
@@ -183,7 +187,7 @@ class SasgeoRaster(SasgeoMatcher):
     """Raster alone, uniform weights."""
 
     card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _BLIND)
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, is_levelled=False)
 
 
 class SasgeoRasterVectors(SasgeoMatcher):
@@ -199,7 +203,7 @@ class SasgeoRasterVectors(SasgeoMatcher):
         _BLIND,
         limits=f"of vectors it reads where they lie, not how they connect or pass over each other; {_LIMITS}",
     )
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True, is_levelled=False)
 
 
 class SasgeoGraph(LearningMatcher):
@@ -214,7 +218,7 @@ class SasgeoGraph(LearningMatcher):
         _BLIND,
         limits=f"without train places rules and weights of the graph are those set by hand; {_LIMITS}",
     )
-    switches = Switches(weights="even", is_unknown_silent=False)
+    switches = Switches(weights="even", is_unknown_silent=False, is_levelled=False)
 
 
 class SasgeoStability(LearningMatcher):
@@ -225,6 +229,7 @@ class SasgeoStability(LearningMatcher):
         "SASGeo: raster, graph and stability",
         "Eqs. 5, 7-9, 11",
         _FITTED,
+        _LEVELLED,
         _GRAPH_FITTED,
         _BLIND,
         limits=_UNTAUGHT,
@@ -235,7 +240,9 @@ class SasgeoStability(LearningMatcher):
 class Sasgeo(LearningMatcher):
     """The whole scorer."""
 
-    card = _card("sasgeo", "SASGeo, whole", "Eqs. 5, 7-9, 11-14", _FITTED, _GRAPH_FITTED, _SILENT, limits=_UNTAUGHT)
+    card = _card(
+        "sasgeo", "SASGeo, whole", "Eqs. 5, 7-9, 11-14", _FITTED, _LEVELLED, _GRAPH_FITTED, _SILENT, limits=_UNTAUGHT
+    )
     switches = Switches()
 
 
@@ -250,7 +257,7 @@ class SasgeoHand(SasgeoMatcher):
         _GRAPH_BY_HAND,
         _SILENT,
     )
-    switches = Switches(weights="hand")
+    switches = Switches(weights="hand", is_levelled=False)
 
 
 class SasgeoDistinct(LearningMatcher):
@@ -261,6 +268,7 @@ class SasgeoDistinct(LearningMatcher):
         "SASGeo with distinctiveness",
         "Eqs. 5-9, 11-14",
         _FITTED,
+        _LEVELLED,
         "cells weigh by -log of the share of the map's configurations that are of their kind (Eq. 6)",
         _GRAPH_FITTED,
         _SILENT,
@@ -277,6 +285,7 @@ class SasgeoAgeless(LearningMatcher):
         "SASGeo without the age of the map",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
+        _LEVELLED,
         "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights; its "
         "exponents are learnt on old maps too",
         _GRAPH_FITTED,
@@ -294,6 +303,7 @@ class SasgeoFresh(LearningMatcher):
         "SASGeo trained without old maps",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
+        _LEVELLED,
         _FRESH,
         _GRAPH_FITTED,
         _SILENT,
@@ -311,6 +321,7 @@ class SasgeoFreshAgeless(LearningMatcher):
         "SASGeo trained without old maps, without the age of the map",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
+        _LEVELLED,
         _FRESH,
         "every map is weighed as one of today is",
         _GRAPH_FITTED,
@@ -328,6 +339,7 @@ class SasgeoStamped(LearningMatcher):
         "SASGeo with OSM timestamps",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
+        _LEVELLED,
         "features weigh by how long nobody had edited them when the map was taken, learnt by class in four strata",
         _GRAPH_FITTED,
         _SILENT,
@@ -344,6 +356,7 @@ class OracleSasgeo(LearningMatcher):
         "SASGeo that learns from the places it is asked on",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
+        _LEVELLED,
         _GRAPH_FITTED,
         _SILENT,
         "a yardstick, never ranked: a pipeline names it among its oracles",
@@ -355,5 +368,23 @@ class OracleSasgeo(LearningMatcher):
 class SasgeoNoGraph(LearningMatcher):
     """The whole scorer without graph."""
 
-    card = _card("sasgeo_no_graph", "SASGeo without graph", "Eqs. 5, 7-8, 12-14", _FITTED, _SILENT, limits=_UNTAUGHT)
+    card = _card(
+        "sasgeo_no_graph", "SASGeo without graph", "Eqs. 5, 7-8, 12-14", _FITTED, _LEVELLED, _SILENT, limits=_UNTAUGHT
+    )
     switches = Switches(has_graph=False)
+
+
+class SasgeoUnlevelled(LearningMatcher):
+    """The whole scorer that counts how much of a class there is, too."""
+
+    card = _card(
+        "sasgeo_unlevelled",
+        "SASGeo that counts how much of a class there is",
+        "Eqs. 5, 7-9, 11-14",
+        _FITTED,
+        "each cell counts alone, as in version 1 of `sasgeo`: beside `sasgeo` it tells what levelling is worth",
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=_UNTAUGHT,
+    )
+    switches = Switches(is_levelled=False)

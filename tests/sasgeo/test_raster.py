@@ -108,6 +108,38 @@ def test_exponents_scale_each_class(tiny, field, asked):
     assert parts == pytest.approx(view.by_class(field, [pose]) * scaling, rel=1e-4, abs=1e-3)
 
 
+def raster_view(weights, known):
+    return RasterView(weights=np.float32(weights)[None], known=np.float32(known)[None], cell_size_m=1.0)
+
+
+def test_levelled_a_class_that_is_everywhere_says_nothing():
+    level = raster_view(np.full((60, 80), 3.0), np.full((60, 80), -1.0)).levelled()
+    assert np.abs(level.weights).max() < 1e-5
+    assert np.abs(level.known).max() < 1e-5
+
+
+def test_levelled_where_a_class_lies_still_counts_and_unknown_cells_say_nothing():
+    cells = np.zeros((120, 120))
+    cells[40:60, 30:90] = 2.0
+    unknown = np.zeros_like(cells, dtype=bool)
+    unknown[:, 100:] = True
+    gains = np.where(unknown, 0.0, np.where(cells > 0, 2.0, -0.5))
+    level = raster_view(gains, np.where(unknown, 0.0, 0.25)).levelled()
+    assert not level.weights[0][unknown].any()
+    assert not level.known[0][unknown].any()
+    assert level.weights[0][(cells > 0) & ~unknown].min() > 0.5  # the rectangle stands out from the ground around it
+    assert level.weights[0][(cells == 0) & ~unknown].max() < 0
+    wide = raster_view(gains[:, :100], np.full((120, 100), 0.25)).levelled()  # what is unknown moves no mean by much
+    assert np.abs(wide.weights[0] - level.weights[0][:, :100]).max() < 0.1
+
+
+def test_levelled_parts_make_up_the_score(tiny, field, asked):
+    query, pose = asked[0]
+    view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region)).levelled()
+    whole = score_at(field, view.template(), pose)
+    assert view.by_class(field, [pose]).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
+
+
 # Vectors burnt as a view
 
 VECTORS = vector_table(

@@ -19,11 +19,8 @@ from sasgeo_bench.matching.learned_file import WHERE, read_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import MANIFEST, read_region
-from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import (
     AGES_YEARS,
-    FITTED,
-    HAND,
     check_age,
     check_classes,
     check_season,
@@ -36,13 +33,8 @@ from sasgeo_bench.sasgeo.class_weights import (
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weight_plot import WeightSheet, draw_weights, top_of
 
-# Column of the table, what it says, what it is multiplied with, digits. By hand the gains of Eq. 7 repeat sigma.
-WEIGHT: Final = (
-    "weight",
-    "weight of 100 m2 that are mapped and seen, after the exponent: nats; by hand, sigma of Eq. 5",
-    1,
-    2,
-)
+# Column of the table, what it says, what it is multiplied with, digits.
+WEIGHT: Final = ("weight", "weight of 100 m2 that are mapped and seen, after the exponent: nats", 1, 2)
 INFORMATION: Final = ("information", "information between map and view: thousandths of a nat a cell", 1000, 1)
 GAINS: Final = (
     ("agree", "gain where mapped and seen (Eq. 7): nats a cell", 1, 2),
@@ -73,18 +65,17 @@ def weights_command(
     model = read_model(learned)
     place = None if region is None else find_region(region, out=out)
     classes = load_taxonomy().names if place is None else place.classes
-    arms: dict[str, tuple[ScorerModel, Switches]] = {"hand": (ScorerModel.by_hand(classes), HAND)}
+    models = {"hand": ScorerModel.by_hand(classes)}
     if model is not None:
-        arms["fitted"] = (check_classes(model, () if place is None else place.classes), FITTED)
+        models["fitted"] = check_classes(model, () if place is None else place.classes)
     tables = {
-        name: class_weight_table(known, arm, ages_years=ages or AGES_YEARS, season=season)
-        for name, (known, arm) in arms.items()
+        name: class_weight_table(known, ages_years=ages or AGES_YEARS, season=season) for name, known in models.items()
     }
     for column, title, factor, digits in (WEIGHT, *(GAINS if model else ()), INFORMATION):
         say(title)
         print_table(_table(side_by_side(tables, column) * factor, digits))
     if place is not None:
-        for path in _drawn(place, *list(arms.values())[-1], ages=ages or [0.0], season=season, out=out):
+        for path in _drawn(place, list(models.values())[-1], ages=ages or [0.0], season=season, out=out):
             say(f"map of weights: {path}")
 
 
@@ -101,14 +92,13 @@ def lookalike_command(
     model = read_model(learned)
     mapped = find_region(region, out=out)
     seen = mapped if world is None else find_region(world, out=out)
-    arm = HAND if model is None else FITTED
     known = check_classes(model or ScorerModel.by_hand(mapped.classes), mapped.classes)
-    found = find_lookalike(mapped, seen, known, arm, side_m=side_m)
+    found = find_lookalike(mapped, seen, known, side_m=side_m)
     for table in (_numbers(found.scores), _numbers(found.terms)):
         print_table(table)
     path = out / "sheets" / f"lookalike-{mapped.manifest.id}-{mapped.manifest.extract.date}.png"
     path.parent.mkdir(parents=True, exist_ok=True)
-    draw_lookalike(path, sheet_of(found, mapped, known, arm))
+    draw_lookalike(path, sheet_of(found, mapped, known))
     say(f"lookalike: {path}")
 
 
@@ -163,15 +153,13 @@ def _numbers(frame: pd.DataFrame) -> Table:
     return table
 
 
-def _drawn(
-    region: Region, model: ScorerModel, arm: Switches, *, ages: Sequence[float], season: str, out: Path
-) -> list[Path]:
+def _drawn(region: Region, model: ScorerModel, *, ages: Sequence[float], season: str, out: Path) -> list[Path]:
     """Draw a map of weights for each age, all by one scale of colours."""
     rarity = rarity_map(region)
-    by_class = {age: class_weights_of(model, arm, age_years=age, season=season) for age in ages}
+    by_class = {age: class_weights_of(model, age_years=age, season=season) for age in ages}
     maps = {age: weight_map(region.layers, by_class[age], rarity) for age in ages}
     top = top_of(list(maps.values()))
-    source = "weights fitted" if arm.learns else "weights by hand"
+    source = "weights fitted" if model.views else "weights by hand"
     (out / "sheets").mkdir(parents=True, exist_ok=True)
     paths = []
     for age in ages:
@@ -184,6 +172,6 @@ def _drawn(
             facts=f"taken to be {age:g} years old  |  season: {season or 'unknown'}  |  {source}",
         )
         name = f"{region.manifest.id}-{region.manifest.extract.date}-{age:g}y{f'-{season}' if season else ''}"
-        paths.append(out / "sheets" / f"weights-{name}{'-fitted' if arm.learns else ''}.png")
+        paths.append(out / "sheets" / f"weights-{name}{'-fitted' if model.views else ''}.png")
         draw_weights(paths[-1], sheet)
     return paths

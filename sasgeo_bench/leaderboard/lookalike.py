@@ -114,10 +114,10 @@ def _place(point_m: NDArray[np.float64]) -> tuple[float, float]:
     return (float(point_m[0]), float(point_m[1]))
 
 
-def find_lookalike(mapped: Region, world: Region, model: ScorerModel, arm: Switches, *, side_m: float) -> Lookalike:
+def find_lookalike(mapped: Region, world: Region, model: ScorerModel, *, side_m: float) -> Lookalike:
     """Score a place, as it is on the day of `world`, and its lookalike on an older map.
 
-    `mapped` and `world` are one region at two dates, or the same twice; `arm` selects the scorer. Raise ConfigError if
+    `mapped` and `world` are one region at two dates, or the same twice. Raise ConfigError if
     the regions are of two places, the map is the younger one, or it holds no such pair of places.
     """
     check_dates(mapped, world)
@@ -140,7 +140,7 @@ def find_lookalike(mapped: Region, world: Region, model: ScorerModel, arm: Switc
         prior_group="rnone-unknown-s0",
         candidates=tuple(places),
     )
-    glance = Reader.of(mapped, model, arm).read(query)
+    glance = Reader.of(mapped, model, Switches()).read(query)
     poses = best_poses(glance)
     views = tuple(on_map.view(pose, size_cells=size, cell_size_m=cell_m) for pose in poses)
     return Lookalike(
@@ -196,10 +196,10 @@ def _terms(glance: Reading, poses: tuple[Pose, ...]) -> pd.DataFrame:
     return pd.DataFrame(rows, index=list(NAMES)).T
 
 
-def sheet_of(found: Lookalike, mapped: Region, model: ScorerModel, arm: Switches) -> LookalikeSheet:
+def sheet_of(found: Lookalike, mapped: Region, model: ScorerModel) -> LookalikeSheet:
     """Put what was found into words and pictures."""
     about, side_m = mapped.manifest, found.query.evidence.size_m[0]
-    class_weights = class_weights_of(model, arm, age_years=found.age_years)
+    class_weights = class_weights_of(model, age_years=found.age_years)
     weights = weight_map(mapped.layers, class_weights, rarity_map(mapped))
     apart_m = math.dist(found.pair.here_m, found.pair.there_m)
     turned_deg = round(float(found.poses[1].yaw_deg)) % 360
@@ -208,7 +208,7 @@ def sheet_of(found: Lookalike, mapped: Region, model: ScorerModel, arm: Switches
         title=f"{about.title}: what is seen, what the map says there, and where else it says nearly the same",
         facts=(
             f"{side_m:g} m views, no errors of perception  |  map {found.age_years:.1f} years older than the view  |  "
-            f"scores of {'sasgeo' if arm.learns else 'sasgeo_hand'}  |  EPSG:{about.epsg}, {east_m} E, {north_m} N"
+            f"scores of {'sasgeo' if model.views else 'sasgeo_prior'}  |  EPSG:{about.epsg}, {east_m} E, {north_m} N"
         ),
         view=found.query.evidence,
         mapped=found.views[0],
@@ -224,7 +224,6 @@ def sheet_of(found: Lookalike, mapped: Region, model: ScorerModel, arm: Switches
             "c  weights of the map there",
             f"d  the lookalike, {apart_m:.0f} m off" + (f", turned by {turned_deg}\u00b0" if turned_deg else ""),
         ),
-        weight_name="weight" if arm.learns else "\u03c3",
         note=NOTE.format(distance=found.pair.distance),
     )
 

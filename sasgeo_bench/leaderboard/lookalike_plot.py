@@ -50,8 +50,6 @@ class LookalikeSheet:
         As those of `lookalike.Lookalike`.
     panels : tuple of str
         A title for each of the four panels.
-    weight_name : str
-        What the weight of a class is called.
     note : str
         How the places were chosen.
     """
@@ -67,7 +65,6 @@ class LookalikeSheet:
     scores: pd.DataFrame
     terms: pd.DataFrame
     panels: tuple[str, str, str, str]
-    weight_name: str
     note: str
 
 
@@ -122,7 +119,7 @@ def _draw_row(
 def _draw_classes(chart: Axes, sheet: LookalikeSheet, shown: Sequence[str]) -> None:
     """Draw legend and table in one: a row for each class."""
     groups = ("", "", "", "", "covers, % of the ground", "", "", "raster score (Eq. 8), nats")
-    heads = ("", "", "view", "map there", "lookalike", sheet.weight_name, "true place", "lookalike")
+    heads = ("", "", "view", "map there", "lookalike", "weight", "true place", "lookalike")
     for number, row in enumerate((groups, heads)):
         _draw_row(chart, number, row, _CLASS_COLUMNS, color=GREY)
     classes = {item.name: item for item in load_taxonomy().classes}

@@ -9,23 +9,23 @@ import numpy as np
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.raster import doubted
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
-from sasgeo_bench.sasgeo.weights import Gains, by_hand, even_gains, hand_gains, likelihood_gains
+from sasgeo_bench.sasgeo.weights import Gains, even_gains, likelihood_gains
 
-Weights = Literal["even", "hand", "fitted"]
+Weights = Literal["even", "fitted"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Switches:
     """Settings in which the ablations differ; defaults are those of the full scorer.
 
-    `weights` are "even"; by "hand", Eqs. 5 and 7 with the numbers of the taxonomy; or "fitted", log-likelihood ratios
-    of fitted rates, each class with a fitted scale of its evidence. `is_unknown_silent` ignores unknown cells of the
-    view, else they count as absent. `has_graph` ranks modes with Eq. 9, too. `is_distinctive`, Eq. 6, gives rare
-    configurations more weight. `is_stamped`, Eq. 5 for each feature, weighs features by the time since their last edit.
-    Unless it `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it
-    `learns_from_old`, training views on an older map are moved to the map of their own day. `burns_vectors` reads the
-    perceived vectors as a second raster view, so that an arm without a graph sees what one with a graph sees.
-    `is_levelled` reads where a class lies and not how much of it there is: see `raster.RasterView.levelled`.
+    `weights` are "even", or "fitted": log-likelihood ratios of rates, each class with a scale of its evidence. A
+    matcher that does not learn has rates set by hand. `is_unknown_silent` ignores unknown cells of the view, else they
+    count as absent. `has_graph` ranks modes with Eq. 9, too. `is_distinctive`, Eq. 6, gives rare configurations more
+    weight. `is_stamped`, Eq. 5 for each feature, weighs features by the time since their last edit. Unless it
+    `knows_age`, every map counts as new, which separates stability from fitted weights. Unless it `learns_from_old`,
+    training views on an older map are moved to the map of their own day. `burns_vectors` reads the perceived vectors as
+    a second raster view, so that an arm without a graph sees what one with a graph sees. `correlates` takes errors of
+    a class to hang together, else each cell counts alone: see `raster.RasterView.levelled` and `damped`.
     """
 
     weights: Weights = "fitted"
@@ -36,7 +36,7 @@ class Switches:
     knows_age: bool = True
     learns_from_old: bool = True
     burns_vectors: bool = False
-    is_levelled: bool = True
+    correlates: bool = True
 
     @property
     def learns(self) -> bool:
@@ -55,7 +55,5 @@ class Switches:
         if self.weights == "even":
             return even_gains(np.ones(len(model.classes)))
         age_years = age_years if self.knows_age else 0.0
-        if self.weights == "hand":
-            return hand_gains(model.classes, age_years=age_years, persists=by_hand(season, model.classes).tolist())
         persists = model.persists(season).tolist()
         return likelihood_gains(model.rates, age_years=age_years, persists=persists).softened(model.missed_share)

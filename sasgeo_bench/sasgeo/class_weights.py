@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights of classes as a map ages, and maps of these weights: Eqs. 5-7 of the SASGeo paper.
 
-Gains are nats a cell. Weights include the scale of the evidence: nats for 100 m2 that are mapped and seen. By hand that
-is sigma of Eq. 5, since the scale is one cell in a hundred.
+Gains are nats a cell. Weights include the scale of the evidence: nats for 100 m2 that are mapped and seen. By hand the
+scale is one cell in a hundred.
 """
 
 import difflib
@@ -157,8 +157,6 @@ def _sectors(cell_m: float) -> list[list[NDArray[np.float32]]]:
 
 AGES_YEARS: Final = (0.0, 2.0, 5.0, 10.0, 20.0)
 AREA_M2: Final = 100.0
-HAND: Final = Switches(weights="hand")
-FITTED: Final = Switches(weights="fitted")
 GAINS: Final = ("agree", "extra", "missed", "quiet")
 
 
@@ -199,22 +197,23 @@ def check_classes(model: ScorerModel, classes: Sequence[str] = ()) -> ScorerMode
     return model.of_classes(classes) if classes else model
 
 
-def class_weights_of(model: ScorerModel, arm: Switches, *, age_years: float, season: str = "") -> NDArray[np.float64]:
+def class_weights_of(model: ScorerModel, *, age_years: float, season: str = "") -> NDArray[np.float64]:
     """Return the weight of each class in nats for 100 m2 that are mapped and seen, shape (C,).
 
     Examples
     --------
-    By hand it is sigma of Eq. 5, here a prior of 0.97 at the half-life of 231 years:
+    By hand, on a map of today and on one of 50 years ago:
 
-    >>> class_weights_of(ScorerModel.by_hand(["railway"]), HAND, age_years=231.0).round(3).tolist()
-    [0.485]
+    >>> railway = ScorerModel.by_hand(["railway"])
+    >>> [class_weights_of(railway, age_years=age).round(2).item() for age in (0.0, 50.0)]
+    [2.3, 1.37]
     """
-    agree = arm.gains(model, age_years=age_years, season=season).agree
+    agree = Switches().gains(model, age_years=age_years, season=season).agree
     return np.asarray(AREA_M2 * model.scaling * agree)
 
 
 def class_weight_table(
-    model: ScorerModel, arm: Switches, *, ages_years: Sequence[float] = AGES_YEARS, season: str = ""
+    model: ScorerModel, *, ages_years: Sequence[float] = AGES_YEARS, season: str = ""
 ) -> pd.DataFrame:
     """Return weights, gains and information of each class as the map ages, a row for each class and age.
 
@@ -224,13 +223,13 @@ def class_weight_table(
     persists = model.persists(season)
     parts = []
     for age in ages_years:
-        gains = arm.gains(model, age_years=age, season=season)
+        gains = Switches().gains(model, age_years=age, season=season)
         nats = [
             information(rates, age_years=age, persists=float(factor))
             for rates, factor in zip(model.rates, persists, strict=True)
         ]
         about = {"class": model.classes, "age_years": float(age), "order": range(len(model.classes))}
-        weights = class_weights_of(model, arm, age_years=age, season=season)
+        weights = class_weights_of(model, age_years=age, season=season)
         columns = {name: getattr(gains, name) for name in GAINS}
         parts.append(pd.DataFrame(about | {"weight": weights} | columns | {"information": nats}))
     rows = pd.concat(parts).sort_values(["order", "age_years"], kind="stable", ignore_index=True)

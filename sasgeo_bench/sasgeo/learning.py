@@ -35,6 +35,7 @@ from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.query import Query, Truth, base_of
 
 MODES: Final = 16  # of each training search
+SEARCHES: Final = 2  # of each view; the second finds the wrong places that the exponents of the first take for right
 WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
 MOST_VALUES: Final = 400_000_000  # cells in all layers of a map that is held whole: 16 km2 in cells of 1 m
 _MARGIN_M: Final = 72.0  # of a part of a map, beyond what any view there shows
@@ -158,14 +159,12 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     classes = classes_of(regions[name] for name in views)
     model = _fit_classes(regions, views, switches, classes) if switches.learns else _even(views, classes)
     lists: list[_ScoredModes] = []
-    for name, some in views.items():
-        reader = Reader.of(regions[name], model, replace(switches, has_graph=False))
-        lists += [_list(query, _pose(truth), reader, plan or Plan(), classes) for query, truth in some]
-    lists = [one for one in lists if len(one.by_class) > 1]
+    for _ in range(SEARCHES if switches.learns else 1):
+        lists = _searched(views, regions, model, switches, plan or Plan())
+        if switches.learns and lists:
+            model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
     if not lists:
         return model
-    if switches.learns:
-        model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
     if not switches.has_graph:
         return model
     model = replace(model, rules=_fit_rules(lists, regions))
@@ -328,6 +327,17 @@ def _in_classes(layers: NDArray[np.uint8], own: Sequence[str], classes: Sequence
         if name in own:
             cells[at] = layers[own.index(name)]
     return cells
+
+
+def _searched(
+    views: ViewsByMap, regions: Mapping[str, Region], model: ScorerModel, switches: Switches, plan: Plan
+) -> list[_ScoredModes]:
+    """Search for all views, and return those of which a wrong place was found."""
+    lists: list[_ScoredModes] = []
+    for name, some in views.items():
+        reader = Reader.of(regions[name], model, replace(switches, has_graph=False))
+        lists += [_list(query, _pose(truth), reader, plan, model.classes) for query, truth in some]
+    return [one for one in lists if len(one.by_class) > 1]
 
 
 def _list(query: Query, pose: Pose, reader: Reader, plan: Plan, classes: tuple[str, ...]) -> _ScoredModes:

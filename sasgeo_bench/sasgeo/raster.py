@@ -33,6 +33,7 @@ BRIDGE: Final = "bridge"
 REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
 DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
 LEVEL_M: Final = 48.0  # standard deviation of the ground that a class is compared with; from train places
+REPEATED: Final = 1e4  # nats2 m2 of a class that say half of what as many independent cells would; from train places
 _STEPS: Final = 8  # coarse cells in it
 _LEAST: Final = 1e-6
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
@@ -243,6 +244,16 @@ class RasterView:
             layers - is_known * _around(layers, is_known, sigma=sigma) for layers in (self.weights, self.known)
         )
         return replace(self, weights=weights, known=known)
+
+    def damped(self) -> Self:
+        """Return the view with each class divided by 1 + E / `REPEATED`, E the sum of its squared weights.
+
+        An error may be common to all of a class in a view. If its share of the evidence is the same for all classes,
+        the variance of a score is E + E^2 / `REPEATED`, its mean at the right place E, and the best weight their ratio
+        (Fisher's discriminant). So a class says no more than `REPEATED` allows, however much of it there is.
+        """
+        energy = np.square(self.weights, dtype=np.float64).sum(axis=(1, 2)) / self.cell_size_m**2
+        return self.scaled(1 / (1 + energy / REPEATED))
 
     def scaled(self, scaling: NDArray[np.float64]) -> Self:
         """Return the view with the score of each class scaled."""

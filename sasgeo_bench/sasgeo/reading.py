@@ -22,7 +22,7 @@ from sasgeo_bench.sasgeo.joint import columns
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
 from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
-from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, doubted, likeness_by_hand, read_field
+from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, doubted, read_field
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.sasgeo.weights import information
 from sasgeo_bench.search.field import Field, Template
@@ -198,7 +198,6 @@ class Reader:
     def of(cls, region: Region, model: ScorerModel, switches: Switches, *, search_cell_m: float = CELL_M) -> Self:
         """Prepare a map; it is searched in cells of about `search_cell_m`."""
         model = model.of_classes(region.classes)
-        near = model.likeness if switches.learns else likeness_by_hand(region.classes)
         cell_m = region.grid.cell_size_m
         is_rare = switches.is_distinctive
         return cls(
@@ -206,7 +205,7 @@ class Reader:
             model=model,
             switches=switches,
             field=read_field(
-                region, near, trust=model.trust if switches.is_stamped else None, cell_size_m=search_cell_m
+                region, model.likeness, trust=model.trust if switches.is_stamped else None, cell_size_m=search_cell_m
             ),
             graph=MappedGraph.of(region) if switches.has_graph else None,
             rarity=Rarity.of(region.layers, region.classes, cell_size_m=cell_m) if is_rare else None,
@@ -240,8 +239,8 @@ class Reading:
             both = [name in drawn.classes for name in reader.region.classes]
             view = view.halved_with(RasterView.of(drawn, reader.region.classes, gains), both)
         view = view.times(np.float32(seen.cell_size_m**2))
-        if reader.switches.is_levelled:
-            view = view.levelled()
+        if reader.switches.correlates:
+            view = view.levelled().damped()
         if reader.rarity is None:
             return view
         return view.times(reader.rarity.weights(seen.cells, seen.classes, cell_size_m=seen.cell_size_m))

@@ -18,7 +18,8 @@ from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_ra
 from sasgeo_bench.sasgeo.weights import SEASONS, STRATA, by_hand, fit_season
 
 START: Final = 0.01  # default: one cell in a hundred is independent
-_WIDTH: Final = 1.0  # of the prior, in logarithms
+_WIDTH: Final = 1.0  # of the prior of an exponent around the common one, in logarithms
+_COMMON_WIDTH: Final = 3.0  # and of the common one
 
 
 def fit_scaling(
@@ -28,7 +29,8 @@ def fit_scaling(
 
     Scores sum over cells as if these were independent. The score of each class is multiplied by an exponent of its own,
     fitted by conditional logit (McFadden 1974): the probability of the right mode among those of its search is the
-    softmax of the sums. Exponents are positive, with a log-normal prior around `start`.
+    softmax of the sums. Exponents are positive, with a log-normal prior around `start`, times a common factor that is
+    fitted, too: it says how sure the scores are, the rest which classes to trust.
 
     `choices` are the scores by class, shape (M, C), of the modes of each search, the right one first. The result has
     shape (C,).
@@ -59,20 +61,22 @@ def fit_scaling(
     starts = np.cumsum([0, *(len(one) for one in choices[:-1])])
     owner = np.repeat(np.arange(len(choices)), [len(one) for one in choices])
 
-    def loss(logs: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Return the negative log posterior of the logarithms of exponents, and its gradient."""
-        exponents = np.exp(logs)
+    def loss(vector: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        """Return the negative log posterior of logarithms of exponents and of the common factor, and its gradient."""
+        logs, common = vector[:-1], vector[-1]
+        off, exponents = (logs - begin - common) / _WIDTH**2, np.exp(logs)
         sums = rows @ exponents
         highest = np.maximum.reduceat(sums, starts)
         mass = np.exp(sums - highest[owner])
         total = np.add.reduceat(mass, starts)
-        value = float((np.log(total) + highest).sum() + 0.5 * (((logs - begin) / _WIDTH) ** 2).sum())
-        slope = ((mass / total[owner]) @ rows) * exponents + (logs - begin) / _WIDTH**2
-        return value, slope
+        prior = (_WIDTH * off) @ (_WIDTH * off) + (common / _COMMON_WIDTH) ** 2
+        value = float((np.log(total) + highest).sum() + 0.5 * prior)
+        slope = ((mass / total[owner]) @ rows) * exponents + off
+        return value, np.append(slope, common / _COMMON_WIDTH**2 - off.sum())
 
     begin = np.log(np.broadcast_to(np.asarray(start, dtype=np.float64), rows.shape[1:]))
-    found = scipy.optimize.minimize(loss, begin, jac=True, method="L-BFGS-B")
-    return np.asarray(np.exp(found.x))
+    found = scipy.optimize.minimize(loss, np.append(begin, 0.0), jac=True, method="L-BFGS-B")
+    return np.asarray(np.exp(found.x[:-1]))
 
 
 VERSION: Final = 2  # of the text

@@ -158,7 +158,7 @@ class SasgeoTrack:
     """
 
     card: MatcherCard
-    switches: ClassVar[Switches] = Switches(has_graph=False, is_levelled=False)
+    switches: ClassVar[Switches] = Switches(has_graph=False, correlates=False)
     over_time: ClassVar[OverTime] = OverTime()
     temper: float = FRESH
     doubt: float = NONE

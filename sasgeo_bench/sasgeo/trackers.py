@@ -87,7 +87,7 @@ class SasgeoTrackEven(_Base):
         _RIVAL,
         equations="Eqs. 7-8, 10-12",
     )
-    switches = Switches(weights="even", has_graph=False, is_levelled=False)
+    switches = Switches(weights="even", has_graph=False, correlates=False)
 
 
 class SasgeoTrackAgeless(_Base):
@@ -100,7 +100,7 @@ class SasgeoTrackAgeless(_Base):
         _NONE,
         _RIVAL,
     )
-    switches = Switches(knows_age=False, has_graph=False, is_levelled=False)
+    switches = Switches(knows_age=False, has_graph=False, correlates=False)
 
 
 class SasgeoTrackBlind(_Base):
@@ -113,4 +113,4 @@ class SasgeoTrackBlind(_Base):
         _NONE,
         _RIVAL,
     )
-    switches = Switches(is_unknown_silent=False, has_graph=False, is_levelled=False)
+    switches = Switches(is_unknown_silent=False, has_graph=False, correlates=False)

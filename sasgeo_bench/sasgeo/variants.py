@@ -148,9 +148,9 @@ _FITTED: Final = (
     "log-likelihood ratios from rates of vanishing, appearing, seeing and mapping by class, how much being near a "
     "class is like being on it, and an exponent for each class by conditional logit; all learnt on train places"
 )
-_LEVELLED: Final = (
-    "each class less its mean over some 48 m of known cells, so that where it lies counts, and not how much of it "
-    "there is: errors of a class hang together"
+_CORRELATED: Final = (
+    "errors of a class hang together: each class less its mean over some 48 m of known cells, so that where it lies "
+    "counts, and bounded, so that much of it says little more than some"
 )
 _GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
 _GRAPH_FITTED: Final = _GRAPH.format(
@@ -173,7 +173,7 @@ _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIM
 def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -> MatcherCard:
     return MatcherCard(
         name=name,
-        version="2" if _LEVELLED in ours else "1",
+        version="2" if _CORRELATED in ours else "1",
         title=title,
         source=_SOURCE.format(what=what),
         ours="; ".join((_OURS, *ours)),
@@ -187,7 +187,7 @@ class SasgeoRaster(SasgeoMatcher):
     """Raster alone, uniform weights."""
 
     card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _BLIND)
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, is_levelled=False)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, correlates=False)
 
 
 class SasgeoRasterVectors(SasgeoMatcher):
@@ -203,7 +203,7 @@ class SasgeoRasterVectors(SasgeoMatcher):
         _BLIND,
         limits=f"of vectors it reads where they lie, not how they connect or pass over each other; {_LIMITS}",
     )
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True, is_levelled=False)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True, correlates=False)
 
 
 class SasgeoGraph(LearningMatcher):
@@ -218,7 +218,7 @@ class SasgeoGraph(LearningMatcher):
         _BLIND,
         limits=f"without train places rules and weights of the graph are those set by hand; {_LIMITS}",
     )
-    switches = Switches(weights="even", is_unknown_silent=False, is_levelled=False)
+    switches = Switches(weights="even", is_unknown_silent=False, correlates=False)
 
 
 class SasgeoStability(LearningMatcher):
@@ -229,7 +229,7 @@ class SasgeoStability(LearningMatcher):
         "SASGeo: raster, graph and stability",
         "Eqs. 5, 7-9, 11",
         _FITTED,
-        _LEVELLED,
+        _CORRELATED,
         _GRAPH_FITTED,
         _BLIND,
         limits=_UNTAUGHT,
@@ -241,23 +241,25 @@ class Sasgeo(LearningMatcher):
     """The whole scorer."""
 
     card = _card(
-        "sasgeo", "SASGeo, whole", "Eqs. 5, 7-9, 11-14", _FITTED, _LEVELLED, _GRAPH_FITTED, _SILENT, limits=_UNTAUGHT
+        "sasgeo", "SASGeo, whole", "Eqs. 5, 7-9, 11-14", _FITTED, _CORRELATED, _GRAPH_FITTED, _SILENT, limits=_UNTAUGHT
     )
     switches = Switches()
 
 
-class SasgeoHand(SasgeoMatcher):
-    """The whole scorer with weights by hand."""
+class SasgeoPrior(SasgeoMatcher):
+    """The whole scorer, untaught: what is believed of classes before any view."""
 
     card = _card(
-        "sasgeo_hand",
-        "SASGeo with the paper's weights by hand",
+        "sasgeo_prior",
+        "SASGeo, untaught",
         "Eqs. 5, 7-9, 11-14",
-        "prior, decay and lambdas of Eqs. 5 and 7 from the taxonomy",
+        "log-likelihood ratios from rates of vanishing, appearing and mapping in the taxonomy, in place of sigma of "
+        "Eq. 5, and of a detector that is mostly right; one cell in a hundred counts",
+        _CORRELATED,
         _GRAPH_BY_HAND,
         _SILENT,
     )
-    switches = Switches(weights="hand", is_levelled=False)
+    switches = Switches()
 
 
 class SasgeoDistinct(LearningMatcher):
@@ -268,7 +270,7 @@ class SasgeoDistinct(LearningMatcher):
         "SASGeo with distinctiveness",
         "Eqs. 5-9, 11-14",
         _FITTED,
-        _LEVELLED,
+        _CORRELATED,
         "cells weigh by -log of the share of the map's configurations that are of their kind (Eq. 6)",
         _GRAPH_FITTED,
         _SILENT,
@@ -285,7 +287,7 @@ class SasgeoAgeless(LearningMatcher):
         "SASGeo without the age of the map",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        _LEVELLED,
+        _CORRELATED,
         "every map is weighed as one of today is: beside `sasgeo` it tells stability from fitted weights; its "
         "exponents are learnt on old maps too",
         _GRAPH_FITTED,
@@ -303,7 +305,7 @@ class SasgeoFresh(LearningMatcher):
         "SASGeo trained without old maps",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        _LEVELLED,
+        _CORRELATED,
         _FRESH,
         _GRAPH_FITTED,
         _SILENT,
@@ -321,7 +323,7 @@ class SasgeoFreshAgeless(LearningMatcher):
         "SASGeo trained without old maps, without the age of the map",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        _LEVELLED,
+        _CORRELATED,
         _FRESH,
         "every map is weighed as one of today is",
         _GRAPH_FITTED,
@@ -339,7 +341,7 @@ class SasgeoStamped(LearningMatcher):
         "SASGeo with OSM timestamps",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        _LEVELLED,
+        _CORRELATED,
         "features weigh by how long nobody had edited them when the map was taken, learnt by class in four strata",
         _GRAPH_FITTED,
         _SILENT,
@@ -356,7 +358,7 @@ class OracleSasgeo(LearningMatcher):
         "SASGeo that learns from the places it is asked on",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        _LEVELLED,
+        _CORRELATED,
         _GRAPH_FITTED,
         _SILENT,
         "a yardstick, never ranked: a pipeline names it among its oracles",
@@ -369,22 +371,22 @@ class SasgeoNoGraph(LearningMatcher):
     """The whole scorer without graph."""
 
     card = _card(
-        "sasgeo_no_graph", "SASGeo without graph", "Eqs. 5, 7-8, 12-14", _FITTED, _LEVELLED, _SILENT, limits=_UNTAUGHT
+        "sasgeo_no_graph", "SASGeo without graph", "Eqs. 5, 7-8, 12-14", _FITTED, _CORRELATED, _SILENT, limits=_UNTAUGHT
     )
     switches = Switches(has_graph=False)
 
 
-class SasgeoUnlevelled(LearningMatcher):
-    """The whole scorer that counts how much of a class there is, too."""
+class SasgeoIndependent(LearningMatcher):
+    """The whole scorer for which each cell counts alone."""
 
     card = _card(
-        "sasgeo_unlevelled",
-        "SASGeo that counts how much of a class there is",
+        "sasgeo_independent",
+        "SASGeo with independent cells",
         "Eqs. 5, 7-9, 11-14",
         _FITTED,
-        "each cell counts alone, as in version 1 of `sasgeo`: beside `sasgeo` it tells what levelling is worth",
+        "each cell counts alone, as in version 1 of `sasgeo`: it tells what correlated errors are worth",
         _GRAPH_FITTED,
         _SILENT,
         limits=_UNTAUGHT,
     )
-    switches = Switches(is_levelled=False)
+    switches = Switches(correlates=False)

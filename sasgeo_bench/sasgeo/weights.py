@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
@@ -78,20 +77,6 @@ def _ratios(rates: ClassRates, age_years: float, persists: float) -> tuple[float
     return agree, extra, missed, quiet
 
 
-def hand_gains(classes: Sequence[str], *, age_years: float, persists: Sequence[float] = ()) -> Gains:
-    """Return the gains of Eqs. 5 and 7 as written: lambdas of 1, times prior, decay by age and season by hand.
-
-    Examples
-    --------
-    >>> hand_gains(["railway"], age_years=0.0).agree.tolist()
-    [0.97]
-    """
-    taxonomy = load_taxonomy()
-    hand = [taxonomy[name].persistence for name in classes]
-    decay = np.array([one.prior * np.exp(-one.vanish_per_year * max(age_years, 0.0)) for one in hand], dtype=np.float64)
-    return even_gains(decay * (np.array(persists, dtype=np.float64) if persists else 1.0))
-
-
 def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the linear form of Eq. 8: factors of map classes and of known map cells, as in `search.field.Template`.
 
@@ -99,9 +84,9 @@ def weigh(cells: NDArray[np.uint8], gains: Gains) -> tuple[NDArray[np.float32], 
 
     Examples
     --------
-    >>> weights, known = weigh(np.array([[[1, 0, 2]]], dtype=np.uint8), hand_gains(["railway"], age_years=0.0))
+    >>> weights, known = weigh(np.array([[[1, 0, 2]]], dtype=np.uint8), even_gains(np.ones(1)))
     >>> weights[0, 0]
-    array([ 1.94, -0.97,  0.  ], dtype=float32)
+    array([ 2., -1.,  0.], dtype=float32)
     """
     weights = np.zeros(cells.shape, dtype=np.float32)
     known = np.zeros(cells.shape[1:], dtype=np.float32)

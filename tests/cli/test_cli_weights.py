@@ -23,7 +23,7 @@ def test_without_a_region_a_table_by_hand_is_printed(program):
     code, told, _ = program("weights", "--age", "0", "--age", "20")
     assert code == 0
     railway = next(line for line in told.splitlines() if line.startswith("railway"))
-    assert railway.split() == ["railway", "0.97", "0.91"]
+    assert railway.split() == ["railway", "2.30", "1.84"]
 
 
 def test_fitted_stands_beside_hand_and_no_line_is_wider_than_a_terminal(program, learnt_file):

@@ -9,7 +9,6 @@ import pytest
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.lookalike import find_lookalike, find_pair
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.sasgeo.class_weights import HAND
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
 from sasgeo_bench.tasks.suites.mining import RINGS, Windows, min_distance_m
 
@@ -44,7 +43,7 @@ def test_where_all_places_are_near_or_empty_there_is_no_pair():
 
 def test_the_true_place_beats_its_lookalike_on_a_fresh_map(towns):
     town = read_region(towns / "regions" / "town-riverside")
-    found = find_lookalike(town, town, ScorerModel.by_hand(town.classes), HAND, side_m=96.0)
+    found = find_lookalike(town, town, ScorerModel.by_hand(town.classes), side_m=96.0)
     assert found.age_years == 0
     assert found.terms.loc["joint", "true place"] > found.terms.loc["joint", "lookalike"]
     for name in ("true place", "lookalike"):
@@ -57,9 +56,9 @@ def test_two_places_and_a_map_of_the_future_are_refused(towns):
     town, other = (read_region(towns / "regions" / name) for name in ("town-riverside", "town-grid"))
     hand = ScorerModel.by_hand(town.classes)
     with pytest.raises(ConfigError, match="not one region at two dates"):
-        find_lookalike(town, other, hand, HAND, side_m=96.0)
+        find_lookalike(town, other, hand, side_m=96.0)
     extract = town.manifest.extract
     older = extract.model_copy(update={"date": extract.date.replace(year=2000)})
     past = replace(town, manifest=town.manifest.model_copy(update={"extract": older}))
     with pytest.raises(ConfigError, match="swap them"):
-        find_lookalike(town, past, hand, HAND, side_m=96.0)
+        find_lookalike(town, past, hand, side_m=96.0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Weights of classes: Eq. 5 by hand, the gains of the arm where fitted, and the weight of each cell of a map."""
+"""Weights of classes: gains and exponents, and the weight of each cell of a map."""
 
 from dataclasses import replace
 
@@ -8,9 +8,8 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.class_weights import (
-    FITTED,
-    HAND,
     check_age,
     check_classes,
     check_season,
@@ -19,23 +18,23 @@ from sasgeo_bench.sasgeo.class_weights import (
     side_by_side,
     weight_map,
 )
-from sasgeo_bench.sasgeo.rates import ClassRates
+from sasgeo_bench.sasgeo.rates import ClassRates, hand_rates
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
-from sasgeo_bench.sasgeo.weights import by_hand, information
+from sasgeo_bench.sasgeo.weights import by_hand, information, likelihood_gains
 
 NAMES = load_taxonomy().names
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
 
 
-def test_by_hand_the_worth_is_sigma_of_eq_5():
-    hand = [load_taxonomy()[name].persistence for name in NAMES]
-    sigma = [one.prior * np.exp(-7 * one.vanish_per_year) for one in hand] * by_hand("snow", NAMES)
-    assert class_weights_of(ScorerModel.by_hand(NAMES), HAND, age_years=7.0, season="snow") == pytest.approx(sigma)
+def test_by_hand_one_cell_in_a_hundred_counts():
+    gains = likelihood_gains([hand_rates(name) for name in NAMES], age_years=7.0, persists=by_hand("snow", NAMES))
+    weights = class_weights_of(ScorerModel.by_hand(NAMES), age_years=7.0, season="snow")
+    assert weights == pytest.approx(gains.agree)
 
 
 def test_gains_and_information_shrink_as_the_map_ages():
     model = replace(ScorerModel.by_hand(["building"]), rates=(HOUSE,))
-    table = class_weight_table(model, FITTED)
+    table = class_weight_table(model)
     for column in ("weight", "agree", "information"):
         assert table[column].is_monotonic_decreasing
     assert table["missed"].is_monotonic_increasing
@@ -45,8 +44,8 @@ def test_a_fitted_table_holds_the_gains_of_the_arm_and_its_exponents():
     model = replace(
         ScorerModel.by_hand(NAMES), scaling=np.linspace(0.001, 0.02, len(NAMES)), missed_share=np.full(13, 0.4)
     )
-    table = class_weight_table(model, FITTED, ages_years=[3.0], season="leaf_on")
-    gains = FITTED.gains(model, age_years=3.0, season="leaf_on")
+    table = class_weight_table(model, ages_years=[3.0], season="leaf_on")
+    gains = Switches().gains(model, age_years=3.0, season="leaf_on")
     assert table["class"].tolist() == list(NAMES)
     assert table["missed"].to_numpy() == pytest.approx(gains.missed)
     assert table["weight"].to_numpy() == pytest.approx(100 * model.scaling * gains.agree)
@@ -57,10 +56,7 @@ def test_information_out_of_season_is_less():
 
 
 def test_tables_stand_side_by_side_in_the_order_of_the_classes():
-    tables = {
-        name: class_weight_table(ScorerModel.by_hand(NAMES), arm, ages_years=[0.0, 5.0])
-        for name, arm in (("a", HAND), ("b", HAND))
-    }
+    tables = {name: class_weight_table(ScorerModel.by_hand(NAMES), ages_years=[0.0, 5.0]) for name in ("a", "b")}
     wide = side_by_side(tables, "weight")
     assert wide.index.tolist() == list(NAMES)
     assert wide.columns.tolist() == [("a", 0.0), ("a", 5.0), ("b", 0.0), ("b", 5.0)]

@@ -10,7 +10,7 @@ from affine import Affine
 from rasterio.features import rasterize
 
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.raster import RasterView, burnt, doubted, likeness_by_hand, line_width_m, read_field
+from sasgeo_bench.sasgeo.raster import REPEATED, RasterView, burnt, doubted, likeness_by_hand, line_width_m, read_field
 from sasgeo_bench.sasgeo.rates import hand_rates
 from sasgeo_bench.sasgeo.weights import even_gains, likelihood_gains
 from sasgeo_bench.search.field import FULL
@@ -138,6 +138,21 @@ def test_levelled_parts_make_up_the_score(tiny, field, asked):
     view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region)).levelled()
     whole = score_at(field, view.template(), pose)
     assert view.by_class(field, [pose]).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
+
+
+def test_damped_much_of_a_class_says_little_more_than_some():
+    few, many = (raster_view(np.full((side, side), 1.0), np.full((side, side), -0.5)) for side in (10, 1000))
+    few, many = (view.damped() for view in (few, many))
+    share = few.known.sum() / few.weights.sum(), many.known.sum() / many.weights.sum()
+    assert share == pytest.approx((-0.5, -0.5))
+    assert few.weights.sum() == pytest.approx(100, rel=0.02)
+    assert many.weights.sum() == pytest.approx(REPEATED, rel=0.02)
+
+
+def test_damped_the_size_of_the_cells_does_not_matter():
+    fine = raster_view(np.full((400, 400), 1.0), np.zeros((400, 400)))
+    coarse = replace(raster_view(np.full((200, 200), 4.0), np.zeros((200, 200))), cell_size_m=2.0)
+    assert coarse.damped().weights.sum() == pytest.approx(fine.damped().weights.sum(), rel=1e-4)
 
 
 # Vectors burnt as a view

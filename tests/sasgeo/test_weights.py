@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo.rates import ClassRates
-from sasgeo_bench.sasgeo.weights import hand_gains, information, likelihood_gains, weigh
+from sasgeo_bench.sasgeo.weights import information, likelihood_gains, weigh
 
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
 shares = st.floats(0.001, 0.999)
@@ -43,15 +42,6 @@ def test_a_class_out_of_season_counts_for_less():
     whole, half = (likelihood_gains([HOUSE], age_years=0.0, persists=[share]) for share in (1.0, 0.5))
     assert 0 < half.agree[0] < whole.agree[0]
     assert whole.missed[0] < half.missed[0] < 0
-
-
-def test_hand_gains_are_the_papers():
-    gains = hand_gains(["railway", "farmland"], age_years=10.0)
-    hand = [load_taxonomy()[name].persistence for name in ("railway", "farmland")]
-    assert gains.agree == pytest.approx([one.prior * np.exp(-10 * one.vanish_per_year) for one in hand])
-    assert (gains.extra == -gains.agree).all()
-    assert (gains.missed == -gains.agree).all()
-    assert not gains.quiet.any()
 
 
 @given(seed=st.integers(0, 9999))

@@ -163,12 +163,11 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
         lists = _searched(views, regions, model, switches, plan or Plan())
         if switches.learns and lists:
             model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
-    if not lists:
+    drawn = [one for one in lists if one.query.vectors is not None]
+    if not (switches.has_graph and drawn):
         return model
-    if not switches.has_graph:
-        return model
-    model = replace(model, rules=_fit_rules(lists, regions))
-    return replace(model, blend=_fit_blend(lists, model, regions))
+    model = replace(model, rules=_fit_rules(drawn, regions))
+    return replace(model, blend=_fit_blend(drawn, model, regions))
 
 
 def classes_of(regions: Iterable[Region]) -> tuple[str, ...]:
@@ -226,11 +225,10 @@ def _graphs(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> Ite
             yield one, mapped
 
 
-def _fit_rules(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> GraphRules:
-    """Estimate the rules of the graph from views with vectors; without any, the starting values hold."""
-    drawn = [one for one in lists if one.query.vectors is not None]
+def _fit_rules(drawn: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> GraphRules:
+    """Estimate the rules of the graph from views with vectors."""
     rules = START
-    for _ in range(ROUNDS if drawn else 0):
+    for _ in range(ROUNDS):
         right: list[Matching] = []
         wrong: list[Matching] = []
         for one, mapped in _graphs(drawn, regions):

@@ -258,14 +258,19 @@ class Reading:
         """Return the template of the search."""
         return self.view.scaled(self.reader.model.scaling).template()
 
+    @property
+    def graph(self) -> MappedGraph | None:
+        """Return the graph of the map, if the ablation has one and the view has vectors."""
+        return None if self.query.vectors is None else self.reader.graph
+
     @cached_property
     def observed(self) -> ObservedGraph:
         """Return the graph of the view."""
         return ObservedGraph.of(self.query)
 
     def proposed(self) -> list[Pose]:
-        """Return poses proposed by pairs of junctions, if the ablation has a graph and the heading is unknown."""
-        prior, graph = self.query.prior, self.reader.graph
+        """Return poses proposed by pairs of junctions, if there is a graph and the heading is unknown."""
+        prior, graph = self.query.prior, self.graph
         if graph is None or prior.yaw_deg is not None:
             return []
         reach = min(SCALE_SPREAD * prior.scale_sigma, MOST_SCALED)
@@ -277,9 +282,8 @@ class Reading:
         return self.view.by_class(self.reader.field, poses)
 
     def verified(self, poses: Sequence[Pose]) -> list[GraphScore] | None:
-        """Return scores of Eq. 9, if the ablation has a graph."""
-        reader = self.reader
-        return None if reader.graph is None else verify(self.observed, reader.graph, poses, reader.model.rules)
+        """Return scores of Eq. 9, if there is a graph."""
+        return None if self.graph is None else verify(self.observed, self.graph, poses, self.reader.model.rules)
 
     def terms(self, poses: Sequence[Pose], verified: Sequence[GraphScore] | None) -> NDArray[np.float64]:
         """Return terms of Eq. 11 of each pose: see `joint.columns`."""

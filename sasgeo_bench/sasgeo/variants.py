@@ -140,9 +140,9 @@ _OURS: Final = (
 )
 _EVEN: Final = "gains of 1 for all classes (Eq. 7), distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for lines"
 _GRAPH: Final = (
-    "correspondences by assignment within a gate and relations of matched nodes (Eq. 9), on the list of modes that the "
-    "raster found; nodes of perceived vectors, or of the thinned mask where there are none; tolerances and likelihood "
-    "ratios of nodes, weights of raster, graph and contradiction (Eq. 11) {how}"
+    "of views with perceived vectors: correspondences by assignment within a gate and relations of matched nodes (Eq. "
+    "9), on the list of modes that the raster found; tolerances and likelihood ratios of nodes, weights of raster, "
+    "graph and contradiction (Eq. 11) {how}"
 )
 _FITTED: Final = (
     "log-likelihood ratios from rates of vanishing, appearing, seeing and mapping by class, how much being near a "
@@ -154,8 +154,8 @@ _CORRELATED: Final = (
 )
 _GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
 _GRAPH_FITTED: Final = _GRAPH.format(
-    how="learnt from train places: the rules of nodes by their plain statistics at true and wrong poses, from views "
-    "with vectors; without such views, and for tolerances of nodes of masks, those set by hand hold"
+    how="learnt from train places, from views with vectors: the rules of nodes by their plain statistics at true and "
+    "wrong poses; without such views those set by hand hold"
 )
 _FRESH: Final = (
     "training views on older maps are moved to the map of their own day, and dropped where there is none: with "
@@ -167,6 +167,11 @@ _LIMITS: Final = (
     "headings and scales beyond 2.5 standard deviations are not searched; places are 2 m apart before they are "
     "refined; where the heading is known the graph finds no place that the raster has not found"
 )
+_BURNT: Final = (
+    "perceived vectors burnt as a second view, lines in the median width of their class; where layers and vectors both "
+    "show a class, each counts half: the rival of the graph with the same sensor"
+)
+_BURNT_LIMITS: Final = "of vectors it reads where they lie, not how they connect or pass over each other"
 _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIMITS}"
 
 
@@ -186,8 +191,8 @@ def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -
 class SasgeoRaster(SasgeoMatcher):
     """Raster alone, uniform weights."""
 
-    card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _BLIND)
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, correlates=False)
+    card = _card("sasgeo_raster", "SASGeo: raster, uniform weights", "Eqs. 7-8", _EVEN, _CORRELATED, _BLIND)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False)
 
 
 class SasgeoRasterVectors(SasgeoMatcher):
@@ -198,12 +203,12 @@ class SasgeoRasterVectors(SasgeoMatcher):
         "SASGeo: raster, with perceived vectors burnt in",
         "Eqs. 7-8",
         _EVEN,
-        "perceived vectors burnt as a second view, lines in the median width of their class; where layers and vectors "
-        "both show a class, each counts half: the rival of the graph with the same sensor",
+        _CORRELATED,
+        _BURNT,
         _BLIND,
-        limits=f"of vectors it reads where they lie, not how they connect or pass over each other; {_LIMITS}",
+        limits=f"{_BURNT_LIMITS}; {_LIMITS}",
     )
-    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True, correlates=False)
+    switches = Switches(weights="even", is_unknown_silent=False, has_graph=False, burns_vectors=True)
 
 
 class SasgeoGraph(LearningMatcher):
@@ -214,11 +219,12 @@ class SasgeoGraph(LearningMatcher):
         "SASGeo: raster and graph",
         "Eqs. 7-9, 11",
         _EVEN,
+        _CORRELATED,
         _GRAPH_FITTED,
         _BLIND,
         limits=f"without train places rules and weights of the graph are those set by hand; {_LIMITS}",
     )
-    switches = Switches(weights="even", is_unknown_silent=False, correlates=False)
+    switches = Switches(weights="even", is_unknown_silent=False)
 
 
 class SasgeoStability(LearningMatcher):
@@ -368,12 +374,19 @@ class OracleSasgeo(LearningMatcher):
 
 
 class SasgeoNoGraph(LearningMatcher):
-    """The whole scorer without graph."""
+    """The whole scorer without graph, that sees the perceived vectors as cells."""
 
     card = _card(
-        "sasgeo_no_graph", "SASGeo without graph", "Eqs. 5, 7-8, 12-14", _FITTED, _CORRELATED, _SILENT, limits=_UNTAUGHT
+        "sasgeo_no_graph",
+        "SASGeo without graph",
+        "Eqs. 5, 7-8, 12-14",
+        _FITTED,
+        _CORRELATED,
+        _BURNT,
+        _SILENT,
+        limits=f"{_BURNT_LIMITS}; {_UNTAUGHT}",
     )
-    switches = Switches(has_graph=False)
+    switches = Switches(has_graph=False, burns_vectors=True)
 
 
 class SasgeoIndependent(LearningMatcher):

@@ -113,8 +113,11 @@ def test_an_answer_tells_its_evidence_and_protection_levels(tiny, whole):
     query, _ = first(tiny, "localization", kind="no error")
     match = whole.match(query, top_k=5)
     told = set(match.diagnostics)
-    assert {"margin_nats", "null_z", "graph_consistency", "unknown_share", "map_age_years", "sigma_m"} <= told
+    assert {"margin_nats", "null_z", "unknown_share", "map_age_years", "sigma_m"} <= told
     assert told <= {*EVIDENCE_NAMES, *(item.name for item in PROTECTION)}
+    assert "graph_consistency" not in told  # the view has no vectors, so there is no graph
+    drawn = next(query for query in tiny.queries if query.vectors is not None and query.track == "localization")
+    assert "graph_consistency" in whole.match(drawn, top_k=5).diagnostics
     assert 0 <= match.confidence <= 1
 
 
@@ -220,20 +223,26 @@ def test_what_is_learnt_is_read_back_and_the_same_again(tiny, training):
     assert math.dist((best.easting_m, best.northing_m), (truth.pose.easting_m, truth.pose.northing_m)) < 5.0
 
 
-def test_the_whole_scorer_learns_weights_of_the_joint_score(training):
-    said = ScorerModel.from_text(Sasgeo().learn(training))
-    assert said.blend != ScorerModel.by_hand(said.classes).blend
-
-
-def test_the_even_graph_learns_rules_and_blend_alone(tiny):
+@pytest.fixture(scope="module")
+def drawn(tiny):
+    """Training views with vectors."""
     pairs = [
         (near(query, truth), truth)
         for query, truth in zip(tiny.queries, tiny.truths, strict=True)
         if query.vectors is not None and query.track == "localization" and query.prior.yaw_deg is not None
     ]
-    said = ScorerModel.from_text(
-        SasgeoGraph().learn(Training(regions={tiny.queries[0].region: tiny.region}, pairs=pairs))
-    )
+    return Training(regions={tiny.queries[0].region: tiny.region}, pairs=pairs)
+
+
+def test_the_whole_scorer_learns_weights_of_the_joint_score_from_views_with_vectors(training, drawn):
+    hand = ScorerModel.by_hand(())
+    assert ScorerModel.from_text(Sasgeo().learn(training)).blend == hand.blend
+    both = replace(training, pairs=[*training.pairs, *drawn.pairs])
+    assert ScorerModel.from_text(Sasgeo().learn(both)).blend != hand.blend
+
+
+def test_the_even_graph_learns_rules_and_blend_alone(drawn):
+    said = ScorerModel.from_text(SasgeoGraph().learn(drawn))
     hand = ScorerModel.by_hand(said.classes)
     assert said.rules != hand.rules
     assert said.blend != hand.blend

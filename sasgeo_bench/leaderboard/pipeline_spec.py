@@ -23,6 +23,7 @@ from sasgeo_bench.config import (
 )
 from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.scoring.verdicts import (
+    LESS,
     LOWER,
     OF_MATCHERS,
     RELATIVE,
@@ -58,7 +59,7 @@ SegmenterName = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_-]{0,99}(\+share
 class PilotSpec(Document):
     """What is known of a contrast from train places; see `scoring.registration.Pilot`."""
 
-    second: Annotated[float, Field(ge=-1, le=1)] | None = None  # of an interaction it may be below 0
+    second: Annotated[float, Field(ge=-1, le=1)] | None = None  # of a difference it may be below 0
     control: Annotated[float, Field(ge=0, le=1)] | None = None
     false_share: Annotated[float, Field(ge=0, le=1)] | None = None
     spread: Annotated[float, Field(ge=0, le=1)] | None = None
@@ -94,8 +95,14 @@ class ContrastSpec(Document):
             message = f'contrast {self.name!r} by false_accepted is of flights: say track = "sequence"'
             raise ValueError(message)
         pilot = self.pilot or PilotSpec()
-        if self.metric != "interaction" and (pilot.control is not None or (pilot.second or 0) < 0):
-            message = f'contrast {self.name!r}: a pilot with control, or second below 0, is for metric = "interaction"'
+        if self.metric not in LESS and (pilot.control is not None or (pilot.second or 0) < 0):
+            message = (
+                f"contrast {self.name!r}: a pilot with control, or second below 0, is for metric = "
+                '"interaction" or "shift"'
+            )
+            raise ValueError(message)
+        if self.metric == "shift" and (len(self.detectors) != 1 or PUBLISHED in self.detectors):
+            message = f"contrast {self.name!r} by shift names one detector, and not {PUBLISHED!r}, which it is held to"
             raise ValueError(message)
         if pilot.second is not None:
             self._check_reach(pilot, pilot.second)

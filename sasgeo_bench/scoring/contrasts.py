@@ -35,16 +35,16 @@ from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.verdicts import (
     COLUMNS,
     LEAST_PLACES,
+    LESS,
     LOWER,
     OF_MATCHERS,
     RELATIVE,
     ContrastMetric,
     Finding,
 )
-from sasgeo_bench.tasks.query import SEQUENCE, UNRIVALLED, Detector
+from sasgeo_bench.tasks.query import PUBLISHED, SEQUENCE, UNRIVALLED, Detector
 
 PRIMARY: Final = "primary"
-INTERACTION: Final = "interaction"
 AREAS: Final = {"aurc": aurc, "e_aurc": excess_aurc, "auroc": auroc}
 ACCEPTED: Final = {metric.name: metric.accepted for metric in THRESHOLDS if metric.what == "right"}
 
@@ -59,12 +59,13 @@ class Contrast:
 
     The metric is "primary", success or recall at 1 on present places under stress; "interaction", the same less what
     the method reaches on the control of the same site and view, so that the difference is what the stress adds to the
-    difference; "false_accepted" of flights, the share of the views with an accepted fix that is false; or of rejectors,
-    on all places: "e_aurc", the area under the risk-coverage curve above that of a perfect order; "auroc", the chance
-    that a right answer is surer than a false one; "right_at_absent_0.05", the share of present places that are rightly
-    accepted where 5 % of the absent ones are; "aurc", the whole area, of which a perfect order has much where many
-    answers are false. `min_effect` is the least relevant difference: of fractions,
-    or for "aurc" and "e_aurc" relative to the second method.
+    difference; "shift", the same less what the method reaches on the view of the same site by the detector that arms
+    learn from, so that the difference is what another detector adds to it; "false_accepted" of flights, the share of
+    the views with an accepted fix that is false; or of rejectors, on all places: "e_aurc", the area under the
+    risk-coverage curve above that of a perfect order; "auroc", the chance that a right answer is surer than a false
+    one; "right_at_absent_0.05", the share of present places that are rightly accepted where 5 % of the absent ones are;
+    "aurc", the whole area, of which a perfect order has much where many answers are false. `min_effect` is the least
+    relevant difference: of fractions, or for "aurc" and "e_aurc" relative to the second method.
     """
 
     name: str
@@ -129,8 +130,8 @@ def _tested(
     first, second = _pair(contrast, scores, rejections)
     if contrast.metric in AREAS:
         return _area_finding(contrast, first, second) if len(first) else _nothing(contrast)
-    if contrast.metric == INTERACTION:
-        sides = _less_control(contrast, scores, first, second)
+    if contrast.metric in LESS:
+        sides = _less_other(contrast, scores, first, second)
         return _value_finding(contrast, first[sides.is_counted], sides, draws)
     return mean_finding(contrast, first, second, draws)
 
@@ -201,7 +202,7 @@ def _at_place(
     if contrast.metric in AREAS:
         found = _area_finding(contrast, *rows)
     else:
-        sides = _sides(contrast, *rows) if contrast.metric != INTERACTION else _less_control(contrast, scores, *rows)
+        sides = _less_other(contrast, scores, *rows) if contrast.metric in LESS else _sides(contrast, *rows)
         found = _value_finding(contrast, rows[0][sides.is_counted], sides, draws)
     return PlaceDifference(
         place=str(rows[0]["place"].iloc[0]),
@@ -296,14 +297,23 @@ def _sides(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame) -> _Si
     return _Sides(ours=ours, theirs=theirs, best=first["is_right"].to_numpy(float)[every], is_counted=every)
 
 
-def _less_control(
+def _less_other(
     contrast: Contrast, scores: Mapping[str, pd.DataFrame], first: pd.DataFrame, second: pd.DataFrame
 ) -> _Sides:
-    """Return the primary metric of both sides less that on the control of the same site, size of view and detector."""
-    metric, key = primary_of(contrast.track), ["suite", "pair_id", "view_cells", "detector"]
-    controls = both_on(contrast, scores, lambda rows: rows["is_present"].astype(bool) & (rows["role"] == "control"))
+    """Return the primary metric of both sides less that on other views of the same site and size.
+
+    Of an interaction these are the controls by the same detector, of a shift the same variants by the other detector.
+    """
+    is_shift = contrast.metric == "shift"
+    metric = primary_of(contrast.track)
+    key = ["suite", "pair_id", "view_cells", *(("kind", "strength") if is_shift else ("detector",))]
+    others = both_on(
+        replace(contrast, detectors=(PUBLISHED,)) if is_shift else contrast,
+        scores,
+        _counted(contrast) if is_shift else lambda rows: rows["is_present"].astype(bool) & (rows["role"] == "control"),
+    )
     before = []
-    for rows, control in zip((first, second), controls, strict=True):
+    for rows, control in zip((first, second), others, strict=True):
         of_site = pd.Series(metric.values(control), index=pd.MultiIndex.from_frame(control[key]))
         mean = of_site.groupby(level=key).mean()
         before.append(mean.reindex(pd.MultiIndex.from_frame(rows[key])).to_numpy(float))

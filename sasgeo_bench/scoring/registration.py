@@ -15,8 +15,17 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.scoring.base import block_codes
 from sasgeo_bench.scoring.compare import design_effect, detectable_difference, detectable_mean
-from sasgeo_bench.scoring.contrasts import INTERACTION, Contrast, chosen_rows
-from sasgeo_bench.scoring.verdicts import ALPHA, LEAST_PLACES, LOWER, RELATIVE, attainable, best_value, unreachable
+from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
+from sasgeo_bench.scoring.verdicts import (
+    ALPHA,
+    LEAST_PLACES,
+    LESS,
+    LOWER,
+    RELATIVE,
+    attainable,
+    best_value,
+    unreachable,
+)
 from sasgeo_bench.tasks.query import SEQUENCE
 
 CORRELATION: Final = 0.05  # of the differences of two queries of one place, unless a pilot says otherwise
@@ -26,11 +35,10 @@ CORRELATION: Final = 0.05  # of the differences of two queries of one place, unl
 class Pilot:
     """What is known of a contrast from train places, before it is registered.
 
-    `second` is the metric of the second side, `control` of an interaction the share that the first side reaches on the
-    controls, `false_share` the share of the second side's answers that are false, `discordant` the share of queries
-    that just one side gets right, `spread` of flights the standard deviation of the difference of one, `correlation`
-    how much more alike differences of one place are than those of two.
-    None where nothing is known.
+    `second` is the metric of the second side, `control` of an interaction or a shift the share that the first side
+    reaches on the other views, `false_share` the share of the second side's answers that are false, `discordant` the
+    share of queries that just one side gets right, `spread` of flights the standard deviation of the difference of one,
+    `correlation` how much more alike differences of one place are than those of two. None where nothing is known.
     """
 
     second: float | None = None
@@ -168,7 +176,7 @@ def _best_and_blind(contrast: Contrast, pilot: Pilot, rows: pd.DataFrame) -> tup
         "auroc": 0.5,
         "aurc": false,
         "e_aurc": false - best_value("aurc", false_share=false),
-        INTERACTION: math.nan,
+        **dict.fromkeys(LESS, math.nan),
         "false_accepted": math.nan,
     }
     return best, blind.get(contrast.metric, 0.0)

@@ -15,6 +15,7 @@ LEAST_BLOCKS: Final = LEAST_PLACES  # where the question is about the places tha
 ContrastMetric = Literal[
     "primary",
     "interaction",
+    "shift",
     "false_accepted",
     "aurc",
     "e_aurc",
@@ -23,7 +24,8 @@ ContrastMetric = Literal[
     "right_at_absent_0.05",
 ]
 # The sides of other metrics are "matcher x rejector".
-OF_MATCHERS: Final = frozenset({"primary", "interaction", "false_accepted"})
+OF_MATCHERS: Final = frozenset({"primary", "interaction", "shift", "false_accepted"})
+LESS: Final = frozenset({"interaction", "shift"})  # differences of a figure and that on other views of the site
 RELATIVE: Final = frozenset({"aurc", "e_aurc"})  # their least difference is a share of the second side
 LOWER: Final = RELATIVE | {"false_accepted"}  # less is better
 _NOTHING: Final = 1e-9  # a smaller excess is a rounding error
@@ -45,8 +47,8 @@ def best_value(
 ) -> float:
     """Return the best value that a first side can have; NaN where it is not known.
 
-    `ceiling` is the share of right answers that nobody can exceed. For an interaction it is less what the first side
-    reaches on the `control`. For "aurc" the best is the area of a perfect order where a share r of many answers is
+    `ceiling` is the share of right answers that nobody can exceed. For a difference (`LESS`) it is less what the first
+    side reaches on the `control`. For "aurc" the best is the area of a perfect order where a share r of many answers is
     false, r + (1 - r) ln(1 - r) (Geifman et al., ICLR 2019).
 
     >>> best_value("interaction", control=0.9).__round__(9), best_value("aurc", false_share=0.75).__round__(3)
@@ -60,7 +62,7 @@ def best_value(
         if false_share is None:
             return math.nan
         return false_share + (1.0 - false_share) * math.log1p(-false_share) if false_share < 1 else 1.0
-    if metric == "interaction":
+    if metric in LESS:
         return math.nan if control is None else ceiling - control
     return ceiling
 
@@ -76,6 +78,7 @@ def unreachable(name: str, metric: ContrastMetric, *, gain: float, least: float)
     more = {
         "aurc": ', or take metric = "e_aurc"',
         "interaction": " (second of its pilot is a difference, the share under stress less that on the controls)",
+        "shift": " (second of its pilot is a difference, the share with its detector less that with the other one)",
     }.get(metric, "")
     return (
         f"contrast {name!r} cannot be reached: at most {gain:.3f} can be gained, and {least:.3f} is to matter: lower "

@@ -314,6 +314,8 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ),
         ({"[[contrast]]": "[[contrast]]\npilot = { control = 0.9 }"}, "is for metric = .interaction"),
         ({"[[contrast]]": "[[contrast]]\npilot = { second = -0.3 }"}, "is for metric = .interaction"),
+        ({"[[contrast]]": '[[contrast]]\nmetric = "shift"'}, "by shift names one detector, and not 'published'"),
+        ({"[[contrast]]": '[[contrast]]\nmetric = "shift"\ndetectors = ["published"]'}, "by shift names one detector"),
         (
             {"[[contrast]]": "[[contrast]]\nmin_effect = 0.4\npilot = { second = 0.7 }"},
             r"'nothing' cannot be reached: at most 0\.300 can be gained, and 0\.400 is to matter",

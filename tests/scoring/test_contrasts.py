@@ -153,6 +153,22 @@ def test_a_detector_chooses_and_its_controls_are_its_own():
     assert held(less, **known).difference == 0.5
 
 
+def test_a_shift_is_what_another_detector_adds_variant_by_variant():
+    sites = [site for site in range(60) for _ in range(4)]
+    about = {"blocks": 60, "pair_id": sites, "detector": ["published", "measured"] * 120}
+    about |= {"kind": ["U2 glare", "U2 glare", "U2 wedge", "U2 wedge"] * 60}
+    right = np.ones(240)
+    # The second side loses glare of the other detector alone, so half of its answers there.
+    worse = np.where(np.arange(240) % 4 == 1, 99.0, 1.0)
+    known = {"with": scores(right, **about), "without": scores(worse, **about)}
+    shift = replace(CONTRAST, metric="shift", detectors=("measured",))
+    found = held(shift, **known)
+    assert (found.n, found.first_value, found.second_value, found.difference) == (120, 0.0, -0.5, 0.5)
+    assert held(replace(shift, kinds=("U2 wedge",)), **known).difference == 0.0
+    both = {"with": scores(worse, **about), "without": scores(worse, **about)}
+    assert held(shift, **both).difference == 0.0
+
+
 def test_rejectors_are_compared_by_the_area_under_risk_against_coverage():
     table = scores(errors(0.6), blocks=60)
     is_false = ~table["is_right"].to_numpy(bool)

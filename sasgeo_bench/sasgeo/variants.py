@@ -149,7 +149,7 @@ _FITTED: Final = (
     "class is like being on it, and an exponent for each class by conditional logit; all learnt on train places"
 )
 _CORRELATED: Final = (
-    "errors of a class hang together: each class less its mean over some 48 m of known cells, so that where it lies "
+    "errors of a class hang together: each class less its mean over some 24 m of known cells, so that where it lies "
     "counts, and bounded, so that much of it says little more than some"
 )
 _GRAPH_BY_HAND: Final = _GRAPH.format(how="set by hand")
@@ -250,6 +250,22 @@ class Sasgeo(LearningMatcher):
         "sasgeo", "SASGeo, whole", "Eqs. 5, 7-9, 11-14", _FITTED, _CORRELATED, _GRAPH_FITTED, _SILENT, limits=_UNTAUGHT
     )
     switches = Switches()
+
+
+class SasgeoEven(LearningMatcher):
+    """The whole scorer for which all classes weigh the same."""
+
+    card = _card(
+        "sasgeo_even",
+        "SASGeo, all classes weigh the same",
+        "Eqs. 7-9, 11-14",
+        _EVEN,
+        _CORRELATED,
+        _GRAPH_FITTED,
+        _SILENT,
+        limits=f"without train places rules and weights of the graph are those set by hand; {_LIMITS}",
+    )
+    switches = Switches(weights="even")
 
 
 class SasgeoPrior(SasgeoMatcher):

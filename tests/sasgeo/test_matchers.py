@@ -19,9 +19,11 @@ from sasgeo_bench.sasgeo.variants import (
     Sasgeo,
     SasgeoAgeless,
     SasgeoDistinct,
+    SasgeoEven,
     SasgeoFresh,
     SasgeoFreshAgeless,
     SasgeoGraph,
+    SasgeoIndependent,
     SasgeoNoGraph,
     SasgeoPrior,
     SasgeoRaster,
@@ -43,6 +45,8 @@ ALL = (
     SasgeoFresh,
     SasgeoFreshAgeless,
     SasgeoNoGraph,
+    SasgeoEven,
+    SasgeoIndependent,
 )
 LEARNERS = {*ALL} - {SasgeoRaster, SasgeoRasterVectors, SasgeoPrior}
 

@@ -145,8 +145,8 @@ def test_damped_much_of_a_class_says_little_more_than_some():
     few, many = (view.damped() for view in (few, many))
     share = few.known.sum() / few.weights.sum(), many.known.sum() / many.weights.sum()
     assert share == pytest.approx((-0.5, -0.5))
-    assert few.weights.sum() == pytest.approx(100, rel=0.02)
-    assert many.weights.sum() == pytest.approx(REPEATED, rel=0.02)
+    assert few.weights.sum() == pytest.approx(100, rel=0.04)
+    assert many.weights.sum() == pytest.approx(REPEATED, rel=0.04)
 
 
 def test_damped_the_size_of_the_cells_does_not_matter():

@@ -17,7 +17,6 @@ from scipy.optimize import linear_sum_assignment
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.sasgeo.graph_rules import (
     GraphRules,
-    arm_offsets_deg,
     by_area,
     by_arms,
     by_degree,
@@ -56,22 +55,14 @@ class GraphScore:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matching:
-    """What the correspondences at one pose show; all but `kinds` of the nodes of vectors.
+    """What the correspondences at one pose show; `degrees` and `links` of the nodes of vectors.
 
-    `offset_m`, shape (P, 2), are offsets of matched nodes from the view to the map, `common_m`, shape (P,), the length
-    of the shift that each shares with its neighbours. `arms_deg`, shape (A,), are angles between arms; `degrees`, shape
-    (3,), counts pairs by how much their degrees differ; `areas`, shape (Q, 2), are logarithms of areas, seen and
-    mapped. `edges`, shape (E, 2), hold the length and the strain of pairs of matched neighbours, metres; `links`, shape
-    (3,), counts ways on both sides, in the view alone and on the map alone. `kinds`, shape (4, K), counts nodes of each
-    kind: map nodes that were visible, those of them matched, seen nodes that count, those of them unmatched.
+    `degrees`, shape (3,), counts pairs by how much their degrees differ; `links`, shape (3,), ways on both sides, in
+    the view alone and on the map alone. `kinds`, shape (4, K), counts nodes of each kind: map nodes that were visible,
+    those of them matched, seen nodes that count, those of them unmatched.
     """
 
-    offset_m: Floats
-    common_m: Floats
-    arms_deg: Floats
     degrees: Ints
-    areas: Floats
-    edges: Floats
     links: Ints
     kinds: Ints
 
@@ -338,25 +329,13 @@ class _Judge:
         return found
 
     def _shown(self, stage: _Stage, pairs: _Pairs) -> Matching:
-        """Return the differences of matched nodes, and counts."""
+        """Return what matched nodes share, and counts."""
         ours, theirs = self.seen.nodes, self.mapped.nodes
-        off_m, shift_m = self._offsets_m(stage, pairs), self._shift_m(stage, pairs)[pairs.seen]
-        ends, kind, length_m = self._neighbours(stage, pairs)
-        strain_m = np.hypot(*(off_m[ends[:, 0]] - off_m[ends[:, 1]]).T)
-        both = _IS_DRAWN[kind].all(axis=1)
         own = _IS_DRAWN[ours.kind[pairs.seen]]
-        row, there = pairs.seen[own], stage.around[pairs.mapped[own]]
-        arms_deg = arm_offsets_deg(ours.arms_deg[row] + stage.pose.yaw_deg, theirs.arms_deg[there])
-        areas = np.log(np.column_stack((ours.area_m2[row] * stage.pose.scale**2, theirs.area_m2[there])))
-        has_degree = (ours.degree[row] > 0) & (theirs.degree[there] > 0)
-        steps = degree_step(ours.degree[row], theirs.degree[there])[has_degree]
+        seen, mapped = ours.degree[pairs.seen[own]], theirs.degree[stage.around[pairs.mapped[own]]]
+        steps = degree_step(seen, mapped)[(seen > 0) & (mapped > 0)]
         return Matching(
-            offset_m=off_m[own],
-            common_m=np.hypot(*shift_m[own].T),
-            arms_deg=arms_deg[np.isfinite(arms_deg)],
             degrees=np.bincount(steps, minlength=len(self.rules.degrees)),
-            areas=areas[np.isfinite(areas).all(axis=1)],
-            edges=np.column_stack((length_m, strain_m))[both],
             links=self._links(stage, pairs)[0],
             kinds=self._counts(stage, pairs),
         )

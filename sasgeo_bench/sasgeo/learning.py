@@ -20,14 +20,14 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sasgeo.ablations import Switches
-from sasgeo_bench.sasgeo.graph import START, Matching, match_nodes, verify
+from sasgeo_bench.sasgeo.graph import Matching, match_nodes, verify
 from sasgeo_bench.sasgeo.graph_rules import GraphRules
 from sasgeo_bench.sasgeo.joint import Blend, columns
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.rates import FAR, NOWHERE, RINGS_M, Tally, rings, tally
 from sasgeo_bench.sasgeo.reading import Reader, age_years
-from sasgeo_bench.sasgeo.rule_fitting import ROUNDS, broadened, fit_rules
+from sasgeo_bench.sasgeo.rule_fitting import BLANK, fit_rules
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel, fit_scaling
 from sasgeo_bench.sasgeo.weights import StampTally, fit_trust, stamp_tally, strata
 from sasgeo_bench.search.find import search
@@ -227,16 +227,13 @@ def _graphs(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> Ite
 
 def _fit_rules(drawn: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> GraphRules:
     """Estimate the rules of the graph from views with vectors."""
-    rules = START
-    for _ in range(ROUNDS):
-        right: list[Matching] = []
-        wrong: list[Matching] = []
-        for one, mapped in _graphs(drawn, regions):
-            first, *rest = match_nodes(one.seen, mapped, one.poses, broadened(rules))
-            right.append(first)
-            wrong += rest
-        rules = fit_rules(right, wrong)
-    return rules
+    right: list[Matching] = []
+    wrong: list[Matching] = []
+    for one, mapped in _graphs(drawn, regions):
+        first, *rest = match_nodes(one.seen, mapped, one.poses, BLANK)
+        right.append(first)
+        wrong += rest
+    return fit_rules(right, wrong)
 
 
 def _fit_blend(lists: Sequence[_ScoredModes], model: ScorerModel, regions: Mapping[str, Region]) -> Blend:

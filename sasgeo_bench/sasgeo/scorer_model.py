@@ -18,7 +18,7 @@ from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_ra
 from sasgeo_bench.sasgeo.weights import SEASONS, STRATA, by_hand, fit_season
 
 START: Final = 0.01  # default: one cell in a hundred is independent
-_WIDTH: Final = 1.0  # of the prior of an exponent around the common one, in logarithms
+_WIDTH: Final = 0.25  # of the prior of an exponent around the common one, in logarithms
 _COMMON_WIDTH: Final = 3.0  # and of the common one
 
 

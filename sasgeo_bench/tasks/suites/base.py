@@ -353,6 +353,12 @@ class Shot:
     seeds: Seeds
     flight_seeds: Seeds | None = None
 
+    @property
+    def draw(self) -> tuple[str, ...]:
+        """Return what seeds of errors are named by: a falsifier of single views has others than the control."""
+        is_again = self.variant.role == "falsifier" and self.flight_seeds is None  # flights say it themselves
+        return (*self.variant.others, *(("again",) if is_again else ()))
+
     def rng(self, *purpose: object) -> np.random.Generator:
         """Return the generator of a purpose for this size of view."""
         return self.seeds.rng(*purpose, self.variant.view_cells)
@@ -362,9 +368,9 @@ class Shot:
         return self.variant.view(state or self.scene.world, self.site.pose)
 
     def perceived(self, clean: Evidence | None = None, *, error_factor: float = 1.0) -> Evidence:
-        """Return a clean view (of the world unless given) with errors, which are equal in all variants of a site."""
+        """Return a clean view (of the world unless given) with errors, equal in all variants of one `draw`."""
         variant = self.variant
-        rng = self.seeds.rng("perception", variant.view_cells, variant.cell_size_m, *variant.others)
+        rng = self.seeds.rng("perception", variant.view_cells, variant.cell_size_m, *self.draw)
         see = perception_of(variant.detector, error_factor=error_factor, profile=self.scene.profile)
         return see(self.clean() if clean is None else clean, rng)
 

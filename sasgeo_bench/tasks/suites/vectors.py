@@ -70,7 +70,7 @@ def perceive_vectors(
 def site_vectors(shot: Shot, pose: Pose | None = None) -> "gpd.GeoDataFrame":
     """Perceive the vectors of a shot with its detector, at its site unless another pose is given."""
     world, place, side_m = shot.scene.world, pose or shot.site.pose, shot.variant.side_m
-    rng = shot.rng("vectors", *shot.variant.others)
+    rng = shot.rng("vectors", *shot.draw)
     if shot.variant.detector == PUBLISHED:
         return perceive_vectors(world, place, side_m=side_m, noise=VectorNoise(), rng=rng)
     return perceive_coarsely(world, place, side_m=side_m, noise=MeasuredVectorNoise(), rng=rng)

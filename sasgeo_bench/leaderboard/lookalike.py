@@ -24,6 +24,7 @@ from sasgeo_bench.search.find import rank
 from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.mining import RINGS, Windows, describe, min_distance_m
+from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 
 VARIED: Final = 0.1  # share of the places that are most varied, among which one is chosen
 LEAST_DRAWN: Final = 0.05  # of a place's ground: with less there is nothing to confuse
@@ -33,10 +34,11 @@ NOTE: Final = (
     "The place was chosen by rule: of the tenth of places whose classes are most evenly mixed on the map, the one "
     "with the nearest lookalike. A lookalike is the place nearest by the shares of all classes, at least three "
     "footprint radii away; these two differ by {distance:.2f} standard deviations over the map. Scores are those of "
-    "the best pose within 24 m of each place, at any heading. What is seen and not mapped counts against both. The "
-    "raster term is the weighted sum of all classes, listed or not."
+    "the best pose within 24 m of each place, at any heading. A class counts by where it lies, not by how much of it "
+    "there is. The raster term is the weighted sum of all classes, listed or not."
 )
 _CHUNK: Final = 256
+_EXACT: Final = VectorNoise(missed_share=0.0, gap_share=0.0, shift_m=0.0)
 _NOTHING: Final = 1e-9
 
 
@@ -139,6 +141,7 @@ def find_lookalike(mapped: Region, world: Region, model: ScorerModel, *, side_m:
         prior=Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0),
         prior_group="rnone-unknown-s0",
         candidates=tuple(places),
+        vectors=perceive_vectors(in_world, places[0], side_m=side_m, noise=_EXACT, rng=np.random.default_rng(0)),
     )
     glance = Reader.of(mapped, model, Switches()).read(query)
     poses = best_poses(glance)

@@ -32,7 +32,7 @@ _LIMITS: Final = (
 def _card(name: str, title: str, *ours: str, equations: str = "Eqs. 5, 7-8, 10-12") -> MatcherCard:
     return MatcherCard(
         name=name,
-        version="1",
+        version="2",
         title=title,
         source=f"SASGeo paper (Trukhina and Vashkelis), {equations}",
         ours="; ".join((_OURS, _SCALE, *ours, _ACCEPTS)),

@@ -21,9 +21,8 @@ import sasgeo_bench as sgb
 from sasgeo_bench.sasgeo import raster
 from sasgeo_bench.sasgeo.variants import SasgeoPrior
 
-WIDTHS_M = (12.0, 24.0, 48.0, 96.0)
-BOUNDS = (1e3, 3e3, 1e4, 3e4)
-PAIRS = [*product((24.0,), BOUNDS), *product((width for width in WIDTHS_M if width != 24.0), (3e3,))]  # noqa: PLR2004
+# Widths, metres, with bounds: both are changed about the values that ship, one at a time.
+PAIRS = [*product((24.0,), (1e3, 3e3, 1e4, 3e4)), *product((12.0, 48.0, 96.0), (3e3,))]
 NEAR_M, NEAR_DEG, SIDE_M = 25.0, 5.0, 192.0
 
 Asked = list[tuple[sgb.Query, sgb.Truth]]
@@ -57,7 +56,7 @@ def is_found(matcher: SasgeoPrior, query: sgb.Query, truth: sgb.Truth) -> bool:
     if not poses or truth.pose is None:
         return False
     east_m, north_m = poses[0].easting_m - truth.pose.easting_m, poses[0].northing_m - truth.pose.northing_m
-    turned_deg = abs((poses[0].yaw_deg - truth.pose.yaw_deg + 180) % 360 - 180)
+    turned_deg = abs(sgb.wrap_deg(poses[0].yaw_deg - truth.pose.yaw_deg))
     return bool(np.hypot(east_m, north_m) <= NEAR_M and turned_deg <= NEAR_DEG)
 
 
@@ -79,7 +78,13 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out"))
     parser.add_argument("--every", type=int, default=1, help="asks one view in so many of each task")
     words = parser.parse_args()
+    if words.every < 1:
+        parser.error(f"--every is at least 1, got {words.every}")
     asked = list(views(words.out, every=words.every))
+    if not asked:
+        parser.error(
+            f"{words.out} holds no such views: sasgeo-bench leaderboard scorer-trials --out {words.out} draws some"
+        )
     names = {some[0][0].region for _, some in asked}
     regions = {name: sgb.read_region(words.out / "regions" / name, with_layers=False) for name in names}
     suites = sorted({suite for suite, _ in asked})

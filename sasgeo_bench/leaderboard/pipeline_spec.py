@@ -102,7 +102,10 @@ class ContrastSpec(Document):
             )
             raise ValueError(message)
         if self.metric == "shift" and (len(self.detectors) != 1 or PUBLISHED in self.detectors):
-            message = f"contrast {self.name!r} by shift names one detector, and not {PUBLISHED!r}, which it is held to"
+            message = (
+                f"contrast {self.name!r} by shift compares one detector with {PUBLISHED!r}: name the other one alone, "
+                'such as detectors = ["measured"]'
+            )
             raise ValueError(message)
         if pilot.second is not None:
             self._check_reach(pilot, pilot.second)
@@ -410,6 +413,14 @@ def _check_drawn(contrast: ContrastSpec, tasks: list[TaskSpec]) -> None:
         message = (
             f"contrast {contrast.name!r} counts views of {' and '.join(sorted(named))} alone, and its suites are drawn "
             f"with {' and '.join(sorted(drawn))}: add the detector to their [[task]]"
+        )
+        raise ValueError(message)
+    both = {name for task in own if {PUBLISHED, *named} <= set(task.looks) for name in task.asked}
+    bare = [name for name in contrast.suites if name not in both]
+    if contrast.metric == "shift" and bare:
+        message = (
+            f"contrast {contrast.name!r} by shift compares views of {PUBLISHED!r} and {contrast.detectors[0]!r}: name "
+            f"both in detectors of the [[task]] of {' and '.join(bare)}"
         )
         raise ValueError(message)
     if all(task.tracks and contrast.track not in task.tracks for task in own):

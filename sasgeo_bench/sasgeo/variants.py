@@ -141,8 +141,8 @@ _OURS: Final = (
 _EVEN: Final = "gains of 1 for all classes (Eq. 7), distance made a degree by exp(-D^2 / 2 tau^2), tau 4 m, for lines"
 _GRAPH: Final = (
     "of views with perceived vectors: correspondences by assignment within a gate and relations of matched nodes (Eq. "
-    "9), on the list of modes that the raster found; tolerances and likelihood ratios of nodes, weights of raster, "
-    "graph and contradiction (Eq. 11) {how}"
+    "9), on the list of modes that the raster found, with tolerances set by hand; likelihood ratios of nodes, and "
+    "weights of raster, graph and contradiction (Eq. 11), {how}"
 )
 _FITTED: Final = (
     "log-likelihood ratios from rates of vanishing, appearing, seeing and mapping by class, how much being near a "

@@ -59,8 +59,8 @@ class Contrast:
 
     The metric is "primary", success or recall at 1 on present places under stress; "interaction", the same less what
     the method reaches on the control of the same site and view, so that the difference is what the stress adds to the
-    difference; "shift", the same less what the method reaches on the view of the same site by the detector that arms
-    learn from, so that the difference is what another detector adds to it; "false_accepted" of flights, the share of
+    difference; "shift", the same less what the method reaches on the view of the same site by the detector
+    `published`, so that the difference is what another detector adds to it; "false_accepted" of flights, the share of
     the views with an accepted fix that is false; or of rejectors, on all places: "e_aurc", the area under the
     risk-coverage curve above that of a perfect order; "auroc", the chance that a right answer is surer than a false
     one; "right_at_absent_0.05", the share of present places that are rightly accepted where 5 % of the absent ones are;

@@ -78,7 +78,7 @@ def unreachable(name: str, metric: ContrastMetric, *, gain: float, least: float)
     more = {
         "aurc": ', or take metric = "e_aurc"',
         "interaction": " (second of its pilot is a difference, the share under stress less that on the controls)",
-        "shift": " (second of its pilot is a difference, the share with its detector less that with the other one)",
+        "shift": " (second of its pilot is a difference, the share with its detector less that with `published`)",
     }.get(metric, "")
     return (
         f"contrast {name!r} cannot be reached: at most {gain:.3f} can be gained, and {least:.3f} is to matter: lower "

@@ -314,8 +314,18 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
         ),
         ({"[[contrast]]": "[[contrast]]\npilot = { control = 0.9 }"}, "is for metric = .interaction"),
         ({"[[contrast]]": "[[contrast]]\npilot = { second = -0.3 }"}, "is for metric = .interaction"),
-        ({"[[contrast]]": '[[contrast]]\nmetric = "shift"'}, "by shift names one detector, and not 'published'"),
-        ({"[[contrast]]": '[[contrast]]\nmetric = "shift"\ndetectors = ["published"]'}, "by shift names one detector"),
+        ({"[[contrast]]": '[[contrast]]\nmetric = "shift"'}, "by shift compares one detector with 'published'"),
+        (
+            {"[[contrast]]": '[[contrast]]\nmetric = "shift"\ndetectors = ["published"]'},
+            r'name the other one alone, such as detectors = \["measured"\]',
+        ),
+        (
+            {
+                "[[contrast]]": '[[contrast]]\nmetric = "shift"\ndetectors = ["measured"]',
+                "sites = 1": 'sites = 1\ndetectors = ["measured"]',
+            },
+            r"views of 'published' and 'measured': name both in detectors of the \[\[task\]\] of clean",
+        ),
         (
             {"[[contrast]]": "[[contrast]]\nmin_effect = 0.4\npilot = { second = 0.7 }"},
             r"'nothing' cannot be reached: at most 0\.300 can be gained, and 0\.400 is to matter",

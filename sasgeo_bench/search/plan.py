@@ -27,7 +27,7 @@ class Plan:
     """
 
     cells: int = 16
-    beam: tuple[int, ...] = (160, 48, 16, 8, 6)
+    beam: tuple[int, ...] = (80, 24, 10, 6, 5)
     each: int = 2
     spread: float = SPREAD
     apart_m: float = 25.0

@@ -59,7 +59,7 @@ queries: $(STAMP) ## draw every suite on the towns, and on each real region whos
 	  $(if $(EXTRACTS),--extracts "$(EXTRACTS)") --out $(OUT) $(ARGS)
 
 leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, or a file; goes on where it was cut off
-	$(SASGEO) leaderboard $(or $(PIPELINE),leaderboard) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") \
+	$(SASGEO) leaderboard $(or $(PIPELINE),modules) --jobs 2 $(if $(EXTRACTS),--extracts "$(EXTRACTS)") \
 	  $(if $(RESULTS),--results "$(RESULTS)") --out $(OUT) $(ARGS)
 
 # Three workers for two processors: now and then a test waits for a process that it has started.
@@ -105,7 +105,7 @@ figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extra
 	$(SASGEO) lookalike vaduz@2015-07-27 --world vaduz --out $(OUT)
 	cp $(OUT)/sheets/lookalike-vaduz-2015-07-27.png docs/figures/lookalike.png
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/regions/vaduz/preview.png docs/figures/region.webp
-	$(SASGEO) publish --board docs/results/leaderboard --into $(OUT)/public
+	$(SASGEO) publish --board docs/results/claims --into $(OUT)/public
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/public/index.html docs/figures/board.webp
 
 $(DOCS_STAMP): $(STAMP) requirements-docs.lock

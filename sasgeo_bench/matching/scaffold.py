@@ -146,7 +146,7 @@ Say in the card (`src/{module}/matcher.py`) where the method comes from, what of
 tell for it to work; raise its version whenever answers change. `card.toml` says the same of a submission:
 
 ```bash
-sasgeo-bench submit --predictions out/runs/{name} --card card.toml --for docs/results/leaderboard
+sasgeo-bench submit --predictions out/runs/{name} --card card.toml --for docs/results/systems
 ```
 """
 

@@ -69,7 +69,7 @@ def test_a_folder_that_is_no_board_is_told_in_one_line(tmp_path, capsys):
 
 
 def test_rejection_is_of_one_prior_group_that_nearly_all_views_have():
-    _, rows = related_work.read_board(RESULTS / "leaderboard")
+    _, rows = related_work.read_board(RESULTS / "claims")
     assert set(rows["prior_group"]) == {related_work.PRIOR}
     assert not rows.duplicated(["matcher", "metric", "rejector"]).any()
 

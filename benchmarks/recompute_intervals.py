@@ -2,9 +2,9 @@
 """Intervals of a board's contrasts, computed again with numpy and statsmodels alone.
 
 Reads `scores.parquet`, `contrasts.parquet` and `board.json` of a board, none of the program's code, and prints for each
-contrast by success or interaction: its bootstrap interval by places (places, blocks and sites drawn one by one), by
-countries where places share some, the cluster-robust interval of statsmodels, a sign-flip p over places, and what the
-board says. The cluster-robust interval is the narrower one: it does not resample blocks and sites.
+contrast by success, interaction or shift: its bootstrap interval by places (places, blocks and sites drawn one by one),
+by countries where places share some, the cluster-robust interval of statsmodels, a sign-flip p over places, and what
+the board says. The cluster-robust interval is the narrower one: it does not resample blocks and sites.
 """
 
 import argparse
@@ -20,29 +20,36 @@ import statsmodels.api as sm
 DRAWS, FLIPS = 1000, 100_000
 FOUND_M, FOUND_DEG = 25.0, 5.0  # success
 SITE = ["suite", "pair_id", "view_cells", "detector"]  # of which a control belongs to a stress
+VARIANT = ["suite", "pair_id", "view_cells", "kind", "strength"]  # of which there is a view by each detector
 Tree = list[Any]  # of clusters within clusters; the innermost are arrays of differences
 
 
 def differences(scores: pd.DataFrame, contrast: dict[str, Any]) -> pd.DataFrame:
     """Return first less second for each query of a contrast under stress, with its clusters.
 
-    Of an interaction the difference on the control of the same site is taken off; queries without one do not count.
+    Of an interaction the difference on the control of the same site is taken off, of a shift that on the view of the
+    same variant by the detector `published`; queries without one do not count.
     """
     rows = scores[scores["suite"].isin(contrast["suites"]) & (scores["track"] == contrast["track"])]
+    is_shift = contrast["metric"] == "shift"
     if contrast.get("detectors"):
-        rows = rows[rows["detector"].isin(contrast["detectors"])]
+        rows = rows[rows["detector"].isin([*contrast["detectors"], *(["published"] if is_shift else [])])]
     hit = (rows["position_error_m"] <= FOUND_M) & (rows["yaw_error_deg"] <= FOUND_DEG)
     rows = rows.assign(hit=hit.astype(float), detector=rows["detector"].fillna("published"))
-    keys = ["query_id", "country", "place", "block", "role", "kind", "is_present", *SITE]
+    keys = list(dict.fromkeys(["query_id", "country", "place", "block", "role", "is_present", *SITE, *VARIANT]))
     wide = rows.pivot_table(index=keys, columns="matcher", values="hit", observed=True).reset_index()
     wide = wide.dropna(subset=[contrast["first"], contrast["second"]])
     wide = wide.assign(gap=wide[contrast["first"]] - wide[contrast["second"]])
     counts = wide["kind"].str.startswith(tuple(contrast["kinds"]) or "") & ~wide["kind"].str.startswith("unrivalled")
-    stress = wide[(wide["role"] == "stress") & wide["is_present"] & counts]
-    if contrast["metric"] != "interaction":
+    stress: pd.DataFrame = wide[(wide["role"] == "stress") & wide["is_present"] & counts]
+    if contrast["metric"] == "primary":
         return stress
-    control = wide[wide["role"] == "control"].groupby(SITE)["gap"].mean().rename("control").reset_index()
-    both = stress.merge(control, on=SITE)
+    other, on = wide[wide["role"] == "control"], SITE
+    if is_shift:
+        is_other = stress["detector"] == "published"
+        other, on, stress = stress[is_other], VARIANT, stress[~is_other]
+    control = other.groupby(on)["gap"].mean().rename("control").reset_index()
+    both: pd.DataFrame = stress.merge(control, on=on)
     return both.assign(gap=both["gap"] - both["control"])
 
 
@@ -78,7 +85,7 @@ def main() -> None:
     scores = pd.read_parquet(board / "scores.parquet")
     rng = np.random.default_rng(7)
     for contrast in json.loads((board / "board.json").read_text(encoding="utf-8"))["contrasts"]:
-        if contrast["metric"] not in {"primary", "interaction"} or contrast["track"] != "localization":
+        if contrast["metric"] not in {"primary", "interaction", "shift"} or contrast["track"] != "localization":
             continue
         gaps = differences(scores, contrast)
         groups = gaps["place"].astype("category").cat.codes

@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is kept, and at what risk, where a declared share of the places is absent, by kind of absence.
+
+    .venv/bin/python -m benchmarks.absent_places docs/results/systems --matchers sasgeo schmidt_segcorr
+
+Reads a board whose suites `absent` and `clean` the matchers were asked. A rejector is fitted on the calibration places
+of each test place, and a threshold is chosen there: the one of largest coverage whose risk, the share of false fixes
+among the accepted, is at most `--risk` where absent places of all kinds make up `--absent` of the views. Chances of
+calibration places are from fits on other countries. Neither fit nor threshold sees a place of the country that is
+tested.
+
+Printed is, for each matcher and rejector, what that threshold does at the test places: of the right answers the share
+that it keeps, where an oracle keeps all at no risk; and the risk with each kind of absence making up the same share of
+the views. The last column is of views that show little: of present places, their right answers kept. Each with its 95 %
+interval by places. A risk that none is accepted to tell is `-`.
+"""
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.leaderboard.board_files import read_board, read_scores
+from sasgeo_bench.matching.plugins import rejector_maker
+from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.publishing.archive_file import read_stored_predictions
+from sasgeo_bench.scoring.base import Floats
+from sasgeo_bench.scoring.decisions import Answers, accept, presence_weights
+from sasgeo_bench.scoring.draws import seed_of_text
+from sasgeo_bench.scoring.integrity_metric import risk_coverage
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval
+from sasgeo_bench.scoring.rejection import OWN, turns
+from sasgeo_bench.scoring.rejection_rows import Share, share_intervals
+from sasgeo_bench.tasks.split import Split, find_split
+
+SUITES, PRIOR = ("absent", "clean"), "r500-weak-s3"
+KINDS = ("outside", "wrong place", "corrupted view")
+POOR = "feature-poor"  # its places are present
+FOLDS, DRAWS = 5, 1000
+COLUMNS = ("right answers kept", "risk", *(f"risk, {kind}" for kind in KINDS), f"kept of {POOR}")
+Said = dict[str, Prediction]
+
+
+def chances(rejector: str, known: pd.DataFrame, asked: pd.DataFrame, said: Said) -> Floats:
+    """Return the chance of a right fix at some views from a fit on others; NaN without an answer."""
+    is_answered = asked["is_answered"].to_numpy(bool)
+    found = np.where(is_answered, asked["confidence"].to_numpy(float), np.nan)
+    if rejector == OWN:
+        return found
+    fitted, taught = rejector_maker(rejector)(), known[known["is_answered"].astype(bool)]
+    fitted.fit([said[name] for name in taught["query_id"]], ~taught["is_right"].to_numpy(bool))
+    some = [said[name] for name in asked.loc[is_answered, "query_id"]]
+    if some:
+        found[is_answered] = 1.0 - np.asarray(fitted.p_false(some), dtype=np.float64)
+    return found
+
+
+def held_back(rejector: str, known: pd.DataFrame, said: Said) -> Floats:
+    """Return chances of calibration views, each from a fit without its country."""
+    fold = known["country"].astype("category").cat.codes.to_numpy() % FOLDS
+    if rejector == OWN or len(set(fold)) == 1:
+        return chances(rejector, known, known, said)
+    found = np.full(len(known), np.nan)
+    for one in set(fold):
+        found[fold == one] = chances(rejector, known[fold != one], known[fold == one], said)
+    return found
+
+
+def answers(rows: pd.DataFrame, chance: Floats) -> Answers:
+    """Return views as answers with chances."""
+    facts = {name: rows[name].to_numpy(bool) for name in ("is_answered", "is_right", "is_present")}
+    return Answers(confidence=chance, **facts)
+
+
+def accepted(
+    rejector: str, rows: pd.DataFrame, said: Said, split: Split, *, is_taught: bool, absent: float, risk: float
+) -> pd.DataFrame:
+    """Return the tested views with `accepted`, by thresholds of calibration places."""
+    parts = []
+    for turn in turns(rows, split, is_taught=is_taught):
+        known, asked = rows[turn.calibration], rows[turn.test]
+        here = answers(known, held_back(rejector, known, said))
+        curve = risk_coverage(here, presence_weights(here.is_present, 1.0 - absent))
+        kept = np.flatnonzero(curve.risk <= risk)
+        threshold = float(curve.threshold[kept[-1]]) if len(kept) else np.inf
+        taken = accept(answers(asked, chances(rejector, known, asked, said)), threshold)
+        parts.append(asked.assign(accepted=taken))
+    return pd.concat(parts, ignore_index=True)
+
+
+def figures(rows: pd.DataFrame, absent: float) -> Iterator[BoardInterval]:
+    """Yield what is kept, the risk with all kinds of absence and with each, and what is kept of feature-poor views."""
+    taken, right, present = (rows[name].to_numpy(float) for name in ("accepted", "is_right", "is_present"))
+    kind = rows["kind"].to_numpy()
+    shares = [Share(counted=taken, mass=right)]
+    for some in (KINDS, *((one,) for one in KINDS)):
+        of_kind = (present == 0) & np.isin(kind, some)
+        mass = np.where(present == 1, (1 - absent) / present.sum(), absent * of_kind / max(of_kind.sum(), 1))
+        shares.append(Share(counted=1.0 - right, mass=mass * len(rows) * taken))
+    shares.append(Share(counted=taken, mass=right * (kind == POOR)))
+    place, block, site = (np.unique(rows[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
+    drawn = BoardDraws.of(place, block, site, seed=seed_of_text("absent places"), draws=DRAWS)
+    return share_intervals(shares, site, drawn)
+
+
+def cell(found: BoardInterval) -> str:
+    """Return a figure with its interval.
+
+    >>> cell(BoardInterval(value=0.5, lo=0.25, hi=1.0))
+    '0.50 [0.25, 1.00]'
+    """
+    return "-" if np.isnan(found.value) else f"{found.value:.2f} [{found.lo:.2f}, {found.hi:.2f}]"
+
+
+def lines(board: Path, matchers: Sequence[str], *, absent: float = 0.3, risk: float = 0.05) -> list[str]:
+    """Return the table, a line for each matcher and rejector of the board.
+
+    Raises
+    ------
+    SasgeoError
+        If the folder holds no board with such answers, or it is damaged.
+    """
+    about, _ = read_board(board)
+    scores, split = read_scores(board), find_split(about["split"])
+    taught = {entry["name"]: bool(entry["learned"]) for entry in about["entries"]}
+    chosen = scores["suite"].isin(SUITES) & (scores["track"] == "localization") & (scores["prior_group"] == PRIOR)
+    found = [f"| matcher | rejector | {' | '.join(COLUMNS)} |", "|---|---|" + "---:|" * len(COLUMNS)]
+    for matcher in matchers:
+        rows = scores[chosen & (scores["matcher"] == matcher)].reset_index(drop=True)
+        said = {one.query_id: one for one in read_stored_predictions(board, matcher)}
+        for rejector in (OWN, *(one["name"] for one in about["rejectors"])):
+            judged = accepted(rejector, rows, said, split, is_taught=taught[matcher], absent=absent, risk=risk)
+            cells = " | ".join(map(cell, figures(judged, absent)))
+            found.append(f"| {matcher} | {rejector} | {cells} |")
+    return found
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("board", type=Path)
+    parser.add_argument("--matchers", nargs="+", required=True)
+    parser.add_argument("--absent", type=float, default=0.3, help="share of absent places")
+    parser.add_argument("--risk", type=float, default=0.05, help="share of false fixes among accepted ones")
+    words = parser.parse_args()
+    for name in ("absent", "risk"):
+        if not 0 < getattr(words, name) < 1:
+            parser.error(f"--{name} lies between 0 and 1, got {getattr(words, name):g}")
+    try:
+        print("\n".join(lines(words.board, words.matchers, absent=words.absent, risk=words.risk)))
+    except SasgeoError as error:
+        parser.error(str(error))
+
+
+if __name__ == "__main__":
+    main()

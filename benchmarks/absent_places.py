@@ -9,6 +9,12 @@ among the accepted, is at most `--risk` where absent places of all kinds make up
 calibration places are from fits on other countries. Neither fit nor threshold sees a place of the country that is
 tested.
 
+With `--conformal` the threshold is the one of largest coverage that conformal risk control allows, with places as what
+is exchangeable (Angelopoulos, Bates, Fisch, Lei and Schuster, ICLR 2024): with n calibration places, and L the sum over
+them of the share of their views that has an accepted false fix, (L + 1) / (n + 1) is at most `--risk`. That is a
+promise in the mean over places like these. It needs 1 / `--risk` - 1 calibration places at least: with fewer it accepts
+nothing.
+
 Printed is, for each matcher and rejector, what that threshold does at the test places: of the right answers the share
 that it keeps, where an oracle keeps all at no risk; and the risk with each kind of absence making up the same share of
 the views. The last column is of views that show little: of present places, their right answers kept. Each with its 95 %
@@ -17,6 +23,7 @@ interval by places. A risk that none is accepted to tell is `-`.
 
 import argparse
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +48,7 @@ KINDS = ("outside", "wrong place", "corrupted view")
 POOR = "feature-poor"  # its places are present
 FOLDS, DRAWS = 5, 1000
 COLUMNS = ("right answers kept", "risk", *(f"risk, {kind}" for kind in KINDS), f"kept of {POOR}")
+_NOTHING = 1e-9
 Said = dict[str, Prediction]
 
 
@@ -69,6 +77,34 @@ def held_back(rejector: str, known: pd.DataFrame, said: Said) -> Floats:
     return found
 
 
+def risk_threshold(here: Answers, mass: Floats, risk: float) -> float:
+    """Return the threshold of largest coverage whose risk among the accepted is small enough; inf if none is."""
+    curve = risk_coverage(here, mass)
+    kept = np.flatnonzero(curve.risk <= risk)
+    return float(curve.threshold[kept[-1]]) if len(kept) else np.inf
+
+
+def conformal_threshold(here: Answers, mass: Floats, place: Sequence[str], risk: float) -> float:
+    """Return the threshold of largest coverage that conformal risk control by places allows; inf if none.
+
+    >>> facts = {"is_answered": [1] * 20, "is_right": [1] * 19 + [0], "is_present": [1] * 20}
+    >>> here = Answers(confidence=np.linspace(1, 0, 20), **facts)
+    >>> conformal_threshold(here, np.ones(20), [str(at) for at in range(20)], 0.05) > 0
+    True
+    >>> conformal_threshold(here, np.ones(20), ["one"] * 20, 0.05)
+    inf
+    """
+    at = np.unique(np.asarray(place), return_inverse=True)[1]
+    whole, best = np.bincount(at, weights=mass), np.inf
+    for threshold in risk_coverage(here, mass).threshold:
+        is_false = accept(here, threshold) & ~here.is_right
+        shares = np.bincount(at, weights=mass * is_false) / np.maximum(whole, np.finfo(float).tiny)
+        if (shares.sum() + 1) / (len(whole) + 1) > risk + _NOTHING:
+            break
+        best = float(threshold)
+    return best
+
+
 def answers(rows: pd.DataFrame, chance: Floats) -> Answers:
     """Return views as answers with chances."""
     facts = {name: rows[name].to_numpy(bool) for name in ("is_answered", "is_right", "is_present")}
@@ -76,16 +112,16 @@ def answers(rows: pd.DataFrame, chance: Floats) -> Answers:
 
 
 def accepted(
-    rejector: str, rows: pd.DataFrame, said: Said, split: Split, *, is_taught: bool, absent: float, risk: float
+    rejector: str, rows: pd.DataFrame, said: Said, split: Split, words: argparse.Namespace, *, is_taught: bool
 ) -> pd.DataFrame:
     """Return the tested views with `accepted`, by thresholds of calibration places."""
     parts = []
     for turn in turns(rows, split, is_taught=is_taught):
         known, asked = rows[turn.calibration], rows[turn.test]
         here = answers(known, held_back(rejector, known, said))
-        curve = risk_coverage(here, presence_weights(here.is_present, 1.0 - absent))
-        kept = np.flatnonzero(curve.risk <= risk)
-        threshold = float(curve.threshold[kept[-1]]) if len(kept) else np.inf
+        mass = presence_weights(here.is_present, 1.0 - words.absent)
+        choose = partial(conformal_threshold, place=known["place"].tolist()) if words.conformal else risk_threshold
+        threshold = choose(here, mass, risk=words.risk)
         taken = accept(answers(asked, chances(rejector, known, asked, said)), threshold)
         parts.append(asked.assign(accepted=taken))
     return pd.concat(parts, ignore_index=True)
@@ -115,44 +151,51 @@ def cell(found: BoardInterval) -> str:
     return "-" if np.isnan(found.value) else f"{found.value:.2f} [{found.lo:.2f}, {found.hi:.2f}]"
 
 
-def lines(board: Path, matchers: Sequence[str], *, absent: float = 0.3, risk: float = 0.05) -> list[str]:
-    """Return the table, a line for each matcher and rejector of the board.
+def lines(words: argparse.Namespace) -> list[str]:
+    """Return the table of what `parsed` returns, a line for each matcher and rejector of the board.
 
     Raises
     ------
     SasgeoError
         If the folder holds no board with such answers, or it is damaged.
     """
-    about, _ = read_board(board)
-    scores, split = read_scores(board), find_split(about["split"])
+    about, _ = read_board(words.board)
+    scores, split = read_scores(words.board), find_split(about["split"])
     taught = {entry["name"]: bool(entry["learned"]) for entry in about["entries"]}
     chosen = scores["suite"].isin(SUITES) & (scores["track"] == "localization") & (scores["prior_group"] == PRIOR)
     found = [f"| matcher | rejector | {' | '.join(COLUMNS)} |", "|---|---|" + "---:|" * len(COLUMNS)]
-    for matcher in matchers:
+    for matcher in words.matchers:
         rows = scores[chosen & (scores["matcher"] == matcher)].reset_index(drop=True)
-        said = {one.query_id: one for one in read_stored_predictions(board, matcher)}
+        said = {one.query_id: one for one in read_stored_predictions(words.board, matcher)}
         for rejector in (OWN, *(one["name"] for one in about["rejectors"])):
-            judged = accepted(rejector, rows, said, split, is_taught=taught[matcher], absent=absent, risk=risk)
-            cells = " | ".join(map(cell, figures(judged, absent)))
+            judged = accepted(rejector, rows, said, split, words, is_taught=taught[matcher])
+            cells = " | ".join(map(cell, figures(judged, words.absent)))
             found.append(f"| {matcher} | {rejector} | {cells} |")
     return found
 
 
-def main() -> None:
-    """Print the table."""
+def parsed(given: Sequence[str] | None = None) -> argparse.Namespace:
+    """Return the words of a command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("board", type=Path)
     parser.add_argument("--matchers", nargs="+", required=True)
     parser.add_argument("--absent", type=float, default=0.3, help="share of absent places")
     parser.add_argument("--risk", type=float, default=0.05, help="share of false fixes among accepted ones")
-    words = parser.parse_args()
+    parser.add_argument("--conformal", action="store_true", help="bound the risk in the mean over places")
+    words = parser.parse_args(given)
     for name in ("absent", "risk"):
         if not 0 < getattr(words, name) < 1:
             parser.error(f"--{name} lies between 0 and 1, got {getattr(words, name):g}")
+    return words
+
+
+def main() -> None:
+    """Print the table."""
     try:
-        print("\n".join(lines(words.board, words.matchers, absent=words.absent, risk=words.risk)))
+        print("\n".join(lines(parsed())))
     except SasgeoError as error:
-        parser.error(str(error))
+        message = f"absent_places: {error}"
+        raise SystemExit(message) from error
 
 
 if __name__ == "__main__":

@@ -165,7 +165,7 @@ def score_command(options: ScoreOptions) -> None:
     folder = options.out / "boards" / options.name
     say(folder)
     tell(_how_to_publish(folder))
-    _check_controls(board)
+    check_controls(board)
 
 
 def _check_names(name: str, truth: Path | None) -> None:
@@ -257,20 +257,20 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     say(board_folder(plan))
     if plan.private is not None:
         tell(f"next: sasgeo-bench score --predictions docs/results/{spec.id} --private {board_folder(plan)}")
-        _check_controls(board)
+        check_controls(board)
         return
     tell(_how_to_publish(board_folder(plan)))
     if not options.matcher:
         more = f"sasgeo-bench leaderboard {options.pipeline} --matcher NAME"
         tell(f"next: {more} adds one of yours (new-matcher begins one)")
-    _check_controls(board)
+    check_controls(board)
 
 
 def _how_to_publish(folder: Path) -> str:
     return f"next: sasgeo-bench publish --board {folder} makes a site of it"
 
 
-def _check_controls(board: Board) -> None:
+def check_controls(board: Board) -> None:
     """End with a status that a script sees where a control or a contestant failed; the board is written though."""
     for name, why in board.failures.found.items():
         tell(f"failed, and so not on the board: {name}: {why}")

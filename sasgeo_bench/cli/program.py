@@ -60,6 +60,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "merge": "runs",
         "validate": "submissions",
         "submit": "submissions",
+        "enter": "entering",
     },
     "Boards": {
         "score": "boards",

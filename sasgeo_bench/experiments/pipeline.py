@@ -73,16 +73,13 @@ def run_pipeline(
         check_results(stored, board_folder(plan))
     rules_of(plan.spec.rejectors, plan.split)
     sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored, tell=tell)
-    drawn = _draw(plan.requests, tell, jobs=plan.jobs)
-    _render(plan, tell)
-    tasks = [*_with_evidence(plan, drawn, tell=tell, progress=progress), *_draw_paper(plan, tell)]
+    tasks, controls = draw_all(plan, tell=tell, progress=progress)
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
     if not asked:
         message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
         raise ConfigError(message)
     contrasts = tuple(contrast_of(item.model_dump(exclude={"why", "pilot"})) for item in plan.spec.contrast)
     _check_contrasts(plan, contrasts, asked, tell)
-    controls = _draw(plan.controls, tell, jobs=1)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
     folders, names = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
     contrasts = tuple(named_on_board(item, names) for item in contrasts)
@@ -111,6 +108,14 @@ def run_pipeline(
     if stored is not None:
         tell(pack_board(board, request, stored).to_text())
     return board
+
+
+def draw_all(plan: PipelinePlan, *, tell: Tell, progress: Progress | None) -> tuple[list[Path], list[Path]]:
+    """Draw what is missing of a pipeline's queries and of its controls, and return the folders of both."""
+    drawn = _draw(plan.requests, tell, jobs=plan.jobs)
+    _render(plan, tell)
+    tasks = [*_with_evidence(plan, drawn, tell=tell, progress=progress), *_draw_paper(plan, tell)]
+    return tasks, _draw(plan.controls, tell, jobs=1)
 
 
 def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: Sequence[Path], tell: Tell) -> None:
@@ -144,7 +149,7 @@ def _run_all(
     folders: list[Path] = []
     for spec, found in runs.items():
         with failures.of(spec, but=(ConfigError,)):
-            folders += _run(spec, found, tell, progress)
+            folders += ask(spec, found, tell=tell, progress=progress)
     if not folders and failures.first is not None:
         raise failures.first
     return folders, {spec: found[0].plan.card.name for spec, found in runs.items()}
@@ -163,7 +168,7 @@ def named_on_board(contrast: Contrast, names: Mapping[str, str]) -> Contrast:
     return replace(contrast, first=first, second=second)
 
 
-def _run(spec: str, runs: Sequence[Run], tell: Tell, progress: Progress | None) -> list[Path]:
+def ask(spec: str, runs: Sequence[Run], *, tell: Tell, progress: Progress | None) -> list[Path]:
     """Run one matcher on all queries without a row, and return the folders of its runs."""
     folders: list[Path] = []
     for one in runs:

@@ -143,10 +143,11 @@ sasgeo-bench run --matcher {name} --tasks out/tasks/clean/town-riverside
 ```
 
 Say in the card (`src/{module}/matcher.py`) where the method comes from, what of it is yours, and what a query must
-tell for it to work; raise its version whenever answers change. `card.toml` says the same of a submission:
+tell for it to work; raise its version whenever answers change. Then enter a published board; `--card card.toml` adds
+authors and code:
 
 ```bash
-sasgeo-bench submit --predictions out/runs/{name} --card card.toml --for docs/results/systems
+sasgeo-bench enter docs/results/systems --matcher {name}
 ```
 """
 

@@ -35,12 +35,12 @@ FOLDER: Final = Path("submissions")  # the default folder of submissions
 class SubmitRequest:
     """A request for a submission.
 
-    `predictions` is a file of predictions or the folder of a matcher's runs, `card` a TOML file, `board` the stored
-    results of the board, `into` the folder to write (submissions/<name> by default).
+    `predictions` is a file of predictions or the folder of a matcher's runs, `card` a card or a TOML file, `board` the
+    stored results of the board, `into` the folder to write (submissions/<name> by default).
     """
 
     predictions: Path
-    card: Path
+    card: Card | Path
     board: Path
     into: Path | None = None
 
@@ -51,12 +51,11 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     `tell` gets a line on misses and on controls that are not answered. Raise `ConfigError` if the card does not fit the
     board or the runs, or the predictions hold faults; `StoreError` if something cannot be read or written.
     """
-    card = read_card(request.card)
+    card = request.card if isinstance(request.card, Card) else read_card(request.card)
     if not is_pack(request.board):
         message = f"{request.board} holds no stored results: name those of the board, as in --for docs/results/demo"
         raise StoreError(message)
-    split = _split_of(request.board)
-    _check_card(card, request.board, split, request.card)
+    split = check_card(card, request.board, source="the card" if isinstance(request.card, Card) else str(request.card))
     with laid_tasks([request.board]) as folders:
         tasks = [AskedTask.of(folder) for folder in folders]
         _check_runs(card, request.predictions, split, tasks)
@@ -84,23 +83,32 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     return folder
 
 
-def _split_of(board: Path) -> Split | None:
+def check_card(card: Card, board: Path, *, source: str) -> Split | None:
+    """Return the split of a board, after refusing a card that does not fit it; `source` is where the card stands.
+
+    Raise `ConfigError` if its name is that of another row or of a matcher that ships, or training places are unknown.
+    """
     name = stored_settings([board]).split
-    return None if name is None else find_split(name)
+    split = None if name is None else find_split(name)
+    _check_name(card.name, board, source)
+    _check_places(card, board, split, source)
+    return split
 
 
-def _check_card(card: Card, board: Path, split: Split | None, path: Path) -> None:
-    """Refuse a name that another row has, and training on unknown places."""
+def _check_name(name: str, board: Path, source: str) -> None:
     taken = {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
     kinds = {
-        "a control of every board": is_unranked(card.name),
-        f"a matcher on the board {board.name}": card.name in taken,
-        "a matcher that ships": card.name in shipped_names(),
+        "a control of every board": is_unranked(name),
+        f"a matcher on the board {board.name}": name in taken,
+        "a matcher that ships": name in shipped_names(),
     }
     whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
     if whose is not None:
-        message = f"{path}: {card.name!r} is the name of {whose}: choose another name"
+        message = f"{source}: {name!r} is the name of {whose}: choose another name"
         raise ConfigError(message)
+
+
+def _check_places(card: Card, board: Path, split: Split | None, source: str) -> None:
     if not board_of([board]):
         message = f"{board} are stored results of no pipeline: name those of a board that one has made"
         raise ConfigError(message)
@@ -108,12 +116,12 @@ def _check_card(card: Card, board: Path, split: Split | None, path: Path) -> Non
     unknown = next((place for place in card.places if place not in known), None)
     if unknown is not None:
         message = (
-            f"{path}: trained_on names {unknown!r}, {_hint(unknown, split)}; what is no place of the split goes into "
+            f"{source}: trained_on names {unknown!r}, {_hint(unknown, split)}; what is no place of the split goes into "
             "trained_elsewhere"
         )
         raise ConfigError(message)
     if card.is_by_half and (split is None or not split.half_of):
-        message = f"{path}: trained_on speaks of halves, and the split of this board has none: list the places"
+        message = f"{source}: trained_on speaks of halves, and the split of this board has none: list the places"
         raise ConfigError(message)
 
 

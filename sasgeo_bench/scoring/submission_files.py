@@ -67,6 +67,16 @@ def predictions_name(name: str) -> str:
     return f"{PREDICTIONS}/{name}.parquet"
 
 
+def check_submission_folder(folder: Path, name: str) -> None:
+    """Raise StoreError if a submission of this name cannot be written to a folder: other things would be lost."""
+    if folder.name != name:
+        message = f"{folder} must be named as the card is, {name!r}: name another folder"
+        raise StoreError(message)
+    if os.path.lexists(folder) and not is_submission(folder) and (not folder.is_dir() or any(folder.iterdir())):
+        message = f"{folder} holds something else than a submission, which would be lost: name another folder"
+        raise StoreError(message)
+
+
 def write_submission(
     folder: Path, submission: Submission, predictions: Sequence[Prediction], asked: Mapping[str, str]
 ) -> Submission:
@@ -76,12 +86,7 @@ def write_submission(
     query, by query id. Raise StoreError if the folder holds something else or has another name, the predictions are too
     large, or writing fails; the folder is then unchanged.
     """
-    if folder.name != submission.card.name:
-        message = f"{folder} must be named as the card is, {submission.card.name!r}: name another folder"
-        raise StoreError(message)
-    if os.path.lexists(folder) and not is_submission(folder) and (not folder.is_dir() or any(folder.iterdir())):
-        message = f"{folder} holds something else than a submission, which would be lost: name another folder"
-        raise StoreError(message)
+    check_submission_folder(folder, submission.card.name)
     rows = [
         {**prediction_row(item), ASKED: asked[item.query_id]}
         for item in sorted(predictions, key=lambda item: item.query_id)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A matcher enters a published board: it is asked the board's own queries, and its row stands beside the others."""
+
+from dataclasses import replace
+
+import pytest
+
+from sasgeo_bench.config import parse_toml
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.experiments import entering
+from sasgeo_bench.experiments.entering import EntryRequest, cost_lines, enter, plan_entry
+from sasgeo_bench.experiments.pipeline import run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
+from sasgeo_bench.matching.controls.blind import PriorCentre
+from sasgeo_bench.publishing.submissions import hold_submission
+from sasgeo_bench.scoring.submission_files import read_submission
+from tests.threaded import threaded
+
+pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings")
+
+TEXT = """
+id = "small"
+title = "Small"
+split = "crossfit"
+regions = ["town-suburb"]
+matchers = ["random", "prior_centre"]
+draws = 100
+
+[[task]]
+suites = ["clean"]
+sites = 1
+matchers = ["random", "prior_centre"]
+
+[[contrast]]
+name = "nothing"
+first = "random"
+second = "prior_centre"
+suites = ["clean"]
+"""
+
+
+class Middle(PriorCentre):
+    """A matcher that is installed nowhere."""
+
+    card = replace(PriorCentre.card, name="middle", trained_on=("porto", "10,000 views of Zurich"))
+
+
+class Shipped(PriorCentre):
+    """A matcher that takes a name that is taken."""
+
+    card = replace(PriorCentre.card, name="sasgeo")
+
+
+def silent(line):
+    del line
+
+
+@pytest.fixture(scope="module")
+def request_(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
+    """A request to enter a board that is stored, with the file of its pipeline."""
+    folder = tmp_path_factory.mktemp("entering")
+    out = lay_towns(folder / "out", "town-suburb")
+    (folder / "small.toml").write_text(TEXT, encoding="utf-8")
+    spec = parse_toml(TEXT, PipelineFile, source="small.toml")
+    with threaded():
+        run_pipeline(plan_pipeline(spec, out=out, tell=silent), tell=silent, results=folder / "results")
+    return EntryRequest(
+        stored=folder / "results" / "small",
+        matcher=f"{__name__}:Middle",
+        out=out,
+        pipeline=folder / "small.toml",
+    )
+
+
+@pytest.fixture(scope="module")
+def entered(request_, tmp_path_factory):
+    lines = []
+    into = tmp_path_factory.mktemp("submitted") / "middle"
+    with threaded():
+        folder, board = enter(plan_entry(request_, tell=silent), into=into, tell=lines.append)
+    return folder, board, lines
+
+
+def test_what_it_costs_is_said_before(request_):
+    first, *rest = cost_lines(plan_entry(request_, tell=silent))
+    assert first.startswith("small: ")
+    assert " queries in 2 tasks" in first  # the suite and the controls
+    assert rest[-1].startswith("  2 maps to build where they are missing, about 4 MB on disk")
+
+
+def test_the_submission_is_sound_and_answers_every_query(request_, entered):
+    folder, _, lines = entered
+    submission, faults = hold_submission(folder, [request_.stored])
+    assert faults == ()
+    assert {task.suite for task in submission.tasks} == {"clean", "controls"}
+    assert all(task.answered == task.queries for task in submission.tasks)
+    assert any(line.endswith("of the board are drawn as they were") for line in lines)
+    assert not any("count as misses" in line for line in lines)
+
+
+def test_the_card_is_that_of_the_matcher_with_places_apart_from_other_training(entered):
+    card = read_submission(entered[0]).card
+    assert (card.name, card.source) == ("middle", PriorCentre.card.source)
+    assert (card.trained_on, card.trained_elsewhere) == (["porto"], "10,000 views of Zurich")
+
+
+def test_its_row_stands_beside_the_others_as_submitted(entered):
+    _, board, _ = entered
+    table = board.table[(board.table["metric"] == "within_25m") & (board.table["suite"] == "clean")]
+    rows = table.set_index(["matcher", "stratum"])["value"]
+    assert rows["middle"].equals(rows["prior_centre"])  # the same answers
+    assert {entry.name: entry.how for entry in board.entries}["middle"] == "as submitted"
+
+
+def test_a_second_time_nothing_is_asked_again(request_, entered, tmp_path):
+    lines = []
+    again, _ = enter(plan_entry(request_, tell=silent), into=tmp_path / "middle", tell=lines.append)
+    assert any(line.endswith(" answered before") and ": 0 queries to ask, " in line for line in lines)
+    files = read_submission(entered[0]).files
+    assert read_submission(again).files == files
+
+
+def test_a_name_that_is_taken_is_refused_before_anything_is_asked(request_, tmp_path, monkeypatch):
+    monkeypatch.setattr(entering, "ask", pytest.fail)
+    request = replace(request_, matcher=f"{__name__}:Shipped")
+    with pytest.raises(MatchError, match="named 'sasgeo', as a matcher that ships: rename it"):
+        enter(plan_entry(request, tell=silent), into=tmp_path / "sasgeo", tell=silent)
+    assert not (tmp_path / "sasgeo").exists()
+
+
+def test_a_folder_that_holds_other_things_is_refused_before_anything_is_asked(request_, tmp_path, monkeypatch):
+    monkeypatch.setattr(entering, "ask", pytest.fail)
+    entry = plan_entry(request_, tell=silent)
+    (tmp_path / "middle").mkdir()
+    (tmp_path / "middle" / "thesis.tex").write_text("mine", encoding="utf-8")
+    with pytest.raises(StoreError, match="holds something else than a submission, which would be lost"):
+        enter(entry, into=tmp_path / "middle", tell=silent)
+    with pytest.raises(StoreError, match="must be named as the card is, 'middle'"):
+        enter(entry, into=tmp_path / "other", tell=silent)
+
+
+def test_another_text_of_the_pipeline_is_refused(request_, tmp_path):
+    (tmp_path / "small.toml").write_text(TEXT.replace("sites = 1", "sites = 2"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"made by another text of the pipeline 'small'.* or name the file by"):
+        plan_entry(replace(request_, pipeline=tmp_path / "small.toml"), tell=silent)
+
+
+def test_a_folder_without_results_is_refused(request_, tmp_path):
+    with pytest.raises(StoreError, match="holds no stored results: name those of a board"):
+        plan_entry(replace(request_, stored=tmp_path), tell=silent)
+
+
+def test_queries_that_are_drawn_otherwise_are_refused_before_anything_is_asked(request_, tmp_path, monkeypatch):
+    entry = plan_entry(request_, tell=silent)
+    other = plan_pipeline(entry.plan.spec.model_copy(update={"seed": 5}), out=tmp_path / "out", tell=silent)
+    monkeypatch.setattr(entering, "ask", pytest.fail)
+    with pytest.raises(ConfigError, match=r"none of the \d+ queries of .* is drawn here as it was: .* version that"):
+        enter(replace(entry, plan=other), into=tmp_path / "middle", tell=silent)
+    assert not (tmp_path / "middle").exists()
+
+
+def test_the_command_says_what_it_costs_and_stops(request_, program):
+    words = ("enter", request_.stored, "--matcher", request_.matcher, "--pipeline", request_.pipeline)
+    code, out, err = program(*words, "--dry-run", "--out", request_.out)
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0].startswith("small: ")

@@ -415,12 +415,10 @@ def _check_drawn(contrast: ContrastSpec, tasks: list[TaskSpec]) -> None:
             f"with {' and '.join(sorted(drawn))}: add the detector to their [[task]]"
         )
         raise ValueError(message)
-    both = {name for task in own if {PUBLISHED, *named} <= set(task.looks) for name in task.asked}
-    bare = [name for name in contrast.suites if name not in both]
-    if contrast.metric == "shift" and bare:
+    if contrast.metric == "shift" and any(not {PUBLISHED, *named} <= set(task.looks) for task in own):
         message = (
             f"contrast {contrast.name!r} by shift compares views of {PUBLISHED!r} and {contrast.detectors[0]!r}: name "
-            f"both in detectors of the [[task]] of {' and '.join(bare)}"
+            f"both in detectors of the [[task]] of {' and '.join(contrast.suites)}"
         )
         raise ValueError(message)
     if all(task.tracks and contrast.track not in task.tracks for task in own):

@@ -21,6 +21,24 @@ _BLUR: Final = 3  # squares of the view across a coarse cell before rotation: od
 _HALF_TURN: Final = 2  # right angles
 
 
+def around_of(template: Template, grid: Grid, turns: Turns) -> Grid:
+    """Return cells of a level around the middle of a view, as many as its largest scale and any heading need."""
+    step_m, largest = grid.cell_size_m, max(base.scale for base in turns.bases)
+    half = math.ceil(template.reach_m * largest / step_m) + 1
+    reach_m, side = (half + 0.5) * step_m, 2 * half + 1
+    return Grid(epsg=0, west_m=-reach_m, north_m=reach_m, cell_size_m=step_m, rows=side, cols=side)
+
+
+def squares_across(template: Template, grid: Grid) -> int:
+    """Return how many cells of a view make the side of a square to be resampled onto a level."""
+    return max(1, round(grid.cell_size_m / template.cell_size_m / _BLUR))
+
+
+def blur_width(frame: Grid, grid: Grid) -> int:
+    """Return how many squares of a view, an odd number, are averaged before they are resampled onto a level."""
+    return 2 * math.floor(grid.cell_size_m / frame.cell_size_m / 2) + 1
+
+
 @dataclass(frozen=True, kw_only=True)
 class Correlation:
     """Transforms of the map under each tile, as it is and turned by a right angle, and the template to correlate.
@@ -40,8 +58,8 @@ class Correlation:
     @classmethod
     def of(cls, level: Level, template: Template, tiles: Sequence[Tile], turns: Turns) -> Self:
         """Transform the windows of all tiles once, padded by the reach of the largest template."""
-        step_m, largest = level.grid.cell_size_m, max(base.scale for base in turns.bases)
-        half = math.ceil(template.reach_m * largest / step_m) + 1
+        around = around_of(template, level.grid, turns)
+        half = around.rows // 2
         shapes = tuple((tile.allowed.shape[0], tile.allowed.shape[1]) for tile in tiles)
         size = int(fft.next_fast_len(max(max(shape) for shape in shapes) + 2 * half, real=True))
         windows = [
@@ -54,13 +72,10 @@ class Correlation:
         for window in windows:
             turned = (np.rot90(window[used], quarter, (1, 2)) for quarter in range(min(turns.quarters, _HALF_TURN)))
             spectra.append(tuple(map_spectrum(each, (size, size)) for each in turned))
-        ratio = step_m / template.cell_size_m
-        bands, frame = pooled(template, level, max(1, round(ratio / _BLUR)))
+        bands, frame = pooled(template, level, squares_across(template, level.grid))
         bands = bands[used]  # classes that the map lacks here add nothing
-        width = 2 * math.floor(step_m / frame.cell_size_m / 2) + 1
+        width = blur_width(frame, level.grid)
         bands = np.stack([cv2.blur(band, (width, width), borderType=cv2.BORDER_CONSTANT) for band in bands])
-        reach_m, side = (half + 0.5) * step_m, 2 * half + 1
-        around = Grid(epsg=0, west_m=-reach_m, north_m=reach_m, cell_size_m=step_m, rows=side, cols=side)
         return cls(
             bands=bands,
             frame=frame,

@@ -19,9 +19,9 @@ from sasgeo_bench.search.correlation import Correlation
 from sasgeo_bench.search.field import FULL, Field, Level, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Disc, Mode, Null, Tile, Turns
 
-_SPARE: Final = 4  # peaks of one heading for each requested mode, since neighbours are dropped
+SPARE: Final = 4  # peaks of one heading for each requested mode, since neighbours are dropped
 _LOW: Final = np.float32(-1e30)  # score of a place that is not allowed
-_NEXT: Final = 1.5  # steps within which peaks are neighbours
+NEXT: Final = 1.5  # steps within which peaks are neighbours
 _NOTHING: Final = 1e-9
 
 
@@ -42,7 +42,7 @@ def dense(
             score[~tiles[at].allowed] = _LOW
             with locks[at]:
                 np.maximum(highest[at], score, out=highest[at])
-            found.append((at, _Peaks.of(score, turn, most=_SPARE * most)))
+            found.append((at, _Peaks.of(score, turn, most=SPARE * most)))
         return found
 
     with ThreadPoolExecutor(threads) as pool:
@@ -107,8 +107,8 @@ class _Peaks:
     def _is_near(self, at: int, other: int, turns: Turns) -> bool:
         """Return whether two peaks have neighbouring headings and scales."""
         off_deg = abs(float(wrap_deg(self.yaw_deg[at] - self.yaw_deg[other])))
-        is_turned = off_deg >= _NEXT * turns.yaw_step_deg + _NOTHING
-        return not is_turned and abs(self.scale[at] - self.scale[other]) < _NEXT * turns.scale_step + _NOTHING
+        is_turned = off_deg >= NEXT * turns.yaw_step_deg + _NOTHING
+        return not is_turned and abs(self.scale[at] - self.scale[other]) < NEXT * turns.scale_step + _NOTHING
 
     def mode(self, at: int, point_m: tuple[float, float]) -> Mode:
         """Return a peak as a mode at a place in metres."""
@@ -119,7 +119,7 @@ class _Peaks:
         return Mode(pose=pose, score=float(self.score[at]))
 
 
-_LEAST_SCALE: Final = 0.05
+LEAST_SCALE: Final = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +185,7 @@ class Stride:
 
     def moved(self, pose: Pose, *, yaw: float = 0.0, scale: float = 0.0) -> Pose:
         """Return a pose turned and scaled by some steps."""
-        larger = max(pose.scale + scale * self.scale, _LEAST_SCALE)
+        larger = max(pose.scale + scale * self.scale, LEAST_SCALE)
         return replace(pose, yaw_deg=pose.yaw_deg + yaw * self.yaw_deg, scale=larger)
 
     def around(self, pose: Pose) -> Iterator[Pose]:

@@ -151,7 +151,7 @@ def _level(field: Field, factor: int) -> Level:
     if factor == 1:
         cells = np.stack((*field.layers, field.known), axis=-1)
         return Level(factor=1, grid=grid, cells=cells, thinner=np.ones(cells.shape[-1]))
-    kernel = _disc(factor)
+    kernel = round_kernel(factor)
     spread = [_spread(band, kernel) for band in field.layers]
     bands, thinner = [*(band for band, _ in spread), field.known], [*(share for _, share in spread), 1.0]
     size, around = (grid.cols, grid.rows), ((0, -field.grid.rows % factor), (0, -field.grid.cols % factor))
@@ -170,7 +170,7 @@ def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray
     return (grown, share) if share < _THIN else (band, 1.0)
 
 
-def _disc(radius: float) -> NDArray[np.uint8]:
+def round_kernel(radius: float) -> NDArray[np.uint8]:
     """Return a round kernel."""
     reach = math.ceil(radius)
     squares = np.arange(-reach, reach + 1) ** 2
@@ -182,7 +182,7 @@ def _softened(template: Template, level: Level) -> NDArray[np.float32]:
     bands = template.bands[template.active]
     if level.factor == 1:
         return bands
-    kernel = _disc(level.grid.cell_size_m / template.cell_size_m)
+    kernel = round_kernel(level.grid.cell_size_m / template.cell_size_m)
     for band, at in zip(bands, template.active.tolist(), strict=True):
         if level.thinner[at] < 1:
             near = cv2.dilate((band > 0).astype(np.uint8), kernel) > 0

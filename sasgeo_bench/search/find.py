@@ -64,7 +64,7 @@ def search(
     >>> round(best.easting_m), round(best.northing_m)
     (26, 28)
     """
-    return _Search(field=field, template=template, prior=prior, plan=plan or Plan()).places(count, starts)
+    return Search(field=field, template=template, prior=prior, plan=plan or Plan()).places(count, starts)
 
 
 def rank(
@@ -74,7 +74,7 @@ def rank(
 
     Candidates that the beam drops keep their order, below all refined ones.
     """
-    return _Search(field=field, template=template, prior=prior, plan=plan or Plan()).candidates(poses)
+    return Search(field=field, template=template, prior=prior, plan=plan or Plan()).candidates(poses)
 
 
 def exhaustive(field: Field, template: Template, *, yaw_step_deg: float, threads: int = 1) -> Mode:
@@ -90,22 +90,21 @@ def score_at(field: Field, template: Template, pose: Pose) -> float:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Search:
-    """Search for one view on one map."""
+class Search:
+    """Search for one view on one map; its headings, and scales, lie at most `yaw_step_deg` apart."""
 
     field: Field
     template: Template
     prior: Prior
     plan: Plan
+    yaw_step_deg: float = math.inf
 
     def places(self, count: int, starts: Sequence[Pose]) -> Found:
         """Return the best modes within the prior."""
-        disc = Disc(center_m=self.prior.center_m, radius_m=self.prior.radius_m or 0.0)
-        tiles = tiles_of(self._coarse_grid, self.field.grid, disc.wider(_CORNER * self._coarse_m))
-        guesses, null = self._begun(tiles, most=self.plan.width(0))
+        guesses, null = self._begun(self.tiles, most=self.plan.width(0))
         guesses = _ranked([*(replace(guess, owner=0) for guess in guesses), *self._proposed(starts)])
-        followed = self._followed(guesses, [disc])
-        near = disc.wider(_CORNER * self.field.grid.cell_size_m)  # dropped modes were limited by larger cells
+        followed = self._followed(guesses, [self.disc])
+        near = self.within(1)  # dropped modes were limited by larger cells
         inside = (guess.mode for guess in followed if near.holds(np.array([place_m(guess.mode.pose)]))[0])
         return Found(modes=tuple(thinned(inside, self.plan.apart_m)[:count]), null=null)
 
@@ -113,7 +112,7 @@ class _Search:
         """Score proposed poses on the coarsest level."""
         if not starts or not len(self.template.active):
             return []
-        level_view = LevelView.of(self.field, self.template, self._factor)
+        level_view = LevelView.of(self.field, self.template, self.factor)
         return [Guess(mode=Mode(pose=pose, score=level_view.score(pose)), owner=0) for pose in starts]
 
     def candidates(self, poses: Sequence[Pose]) -> tuple[list[Mode | None], Null]:
@@ -128,35 +127,50 @@ class _Search:
         return best, null
 
     @cached_property
-    def _factor(self) -> int:
+    def factor(self) -> int:
         """Return map cells a side of the largest cell that leaves `plan.cells` along the side of the view."""
         most = self.template.side_m / (self.plan.cells * self.field.grid.cell_size_m)
         return 1 << max(0, math.floor(math.log2(max(most, 1.0)) + _NOTHING))
 
     @property
+    def disc(self) -> Disc:
+        """Return the disc of the prior."""
+        return Disc(center_m=self.prior.center_m, radius_m=self.prior.radius_m or 0.0)
+
+    def within(self, factor: int) -> Disc:
+        """Return the disc of the prior, wider by the corner of a cell of a level."""
+        return self.disc.wider(_CORNER * factor * self.field.grid.cell_size_m)
+
+    @property
+    def tiles(self) -> list[Tile]:
+        """Return the places of the coarsest level that the prior allows."""
+        return tiles_of(self._coarse_grid, self.field.grid, self.within(self.factor))
+
+    @property
     def _coarse_grid(self) -> Grid:
-        return self.field.grid.coarsen(self._factor)
+        return self.field.grid.coarsen(self.factor)
 
     @property
     def _coarse_m(self) -> float:
         return self._coarse_grid.cell_size_m
 
     @cached_property
-    def _turns(self) -> Turns:
-        """Return headings and scales whose neighbours differ by a coarse cell at the side of the view."""
-        return turns_of(self.prior, spread=self.plan.spread, step=self._coarse_m / (self.template.side_m / 2))
+    def turns(self) -> Turns:
+        """Return headings and scales whose neighbours differ by at most a coarse cell at the side of the view."""
+        step = min(self._coarse_m / (self.template.side_m / 2), math.radians(self.yaw_step_deg))
+        return turns_of(self.prior, spread=self.plan.spread, step=step)
 
     def _begun(self, tiles: Sequence[Tile], *, most: int) -> tuple[list[Guess], Null]:
         """Return the best modes of each tile on the coarsest level, best first."""
-        level = self.field.level(self._factor)
-        found, null = dense(level, self.template, tiles, self._turns, most=most, threads=self.plan.threads)
+        level = self.field.level(self.factor)
+        found, null = dense(level, self.template, tiles, self.turns, most=most, threads=self.plan.threads)
         return _ranked(Guess(mode=mode, owner=owner) for owner, modes in enumerate(found) for mode in modes), null
 
     def _followed(self, guesses: list[Guess], discs: Sequence[Disc]) -> list[Guess]:
         """Refine the best to the map's own cells and between them; best first, then dropped ones."""
-        stride = Stride(yaw_deg=self._turns.yaw_step_deg, scale=self._turns.scale_step)
+        stride = Stride(yaw_deg=self.turns.yaw_step_deg, scale=self.turns.scale_step)
         kept, behind = guesses[: self.plan.width(0)], [guesses[self.plan.width(0) - 1 :]]
-        factor = self._factor
+        factor = self.factor
         with ThreadPoolExecutor(self.plan.threads) as pool:
             while factor > 1:
                 factor, stride = factor // 2, stride.half()

@@ -135,7 +135,7 @@ def is_near(one: Mode, other: Mode, near_m: float, near_deg: float) -> bool:
 def agreement(found: Sequence[Found], wanted: Sequence[Found]) -> str:
     """Return columns: views with the same best pose, modes found too, and the largest difference of scores."""
     best, modes, off = 0, [], [0.0]
-    for mine, theirs in zip(found, wanted, strict=True):
+    for mine, theirs in zip(found, wanted, strict=False):  # the first views alone are searched one by one
         best += is_near(mine.modes[0], theirs.modes[0], CELL_M / 2, 0.5)
         unit = abs(theirs.modes[0].score)
         for mode in theirs.modes:

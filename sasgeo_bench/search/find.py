@@ -141,7 +141,7 @@ class Search:
         """Return the disc of the prior, wider by the corner of a cell of a level."""
         return self.disc.wider(_CORNER * factor * self.field.grid.cell_size_m)
 
-    @property
+    @cached_property
     def tiles(self) -> list[Tile]:
         """Return the places of the coarsest level that the prior allows."""
         return tiles_of(self._coarse_grid, self.field.grid, self.within(self.factor))

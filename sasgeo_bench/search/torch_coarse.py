@@ -22,7 +22,7 @@ Tensor = Any
 _LOW: Final = -1e30  # score of a place that is not allowed
 _NOTHING: Final = 1e-9
 _PLACES: Final = 64  # places for each requested mode whose headings are looked through
-_PEAKS: Final = 16  # peaks for each requested mode: far more than their better neighbours can drop
+_PEAKS: Final = 8  # peaks for each requested mode: far more than their better neighbours can drop
 _PARTS: Final = 5  # arrays as large as the transformed scores that are alive at once
 _HALF: Final = 0.5  # of a cell, where whole cells are counted
 
@@ -111,37 +111,34 @@ class Coarse:
         quarters = self.turns.quarters
         planes = max(1, self.most_bytes // (_PARTS * board.bytes_a_plane))
         bases = max(1, min(planes // quarters, len(self.turns.bases)))
-        best, modes = [], []
-        for bands in self.bands.split(max(1, planes // (bases * quarters))):
-            parts = []
-            for first in range(0, len(self.turns.bases), bases):
-                laid, poses = self.laid(bands, self.turns.bases[first : first + bases])
-                parts.append(board.peaks(laid, poses, most=most))
-            best.append(torch.stack([highest for highest, _ in parts]).amax(0))
-            modes.append(self._separate(Guesses.joined([peaks for _, peaks in parts]).ranked(), most))
-        found = Guesses(pose=torch.cat([one.pose for one in modes]), score=torch.cat([one.score for one in modes]))
+        modes, best = [], []
+        for first in range(0, len(self.turns.bases), bases):
+            lay = self.lay(self.turns.bases[first : first + bases])
+            some = self.bands.split(max(1, planes // (bases * quarters)))
+            highest, peaks = zip(*(board.peaks(lay.laid(bands), lay.turned, most=most) for bands in some), strict=True)
+            best.append(torch.cat(highest))
+            modes.append(Guesses.stacked(peaks))
+        found = self._separate(Guesses.joined(modes).ranked(), most)
         found.pose[..., :2] += found.pose.new_tensor([tile.row, tile.col])
-        return self._placed(found), torch.cat(best)
+        return self._placed(found), torch.stack(best).amax(0)
 
-    def laid(self, bands: Tensor, bases: Sequence[Pose]) -> tuple[Tensor, Tensor]:
-        """Resample views onto cells of the level, shape (Q, H, B, side, side), at headings and scales, shape (H, 2).
-
-        They are in the order in which equal scores are ranked.
-        """
+    def lay(self, bases: Sequence[Pose]) -> "Lay":
+        """Return how to lay views at some headings and scales."""
         back = [inverse(base) for base in bases]
         rows = [(pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale) for pose in back]
-        where = positions(_double(rows, bands), offsets_m(self.around).to(bands.device), self.frame)
-        where = where.view(1, -1, self.around.cols, 2).expand(len(bands), -1, -1, -1)
-        laid = torch.nn.functional.grid_sample(bands, where, align_corners=False)
-        laid = laid.unflatten(2, (len(bases), -1)).transpose(1, 2)
+        where = positions(_double(rows, self.bands), offsets_m(self.around).to(self.bands.device), self.frame)
         shares = [(self.around.cell_size_m / (base.scale * self.frame.cell_size_m)) ** 2 for base in bases]
-        laid = laid * _double(shares, bands).float()[:, None, None, None]
         quarters = range(self.turns.quarters)
         turned = [replace(base, yaw_deg=base.yaw_deg + 90 * quarter) for quarter in quarters for base in bases]
         poses = [(pose.yaw_deg, pose.scale) for pose in turned]
         order = sorted(range(len(poses)), key=poses.__getitem__)
-        laid = torch.cat([torch.rot90(laid, -quarter, (3, 4)) for quarter in quarters], dim=1)[:, order]
-        return laid, _double(poses, bands)[order]
+        return Lay(
+            where=where.view(1, -1, self.around.cols, 2),
+            shares=_double(shares, self.bands).float()[:, None, None, None],
+            quarters=self.turns.quarters,
+            order=torch.tensor(order, device=self.bands.device),
+            turned=_double([poses[at] for at in order], self.bands),
+        )
 
     def _separate(self, peaks: Guesses, most: int) -> Guesses:
         """Return the best peaks, none next to a better one in place, heading and scale at once."""
@@ -156,6 +153,28 @@ class Coarse:
         cells = peaks.pose[..., :2].long().flatten(0, 1).cpu().numpy()
         places = torch.from_numpy(self.grid.to_centres_m(cells)).to(peaks.pose)
         return replace(peaks, pose=torch.cat((places.view_as(peaks.pose[..., :2]), peaks.pose[..., 2:]), dim=-1))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lay:
+    """Headings and scales, `turned` of shape (H, 2), in the order in which equal scores are ranked.
+
+    `where` are the cells of a level in a view for those of the first quarter turn, `shares` the areas of its cells.
+    """
+
+    where: Tensor
+    shares: Tensor
+    quarters: int
+    order: Tensor
+    turned: Tensor
+
+    def laid(self, bands: Tensor) -> Tensor:
+        """Resample views onto cells of the level, shape (Q, H, B, side, side)."""
+        laid = torch.nn.functional.grid_sample(bands, self.where.expand(len(bands), -1, -1, -1), align_corners=False)
+        laid = laid.unflatten(2, (len(self.shares), -1)).transpose(1, 2) * self.shares
+        return torch.cat([torch.rot90(laid, -quarter, (3, 4)) for quarter in range(self.quarters)], dim=1)[
+            :, self.order
+        ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -186,8 +205,12 @@ class Board:
         waves = torch.polar(torch.ones(turns.shape), 2 * math.pi / size * (turns % size))
         real, imag = waves.real, waves.imag  # of the conjugate, since a correlation is wanted
         factors = torch.stack((torch.stack((real, -imag), dim=1), torch.stack((imag, real), dim=1)), dim=1)
-        kind = torch.float16 if coarse.cells.is_cuda else torch.float32
+        is_gpu = coarse.cells.is_cuda
+        kind = torch.float16 if is_gpu else torch.float32
         spectrum = torch.view_as_real(torch.fft.rfft(window, n=size)).permute(2, 3, 1, 0)
+        if is_gpu:  # matrices of the tensor cores have rows of multiples of 16 bytes
+            spectrum = torch.nn.functional.pad(spectrum, (0, -spectrum.shape[-1] % 4))
+            factors = torch.nn.functional.pad(factors, (0, -side % 8))
         return cls(
             allowed=torch.from_numpy(tile.allowed).to(coarse.cells.device),
             spectrum=spectrum.to(kind, memory_format=torch.contiguous_format),
@@ -202,20 +225,24 @@ class Board:
         return 8 * len(self.spectrum) * int(self.spectrum.shape[2])
 
     def scores(self, laid: Tensor) -> Tensor:
-        """Score laid views, shape (Q, H, B, side, side), at all places; shape (cols, rows, Q, H)."""
-        rows, cols = self.allowed.shape
+        """Score laid views, shape (Q, H, B, side, side), at all places, times `size`; shape (rows, Q, H, size).
+
+        Columns beyond those of the tile hold nothing.
+        """
+        rows = len(self.allowed)
         views, headings, bands, side, _ = laid.shape
-        wide = rows * 2 * side * bands * self.spectrum.element_size()
-        parts = []
-        for spectrum, waves in zip(
-            *(part.split(max(1, self.most_bytes // (4 * wide))) for part in (self.spectrum, self.waves)), strict=True
-        ):
+        aligned = (0, self.waves.shape[-1] - side, 0, 0, 0, self.spectrum.shape[-1] - bands)
+        laid = torch.nn.functional.pad(laid.to(self.waves.dtype), aligned)
+        wide = rows * 2 * side * self.spectrum.shape[-1] * self.spectrum.element_size()
+        at_once, parts = max(1, self.most_bytes // (4 * wide)), []
+        for spectrum, waves in zip(self.spectrum.split(at_once), self.waves.split(at_once), strict=True):
             under = spectrum.unfold(2, side, 1).permute(0, 2, 1, 4, 3).flatten(2)
-            factors = torch.einsum("foid,qhbrd->fqhoirb", waves, laid.to(waves.dtype))
+            factors = torch.einsum("foid,qhbrd->fqhoirb", waves, laid)
             parts.append(_product(under, factors.reshape(len(waves), views * headings * 2, -1).mT))
         sums = parts[0] if len(parts) == 1 else torch.cat(parts)
         sums = torch.view_as_complex(sums.view(len(sums), rows, views * headings, 2))
-        return torch.fft.irfft(sums, n=self.size, dim=0)[:cols].view(cols, rows, views, headings)
+        scores = torch.fft.irfft(sums, n=self.size, dim=0, norm="forward")
+        return scores.permute(1, 2, 0).unflatten(1, (views, headings))
 
     def peaks(self, laid: Tensor, turned: Tensor, *, most: int) -> tuple[Tensor, Guesses]:
         """Return the highest score of each allowed place, and the best local maxima at any heading.
@@ -225,20 +252,21 @@ class Board:
         """
         unit = laid.abs().flatten(1).amax(1).clamp(min=_NOTHING)  # of half precision
         scores = self.scores(laid / unit[:, None, None, None, None])
-        highest = scores.amax(-1).permute(2, 1, 0).where(self.allowed, _LOW).contiguous()
+        unit = unit / self.size
+        highest = scores.amax(2)[..., : self.allowed.shape[1]].transpose(0, 1).where(self.allowed, _LOW).contiguous()
         is_top = (highest == torch.nn.functional.max_pool2d(highest, 3, 1, 1)) & self.allowed
         flat, enough = highest.flatten(1), min(SPARE * most, self.allowed.numel())
         least = highest.where(is_top, _LOW).flatten(1).topk(enough).values[:, -1]
         places = flat.topk(min(_PLACES * most, flat.shape[1])).indices.sort(1).values
         row, col = places // self.allowed.shape[1], places % self.allowed.shape[1]
-        values = scores[col, row, torch.arange(len(laid), device=laid.device)[:, None]]
+        values = scores[row, torch.arange(len(laid), device=laid.device)[:, None], :, col]
         is_high = (values >= least[:, None, None]) & self.allowed[row, col][..., None]
         view, place, turn = is_high.nonzero().unbind(1)
         row, col, score = row[view, place], col[view, place], values[view, place, turn]
         is_peak = torch.ones_like(score, dtype=torch.bool)
         for down, right in ((-1, -1), (-1, 0), (-1, 1), (0, -1), (0, 1), (1, -1), (1, 0), (1, 1)):
             there = (row + down).clamp(0, self.allowed.shape[0] - 1), (col + right).clamp(0, self.allowed.shape[1] - 1)
-            is_peak &= ~self.allowed[there] | (score >= scores[there[1], there[0], view, turn])
+            is_peak &= ~self.allowed[there] | (score >= scores[there[0], view, turn, there[1]])
         view, row, col, turn, score = (part[is_peak] for part in (view, row, col, turn, score))
         pose = torch.cat((torch.stack((row, col), dim=1).double(), turned[turn]), dim=1)
         return flat[:, self.allowed.flatten()] * unit[:, None], _padded(

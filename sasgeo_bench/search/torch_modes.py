@@ -103,6 +103,13 @@ class Guesses:
         """Join modes of the same views."""
         return cls(pose=torch.cat([p.pose for p in parts], dim=1), score=torch.cat([p.score for p in parts], dim=1))
 
+    @classmethod
+    def stacked(cls, parts: Sequence[Self]) -> Self:
+        """Stack modes of different views."""
+        most = max(part.score.shape[1] for part in parts)
+        even = [part.filled(most) for part in parts]
+        return cls(pose=torch.cat([part.pose for part in even]), score=torch.cat([part.score for part in even]))
+
     def __getitem__(self, some: slice) -> Self:
         """Return a part of the modes of each view."""
         return type(self)(pose=self.pose[:, some], score=self.score[:, some])
@@ -158,7 +165,7 @@ def _is_inside(pose: Tensor, discs: Tensor) -> Tensor:
 class Windows:
     """Views on one level of the map, to be scored pose by pose and at shifts by a cell, as `dense.LevelView` is.
 
-    `cells`, shape (B, rows, cols), are the level; `weights`, shape (Q, P, 9), the bands of each view at each of the
+    `cells`, shape (B, rows, cols), are the level; `weights`, shape (Q, 9, P), the bands of each view at each of the
     shifts of a window that is wider by a cell on each side; `offsets`, shape (2, P / B), the cells of that window.
     """
 
@@ -179,7 +186,7 @@ class Windows:
         return cls(
             cells=cells,
             grid=grid,
-            weights=torch.stack(shifted, dim=-1),
+            weights=torch.stack(shifted, dim=1),
             window=window,
             offsets=offsets_m(window).to(bands.device),
             cell_m=frame.cell_size_m,
@@ -188,7 +195,7 @@ class Windows:
 
     def tables(self, pose: Tensor) -> Tensor:
         """Return scores of poses, shape (Q, N, 4), and their shifts by cells; shape (Q, N, 9)."""
-        at_once = max(1, self.most_bytes // (4 * self.weights.shape[0] * self.weights.shape[1]))
+        at_once = max(1, self.most_bytes // (4 * self.weights.shape[0] * self.weights.shape[2]))
         return torch.cat([self._tables(some) for some in pose.split(at_once, dim=1)], dim=1).double()
 
     def shifted(self, pose: Tensor) -> Tensor:
@@ -201,7 +208,7 @@ class Windows:
         where = positions(pose.reshape(-1, 4), self.offsets, self.grid).unflatten(1, self.window.shape)
         cells = self.cells.expand(len(where), *self.cells.shape)
         under = torch.nn.functional.grid_sample(cells, where, align_corners=False)
-        return under.view(views, count, -1) @ self.weights
+        return under.view(views, count, -1) @ self.weights.mT
 
 
 def climbed(windows: Windows, stride: Tensor, guesses: Guesses, discs: Tensor) -> Guesses:

@@ -22,7 +22,7 @@ Tensor = Any
 
 DEVICES: Final = ("cpu", "cuda")
 _AT_ONCE: Final = 64  # views: bounds the memory of what is held for each
-MOST_BYTES: Final = {"cpu": 2**29, "cuda": 6 * 2**30}  # of what is made for a part of the views, headings or modes
+MOST_BYTES: Final = {"cpu": 2**29, "cuda": 2**33}  # of what is made for a part of the views, headings or modes
 _NONE: Final = Found(modes=(), null=Null(best=0.0, mean=0.0, deviation=0.0, places=0))
 
 
@@ -99,6 +99,7 @@ class BatchSearch:
     plan: Plan = made(default_factory=Plan)
     device: str = "cpu"
     yaw_step_deg: float = math.inf
+    _searches: dict[tuple[object, ...], Search] = made(default_factory=dict, init=False, repr=False, compare=False)
     _levels: dict[int, Tensor] = made(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -144,8 +145,15 @@ class BatchSearch:
         return [Found(modes=_modes(poses, scores), null=null) for poses, scores, null in rows]
 
     def _search(self, template: Template, prior: Prior) -> Search:
-        """Return the settings of a search for any view of one shape."""
-        return Search(field=self.field, template=template, prior=prior, plan=self.plan, yaw_step_deg=self.yaw_step_deg)
+        """Return the settings of a search for any view of one shape; those of the last priors are kept."""
+        key = (template.known.shape, template.cell_size_m, prior)
+        if key not in self._searches:
+            if len(self._searches) >= _AT_ONCE:
+                self._searches.clear()
+            self._searches[key] = Search(
+                field=self.field, template=template, prior=prior, plan=self.plan, yaw_step_deg=self.yaw_step_deg
+            )
+        return self._searches[key]
 
     def _coarse(self, views: Views, search: Search) -> Coarse:
         """Prepare views of one prior for the coarsest level."""

@@ -166,12 +166,12 @@ def test_scores_of_a_level_are_those_of_the_correlation(town):
         2, 0, 1
     )
     coarse = torch_coarse.Coarse.of(cells=cells, level=level, views=views, turns=job.turns, most_bytes=2**24)
-    laid, turned = coarse.laid(coarse.bands, job.turns.bases)
-    scores = torch_coarse.Board.of(coarse, tile).scores(laid)[:, :, 0].permute(2, 1, 0)
+    lay, board = coarse.lay(job.turns.bases), torch_coarse.Board.of(coarse, tile)
+    scores = board.scores(lay.laid(coarse.bands))[:, 0].transpose(0, 1)[..., : tile.allowed.shape[1]] / board.size
     votes = Correlation.of(level, template, [tile], job.turns)
     for base in job.turns.bases[::5]:
         for _, pose, wanted in votes.scores(base):
-            at = turned[:, 0].tolist().index(pose.yaw_deg)
+            at = lay.turned[:, 0].tolist().index(pose.yaw_deg)
             np.testing.assert_allclose(scores[at], wanted, atol=0.01 * np.abs(wanted).max())
 
 

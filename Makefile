@@ -75,9 +75,10 @@ test: $(STAMP) ## run the tests and every example in the docstrings; says what i
 test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built for several of them
 	$(VENV_PYTHON) -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
 
-test-torch: $(STAMP) ## install the extra [torch] of the baselines and run the tests that need it; a PyTorch in .venv is kept
-	$(PIP) install --quiet --no-build-isolation -e 'baselines[torch]'
-	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(addprefix tests/baselines/test_,unet.py deep_retrieval.py image_matchers.py orienternet.py) $(ARGS)
+test-torch: $(STAMP) ## install the extra [torch] of both packages and run the tests that need it; a PyTorch in .venv is kept
+	$(PIP) install --quiet --no-build-isolation -e '.[torch]' -e 'baselines[torch]'
+	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(addprefix tests/baselines/test_,unet.py deep_retrieval.py image_matchers.py orienternet.py) \
+	  tests/search/test_torch_search.py $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)

@@ -142,8 +142,9 @@ def test_the_lock_names_no_address_and_no_folder(name: str) -> None:
 
 
 def test_the_lock_holds_every_declared_requirement() -> None:
-    extras = [name for names in project()["optional-dependencies"].values() for name in names]
-    declared = project()["dependencies"] + extras
+    # PyTorch is large and built for each GPU: whoever wants it chooses a build.
+    groups = project()["optional-dependencies"].items()
+    declared = project()["dependencies"] + [name for extra, names in groups if extra != "torch" for name in names]
     missing = requirement_names(declared) - requirement_names(locked_blocks())
     assert missing == set(), "run `make lock`"
 

@@ -15,29 +15,14 @@ from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.publishing.submissions import hold_submission
 from sasgeo_bench.scoring.submission_files import read_submission
+from tests.experiments.test_pipeline import TEXT as PIPELINE
 from tests.threaded import threaded
 
 pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings")
 
-TEXT = """
-id = "small"
-title = "Small"
-split = "crossfit"
-regions = ["town-suburb"]
-matchers = ["random", "prior_centre"]
-draws = 100
-
-[[task]]
-suites = ["clean"]
-sites = 1
-matchers = ["random", "prior_centre"]
-
-[[contrast]]
-name = "nothing"
-first = "random"
-second = "prior_centre"
-suites = ["clean"]
-"""
+TEXT = PIPELINE.replace(
+    "sites = 1", 'sites = 1\nmatchers = ["random", "prior_centre"]'
+)  # who enters is asked all the same
 
 
 class Middle(PriorCentre):

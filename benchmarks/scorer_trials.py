@@ -6,6 +6,7 @@
     python benchmarks/scorer_trials.py shifts --out out     # each square of a view may lie a few metres off
     python benchmarks/scorer_trials.py ages --out out       # every map is some years older than it says
     python benchmarks/scorer_trials.py survival --out out   # nodes of an old map weigh by what is left of their class
+    python benchmarks/scorer_trials.py unknown --out out    # what is hidden counts as absent, errors hang together or not
 
 Needs the views that `sasgeo-bench leaderboard scorer-trials` draws into `--out`. Each asks the untaught scorer for
 stressed localization views of 192 m and prints the share found within 25 m and 5 deg, by suite, with the processor time
@@ -137,6 +138,11 @@ def alone(reader: Reader) -> Finder:
     return first_of(replace(reader, switches=replace(reader.switches, correlates=False)))
 
 
+def blind(reader: Reader, *, correlates: bool) -> Finder:
+    """Return who takes what is hidden for absent."""
+    return first_of(replace(reader, switches=replace(reader.switches, is_unknown_silent=False, correlates=correlates)))
+
+
 def levelled_by(reader: Reader, *, width_m: float, bound: float) -> Finder:
     """Return who finds with another width of a level, and another bound."""
     find = first_of(reader)
@@ -246,6 +252,13 @@ def rows_of(trial: str, out: Path) -> dict[str, Row]:
         return {" ".join(map(str, beam)): partial(first_of, plan=Plan(beam=beam)) for beam in BEAMS}
     if trial == "ages":
         return {f"{years:g} years": partial(older_by, years=years) for years in YEARS}
+    if trial == "unknown":
+        return {
+            "each cell alone": alone,
+            "each cell alone, hidden is absent": partial(blind, correlates=False),
+            "hang together": first_of,
+            "hang together, hidden is absent": partial(blind, correlates=True),
+        }
     if trial == "shifts":
         pairs = {f"{s:g} m, {m:g} m": partial(shifted, square_m=s, sigma_m=m) for s, m in product(SQUARES_M, SIGMAS_M)}
         return {"as it is": first_of, **pairs}
@@ -262,7 +275,7 @@ def rows_of(trial: str, out: Path) -> dict[str, Row]:
 def main() -> None:
     """Print the table of one trial."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("trial", choices=("levels", "beams", "shifts", "ages", "survival"))
+    parser.add_argument("trial", choices=("levels", "beams", "shifts", "ages", "survival", "unknown"))
     parser.add_argument(
         "--out", type=Path, default=Path("out"), help="where sasgeo-bench leaderboard scorer-trials drew its views"
     )
@@ -274,8 +287,8 @@ def main() -> None:
     if words.radius_m is not None and not 0 < words.radius_m < math.inf:
         parser.error(f"--radius-m is above 0 and finite, got {words.radius_m:g}")
     asked = list(views(words.out, every=words.every, radius_m=words.radius_m))
-    if words.trial == "survival":
-        asked = [one for one in asked if one[0] == "real-age"]
+    only = {"survival": "real-age", "unknown": "occlusion"}.get(words.trial)
+    asked = [one for one in asked if only in (None, one[0])]
     if not asked:
         parser.error(
             f"{words.out} holds no such views: sasgeo-bench leaderboard scorer-trials --out {words.out} draws some"

@@ -106,7 +106,7 @@ figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extra
 	$(SASGEO) lookalike vaduz@2015-07-27 --world vaduz --out $(OUT)
 	cp $(OUT)/sheets/lookalike-vaduz-2015-07-27.png docs/figures/lookalike.png
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/regions/vaduz/preview.png docs/figures/region.webp
-	$(SASGEO) publish --board docs/results/claims --into $(OUT)/public
+	$(SASGEO) publish --board docs/results/modules --into $(OUT)/public
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/public/index.html docs/figures/board.webp
 
 $(DOCS_STAMP): $(STAMP) requirements-docs.lock

@@ -79,7 +79,7 @@ def interval(gaps: pd.DataFrame, levels: list[str], rng: np.random.Generator) ->
 def main() -> None:
     """Print a line for each contrast."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--board", type=Path, default=Path("docs/results/claims"))
+    parser.add_argument("--board", type=Path, default=Path("docs/results/modules"))
     board = parser.parse_args().board
     said = pd.read_parquet(board / "contrasts.parquet").set_index("name")
     scores = pd.read_parquet(board / "scores.parquet")

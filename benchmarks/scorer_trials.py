@@ -6,7 +6,7 @@
     python benchmarks/scorer_trials.py shifts --out out     # each square of a view may lie a few metres off
     python benchmarks/scorer_trials.py ages --out out       # every map is some years older than it says
     python benchmarks/scorer_trials.py survival --out out   # nodes of an old map weigh by what is left of their class
-    python benchmarks/scorer_trials.py unknown --out out    # what is hidden counts as absent, errors hang together or not
+    python benchmarks/scorer_trials.py unknown --out out    # hidden is absent, with each kind of errors
 
 Needs the views that `sasgeo-bench leaderboard scorer-trials` draws into `--out`. Each asks the untaught scorer for
 stressed localization views of 192 m and prints the share found within 25 m and 5 deg, by suite, with the processor time

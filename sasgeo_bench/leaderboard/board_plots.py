@@ -61,8 +61,8 @@ PRIMARY: Final = {
     "recall_1": "recall@1\n(share of queries)",
 }
 INTERVALS: Final = (
-    "Bars: 95 % intervals as on the board (blocks, then sites are drawn; never narrower than Wilson's over sites). "
-    "n: queries of each point."
+    "Bars: 95 % intervals as on the board (places, then blocks, then sites are drawn; never narrower than Wilson's "
+    "over sites). n: queries of each point."
 )
 ACROSS: Final = 4  # panels side by side
 _NAME_INCHES: Final = 2.6  # of a name next to its bar, before it is broken

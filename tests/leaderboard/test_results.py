@@ -23,13 +23,13 @@ TEXTS = {page: page.read_text(encoding="utf-8") for page in PAGES}
 BOARDS = sorted(path.parent.name for path in RESULTS.glob("*/board.json"))
 SEGMENTERS = RESULTS / "segmenters"
 PROGRAM = re.compile(r"```python\n(.*?)```\n\n```text\n(.*?)```", re.DOTALL)
-ROW = re.compile(r"^\|(?!---).*\|$", re.MULTILINE)
+ROW = re.compile(r"^\|.*\d\.\d.*\|$", re.MULTILINE)  # of a table of figures, not one of words
 
 pytestmark = pytest.mark.skipif(not BOARDS, reason="no results are stored yet")
 
 
 def test_there_are_results_of_the_registered_experiment():
-    assert "claims" in BOARDS
+    assert {"claims", "modules"} <= set(BOARDS)
 
 
 @pytest.mark.parametrize("name", BOARDS)
@@ -168,7 +168,7 @@ def test_the_stored_board_of_segmenters_is_small_and_each_trial_has_a_profile(se
 @pytest.mark.parametrize(
     ("page", "board", "unsaid"),
     [
-        ("README", "claims", set()),
+        ("README", "modules", set()),
         ("pictures", "aerial-soft", set()),
         ("flights", "flights", set()),
     ],
@@ -188,6 +188,12 @@ def test_the_verdicts_that_the_pages_put_into_words_are_those_of_the_boards():
         board: pd.read_parquet(RESULTS / board / "contrasts.parquet").set_index("name")["outcome"] for board in BOARDS
     }
     said = {
+        "modules": {
+            **dict.fromkeys(("graph-junctions", "graph-instances"), "decided"),
+            **dict.fromkeys(("graph-levels", "graph-warp", "learned-age", "prior-age", "prior-lure"), "not decided"),
+            **dict.fromkeys(("age", "unknown", "correlation", "shift"), "not decided"),
+            **dict.fromkeys(("rejection-alias", "rejection-absent"), "not decided"),
+        },
         "claims": {
             **dict.fromkeys(("graph-warp", "graph-junctions", "graph-instances", "graph-levels", "unknown"), "decided"),
             **dict.fromkeys(("stability-age", "stability-lure", "rejection-alias"), "not decided"),

@@ -169,8 +169,9 @@ class Section:
 
 
 def sections_of(book: Book) -> tuple[Section, ...]:
-    """Return the tables of a board's suites; prior groups are never mixed in one."""
-    return tuple(_section(book, key) for key in book.matchers)
+    """Return the tables of a board's suites, those of one contestant last; prior groups are never mixed in one."""
+    alone = {key: len(set(names) - book.controls) < 2 for key, names in book.matchers.items()}  # noqa: PLR2004
+    return tuple(_section(book, key) for key in sorted(book.matchers, key=lambda key: (alone[key], key)))
 
 
 def _section(book: Book, key: Key) -> Section:
@@ -392,26 +393,47 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
 
 
 def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
-    """Yield what a terminal shows of some suites, or of all: a matcher a line, a suite a column, figure and rank."""
+    """Yield who is good at what, of some suites or of all: a matcher a line, a suite a column, figure and rank.
+
+    Suites with more ranked matchers come first, so do matchers that were asked about more of them; controls come last.
+    A cell leads where its rank may be the first of several.
+    """
     groups = sorted({key[1:] for key in book.matchers if not suites or key[0] in suites})
     for track, prior_group in groups:
         primary = primary_of(track).name
         keys = [key for key in book.matchers if key[1:] == (track, prior_group) and (not suites or key[0] in suites)]
-        found = {
-            name: [book.main(key, name, primary) for key in keys] for key in keys for name in sorted(book.matchers[key])
-        }
-        shown = [at for at in range(len(keys)) if any(rows[at] is not None for rows in found.values())]
-        order = sorted(found, key=lambda name: (-_mean_value(found[name]), name))
+        names = sorted({name for key in keys for name in book.matchers[key]})
+        by_suite = {key: {name: book.main(key, name, primary) for name in names} for key in keys}
+        ranked = {key: sum(map(_is_ranked, rows.values())) for key, rows in by_suite.items()}
+        shown = sorted((key for key in keys if any(by_suite[key].values())), key=lambda key: (-ranked[key], key))
+        found = {name: [by_suite[key][name] for key in shown] for name in names}
+        means = {name: _mean_value(rows) for name, rows in found.items()}
+        order = sorted(
+            (name for name in names if any(row is not None for row in found[name])),
+            key=lambda name: (name in book.controls, -sum(map(bool, found[name])), -means[name], name),
+        )
+        columns = [column(primary, title=_heading(book, key, primary)) for key in shown]
+        whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
+        has_mean = len(shown) > 1 and len(whole - book.controls) > 1
+        rows = []
+        for name in order:
+            cells = [_short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
+            if has_mean:
+                cells.append(number_cell(means[name] if name in whole else math.nan))
+            tone = "control" if name in book.controls else "plain"
+            first = book.name_cell(name)
+            marks = tuple(mark for mark in first.marks if mark.tone != "plain" or name in book.controls)
+            rows.append(Row(cells=(replace(first, marks=marks), *cells), tone=tone))
         yield Table(
             name=file_stem("summary", track, prior_group),
             title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-            columns=(*words("matcher"), *(column(primary, title=_heading(book, keys[at], primary)) for at in shown)),
-            rows=tuple(
-                Row(cells=(replace(book.name_cell(name), href=""), *(_short_cell(found[name][at]) for at in shown)))
-                for name in order
-                if any(row is not None for row in found[name])
-            ),
+            columns=(*words("matcher"), *columns, *([column("mean")] if has_mean else [])),
+            rows=tuple(rows),
         )
+
+
+def _is_ranked(row: Record | None) -> bool:
+    return row is not None and not is_unranked(str(row["matcher"])) and not pd.isna(row["rank_best"])
 
 
 def _mean_value(rows: Sequence[Record | None]) -> float:
@@ -420,19 +442,25 @@ def _mean_value(rows: Sequence[Record | None]) -> float:
 
 
 def _heading(book: Book, key: Key, primary: str) -> str:
-    """Return a suite with its number of queries, and what guessing among candidates reaches."""
+    """Return a suite with its number of queries, what guessing among candidates reaches, and a ceiling below 1."""
     rows = [row for name in book.matchers[key] if (row := book.main(key, name, primary)) is not None]
     # A matcher that does not answer the track has one row of all queries, stressed or not.
     n = max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
     chance = next(filter(None, (book.main(key, name, CHANCE.name) for name in book.matchers[key])), None)
-    return f"{key[0]}, n = {n}" + ("" if chance is None else f", chance {number_text(chance['value'])}")
+    most = book.main(key, book.matchers[key][0], CEILING.name)
+    texts = [f"{key[0]}, n = {n}"]
+    texts += [] if chance is None else [f"chance {number_text(chance['value'])}"]
+    texts += [] if most is None or float(most["value"]) == 1 else [f"at most {number_text(float(most['value']))}"]
+    return ", ".join(texts)
 
 
-def _short_cell(row: Record | None) -> Cell:
+def _short_cell(row: Record | None, *, is_rivalled: bool) -> Cell:
     """Return a cell as in "0.750 [0.30, 0.95] (2-3)"."""
     if row is None:
         return Cell(text="-")
     if not row["is_applicable"]:
         return Cell(text="n/a")
-    ends = "" if math.isnan(row["lo"]) else f" [{row['lo']:.2f}, {row['hi']:.2f}]"
-    return Cell(text=f"{number_text(row['value'])}{ends} ({rank_text(row)})", key=sort_key(float(row["value"])))
+    value, leads = float(row["value"]), is_rivalled and _is_ranked(row) and int(row["rank_best"]) == 1
+    ends = [] if math.isnan(row["lo"]) else [f"[{row['lo']:.2f}, {row['hi']:.2f}]"]
+    details = (*ends, f"({rank_text(row)})")
+    return Cell(text=number_text(value), key=sort_key(value), tone="leading" if leads else "plain", details=details)

@@ -21,6 +21,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "detectable": "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf "
     "if none, - where nobody is ranked",
     "n": "Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones",
+    "mean": "Mean of the suites beside it, which weigh alike; of entries that were asked about all of them",
     "missing": "Queries without a row; they count as misses",
     "blocks": "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
     "places, then blocks in them",

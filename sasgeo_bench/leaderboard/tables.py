@@ -91,13 +91,18 @@ class Mark:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """Text of one cell; `key` is its sort key where that is not its text."""
+    """Text of one cell, and `details` that may stand below it; `key` is its sort key where that is not its text.
+
+    `tone` says how it looks: plain, leading.
+    """
 
     text: str
     key: float | None = None
     href: str = ""
     marks: tuple[Mark, ...] = ()
     bar: Bar | None = None
+    tone: str = "plain"
+    details: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -153,7 +158,8 @@ def text_of(cell: Cell) -> str:
     >>> text_of(Cell(text="mine", marks=(Mark(text="as submitted", meaning="", tone="warn"),)))
     'mine (as submitted)'
     """
-    return " ".join((cell.text, *(f"({mark.text})" for mark in cell.marks if mark.tone != "plain")))
+    marks = (f"({mark.text})" for mark in cell.marks if mark.tone != "plain")
+    return " ".join(filter(None, (cell.text, *cell.details, *marks)))
 
 
 def sort_key(value: float) -> float | None:
@@ -170,7 +176,7 @@ def plain_cell(value: object) -> Cell:
     """Return a cell of a text or a whole number; "-" where there is none.
 
     >>> plain_cell(3), plain_cell("").text
-    (Cell(text='3', key=3.0, href='', marks=(), bar=None), '-')
+    (Cell(text='3', key=3.0, href='', marks=(), bar=None, tone='plain', details=()), '-')
     """
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return Cell(text=str(value) if value not in ("", None) else "-", key=float(str(value)) if is_number else None)

@@ -12,11 +12,11 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of
+from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of, summary
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
-from sasgeo_bench.leaderboard.tables import Bar, Record, file_stem, interval_text, number_text, p_text
+from sasgeo_bench.leaderboard.tables import Bar, Record, Row, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.publishing.site_pages import (
@@ -33,6 +33,7 @@ from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.tasks.query import SEQUENCE
 from sasgeo_bench.texts import plain
 
+_TOLD: Final = frozenset({"decided", "cause open", "decided, small"})  # in which one is better
 OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided", "not tested")  # as on the page
 
 
@@ -40,7 +41,7 @@ OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decid
 class ContrastSummary:
     """A registered contrast in plain words.
 
-    `outcome` is one of `OUTCOMES`.
+    `outcome` is one of `OUTCOMES`; `because` says why neither is better, empty where one is.
     `unstressed` compares both where they should not differ, empty if nothing was measured there; `bar` spans from
     -`reach` to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
     """
@@ -48,6 +49,8 @@ class ContrastSummary:
     name: str
     outcome: str
     headline: str
+    because: str
+    difference: str
     sentence: str
     facts: tuple[str, ...]
     unstressed: str
@@ -83,6 +86,8 @@ def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
         name=name,
         outcome=outcome,
         headline=_headline(row, verdict, outcome),
+        because="" if outcome in _TOLD else verdict.partition(": ")[2] or verdict,
+        difference=_difference_text(row) if int(row["n"]) else "",
         sentence=_sentence(row, least),
         facts=tuple(_contrast_facts(row, source, contrast)),
         unstressed="" if falsifier is None else _unstressed(falsifier),
@@ -96,24 +101,27 @@ def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
 
 def _headline(row: Record, verdict: str, outcome: str) -> str:
     first, second = row["first"], row["second"]
-    if outcome not in {"null", "not decided", "not tested"}:
+    if outcome in _TOLD:
         better, worse = (first, second) if verdict.startswith(f"{first} is better") else (second, first)
         return f"{better} is better than {worse}" + verdict.partition(" is better")[2]
-    return f"{first} against {second}: {verdict.partition(': ')[2] or verdict}"
+    return f"{first} against {second}"
 
 
 def _sentence(row: Record, least: float) -> str:
     """Return the difference with its interval, in words that state which direction is good."""
     if not int(row["n"]):
         return "No query of this board counts for it."
-    difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
     values = f"{number_text(float(row['first_value']))} against {number_text(float(row['second_value']))}"
     what = "share of queries that are right" if row["metric"] == "primary" else str(row["metric"])
     most = number_text(float(row["attainable"]))
     return (
-        f"Difference {difference} in the {what}: {values}. At most {most} could be gained. "
+        f"Difference {_difference_text(row)} in the {what}: {values}. At most {most} could be gained. "
         f"The least difference registered as one that matters is {number_text(least)}."
     )
+
+
+def _difference_text(row: Record) -> str:
+    return interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
 
 
 def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
@@ -123,10 +131,9 @@ def _falsifier_of(falsifiers: pd.DataFrame, contrast: str) -> Record | None:
 
 
 def _unstressed(row: Record) -> str:
-    difference = interval_text(*(float(row[name]) for name in ("difference", "lo", "hi")))
     gained = " What it gains there is not owed to what the contrast is named for." if row["lo"] > 0 else ""
     return (
-        f"Without the stress, where they should not differ: {difference}, {row['verdict'].lower()} "
+        f"Without the stress, where they should not differ: {_difference_text(row)}, {row['verdict'].lower()} "
         f"(n = {row['n']}, {counted(int(row['blocks']), 'block')}).{gained}"
     )
 
@@ -230,8 +237,12 @@ def site_pages(source: SiteSource) -> dict[str, str]:
 def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
     """Return what the first page shows."""
     controls = _verdicts(source)
+    overview = tuple(table for table in summary(book) if any(map(_leads, table.rows)))
+    prices = {table.name.replace("summary", "price", 1) for table in overview}
     return {
         "sections": sections,
+        "overview": overview,
+        "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),
         "ranks_note": RANKS_NOTE,
         "contrasts": contrasts_of(source),
         "control_lines": control_lines(controls),
@@ -244,6 +255,10 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }
+
+
+def _leads(row: Row) -> bool:
+    return any(cell.tone == "leading" for cell in row.cells)
 
 
 def _environment() -> Environment:

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
-from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
+from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table, summary
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
 from sasgeo_bench.publishing.site import contrasts_of
@@ -105,6 +105,31 @@ def test_a_table_is_sorted_by_its_figure_and_says_who_is_tied():
     assert {column.term for column in section.table.columns} <= MEANINGS.keys()
 
 
+def test_who_may_be_first_leads_in_the_overview_and_who_was_asked_about_more_comes_first():
+    first = many_rows(6)
+    first.loc[first["matcher"] == "matcher-003", ["rank_best", "rank_worst"]] = [5, 6]
+    fewer = first[first["matcher"] != HOSTILE].assign(suite="occlusion")
+    (table,) = summary(book_of(source(pd.concat([first, fewer], ignore_index=True))))
+    names = [row.cells[0].text for row in table.rows]
+    assert names[0] == MARKUP
+    assert names[-1] == HOSTILE  # best where it was asked, which is one suite of two
+    assert [column.term for column in table.columns] == ["matcher", "success_25m", "success_25m", "mean"]
+    assert table.rows[-1].cells[-1].text == "-"
+    tones = {row.cells[0].text: row.cells[1].tone for row in table.rows}
+    assert [tones[name] for name in (MARKUP, HOSTILE, "matcher-003")] == ["leading", "leading", "plain"]
+
+
+def test_who_has_no_rival_does_not_lead():
+    (table,) = summary(book_of(source(many_rows(1))))
+    assert [row.cells[1].tone for row in table.rows] == ["plain"]
+
+
+def test_tables_of_one_contestant_come_last():
+    alone = many_rows(1).assign(suite="absent")
+    sections = sections_of(book_of(source(pd.concat([many_rows(6), alone], ignore_index=True))))
+    assert [item.suite for item in sections][-1] == "absent"
+
+
 def test_prior_groups_and_tracks_are_never_in_one_table():
     other = many_rows(6).assign(prior_group="rnone-unknown-s15")
     table = pd.concat([many_rows(6), other], ignore_index=True)
@@ -136,27 +161,29 @@ def test_a_matcher_that_cannot_has_words_and_no_figure():
 
 
 @pytest.mark.parametrize(
-    ("changes", "outcome", "headline"),
+    ("changes", "outcome", "headline", "because"),
     [
-        ({}, "decided", "graph is better than raster, by as much as matters"),
+        ({}, "decided", "graph is better than raster, by as much as matters", ""),
         (
             {"gains_without_stress": True},
             "cause open",
             "graph is better than raster, by as much as matters; cause open: it gains without the stress, too",
+            "",
         ),
-        ({"least": 0.2}, "decided, small", "graph is better than raster, by less than would matter"),
+        ({"least": 0.2}, "decided, small", "graph is better than raster, by less than would matter", ""),
         (
             {"least": 0.2, "p_holm": 1.0},
             "null",
-            "graph against raster: any difference is smaller than would matter",
+            "graph against raster",
+            "any difference is smaller than would matter",
         ),
-        ({"places": 2}, "not decided", "graph against raster: 2 places, at least 6 are needed"),
-        ({"n": 0}, "not tested", "graph against raster: no query"),
+        ({"places": 2}, "not decided", "graph against raster", "2 places, at least 6 are needed"),
+        ({"n": 0}, "not tested", "graph against raster", "no query"),
     ],
 )
-def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, outcome, headline):
+def test_a_contrast_is_told_in_words_with_figure_interval_p_and_counts(changes, outcome, headline, because):
     (told,) = contrasts_of(source(findings=[replace(FINDING, **changes)]))
-    assert (told.outcome, told.headline) == (outcome, headline)
+    assert (told.outcome, told.headline, told.because) == (outcome, headline, because)
     if told.outcome == "null":
         assert told.facts[0] == "adjusted p 1.000 (Holm, 1 contrast)"
     elif "n" not in changes:

@@ -120,6 +120,25 @@ def test_filters_show_what_was_asked_for_and_a_link_to_what_is_hidden_shows_it(p
     until(page, f"{SHOWN}.length === 4")
 
 
+def test_what_is_filtered_and_sorted_stands_in_the_address_and_is_shown_again_from_it(page, site):
+    page.open(address(site))
+    page.value(
+        "((one) => { one.value = 'occlusion'; one.dispatchEvent(new Event('change', {bubbles: true})); })"
+        "(document.querySelector('select[name=suite]'))"
+    )
+    page.value("document.querySelector('section.group:not([hidden]) thead button').click()")
+    linked = page.value("location.href")
+    names = page.value(NAMES)
+    page.open(address(site))
+    assert page.value(SHOWN) != ["occlusion", "occlusion"]
+    page.open(linked)
+    assert page.value(SHOWN) == ["occlusion", "occlusion"]
+    assert page.value(NAMES) == names
+    page.open(f"{address(site)}?suite=%3Cscript%3E&sort=no-table!5!ascending&sort=x")
+    assert page.faults == []
+    assert page.value(SHOWN) == ["occlusion", "occlusion", "real-age", "real-age"]
+
+
 def test_ties_are_told_beside_the_ranks_and_below_the_table(page, site):
     page.open(address(site))
     rows = page.value(

@@ -318,7 +318,7 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     one, none = wilson(1, 4), wilson(0, 4)
     expected = [f"0.250 [{one.lo:.2f}, {one.hi:.2f}] (-)", f"0.000 [0.00, {none.hi:.2f}] (control)"]
     assert [column.name for column in short.columns] == ["matcher", "occlusion, n = 4"]
-    shown = [row.cells[1].text for row in short.rows]
+    shown = [text_of(row.cells[1]) for row in short.rows]
     assert shown[1] == expected[1]
     assert shown[0].endswith("] (-)")
     assert f"| {none.value:.3f} [0.000, {none.hi:.3f}]† |" in text
@@ -341,7 +341,7 @@ def test_two_versions_of_a_control_are_controls_both():
     found = {name: ranks(pick(board, name, "success_25m")) for name in names}
     assert found == {names[0]: (None, None), names[1]: (None, None), "mine": (1, 1)}
     (short,) = summary(Book.of(board, {}))
-    assert sorted(row.cells[1].text.partition("] ")[2] for row in short.rows) == ["(1)", "(control)", "(control)"]
+    assert sorted(text_of(row.cells[1]).partition("] ")[2] for row in short.rows) == ["(1)", "(control)", "(control)"]
 
 
 def test_no_name_breaks_a_table():

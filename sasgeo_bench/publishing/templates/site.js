@@ -17,12 +17,26 @@ function compare(a, b, sign) {
   return sign * (a - b);
 }
 
-function sortBy(head) {
+// How tables are sorted and filtered stands in the address, so that what is seen can be linked.
+const asked = new URLSearchParams(location.search);
+function remember(name, value, isOld) {
+  const others = asked.getAll(name).filter((one) => !isOld(one));
+  asked.delete(name);
+  for (const one of value ? [...others, value] : others) asked.append(name, one);
+  const text = asked.toString();
+  history.replaceState(null, "", `${location.pathname}${text && "?"}${text}${location.hash}`);
+}
+
+function nextOrder(head) {
+  const before = head.getAttribute("aria-sort");
+  if (before === "none") return head.classList.contains("num") ? "descending" : "ascending";
+  return before === "ascending" ? "descending" : "ascending";
+}
+
+function sortBy(head, order) {
   const table = head.closest("table");
   const at = head.cellIndex;
   const isNumber = head.classList.contains("num");
-  const before = head.getAttribute("aria-sort");
-  const order = before === "none" ? (isNumber ? "descending" : "ascending") : before === "ascending" ? "descending" : "ascending";
   const sign = order === "ascending" ? 1 : -1;
   const rows = Array.from(table.tBodies[0].rows, (row) => ({ row, key: keyOf(row, at, isNumber) }));
   rows.sort((a, b) => compare(a.key, b.key, sign));
@@ -31,7 +45,18 @@ function sortBy(head) {
 }
 
 for (const button of document.querySelectorAll("thead button")) {
-  button.addEventListener("click", () => sortBy(button.closest("th")));
+  const head = button.closest("th");
+  const name = head.closest("table").getAttribute("aria-labelledby");
+  button.addEventListener("click", () => {
+    const order = nextOrder(head);
+    sortBy(head, order);
+    remember("sort", `${name}!${head.cellIndex}!${order}`, (one) => one.startsWith(`${name}!`));
+  });
+}
+for (const [name, at, order] of asked.getAll("sort").map((one) => one.split("!"))) {
+  const table = Array.from(document.querySelectorAll("table")).find((one) => one.getAttribute("aria-labelledby") === name);
+  const head = table && table.tHead.rows[0].cells[Number(at)];
+  if (head && ["ascending", "descending"].includes(order)) sortBy(head, order);
 }
 
 // Escape puts a tip away until the pointer or the focus moves on.
@@ -51,9 +76,16 @@ if (form) {
     const shown = groups.filter((group) => !group.hidden).length;
     form.querySelector("output").textContent = `${shown} of ${groups.length} tables shown`;
   };
+  for (const one of form.querySelectorAll("select")) {
+    const wanted = asked.get(one.name);
+    if (Array.from(one.options, (option) => option.value).includes(wanted)) one.value = wanted;
+  }
   form.hidden = false;
   form.addEventListener("submit", (event) => event.preventDefault());
-  form.addEventListener("change", filter);
+  form.addEventListener("change", (event) => {
+    remember(event.target.name, event.target.value, () => true);
+    filter();
+  });
   filter(); // a browser may keep what was chosen before
   // A link to a table that is filtered away shows it all the same.
   const reveal = () => {
@@ -61,6 +93,7 @@ if (form) {
     const group = found && found.closest("section.group[hidden]");
     if (group) {
       form.reset();
+      for (const one of form.querySelectorAll("select")) remember(one.name, "", () => true);
       filter();
       found.scrollIntoView();
     }

@@ -14,6 +14,7 @@ from matplotlib.lines import Line2D
 
 from sasgeo_bench.canvas import Page, broken, page, panels
 from sasgeo_bench.errors import counted
+from sasgeo_bench.leaderboard.columns import prior_words
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.metrics import primary_of
@@ -76,7 +77,7 @@ def those_there(rows: pd.DataFrame, shown: Sequence[str]) -> list[str]:
 
 def of_which(row: Mapping[str, Any] | pd.Series) -> str:
     """Return the suite, track and prior group of a figure in words."""
-    return f"{row['suite']}, {row['track']}, prior {row['prior_group']}"
+    return f"{row['suite']}, {row['track']}, {prior_words(str(row['prior_group']))}"
 
 
 def panels_across(count: int) -> tuple[int, int]:

@@ -161,8 +161,7 @@ class Section:
     @property
     def context(self) -> str:
         """Return which queries the table counts, and the success on them without a method."""
-        texts = [f"Prior group {self.prior_group}."]
-        texts += [f"Stress that is counted: {self.counted}."] if self.counted else []
+        texts = [f"Stress that is counted: {self.counted}."] if self.counted else []
         texts += [f"Without looking at the view: {self.for_nothing}."] if self.for_nothing else []
         texts += [f"Attainable: {self.attainable}."] if self.attainable else []
         return " ".join(texts)

@@ -115,7 +115,6 @@ MARKS: Final[dict[str, str]] = {  # words next to names and ranks
 }
 CONTROL: Final = Mark(text="control", meaning="no rival: it shows what a figure means that nobody earned")
 _TONES: Final = {RUN_HERE: "plain", REPRODUCED: "good", NOT_REPRODUCED: "warn", AS_SUBMITTED: "warn"}
-_HEADINGS: Final = {"known": "to 5 deg", "weak": "to 20 deg", "unknown": "unknown"}
 
 
 def column(term: str, *, is_number: bool = True, order: str = "none", title: str = "") -> Column:
@@ -138,7 +137,7 @@ def words(*terms: str) -> tuple[Column, ...]:
 
 
 def prior_words(name: str) -> str:
-    """Describe a prior group in words.
+    """Return a prior group in words, or its name where that is none of ours.
 
     >>> prior_words("r500-weak-s3")
     'within 500 m, heading known to 20 deg, scale to 3 %'
@@ -146,13 +145,9 @@ def prior_words(name: str) -> str:
     ('anywhere on the map, heading unknown, scale to 15 %', 'another')
     """
     try:
-        group = PriorGroup.parse(name)
+        return PriorGroup.parse(name).words
     except ConfigError:
         return name
-    place = "anywhere on the map" if group.radius_m is None else f"within {group.radius_m:g} m"
-    known = _HEADINGS[group.yaw]
-    heading = f"heading {known}" if group.yaw == "unknown" else f"heading known {known}"
-    return f"{place}, {heading}, scale to {100 * group.scale_sigma:g} %"
 
 
 def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:

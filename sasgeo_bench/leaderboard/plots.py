@@ -33,6 +33,7 @@ from sasgeo_bench.leaderboard.board_plots import (
     panels_across,
     those_there,
 )
+from sasgeo_bench.leaderboard.columns import prior_words
 from sasgeo_bench.leaderboard.plot_tables import BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
 from sasgeo_bench.scoring.contrasts import Contrast, PlaceDifference
 from sasgeo_bench.scoring.metrics import primary_of
@@ -114,7 +115,7 @@ def _write_counts(chart: Axes, mine: pd.DataFrame, column: str) -> None:
 def draw_bars(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """Draw the success of each matcher on the stresses of each suite, from `stress_frame`, as bars with intervals."""
     first = rows.iloc[0]
-    title = f"Success under stress, suite by suite: {first['track']}, prior {first['prior_group']}"
+    title = f"Success under stress, suite by suite: {first['track']}, {prior_words(str(first['prior_group']))}"
     note = INTERVALS.replace("each point", "each bar")
     draw_bar_panels(path, rows, shown, "suite", sorted(set(rows["suite"])), title=title, note=note)
 
@@ -222,7 +223,7 @@ def draw_reliability(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> No
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     first = rows.iloc[0]
     about = BoardPage(
-        title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
+        title=f"Reliability of P(false fix): {ALL_SUITES}, {first['track']}, {prior_words(str(first['prior_group']))}",
         note=(
             "Answers alone, in at most ten bins of equally many; equal P share a bin. n: answers; next to a point, "
             "where there is room, those of its bin. Lines: Wilson's 95 % intervals of as many trials as the bin has "
@@ -287,7 +288,7 @@ def draw_stanford(path: Path, levels: Mapping[tuple[str, str], ProtectionLevels]
     cells = {key: stanford_cells(item) for key, item in levels.items()}
     most = max(int(frame["n"].max()) for frame in cells.values())
     about = BoardPage(
-        title=f"Protection levels at risk {first.risk:g}: all suites, localization, prior {first.prior_group}",
+        title=f"Protection levels at risk {first.risk:g}: all suites, localization, {prior_words(first.prior_group)}",
         note=(
             f"Alert limit {limit_m:g} m. Available: error <= level <= limit. Misleading: level < error <= limit. "
             "Hazardous (hazardously misleading): level <= limit < error. Unavailable: level > limit, or none. "

@@ -33,6 +33,7 @@ from sasgeo_bench.leaderboard.board_plots import (
     those_there,
     ticks_across,
 )
+from sasgeo_bench.leaderboard.columns import prior_words
 from sasgeo_bench.leaderboard.pooled_tables import LEAST_ERROR_M, MOST_ERROR_M, front_of
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.metrics import primary_of
@@ -49,7 +50,7 @@ def draw_ablation(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     """Draw success pooled over the suites of each contrast, from `ablation_frame`, as bars with intervals."""
     first, pools = rows.iloc[0], list(dict.fromkeys(rows["pool"]))
     suites = "; ".join(f"{pool}: {rows.loc[rows['pool'] == pool, 'suites'].iloc[0]}" for pool in pools)
-    title = f"Arms side by side: {first['track']}, prior {first['prior_group']}"
+    title = f"Arms side by side: {first['track']}, {prior_words(str(first['prior_group']))}"
     note = (
         f"Pools of the registered contrasts, all queries of a pool weighing the same. {suites}. "
         f"{INTERVALS.replace('each point', 'each bar')} {_MOST_ASKED}"
@@ -65,7 +66,7 @@ def _suite_panels(
     first, suites = rows.iloc[0], sorted(set(rows["suite"]))
     down, across = panels_across(len(suites))
     about = BoardPage(
-        title=f"{title}: {first['track']}, prior {first['prior_group']}",
+        title=f"{title}: {first['track']}, {prior_words(str(first['prior_group']))}",
         note=f"{note} {_STRESS} {_MOST_ASKED}",
         below=below,
         rows=down,
@@ -137,7 +138,7 @@ def draw_costs(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     first = rows.iloc[0]
     down, across = panels_across(len(names))
     about = BoardPage(
-        title=f"Cost of a query: {ALL_SUITES}, {first['track']}, prior {first['prior_group']}",
+        title=f"Cost of a query: {ALL_SUITES}, {first['track']}, {prior_words(str(first['prior_group']))}",
         note=(
             "A fix is accepted where the rejector says that its chance to be false is below 1 / (1 + C) (Eq. 14). A "
             "false fix costs C, a present place without an accepted fix 1, all else nothing: cost_5_place, "
@@ -182,7 +183,7 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     first = rows.iloc[0]
     axes = [(name, label) for name, label in _PRICES.items() if np.isfinite(rows[name].to_numpy(float)).any()]
     about = BoardPage(
-        title=f"Success against cost: {first['track']}, prior {first['prior_group']}",
+        title=f"Success against cost: {first['track']}, {prior_words(str(first['prior_group']))}",
         note=(
             f"Suites {first['suites']}: those that all of these matchers were asked; n {first['n']:g} present places, "
             f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median "

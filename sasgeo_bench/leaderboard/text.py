@@ -129,7 +129,10 @@ def tables_of(
     suites = [
         table
         for section in sections_of(book)
-        for table in (replace(section.table, notes=(section.context, *section.table.notes)), section.apart)
+        for table in (
+            replace(section.table, notes=(*filter(None, (section.context,)), *section.table.notes)),
+            section.apart,
+        )
     ]
     found = (
         seed_table(about),

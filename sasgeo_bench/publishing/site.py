@@ -241,6 +241,7 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
     prices = {table.name.replace("summary", "price", 1) for table in overview}
     return {
         "sections": sections,
+        "words_of": {item.prior_group: item.prior for item in sections},
         "overview": overview,
         "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),
         "ranks_note": RANKS_NOTE,

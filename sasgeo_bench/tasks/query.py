@@ -78,8 +78,9 @@ class PriorGroup:
 
     Examples
     --------
-    >>> PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03).name
-    'r500-weak-s3'
+    >>> group = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
+    >>> group.name, group.words
+    ('r500-weak-s3', 'within 500 m, heading known to 20 deg, scale to 3 %')
     """
 
     radius_m: float | None
@@ -91,6 +92,13 @@ class PriorGroup:
         """Return the short name, as in "r500-weak-s3": metres, yaw, per cent of scale."""
         radius = "none" if self.radius_m is None else f"{self.radius_m:g}"
         return f"r{radius}-{self.yaw}-s{100 * self.scale_sigma:g}"
+
+    @property
+    def words(self) -> str:
+        """Return the group in words, as people read it."""
+        place = "anywhere on the map" if self.radius_m is None else f"within {self.radius_m:g} m"
+        heading = {"known": "known to 5 deg", "weak": "known to 20 deg", "unknown": "unknown"}[self.yaw]
+        return f"{place}, heading {heading}, scale to {100 * self.scale_sigma:g} %"
 
     @classmethod
     def parse(cls, name: str) -> Self:

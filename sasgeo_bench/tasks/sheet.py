@@ -22,7 +22,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.preview import PAINT_ORDER
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, Query, Truth
+from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, PriorGroup, Query, Truth
 from sasgeo_bench.tasks.suites.rivals import IN_DISC, LEAD, LISTED, RIVALS, TRUTH_LISTED
 
 GROUND: Final = "#fbfaf5"
@@ -207,10 +207,10 @@ def rival_text(truth: Truth) -> str:
 def _known_text(query: Query) -> str:
     """Return what a query tells besides its view: its place in a flight, or its priors, candidates and vectors."""
     if query.step is not None:
-        known = f", priors {query.prior_group}" if query.step.frame == 0 else ""
+        known = f", {PriorGroup.parse(query.prior_group).words}" if query.step.frame == 0 else ""
         return f"view {query.step.frame} of flight {query.step.sequence_id}{known}"
     vectors = f", {len(query.vectors)} vectors" if query.vectors is not None else ""
-    return f"priors {query.prior_group}; {len(query.candidates)} candidates{vectors}"
+    return f"{PriorGroup.parse(query.prior_group).words}; {len(query.candidates)} candidates{vectors}"
 
 
 def _text(panel: Panel) -> tuple[str, ...]:

@@ -17,7 +17,7 @@ SOURCES := sasgeo_bench baselines benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region queries leaderboard test test-quick test-torch check bench ageing figures docs lock clean
+.PHONY: help install demo list-regions build-region queries leaderboard test test-quick test-torch test-oldest check bench ageing figures docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -64,10 +64,10 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 
 # Three workers for two processors: now and then a test waits for a process that it has started.
 # Hundreds of processes import the same modules: none of them compiles them again.
-test test-quick test-torch: export PYTHONDONTWRITEBYTECODE :=
+test test-quick test-torch test-oldest: export PYTHONDONTWRITEBYTECODE :=
 # The workers fill the processors already: threads of linear algebra and of image warps would wait for each other.
-test test-quick test-torch: export OMP_NUM_THREADS := 1
-test test-quick test-torch: export OPENCV_FOR_THREADS_NUM := 1
+test test-quick test-torch test-oldest: export OMP_NUM_THREADS := 1
+test test-quick test-torch test-oldest: export OPENCV_FOR_THREADS_NUM := 1
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 3 --dist loadfile -p no:benchmark -rs $(ARGS)
@@ -79,6 +79,13 @@ test-torch: $(STAMP) ## install the extra [torch] of both packages and run the t
 	$(PIP) install --quiet --no-build-isolation -e '.[torch]' -e 'baselines[torch]'
 	$(VENV_PYTHON) -m pytest -n 2 -p no:benchmark -rs $(addprefix tests/baselines/test_,unet.py deep_retrieval.py image_matchers.py orienternet.py) \
 	  tests/search/test_torch_search.py $(ARGS)
+
+test-oldest: ## run the tests of test-quick with the oldest dependencies that pyproject.toml allows, in .venv-oldest (needs uv)
+	$(PYTHON) -m venv .venv-oldest
+	$(UV) pip compile --quiet --resolution lowest-direct --extra dask --extra publish --extra dev pyproject.toml -o .venv-oldest/oldest.txt
+	$(UV) pip install --quiet --python .venv-oldest/bin/python -r .venv-oldest/oldest.txt
+	$(UV) pip install --quiet --python .venv-oldest/bin/python --no-deps --no-build-isolation -e . -e baselines
+	.venv-oldest/bin/python -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)
@@ -126,5 +133,5 @@ lock: ## resolve requirements.lock and requirements-docs.lock anew from pyprojec
 	  --output-file requirements-docs.lock $(ARGS)
 
 clean: ## remove .venv and caches; keeps what was built in $(OUT)
-	rm -rf $(VENV) .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
+	rm -rf $(VENV) .venv-oldest .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +

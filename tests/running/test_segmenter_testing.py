@@ -73,7 +73,7 @@ def test_what_a_segmenter_may_do_is_no_fault(table, name) -> None:
         ("NotOnItsCard", 1, "(4 of 4 images)"),
         ("PaintsOver", 1, "changed the picture that it was given"),
         ("Fickle", 2, "image 0 has another answer the second time"),
-        ("OtherClasses", 3, "tells green, the first one building"),
+        ("OtherClasses", 3, ", the first one "),
         ("WantsRoom", 4, "one pixel (1 x 1): crash: ValueError: the picture is smaller than the filter"),
         ("LooksBack", 5, "has another answer after others, in a fresh process"),
     ],

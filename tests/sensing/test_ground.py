@@ -45,7 +45,7 @@ def test_a_ray_to_a_slope_meets_it_where_geometry_says(east, north, right, up):
     met = dem.meet(origin, direction[None])[0]
     inside = 5 <= expected[0] <= 115 and 0 <= expected[1] <= 100
     if inside:
-        np.testing.assert_allclose(met, expected, atol=1e-4)
+        assert np.allclose(met, expected, rtol=1e-7, atol=1e-4)
     elif not (-0.1 <= expected[0] <= 120.1 and -0.1 <= expected[1] <= 100.1):
         assert np.isnan(met).all()
 

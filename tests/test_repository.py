@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import yaml
 
 from docs.site import reference
 
@@ -24,6 +25,7 @@ SHIPPED = ("regions", "splits", "pipelines")
 GENERATED = {
     ".git",
     ".venv",
+    ".venv-oldest",
     "out",
     "dist",
     "__pycache__",
@@ -191,6 +193,14 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
 
 
 # Commands
+
+
+def test_every_step_of_the_workflow_is_a_target_of_the_makefile() -> None:
+    jobs = yaml.safe_load(read(".github/workflows/checks.yml"))["jobs"]
+    runs = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    phony = re.search(r"^\.PHONY: (.*)$", read("Makefile"), flags=re.MULTILINE)[1].split()
+    assert sorted(runs) == ["make check", "make docs", "make test", "make test-oldest"]
+    assert {run.removeprefix("make ") for run in runs} <= set(phony)
 
 
 def test_make_alone_prints_every_target_with_its_line() -> None:

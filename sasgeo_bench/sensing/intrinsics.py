@@ -173,11 +173,13 @@ class Intrinsics:
         return np.where(missed[:, None], np.nan, slopes)
 
 
+_NO_BEND: Final = 1e-15  # moves no pixel of any lens; the division of a root by less would overflow
+
+
 def _fold(distortion: Distortion) -> float:
     """Return the radius, as a slope, from which the radial polynomial no longer grows; infinite if it always does."""
     k1, k2, _, _, k3 = distortion
-    squares = np.roots(
-        [7 * k3, 5 * k2, 3 * k1, 1.0]
-    )  # of r, where the derivative of r (1 + k1 r2 + k2 r4 + k3 r6) is 0
+    slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])  # the derivative of r (1 + k1 r2 + k2 r4 + k3 r6), in r2
+    squares = np.roots(np.where(np.abs(slope) < _NO_BEND, 0.0, slope))
     real = squares.real[(np.abs(squares.imag) < 1e-12) & (squares.real > 0)]  # noqa: PLR2004 - rounding of a real root
     return float(np.sqrt(real.min())) if len(real) else math.inf

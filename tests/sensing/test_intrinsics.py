@@ -4,7 +4,7 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import CameraError
@@ -26,6 +26,7 @@ def test_pixels_are_those_of_opencv_half_a_pixel_on():
     np.testing.assert_allclose(lens_of().to_pixels(slopes), expected + 0.5, atol=1e-9)
 
 
+@example(k1=0.0, k2=2e-311, p1=0.0, at=(0.0, 0.0))
 @given(
     k1=st.floats(-0.2, 0.2),
     k2=st.floats(-0.05, 0.05),

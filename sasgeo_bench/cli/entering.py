@@ -57,5 +57,6 @@ def enter_command(options: EnterOptions) -> None:
         folder, board = enter(entry, card=options.card, into=options.into, tell=tell, progress=progress)
     show_board(board)
     say(folder)
+    tell(f"the board of both, with every figure: {options.out / 'boards' / f'{entry.board}-{folder.name}'}")
     tell(f"next: look at your row, then open a pull request with {folder}")
     check_controls(board)

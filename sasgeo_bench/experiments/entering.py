@@ -4,13 +4,14 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import shorten
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.pipeline import ask, draw_all
 from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, Run, plan_pipeline, plan_runs
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_files import read_scores
+from sasgeo_bench.leaderboard.board_files import read_board, read_scores
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.submission import NONE, Card
@@ -20,12 +21,14 @@ from sasgeo_bench.publishing.archive_folder import is_pack
 from sasgeo_bench.publishing.submissions import FOLDER, SubmitRequest, check_card, make_submission, with_submissions
 from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.rows import is_unranked
-from sasgeo_bench.scoring.submission_files import check_submission_folder, read_card
+from sasgeo_bench.scoring.submission_files import check_submission_folder, is_submission, read_card, read_submission
 from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.query import TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import HALVES, Split
 
 _MAP_MB: Final = 2  # of a built map, on average over the shipped regions and their dates
 _HOUR_S: Final = 3600.0
+_MOST_LETTERS: Final = 300  # of a line of a submission's card; that of a matcher may be longer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -68,7 +71,7 @@ def plan_entry(request: EntryRequest, *, tell: Tell) -> Entry:
     StoreError
         If there are no stored results, or they are damaged.
     ConfigError
-        If the pipeline is another one than that of the board, or cannot be drawn here.
+        If the pipeline or the seed of sealed places is another one than that of the board, or it cannot be drawn here.
     MatchError
         If there is no such matcher.
     """
@@ -87,6 +90,7 @@ def plan_entry(request: EntryRequest, *, tell: Tell) -> Entry:
             "the program that made it, or name the file by --pipeline"
         )
         raise ConfigError(message)
+    _check_seed(stored, request.sealed)
     plan = plan_pipeline(
         _asking(spec, request.matcher),
         out=request.out,
@@ -96,6 +100,17 @@ def plan_entry(request: EntryRequest, *, tell: Tell) -> Entry:
         sealed=request.sealed,
     )
     return Entry(stored=stored, plan=plan, matcher=request.matcher)
+
+
+def _check_seed(stored: Path, seed: PrivateSeed | None) -> None:
+    """Refuse a seed that did not draw the sealed places of the board: none of their queries would be the same."""
+    opened = read_board(stored)[0].get("sealed", {})
+    if seed is not None and all(one.get("drawn_by") != seed.commitment for one in opened.values()):
+        message = (
+            f"{stored} was not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}: take the "
+            "seed that was published with the board, or none"
+        )
+        raise ConfigError(message)
 
 
 def _asking(spec: PipelineFile, matcher: str) -> PipelineFile:
@@ -123,7 +138,20 @@ def cost_lines(entry: Entry) -> Iterator[str]:
             f"  asking took {_duration(count * fast_s)} at the speed of {fast}, {_duration(count * slow_s)} at that of "
             f"{slow}; --jobs divides it"
         )
-    yield f"  {counted(maps, 'map')} to build where they are missing, about {maps * _MAP_MB} MB on disk"
+    yield (
+        f"  {counted(maps, 'map')} to build where they are missing, about {maps * _MAP_MB} MB on disk; drawing and "
+        "scoring take time, too"
+    )
+    about, seal = read_board(entry.stored)[0], entry.plan.seal
+    if about.get("task_version") != TASK_VERSION:
+        yield (
+            f"  the board is of task version {about.get('task_version')}, and this program draws version "
+            f"{TASK_VERSION}: queries that changed in between count as misses (CHANGELOG.md says which)"
+        )
+    closed = set(about.get("sealed", {})) if seal is None or seal.seed is None else set()
+    lost = sum(len(task.asked) for task in tasks if base_of(task.about["region"]) in closed)
+    if lost:
+        yield f"  {lost} of them are of sealed places, and count as misses without --sealed-seed-file"
     yield from (f"  {line.strip()}" for line in (() if entry.plan.seal is None else entry.plan.seal.lines()))
 
 
@@ -161,6 +189,7 @@ def enter(
     said = _card_of(planned.card, runs, plan.split) if card is None else read_card(card)
     check_card(said, entry.stored, source=entry.matcher if card is None else str(card))
     check_submission_folder(into or FOLDER / said.name, said.name)
+    _check_same_board(into or FOLDER / said.name, entry.board)
     for line in _held(entry, [*tasks, *controls]):
         tell(line)
     ask(entry.matcher, runs, tell=tell, progress=progress)
@@ -169,6 +198,17 @@ def enter(
     both = plan.out / "boards" / f"{entry.board}-{said.name}"
     board = with_submissions(entry.stored, [folder], both, tell=tell, root=plan.out, jobs=plan.jobs)
     return folder, board
+
+
+def _check_same_board(folder: Path, board: str) -> None:
+    """Refuse to replace answers to another board."""
+    other = read_submission(folder).board if is_submission(folder) else board
+    if other != board:
+        message = (
+            f"{folder} holds answers to the board {other!r}, which would be lost: name another folder, as in --into "
+            f"submissions/{board}/{folder.name}"
+        )
+        raise StoreError(message)
 
 
 def _held(entry: Entry, tasks: Sequence[Path]) -> Iterator[str]:
@@ -188,6 +228,10 @@ def _held(entry: Entry, tasks: Sequence[Path]) -> Iterator[str]:
         yield f"  {len(board) - same} are not, and count as misses"
 
 
+def _line(text: str) -> str:
+    return shorten(text, _MOST_LETTERS, placeholder=" ...")
+
+
 def _card_of(card: MatcherCard, runs: Sequence[Run], split: Split | None) -> Card:
     """Return the card of a submission from that of the matcher, with the places that taught its runs."""
     known = () if split is None else split.blocks
@@ -203,12 +247,12 @@ def _card_of(card: MatcherCard, runs: Sequence[Run], split: Split | None) -> Car
     return Card(
         name=card.name,
         version=card.version,
-        title=card.title,
-        source=card.source,
-        ours=card.ours,
+        title=_line(card.title),
+        source=_line(card.source),
+        ours=_line(card.ours),
         licence=card.licence,
         trained_on=trained_on,
-        trained_elsewhere="; ".join(others) or None,
+        trained_elsewhere=_line("; ".join(others)) or None,
         needs=list(card.needs),
-        limits=card.limits or None,
+        limits=_line(card.limits) or None,
     )

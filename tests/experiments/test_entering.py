@@ -15,6 +15,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.publishing.submissions import hold_submission
 from sasgeo_bench.scoring.submission_files import read_submission
+from sasgeo_bench.tasks.private_seed import PrivateSeed
 from tests.experiments.test_pipeline import TEXT as PIPELINE
 from tests.threaded import threaded
 
@@ -123,6 +124,45 @@ def test_a_folder_that_holds_other_things_is_refused_before_anything_is_asked(re
         enter(entry, into=tmp_path / "middle", tell=silent)
     with pytest.raises(StoreError, match="must be named as the card is, 'middle'"):
         enter(entry, into=tmp_path / "other", tell=silent)
+
+
+def test_answers_to_another_board_are_not_replaced(request_, entered, monkeypatch):
+    folder, _, _ = entered
+    monkeypatch.setattr(entering, "ask", pytest.fail)
+    entry = plan_entry(request_, tell=silent)
+    other = replace(entry, plan=replace(entry.plan, spec=entry.plan.spec.model_copy(update={"id": "other"})))
+    with pytest.raises(
+        StoreError, match=r"holds answers to the board 'small', .* as in --into submissions/other/middle"
+    ):
+        enter(other, into=folder, tell=silent)
+
+
+def test_a_seed_that_did_not_draw_the_board_is_refused(request_, monkeypatch):
+    seed = PrivateSeed("3f" * 16, is_sealed=True)
+    about = {"sealed": {"porto": {"drawn_by": "ab" * 32}}}
+    monkeypatch.setattr(entering, "read_board", lambda _: (about, None))
+    with pytest.raises(
+        ConfigError, match=f"not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}"
+    ):
+        plan_entry(replace(request_, sealed=seed), tell=silent)
+
+
+def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_, monkeypatch):
+    about = {"sealed": {"town-suburb": {"drawn_by": "ab" * 32}}, "task_version": 3}
+    entry = plan_entry(request_, tell=silent)
+    assert not any("count as misses" in line for line in cost_lines(entry))
+    monkeypatch.setattr(entering, "read_board", lambda _: (about, None))
+    told = "\n".join(cost_lines(entry))
+    assert "of task version 3, and this program draws version" in told
+    assert "are of sealed places, and count as misses without --sealed-seed-file" in told
+
+
+def test_lines_of_a_matchers_card_are_cut_to_those_of_a_submission(request_):
+    long = "word " * 100
+    card = replace(Middle.card, source=long, limits=long)
+    made = entering._card_of(card, [], None)  # noqa: SLF001
+    assert made.source.endswith(" ...")
+    assert len(made.limits) <= 300
 
 
 def test_another_text_of_the_pipeline_is_refused(request_, tmp_path):

@@ -157,10 +157,10 @@ def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_
     assert "are of sealed places, and count as misses without --sealed-seed-file" in told
 
 
-def test_lines_of_a_matchers_card_are_cut_to_those_of_a_submission(request_):
+def test_lines_of_a_matchers_card_are_cut_to_those_of_a_submission():
     long = "word " * 100
     card = replace(Middle.card, source=long, limits=long)
-    made = entering._card_of(card, [], None)  # noqa: SLF001
+    made = entering._card_of(card, [], None)
     assert made.source.endswith(" ...")
     assert len(made.limits) <= 300
 

@@ -151,7 +151,7 @@ def cost_lines(entry: Entry) -> Iterator[str]:
     closed = set(about.get("sealed", {})) if seal is None or seal.seed is None else set()
     lost = sum(len(task.asked) for task in tasks if base_of(task.about["region"]) in closed)
     if lost:
-        yield f"  {lost} of them are of sealed places, and count as misses without --sealed-seed-file"
+        yield f"  {lost} of the queries are of sealed places, and count as misses without --sealed-seed-file"
     yield from (f"  {line.strip()}" for line in (() if entry.plan.seal is None else entry.plan.seal.lines()))
 
 

@@ -17,7 +17,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
 _FEW: Final = 8  # known names, or faults, that an error lists in full
-_LONGEST: Final = 300
+LONGEST_LINE: Final = 300
 
 
 def _printable(text: str) -> str:
@@ -36,7 +36,7 @@ def _not_blank(text: str) -> str:
 
 
 Prose = Annotated[str, Field(max_length=2000), AfterValidator(_printable)]  # which may be empty
-Line = Annotated[str, Field(max_length=_LONGEST), AfterValidator(_printable), AfterValidator(_not_blank)]
+Line = Annotated[str, Field(max_length=LONGEST_LINE), AfterValidator(_printable), AfterValidator(_not_blank)]
 Short = Annotated[str, Field(max_length=_SHORT), AfterValidator(_printable), AfterValidator(_not_blank)]
 
 
@@ -122,7 +122,7 @@ def _json(value: object) -> str:
 def _short(value: object) -> str:
     """Quote a value, cut to a bounded length: a table or text may be as long as the file."""
     text = repr(value)
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST - 3]}..."
+    return text if len(text) <= LONGEST_LINE else f"{text[: LONGEST_LINE - 3]}..."
 
 
 def _known_keys(location: tuple[int | str, ...], model: type[BaseModel]) -> list[str]:

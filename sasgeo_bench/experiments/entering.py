@@ -7,6 +7,7 @@ from pathlib import Path
 from textwrap import shorten
 from typing import Final
 
+from sasgeo_bench.config import LONGEST_LINE
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.pipeline import ask, draw_all
 from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, Run, plan_pipeline, plan_runs
@@ -28,7 +29,6 @@ from sasgeo_bench.tasks.split import HALVES, Split
 
 _MAP_MB: Final = 2  # of a built map, on average over the shipped regions and their dates
 _HOUR_S: Final = 3600.0
-_MOST_LETTERS: Final = 300  # of a line of a submission's card; that of a matcher may be longer
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -229,7 +229,8 @@ def _held(entry: Entry, tasks: Sequence[Path]) -> Iterator[str]:
 
 
 def _line(text: str) -> str:
-    return shorten(text, _MOST_LETTERS, placeholder=" ...")
+    """Return a line of a matcher's card as one of a submission's, which is no longer than `LONGEST_LINE`."""
+    return shorten(text, LONGEST_LINE, placeholder=" ...")
 
 
 def _card_of(card: MatcherCard, runs: Sequence[Run], split: Split | None) -> Card:

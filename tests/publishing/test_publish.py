@@ -196,6 +196,7 @@ def test_the_board_is_what_its_tables_say_read_by_meaning(pages):
     outcomes = [text for text in index.said("h3") if text.startswith(("decided", "null", "not decided"))]
     assert outcomes[0] == "decided real: graph is better than weak, by as much as matters"
     assert outcomes[1] == "not decided close: graph against raster"
+    assert any(text.startswith("No difference shown") for text in index.said("p"))
     first = " ".join(index.said("li"))
     assert re.search(r"Difference 0\.\d{3} \[0\.\d{3}, 0\.\d{3}\] in the share of queries that are right", first)
     assert re.search(r"adjusted p 0\.004 \(Holm, 2 contrasts\); n = 120 queries; 20 blocks; 10 places;", first)

@@ -16,7 +16,7 @@ from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sec
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
-from sasgeo_bench.leaderboard.tables import Bar, Record, Row, file_stem, interval_text, number_text, p_text
+from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.publishing.site_pages import (
@@ -237,7 +237,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
 def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
     """Return what the first page shows."""
     controls = _verdicts(source)
-    overview = tuple(table for table in summary(book) if any(map(_leads, table.rows)))
+    overview = tuple(table for table in summary(book) if _has_rivals(table))
     prices = {table.name.replace("summary", "price", 1) for table in overview}
     return {
         "sections": sections,
@@ -258,8 +258,8 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
     }
 
 
-def _leads(row: Row) -> bool:
-    return any(cell.tone == "leading" for cell in row.cells)
+def _has_rivals(table: Table) -> bool:
+    return sum(row.tone != "control" for row in table.rows) > 1
 
 
 def _environment() -> Environment:

@@ -63,6 +63,12 @@ class Page:
         assert "exceptionDetails" not in said, said["exceptionDetails"]
         return said["result"].get("value")
 
+    def settled(self, script: str) -> Any:
+        """What a promise comes to in the page."""
+        said = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in said, said["exceptionDetails"]
+        return said["result"].get("value")
+
     def press(self, key: str) -> None:
         """Press a key, as a hand would."""
         about = {"key": key, "code": key, "windowsVirtualKeyCode": KEYS[key]}

@@ -394,8 +394,9 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
 def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
     """Yield who is good at what, of some suites or of all: a matcher a line, a suite a column, figure and rank.
 
-    Suites with more ranked matchers come first, so do matchers that were asked about more of them; controls come last.
-    A cell leads where its rank may be the first of several.
+    The first lines say of each suite how many queries count, what can be reached and what guessing and the controls
+    reach. Suites with more ranked matchers come first, so do matchers that were asked about more of them. A cell leads
+    where its rank may be the first of several.
     """
     groups = sorted({key[1:] for key in book.matchers if not suites or key[0] in suites})
     for track, prior_group in groups:
@@ -409,17 +410,17 @@ def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
         means = {name: _mean_value(rows) for name, rows in found.items()}
         order = sorted(
             (name for name in names if any(row is not None for row in found[name])),
-            key=lambda name: (name in book.controls, -sum(map(bool, found[name])), -means[name], name),
+            key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
         )
-        columns = [column(primary, title=_heading(book, key, primary)) for key in shown]
+        columns = [column(primary, title=key[0]) for key in shown]
         whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
         has_mean = len(shown) > 1 and len(whole - book.controls) > 1
-        rows = []
+        rows = _heads(book, shown, primary, width=len(shown) + has_mean)
         for name in order:
             cells = [_short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
             if has_mean:
                 cells.append(number_cell(means[name] if name in whole else math.nan))
-            tone = "control" if name in book.controls else "plain"
+            tone = "head" if name in book.controls else "plain"
             first = book.name_cell(name)
             marks = tuple(mark for mark in first.marks if mark.tone != "plain" or name in book.controls)
             rows.append(Row(cells=(replace(first, marks=marks), *cells), tone=tone))
@@ -440,17 +441,24 @@ def _mean_value(rows: Sequence[Record | None]) -> float:
     return sum(values) / len(values) if values else -1.0
 
 
-def _heading(book: Book, key: Key, primary: str) -> str:
-    """Return a suite with its number of queries, what guessing among candidates reaches, and a ceiling below 1."""
+def _heads(book: Book, keys: Sequence[Key], primary: str, *, width: int) -> list[Row]:
+    """Return lines above the matchers: how many queries count, and a ceiling below 1 and chance where there is one."""
+    lines = {"queries": [plain_cell(_count(book, key, primary)) for key in keys]}
+    for title, metric in (("at most", CEILING.name), ("chance", CHANCE.name)):
+        rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
+        lines[title] = [number_cell(math.nan if row is None else float(row["value"])) for row in rows]
+    no_mean = [Cell(text="-")] * (width - len(keys))
+    return [
+        Row(cells=(Cell(text=title), *cells, *no_mean), tone="head")
+        for title, cells in lines.items()
+        if any(cell.text not in ("-", "1.000") for cell in cells)
+    ]
+
+
+def _count(book: Book, key: Key, primary: str) -> int:
+    """Return how many queries count: a matcher that does not answer the track has a row of all, stressed or not."""
     rows = [row for name in book.matchers[key] if (row := book.main(key, name, primary)) is not None]
-    # A matcher that does not answer the track has one row of all queries, stressed or not.
-    n = max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
-    chance = next(filter(None, (book.main(key, name, CHANCE.name) for name in book.matchers[key])), None)
-    most = book.main(key, book.matchers[key][0], CEILING.name)
-    texts = [f"{key[0]}, n = {n}"]
-    texts += [] if chance is None else [f"chance {number_text(chance['value'])}"]
-    texts += [] if most is None or float(most["value"]) == 1 else [f"at most {number_text(float(most['value']))}"]
-    return ", ".join(texts)
+    return max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
 
 
 def _short_cell(row: Record | None, *, is_rivalled: bool) -> Cell:

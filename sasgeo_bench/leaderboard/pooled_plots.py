@@ -185,7 +185,7 @@ def draw_prices(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
     about = BoardPage(
         title=f"Success against cost: {first['track']}, {prior_words(str(first['prior_group']))}",
         note=(
-            f"Suites {first['suites']}: those that all of these matchers were asked; n {first['n']:g} present places, "
+            f"Suites {first['suites']}: those that all of these matchers were asked; n {first['n']:g} queries, "
             f"{counted(int(first['blocks']), 'block')}. Upright bars: 95 % intervals; level bars: from the median "
             "latency to the 95th percentile, all suites of the track. Grey line: the front, where no other matcher is "
             "both cheaper and "

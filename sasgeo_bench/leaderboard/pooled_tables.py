@@ -232,14 +232,14 @@ COSTS: Final = {"latency_p50": "latency_s", "latency_p95": "slow_s", "map_per_km
 
 
 def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd.DataFrame:
-    """Return accuracy against cost: a row for each matcher, on the queries that all of them were asked.
+    """Return accuracy against cost: a row for each matcher that was asked the suites that most were asked.
 
     The columns are suites, track, prior_group, matcher, n, blocks, value, lo, hi, latency_s, slow_s (95th percentile)
-    and map_kb_per_km2, from the leaderboard `table`; NaN where a cost is unknown. The queries are the present places of
-    the suites of the track that all were asked.
+    and map_kb_per_km2, from the leaderboard `table`; NaN where a cost is unknown. The queries are those that the
+    first figure counts, of the suites of the track that all of these matchers were asked.
     """
     rows: list[dict[str, Any]] = []
-    mine = {name: scores[name][scores[name]["is_present"].to_numpy(bool)] for name in shown if name in scores}
+    mine = {name: _counted(scores[name]) for name in shown if name in scores}
     groups = {key for one in mine.values() for key in zip(one["track"], one["prior_group"], strict=True)}
     for track, prior_group in sorted(groups):
         some = {
@@ -247,8 +247,7 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
             for name, frame in mine.items()
         }
         some = {name: frame for name, frame in some.items() if _is_able(frame)}
-        suites = [set(frame["suite"]) for frame in some.values()]
-        shared = set.intersection(*suites) if suites else set()
+        some, shared = _of_most(some)
         group = {"suites": ", ".join(sorted(shared)), "track": track, "prior_group": prior_group}
         for name, frame in _alike({name: one[one["suite"].isin(shared)] for name, one in some.items()}).items():
             values = primary_of(track).values(frame)[:, None]
@@ -256,6 +255,21 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
             rows.append({**group, "matcher": name, **found, **_costs_of(table, name, track)})
     columns = ["suites", "track", "prior_group", "matcher", *_FIGURE, *COSTS.values()]
     return pd.DataFrame(rows, columns=columns)
+
+
+def _counted(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return the rows that the first figure of each suite counts, of places that are on the map."""
+    parts = [part[_is_whole(part)] for _, part in frame.groupby(["suite", "track"], sort=False)]
+    return pd.concat(parts, ignore_index=True) if parts else frame
+
+
+def _of_most(frames: Scores) -> tuple[dict[str, pd.DataFrame], set[str]]:
+    """Return the matchers of the suite that most were asked, the first of several, and all suites that they share."""
+    suites = {name: set(frame["suite"]) for name, frame in frames.items()}
+    every = sorted(set().union(*suites.values()))
+    most = max(every, key=lambda suite: sum(suite in own for own in suites.values()), default="")
+    chosen = {name: frame for name, frame in frames.items() if most in suites[name]}
+    return chosen, set.intersection(*(suites[name] for name in chosen)) if chosen else set()
 
 
 def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> dict[str, float]:

@@ -121,7 +121,10 @@ class Column:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """A line of a table; the first cell is its head. `tone` says how it looks: plain, control, tied, other-tie."""
+    """A line of a table; the first cell is its head.
+
+    `tone` says how it looks: plain, control, tied, other-tie; head stays above all others, however they are sorted.
+    """
 
     cells: tuple[Cell, ...]
     tone: str = "plain"

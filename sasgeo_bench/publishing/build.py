@@ -84,7 +84,7 @@ def publish(
                 about={"board": source.name, "made_by": files.about.get("made_by")},
             )
     if written.site_bytes > MOST_BYTES:
-        tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB without pictures: slow to open from afar")
+        tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB without pictures and downloads: slow to open from afar")
     return written
 
 

@@ -92,7 +92,7 @@ def _fault_of(item: ET.Element) -> str | None:
 
 PICTURES: Final = "pictures"
 FILES: Final = "files"
-MOST_BYTES: Final = 5_000_000  # of a site without pictures of regions and cases; a larger one is reported
+MOST_BYTES: Final = 3_000_000  # of the pages of a site with their figures; a larger one is reported
 _TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION)
 _OFFERED: Final = {  # files for download, with descriptions
     f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
@@ -258,17 +258,19 @@ def _check_picture(folder: Path, name: str) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Written:
-    """Result of writing a site: folder, bytes without and of pictures, number of pages."""
+    """Result of writing a site: folder, bytes of pages and figures, of pictures and of downloads, number of pages."""
 
     folder: Path
     site_bytes: int
+    download_bytes: int
     picture_bytes: int
     pages: int
 
     def to_text(self) -> str:
         """Return folder and sizes in one line."""
-        sizes = f"{self.site_bytes / 1e6:.2f} MB and {self.picture_bytes / 1e6:.2f} MB of pictures"
-        return f"{self.folder}: {self.pages} pages, {sizes}"
+        sizes = {"": self.site_bytes, " of pictures": self.picture_bytes, " of downloads": self.download_bytes}
+        texts = [f"{size / 1e6:.2f} MB{what}" for what, size in sizes.items()]
+        return f"{self.folder}: {self.pages} pages, {', '.join(texts)}"
 
 
 @contextmanager
@@ -345,7 +347,8 @@ def write_site(
         raise StoreError(message) from error
     return Written(
         folder=target,
-        site_bytes=sum(map(len, files.values())),
+        site_bytes=sum(len(data) for name, data in files.items() if not name.startswith(f"{FILES}/")),
+        download_bytes=sum(len(item.data) for item in board.downloads),
         picture_bytes=picture_bytes,
         pages=sum(name.endswith(".html") for name in pages),
     )

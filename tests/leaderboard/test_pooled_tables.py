@@ -156,6 +156,16 @@ def test_who_cannot_answer_has_no_bar_and_no_line(listed):
         assert set(rows["matcher"]) == {"one"}
 
 
+def test_prices_are_of_the_suites_that_most_were_asked_and_of_the_queries_that_the_first_figure_counts():
+    first = answered(np.full(COUNT, 4.0)).assign(role=np.where(AT % 2, "stress", "control"))
+    other = first.assign(suite="clean", query_id=[f"x{at}" for at in AT])
+    tables = {"one": first, "two": pd.concat([first, other]), "three": other, "four": first}
+    rows = price_frame(leaderboard({"one": first}, draws=100), tables, list(tables))
+    assert rows["matcher"].tolist() == ["one", "two", "four"]
+    assert set(rows["suites"]) == {"occlusion"}
+    assert set(rows["n"]) == {COUNT // 2}
+
+
 def test_prices_are_those_of_the_board_on_the_queries_that_all_were_asked(tmp_path):
     one = answered(np.where(AT % 3 == 0, 4.0, 300.0))
     more = answered(np.full(COUNT, 4.0)).assign(suite="clean", query_id=[f"x{at}" for at in AT])

@@ -110,7 +110,9 @@ def test_who_may_be_first_leads_in_the_overview_and_who_was_asked_about_more_com
     first.loc[first["matcher"] == "matcher-003", ["rank_best", "rank_worst"]] = [5, 6]
     fewer = first[first["matcher"] != HOSTILE].assign(suite="occlusion")
     (table,) = summary(book_of(source(pd.concat([first, fewer], ignore_index=True))))
-    names = [row.cells[0].text for row in table.rows]
+    heads = [[cell.text for cell in row.cells] for row in table.rows if row.tone == "head"]
+    assert heads == [["queries", "80", "80", "-"]]
+    names = [row.cells[0].text for row in table.rows if row.tone != "head"]
     assert names[0] == MARKUP
     assert names[-1] == HOSTILE  # best where it was asked, which is one suite of two
     assert [column.term for column in table.columns] == ["matcher", "success_25m", "success_25m", "mean"]
@@ -121,7 +123,7 @@ def test_who_may_be_first_leads_in_the_overview_and_who_was_asked_about_more_com
 
 def test_who_has_no_rival_does_not_lead():
     (table,) = summary(book_of(source(many_rows(1))))
-    assert [row.cells[1].tone for row in table.rows] == ["plain"]
+    assert [row.cells[1].tone for row in table.rows] == ["plain", "plain"]  # the first says how many queries count
 
 
 def test_tables_of_one_contestant_come_last():

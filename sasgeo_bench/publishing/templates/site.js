@@ -38,9 +38,10 @@ function sortBy(head, order) {
   const at = head.cellIndex;
   const isNumber = head.classList.contains("num");
   const sign = order === "ascending" ? 1 : -1;
-  const rows = Array.from(table.tBodies[0].rows, (row) => ({ row, key: keyOf(row, at, isNumber) }));
+  const body = table.tBodies[table.tBodies.length - 1]; // lines that stay above have one of their own
+  const rows = Array.from(body.rows, (row) => ({ row, key: keyOf(row, at, isNumber) }));
   rows.sort((a, b) => compare(a.key, b.key, sign));
-  table.tBodies[0].append(...rows.map((item) => item.row));
+  body.append(...rows.map((item) => item.row));
   for (const other of table.tHead.rows[0].cells) other.setAttribute("aria-sort", other === head ? order : "none");
 }
 

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.canvas import page
-from sasgeo_bench.leaderboard.board_files import Extra, write_board
+from sasgeo_bench.leaderboard.board_files import ANSWER_COLUMNS, Extra, write_board
 from sasgeo_bench.leaderboard.board_plots import BoardPage
 from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict, verdict_frame
@@ -152,12 +152,37 @@ def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=Non
         findings=hold_contrasts(known, scored, {}, draws=200),
         verdicts=[replace(verdict(holds=holds), matcher=tested)],
         scored=pd.concat([frame.assign(matcher=name) for name, frame in scored.items()], ignore_index=True),
-        extras=[Extra(figures={"age-real-age-localization-r500-weak-s3.svg": draw})],
+        extras=[
+            Extra(
+                figures={"age-real-age-localization-r500-weak-s3.svg": draw},
+                tables={"answers": answers_of(shares)},
+            )
+        ],
         contrasts=[
             {name: getattr(item, name) for name in ("name", "first", "second", "suites", "kinds", "metric", "track")}
             for item in known
         ],
     )
+
+
+def answers_of(names, **changes):
+    """Three answers of each matcher: a right one, one 300 m off, and none to a place that is absent."""
+    right = {"true_easting_m": 540100.0, "true_northing_m": 5220200.0, "true_yaw_deg": 90.0}
+    right |= {"fix_easting_m": 540100.0, "fix_northing_m": 5220200.0, "fix_yaw_deg": 90.0}
+    rows = [
+        right | {"query_id": "q0", "failure": ""},
+        right | {"query_id": "q1", "failure": "aliased", "fix_easting_m": 540400.0},
+        right
+        | {"query_id": "q2", "failure": "of tomorrow", "is_present": False}
+        | {"fix_easting_m": np.nan, "fix_northing_m": np.nan, "fix_yaw_deg": np.nan},
+    ]
+    facts = {"suite": "real-age", "region": "vaduz@2015-07-27", "kind": "S1", "role": "stress", "status": "ok"}
+    facts |= {"is_present": True, "view_m": 128.0}
+    table = pd.DataFrame([facts | row | {"matcher": name} for name in names for row in rows])
+    return table[list(ANSWER_COLUMNS)].assign(**changes)
+
+
+BOUNDS_M = [540000.0, 5220000.0, 541000.0, 5220800.0]  # of the handmade map
 
 
 def put_pictures(folder, *, failures=("aliased", "occluded", "odd one"), **changes):
@@ -169,7 +194,10 @@ def put_pictures(folder, *, failures=("aliased", "occluded", "odd one"), **chang
     for name in names:
         cv2.imwrite(str(home / name), image)
     said = {
-        "regions": [{"region": "vaduz", "file": "vaduz.png", "alt": "Vaduz from above"}],
+        "regions": [
+            {"region": "vaduz", "file": "vaduz.png", "alt": "Vaduz from above", "bounds_m": BOUNDS_M}
+            | {"blocks": [{"name": f"vaduz/0-0 {MARKUP}", "bounds_m": BOUNDS_M}]}
+        ],
         "suites": [{"suite": "real-age", "file": "example.png", "alt": f"Example {MARKUP}"}],
         "cases": [
             {"query_id": f"q{at}", "matcher": "graph", "failure": failure, "file": f"cases/{at}.png"}

@@ -207,6 +207,19 @@ class _Picture(_Record):
     suite: str = ""
 
 
+_Bounds = Annotated[list[float], Field(min_length=4, max_length=4)]  # west, south, east, north
+
+
+class _Block(_Record):
+    name: str
+    bounds_m: _Bounds
+
+
+class _Region(_Picture):
+    bounds_m: _Bounds | None = None
+    blocks: list[_Block] = []
+
+
 class _Strip(_Picture):
     matcher: str = ""
 
@@ -225,7 +238,7 @@ class PicturesRecord(_Record):
     []
     """
 
-    regions: list[_Picture] = []
+    regions: list[_Region] = []
     suites: list[_Picture] = []
     strips: list[_Strip] = []
     flights: list[_Picture] = []

@@ -34,6 +34,7 @@ LEADERBOARD: Final = "leaderboard"
 PROTECTION: Final = "protection"
 ACCEPTANCE: Final = "acceptance"
 SCORES: Final = "scores"
+ANSWERS: Final = "answers"
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
 PICTURES: Final = "pictures"
@@ -45,7 +46,7 @@ BOARD_FILES: Final = (
     *(f"{SCORES}.parquet", "contrasts.parquet", "falsifiers.parquet", "controls.parquet", BOARD),
     *("contrasts.md", "controls.md"),
     *(f"{PROTECTION}.{kind}" for kind in ("parquet", "csv")),
-    f"{ACCEPTANCE}.parquet",
+    *(f"{ACCEPTANCE}.parquet", f"{ANSWERS}.parquet"),
     *("paper.parquet", "trials.parquet", "paper.md"),
 )
 MEND: Final = "score it again"
@@ -185,6 +186,10 @@ _TEXTS: Final = frozenset(
     }
 )
 _FINDING: Final = {item.name: item.type for item in fields(Finding)} | {"outcome": str, "verdict": str}
+ANSWER_COLUMNS: Final = (
+    *("query_id", "matcher", "suite", "region", "kind", "role", "is_present", "status", "failure", "view_m"),
+    *("true_easting_m", "true_northing_m", "true_yaw_deg", "fix_easting_m", "fix_northing_m", "fix_yaw_deg"),
+)
 _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
     "leaderboard": {item.name: item.type for item in fields(Row)},
     "contrasts": _FINDING,
@@ -195,6 +200,10 @@ _SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
     "scores": {
         **dict.fromkeys(("query_id", "matcher", "suite", "track", "kind", "role", "place"), str),
         "is_present": bool,
+    },
+    ANSWERS: {
+        name: bool if name == "is_present" else float if name.endswith(("_m", "_deg")) else str
+        for name in ANSWER_COLUMNS
     },
 }
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pictures of a board: regions as thumbnails, an example of each suite, and queries that went wrong."""
+"""The pictures of a board: a map of each region, an example of each suite, and queries that went wrong."""
 
 import re
 from collections import Counter
@@ -9,12 +9,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_files import PICTURES_FILE, Extra
-from sasgeo_bench.leaderboard.case_plot import WEBP, case_pixels, fitted, pixels_of, thumbnail
+from sasgeo_bench.leaderboard.board_answers import answers_frame
+from sasgeo_bench.leaderboard.board_files import ANSWERS, PICTURES_FILE, Extra
+from sasgeo_bench.leaderboard.case_plot import WEBP, case_pixels, fitted, pixels_of
 from sasgeo_bench.leaderboard.cases import (
     COLUMNS,
     MOST_CASES,
@@ -24,13 +26,14 @@ from sasgeo_bench.leaderboard.cases import (
     words_of,
 )
 from sasgeo_bench.leaderboard.flight_maps import MOST_TRACKERS, flight_map_pixels, shown_flight
-from sasgeo_bench.leaderboard.plot_tables import shown_matchers
+from sasgeo_bench.leaderboard.plot_tables import ranked_matchers, shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
-from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
 from sasgeo_bench.running.failures import Failures, stops_all
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.score import single_views
@@ -38,18 +41,19 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import CONTROLS, Truth, base_of
 from sasgeo_bench.tasks.sheet import sheet_figure
+from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.texts import json_text, one_line
 
-REGION_BYTES: Final = 15_000
+REGION_BYTES: Final = 120_000
 SUITE_BYTES: Final = 38_000
 CASE_BYTES: Final = 31_000
-MOST_BYTES: Final = 3_000_000  # of all pictures of a board
+MOST_BYTES: Final = 8_000_000  # of all pictures of a board
 STRIP_BYTES: Final = 160_000
 STRIP_ROWS: Final = 4
 FLIGHT_BYTES: Final = 220_000
 KINDS: Final = ("regions", "suites", "strips", "flights", "cases")
 _SOMETIMES: Final = ("strips", "flights")  # kinds that are not named where there are none
-_THUMB_CELLS: Final = 1100  # a level of the layers that is not much finer than a thumbnail
+_MAP_CELLS: Final = 1100  # along the longer side of a map: finer ones take more than they show
 _SHEET_DPI: Final = 72
 _EACH: Final = 4  # cases of one class and matcher
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.@+]+")
@@ -90,32 +94,37 @@ def pictures_extra(
     tell: Tell,
     root: Path,
     contrasts: Sequence[Contrast] = (),
+    split: Split | None = None,
     has_cases: bool = True,
 ) -> Extra:
     """Draw pictures of a board, and list them in `pictures.json`; empty if there is none.
 
     `root` holds regions/, tasks/ and truth/; tasks that are missing there, or of other queries, have no picture. Report
-    by `tell` which pictures cannot be drawn, and how many there are. `contrasts` are the registered ones; `has_cases`
-    adds failed queries, with their truths.
+    by `tell` which pictures cannot be drawn, and how many there are. `contrasts` are the registered ones, `split` has
+    the blocks of a map; `has_cases` adds failed queries, and `answers.parquet` with the place of every query.
     """
     found = _Found(failures=board.failures)
     tasks = [about for about in board.tasks if about["suite"] != CONTROLS]
     asked = [about for about in tasks if _is_there(about, root)]
     if len(asked) < len(tasks):
         tell(f"pictures of {len(asked)} of {counted(len(tasks), 'task')}: {root / 'tasks'} lacks the views of the rest")
-    _add_regions(found, asked, root)
+    _add_regions(found, asked, root, split)
     _add_suites(found, asked, board, root)
+    answers = {}
     if has_cases:
+        failures = _failures(board, contrasts)
+        answers = {ANSWERS: answers_frame(board, failures, ranked_matchers(board.table))}
         _add_strips(found, board, asked, root)
         _add_flights(found, board, asked, root)
-        _add_cases(found, board, contrasts, asked, root)
+        shown = failures[failures["matcher"].isin(shown_matchers(board.table, contrasts))]
+        _add_cases(found, board, shown, asked, root)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
     listed = ", ".join(
         f"{len(rows)} of {kind}" for kind, rows in found.listed.items() if rows or kind not in _SOMETIMES
     )
     tell(f"pictures: {listed}, {sum(map(len, found.files.values())) / 1e6:.2f} MB")
-    return Extra(pictures=_with_list(found.files, found.listed) if found.files else {})
+    return Extra(tables=answers, pictures=_with_list(found.files, found.listed) if found.files else {})
 
 
 def _with_list(files: Mapping[str, bytes], listed: Mapping[str, Any]) -> dict[str, bytes]:
@@ -135,7 +144,7 @@ def _is_there(about: Mapping[str, Any], root: Path) -> bool:
 # --- regions and suites -----------------------------------------------------------------------------------------------
 
 
-def _add_regions(found: _Found, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
+def _add_regions(found: _Found, asked: Sequence[Mapping[str, Any]], root: Path, split: Split | None) -> None:
     """Add each region once: itself, or the first of its maps if it is missing."""
     maps: dict[str, list[str]] = {}
     for about in asked:
@@ -143,14 +152,25 @@ def _add_regions(found: _Found, asked: Sequence[Mapping[str, Any]], root: Path) 
     for base, variants in sorted(maps.items()):
         there = (name for name in (base, *sorted(variants)) if (root / "regions" / name).is_dir())
         folder = root / "regions" / next(there, base)
-        alt = f"Map of {base}: semantic classes in colours"
-        found.add("regions", base, partial(_thumbnail, folder), {"region": base, "alt": alt})
+        try:
+            manifest = region_files.read_manifest(folder)
+        except SasgeoError as error:
+            found.lacking[one_line(str(error))] += 1
+            continue
+        blocks = () if split is None else split.blocks_in(base)
+        lies = {
+            "region": base,
+            "alt": f"Map of {base}: semantic classes in colours",
+            "bounds_m": list(manifest.bounds_m),
+            "blocks": [{"name": one.id, "bounds_m": list(one.bounds_m)} for one in blocks],
+        }
+        found.add("regions", base, partial(_map, folder, manifest), lies)
 
 
-def _thumbnail(folder: Path) -> bytes:
-    manifest = region_files.read_manifest(folder)
-    overview = read_overview(folder / region_files.LAYERS, longest_cells=_THUMB_CELLS)
-    return fitted(thumbnail(manifest, overview), REGION_BYTES)
+def _map(folder: Path, manifest: Manifest) -> bytes:
+    """Return a map that fills its picture."""
+    colours = paint_overview(manifest, read_overview(folder / region_files.LAYERS, longest_cells=_MAP_CELLS))
+    return fitted(np.ascontiguousarray((255 * colours[..., ::-1]).round().astype(np.uint8)), REGION_BYTES)
 
 
 def _add_suites(found: _Found, asked: Sequence[Mapping[str, Any]], board: Board, root: Path) -> None:
@@ -257,10 +277,9 @@ def _flight_map(about: Mapping[str, Any], flight: str, views: Mapping[str, pd.Da
 
 
 def _add_cases(
-    found: _Found, board: Board, contrasts: Sequence[Contrast], asked: Sequence[Mapping[str, Any]], root: Path
+    found: _Found, board: Board, failures: pd.DataFrame, asked: Sequence[Mapping[str, Any]], root: Path
 ) -> None:
     about = {(str(item["suite"]), str(item["region"])): item for item in asked}
-    failures = _failures(board, contrasts)
     failures = failures[[key in about for key in zip(failures["suite"], failures["region"], strict=True)]]
     if not len(failures):
         return
@@ -284,9 +303,9 @@ def _add_cases(
 
 
 def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
-    """Return every failure of the matchers that a board shows, with its class."""
+    """Return every failure of the ranked matchers of a board, with its class."""
     frames = [pd.DataFrame(columns=list(COLUMNS))]
-    for name in shown_matchers(board.table, contrasts):
+    for name in ranked_matchers(board.table):
         with board.failures.of(f"cases of {name}"):
             if name in board.scores:
                 rejector = operating_rejector(board.judged, name, contrasts)

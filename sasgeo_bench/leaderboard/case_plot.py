@@ -21,8 +21,7 @@ from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.regions.evidence import Evidence, footprint
-from sasgeo_bench.regions.preview import paint_overview, scale_bar
-from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.preview import scale_bar
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.segmented import Segmented
@@ -32,8 +31,6 @@ WEBP: Final = ".webp"
 PNG: Final = ".png"
 _QUALITIES: Final = (80, 65, 50, 35, 20, 10)
 _SCALES: Final = (1.0, 0.75, 0.5)
-_THUMB_INCHES: Final = 3.2
-_FOOT_INCHES: Final = 0.16
 
 
 def pixels_of(figure: Figure) -> NDArray[np.uint8]:
@@ -79,25 +76,6 @@ def _encoded(kind: str, pixels: NDArray[np.uint8], settings: list[int]) -> bytes
         message = f"a picture cannot be written as {kind}"
         raise StoreError(message)
     return bytes(data)
-
-
-def thumbnail(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return a region as a small picture with its attribution below, as of `pixels_of`.
-
-    `overview`, shape (C, rows, cols), is a coarse level of the layers.
-    """
-    rows, cols = overview.shape[1:]
-    scale = _THUMB_INCHES / max(rows, cols)
-    with styled():
-        figure = new_figure((max(cols * scale, 1.6), rows * scale + _FOOT_INCHES), dpi=_DPI)
-        chart = figure.subplots()
-        chart.imshow(paint_overview(manifest, overview), interpolation="antialiased")
-        chart.set_axis_off()
-        chart.set_anchor("W")
-        figure.supxlabel(manifest.attribution, x=0.01, ha="left", fontsize=5.5, color=GREY)
-        engine: Any = figure.get_layout_engine()  # without types
-        engine.set(w_pad=0, h_pad=0.02)
-        return pixels_of(figure)
 
 
 MOST_MODES: Final = 8  # bars of an answer; a list may be longer

@@ -39,6 +39,15 @@ from sasgeo_bench.scoring.rejection import OWN
 
 BOTH: Final = "also without the stress"
 FAILURES: Final = ("aliased", "aged", "occluded", "absent accepted", "right but not accepted", BOTH, "other")
+MEANINGS: Final = {  # of the classes, for whoever looks at them; above in full
+    "aliased": "wrong and accepted, where the map has a place much alike",
+    "aged": "right on the map of the day, wrong where more of the map has changed",
+    "occluded": "right in the open, wrong where more of the view is hidden",
+    "absent accepted": "an answer is accepted although the place is not on the map",
+    "right but not accepted": "the answer is right, and the rejector refuses it",
+    BOTH: "as wrong without the stress, which is not to blame",
+    "other": "no right answer, for no reason that is told here",
+}
 OPERATING: Final = "accepted_0.05"  # column of judged rows
 COLUMNS: Final = ("query_id", "matcher", "failure", "suite", "region", "kind")
 MOST_CASES: Final = 60  # of a board

@@ -214,7 +214,12 @@ def score_all(
     with laid_out(request) as laid:
         figures = partial(figures_extra, tell=tell, contrasts=request.contrasts, split=request.split)
         pictures = partial(
-            pictures_extra, tell=tell, root=request.root, contrasts=request.contrasts, has_cases=has_cases
+            pictures_extra,
+            tell=tell,
+            root=request.root,
+            contrasts=request.contrasts,
+            split=request.split,
+            has_cases=has_cases,
         )
         record = {} if kept is None else read_board(kept)[0]
         board = make_board(replace(laid, extras=(figures, pictures), kept=record), tell=tell, progress=progress)

@@ -21,7 +21,7 @@ from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import SITE_FOLDERS, fresh_folder, hashes_of, list_files, locked, resolve_link
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import MOST_VALUES, read_schema, read_table, write_table
-from sasgeo_bench.leaderboard.board_files import BOARD_FILES
+from sasgeo_bench.leaderboard.board_files import ANSWERS, BOARD_FILES
 from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.matching import learned_file
 from sasgeo_bench.matching.learned_file import TrainingRecord
@@ -70,7 +70,7 @@ _TEXTS: Final = (  # columns of short texts that come again
 )
 # Nearly all bits of these are noise, and only their first bytes are alike: split into bytes they are a tenth smaller.
 _SPLIT: Final = ("candidates.list.element.score", "latency_s")
-_MADE_AGAIN: Final = (".csv", ".tex")  # of a board: the same tables for other programs
+_MADE_AGAIN: Final = (".csv", ".tex")  # of a board: the same tables for other programs; `answers` are stored anyway
 _MEND: Final = "fetch the results again"
 _AGAIN: Final = "make the queries again"
 _AND: Final = "; "
@@ -152,7 +152,7 @@ def _copy_tables(board: Path, folder: Path) -> None:
     """Copy the tables and texts of a board, tables as small as they get."""
     for name in list_files(board, without=SITE_FOLDERS):  # refuses links: they would be followed to what they lead to
         source = board / name
-        if name not in BOARD_FILES or source.suffix in _MADE_AGAIN:
+        if name not in BOARD_FILES or source.suffix in _MADE_AGAIN or source.stem == ANSWERS:
             continue
         if source.suffix == ".parquet":
             table = read_table(source, mend=BOARD_MEND, most_rows=MOST_VALUES)

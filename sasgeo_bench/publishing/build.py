@@ -13,7 +13,7 @@ from typing import Any, Final
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import SITE, resolve_link
-from sasgeo_bench.leaderboard.board_files import BOARD_FILES, FIGURES, LEADERBOARD, check_shape, read_board
+from sasgeo_bench.leaderboard.board_files import ANSWERS, BOARD_FILES, FIGURES, LEADERBOARD, check_shape, read_board
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Progress, Tell
@@ -32,7 +32,7 @@ from sasgeo_bench.publishing.site_files import (
 )
 from sasgeo_bench.publishing.site_pages import places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
-from sasgeo_bench.publishing.site_source import Case, Picture, Pictures, SiteFigure, SiteSource, Spot
+from sasgeo_bench.publishing.site_source import Case, Picture, Pictures, RegionMap, SiteFigure, SiteSource, Spot
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
@@ -149,6 +149,7 @@ def _source(files: BoardFiles, tell: Tell) -> SiteSource:
         scores=tables["scores"],
         protection=tables["protection"],
         acceptance=tables["acceptance"],
+        answers=tables[ANSWERS],
         registered=_registered(files, spec),
         reasons={} if spec is None else {item.name: " ".join(item.why.split()) for item in spec.contrast},
         figures=files.figures,
@@ -223,8 +224,17 @@ def _pictures(record: Mapping[str, Any]) -> Pictures:
 
     of_kind = {
         kind: tuple(Picture(of=str(item.get(what, "")), **plain(item, "file", "alt")) for item in record.get(kind, ()))
-        for kind, what in (("regions", "region"), ("suites", "suite"), ("strips", "suite"), ("flights", "suite"))
+        for kind, what in (("suites", "suite"), ("strips", "suite"), ("flights", "suite"))
     }
+    regions = tuple(
+        RegionMap(
+            of=str(item.get("region", "")),
+            **plain(item, "file", "alt"),
+            bounds_m=item.get("bounds_m") and tuple(item["bounds_m"]),
+            blocks_m={str(block["name"]): tuple(block["bounds_m"]) for block in item.get("blocks", ())},
+        )
+        for item in record.get("regions", ())
+    )
     cases = tuple(
         Case(
             **plain(item, "query_id", "matcher", "failure", "file", "alt", "suite", "region", "kind"),
@@ -232,4 +242,4 @@ def _pictures(record: Mapping[str, Any]) -> Pictures:
         )
         for item in record.get("cases", ())
     )
-    return Pictures(**of_kind, cases=cases)
+    return Pictures(**of_kind, regions=regions, cases=cases)

@@ -6,6 +6,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import resources
 from typing import Any, Final
 
 import pandas as pd
@@ -19,6 +20,9 @@ from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejecti
 from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.publishing.site_maps import OUTCOMES as ANSWER_OUTCOMES
+from sasgeo_bench.publishing.site_maps import place_maps
 from sasgeo_bench.publishing.site_pages import (
     figures_by_kind,
     matchers_of,
@@ -159,6 +163,7 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
 
 
 ASSETS: Final = ("site.css", "site.js")
+MAP_ASSETS: Final = ("leaflet.css", "leaflet.js")  # as they came, with their licence
 FAILURES: Final = (  # in the order they are shown; others follow
     *("aliased", "aged", "occluded", "absent accepted", "right but not accepted", "also without the stress"),
 )
@@ -168,6 +173,7 @@ _NAMES: Final = {  # pages that every site has or may have, in the order of the 
     "matchers.html": "Matchers",
     "rejection.html": "Rejection",
     "figures.html": "Figures",
+    "map.html": "Map",
     "failures.html": "Failures",
     "regions.html": "Regions",
     "ageing.html": "Ageing",
@@ -193,12 +199,14 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     """
     templates = _environment()
     book = Book.of(source.board, source.about, source.scores)
+    maps = place_maps(source)
     rejection = rejection_tables(source.board)
     protection = protection_tables(source.protection)
     acceptance = acceptance_tables(source.acceptance)
     optional = {
         "rejection.html": rejection or protection,
         "figures.html": source.figures,
+        "map.html": maps,
         "failures.html": source.pictures.cases,
     }
     there = [name for name in _NAMES if optional.get(name, True)]
@@ -217,6 +225,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
         "rejection.html": {"tables": rejection, "acceptance": acceptance, "protection": protection, "kinds": kinds},
         "figures.html": {"kinds": kinds},
+        "map.html": {"places": list(maps), "outcomes": ANSWER_OUTCOMES, "classes": load_taxonomy().classes},
         "failures.html": {"groups": groups_of(source.pictures.cases), "total": len(source.pictures.cases)},
         "regions.html": {"table": region_table(source)},
         "ageing.html": {"table": rate_table(source.rates), "kinds": kinds},
@@ -231,7 +240,17 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         pages[suite.page] = _render(templates, "suite.html", suite.page, common | {"suite": suite})
     for matcher in matchers:
         pages[matcher.page] = _render(templates, "matcher.html", matcher.page, common | {"matcher": matcher})
-    return pages | {name: templates.get_template(name).render() for name in ASSETS}
+    pages |= {name: templates.get_template(name).render() for name in ASSETS}
+    return pages | _map_files(templates, {place.file: script for place, script in maps.items()})
+
+
+def _map_files(templates: Environment, scripts: Mapping[str, str]) -> dict[str, str]:
+    """Return what the page with the map loads; nothing for a board without one."""
+    if not scripts:
+        return {}
+    vendor = resources.files("sasgeo_bench.publishing").joinpath("vendor")
+    kept = {name: vendor.joinpath(name).read_text(encoding="utf-8") for name in (*MAP_ASSETS, "LICENSE-leaflet")}
+    return {"map.js": templates.get_template("map.js").render(), **kept, **scripts}
 
 
 def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:

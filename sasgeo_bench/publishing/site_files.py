@@ -23,6 +23,7 @@ from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import (
     ACCEPTANCE,
+    ANSWERS,
     BOARD,
     FIGURES,
     LEADERBOARD,
@@ -33,6 +34,7 @@ from sasgeo_bench.leaderboard.board_files import (
 )
 from sasgeo_bench.leaderboard.board_pictures import KINDS
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
+from sasgeo_bench.publishing.site_maps import MAPS
 from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import json_text, one_line
@@ -93,7 +95,7 @@ def _fault_of(item: ET.Element) -> str | None:
 PICTURES: Final = "pictures"
 FILES: Final = "files"
 MOST_BYTES: Final = 3_000_000  # of the pages of a site with their figures; a larger one is reported
-_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION)
+_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION, ANSWERS)
 _OFFERED: Final = {  # files for download, with descriptions
     f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
     f"{LEADERBOARD}.csv": "the same for a spreadsheet",
@@ -107,6 +109,7 @@ _OFFERED: Final = {  # files for download, with descriptions
     "paper.md": "the paper's experiment next to its Table II",
     "paper.parquet": "the same as a table",
     f"{SCORES}.parquet": "a row for each query of each matcher",
+    f"{ANSWERS}.parquet": "true place and fix of each query of each matcher, and the class of its failure",
     BOARD: "versions, hashes and cards",
 }
 _LARGE_BYTES: Final = 500_000  # text beyond is offered as .gz
@@ -258,7 +261,7 @@ def _check_picture(folder: Path, name: str) -> None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Written:
-    """Result of writing a site: folder, bytes of pages and figures, of pictures and of downloads, number of pages."""
+    """Result of writing a site: folder, bytes of pages and figures, of pictures and maps, of downloads; pages."""
 
     folder: Path
     site_bytes: int
@@ -338,7 +341,9 @@ def write_site(
                 _put(scratch / name, data)
             for name, path in pictures.items():
                 _put(scratch / name, path.read_bytes())
-        picture_bytes = sum((target / name).stat().st_size for name in pictures)
+        picture_bytes = sum(
+            path.stat().st_size for kind in (PICTURES, MAPS) for path in (target / kind).rglob("*") if path.is_file()
+        )
     except OSError as error:
         message = (
             f"{target} cannot be written ({error.strerror or error}): check the free space and your rights, and "
@@ -347,7 +352,7 @@ def write_site(
         raise StoreError(message) from error
     return Written(
         folder=target,
-        site_bytes=sum(len(data) for name, data in files.items() if not name.startswith(f"{FILES}/")),
+        site_bytes=sum(len(data) for name, data in files.items() if not name.startswith((f"{FILES}/", f"{MAPS}/"))),
         download_bytes=sum(len(item.data) for item in board.downloads),
         picture_bytes=picture_bytes,
         pages=sum(name.endswith(".html") for name in pages),

@@ -53,6 +53,14 @@ class Picture:
     alt: str
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegionMap(Picture):
+    """A map that fills its picture: its edges (west, south, east, north), and those of its blocks by name, metres."""
+
+    bounds_m: tuple[float, float, float, float] | None = None
+    blocks_m: Mapping[str, tuple[float, float, float, float]] = field(default_factory=dict)
+
+
 _OF_REJECTOR: Final = {"p_false_": "P(false)", "order_": "order"}
 _VERDICT: Final = "accepted_"
 _LEFT_OUT: Final = (_VERDICT, "told_hpl_")
@@ -95,7 +103,7 @@ class Case:
 class Pictures:
     """Pictures in a board's folder `pictures/`; empty if there is none."""
 
-    regions: tuple[Picture, ...] = ()
+    regions: tuple[RegionMap, ...] = ()
     suites: tuple[Picture, ...] = ()
     strips: tuple[Picture, ...] = ()
     flights: tuple[Picture, ...] = ()
@@ -143,6 +151,7 @@ class SiteSource:
     scores: pd.DataFrame = field(default_factory=pd.DataFrame)
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)
     acceptance: pd.DataFrame = field(default_factory=pd.DataFrame)
+    answers: pd.DataFrame = field(default_factory=pd.DataFrame)
     registered: tuple[Contrast, ...] = ()
     reasons: Mapping[str, str] = field(default_factory=dict)
     figures: tuple[SiteFigure, ...] = ()

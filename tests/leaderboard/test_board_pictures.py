@@ -27,8 +27,10 @@ from sasgeo_bench.leaderboard.case_plot import case_pixels, fitted
 from sasgeo_bench.leaderboard.cases import words_of
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.tasks import task_files
+from sasgeo_bench.tasks.split import find_split
 
 HASH = "0123456789ab"
 ASKED = (("absent", "town-riverside"), ("alias", "town-grid+alias"))
@@ -120,9 +122,42 @@ def test_each_case_says_what_it_is_of_in_plain_numbers_and_words(made):
     assert wrong["said"].get("error_m", np.inf) == pytest.approx(error_m)
 
 
+def test_every_answer_has_its_place_and_every_failure_its_class(made):
+    folder, _, board = made
+    answers = pd.read_parquet(folder / "answers.parquet")
+    scores = board.scores["mine"]
+    asked = scores[scores["role"] != "falsifier"].set_index("query_id")
+    assert set(answers["query_id"]) == set(asked.index)
+    off_m = np.hypot(
+        answers["fix_easting_m"] - answers["true_easting_m"], answers["fix_northing_m"] - answers["true_northing_m"]
+    )
+    expected = asked.loc[answers["query_id"], "position_error_m"].to_numpy(float)
+    is_known = ~np.isnan(expected)  # of localization: candidates of a retrieval are right or wrong
+    assert is_known.any()
+    found = off_m.fillna(np.inf).to_numpy()[is_known]  # no answer is infinitely far off
+    assert found == pytest.approx(expected[is_known], abs=0.2)
+    is_wrong = ~asked.loc[answers["query_id"], "is_right"].to_numpy(bool) & answers["is_present"].to_numpy(bool)
+    assert (answers.loc[is_wrong, "failure"] != "").all()
+    cases = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))["cases"]
+    classes = answers.set_index(["query_id", "matcher"])["failure"]
+    assert all(classes[one["query_id"], one["matcher"]] == one["failure"] for one in cases)
+
+
+def test_a_map_says_where_it_lies_and_which_blocks_it_has(made, root):
+    _, _, board = made
+    extra = pictures_extra(board, tell=lambda _: None, root=root, split=find_split("crossfit"), has_cases=False)
+    first = json.loads(extra.pictures["pictures.json"])["regions"][0]
+    assert tuple(first["bounds_m"]) == read_manifest(root / "regions" / first["region"]).bounds_m
+    edges = np.array([one["bounds_m"] for one in first["blocks"]])
+    assert [*edges[:, :2].min(axis=0), *edges[:, 2:].max(axis=0)] == first["bounds_m"]
+    assert first["blocks"][0]["name"] == f"{first['region']}/0-0"
+
+
 def test_without_cases_no_truth_is_shown(made, root):
     _, _, board = made
-    files = pictures_extra(board, tell=lambda _: None, root=root, has_cases=False).pictures
+    extra = pictures_extra(board, tell=lambda _: None, root=root, has_cases=False)
+    assert not extra.tables
+    files = extra.pictures
     assert {name.partition("/")[0] for name in files} == {"pictures.json", "regions", "suites"}
     assert json.loads(files["pictures.json"])["cases"] == []
 

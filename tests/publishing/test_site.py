@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of a site: every page has its own name, ties are told, what is registered is said in words."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -14,13 +15,14 @@ from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
 from sasgeo_bench.publishing.site import contrasts_of
+from sasgeo_bench.publishing.site_maps import place_maps
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
-from sasgeo_bench.publishing.site_source import SiteSource, Spot
+from sasgeo_bench.publishing.site_source import Case, Pictures, RegionMap, SiteSource, Spot
 from sasgeo_bench.scoring.contrasts import contrast_frame
 from sasgeo_bench.scoring.controls import Falsifier, falsifier_frame
 from sasgeo_bench.scoring.verdicts import Finding
-from tests.handmade import HOSTILE, MARKUP, about_of, card_of, entry_of, many_rows
+from tests.handmade import BOUNDS_M, HOSTILE, MARKUP, about_of, answers_of, card_of, entry_of, many_rows
 
 FINDING = Finding(
     name="age",
@@ -297,3 +299,19 @@ def test_the_training_of_a_matcher_is_listed_by_region_because_tasks_are_hundred
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"learned": [learned]}})
     (page,) = matchers_of(given, book_of(given))
     assert page.training == ("Trained on 24 queries of porto; then tested in 3 tasks on eschen, vaduz.",)
+
+
+def test_a_place_has_its_answers_in_metres_from_the_corner_of_its_map():
+    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
+    unknown = RegionMap(of="balzers", file="balzers.png", alt="")
+    cases = (Case(query_id="q1", matcher="graph", failure="aliased", file="a.png", alt=""),)
+    pictures = Pictures(regions=(unknown, item), cases=cases)
+    whole = replace(source(), answers=answers_of([MARKUP]), pictures=pictures)
+    ((place, script),) = place_maps(whole).items()
+    assert (place.region, place.queries) == ("vaduz", 3)
+    said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
+    assert said["queries"][0] == ["q0", "real-age", "vaduz@2015-07-27", "S1", 1, 128.0, 100.0, 200.0, 90.0]
+    assert said["answers"] == {MARKUP: [[0, 0, 100.0, 200.0, 90.0], [1, 1, 400.0, 200.0, 90.0], [2, -1]]}
+    assert said["cases"] == {"1": 1}
+    assert script.isascii()
+    assert place_maps(replace(whole, answers=pd.DataFrame())) == {}

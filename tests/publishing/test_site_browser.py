@@ -3,6 +3,7 @@
 
 import gzip
 import json
+import shutil
 import threading
 import time
 from functools import partial
@@ -218,6 +219,47 @@ def test_without_scripts_everything_can_be_read_and_nothing_pretends_to_work(pag
     page.open(address(site, "failures.html"))
     assert page.value("[...document.querySelectorAll('article.case')].every((one) => one.offsetHeight > 0)")
     page.scripts(are_on=True)
+
+
+TOLD = "document.getElementById('told').textContent"
+
+
+def test_the_map_turns_through_the_queries_and_the_address_keeps_which(page, site):
+    page.open(address(site, "map.html") + "?outcome=&matcher=raster")
+    until(page, f"{TOLD} === '1 of 3 queries'")
+    assert page.value("document.getElementById('which').textContent") == "as it should be"
+    assert page.value("document.querySelectorAll('#map path.leaflet-interactive').length") >= 3
+    page.value("document.getElementById('next').focus(), 0")
+    page.press("Enter")
+    until(page, f"{TOLD} === '2 of 3 queries'")
+    assert page.value("document.getElementById('which').textContent") == "aliased"
+    assert "300.0 m from where the view was taken" in page.value("document.getElementById('facts').textContent")
+    assert page.value("document.querySelectorAll('.crop').length") == 3  # the place, the answer, a rival's
+    assert page.value("location.search") == "?place=vaduz&matcher=raster&outcome=&query=q1"
+    page.reload()
+    until(page, f"{TOLD} === '2 of 3 queries'")
+    page.value("(document.getElementById('next').click(), 0)")
+    assert page.value("document.getElementById('which').textContent") == "unknown"  # a class of another version
+    facts = page.value("document.getElementById('facts').textContent")
+    assert "Answernone" in facts
+    assert "the right answer is none" in facts
+    assert page.faults == []
+
+
+def test_a_map_that_is_lost_is_told(page, site, tmp_path):
+    less = shutil.copytree(site, tmp_path / "less")
+    for path in (less / "maps").iterdir():
+        path.unlink()
+    page.open(address(less, "map.html"))
+    until(page, f"{TOLD}.startsWith('The map of this place cannot be loaded (maps/vaduz-0.js)')")
+
+
+def test_names_with_markup_on_the_map_are_text(page, site):
+    page.open(address(site, "map.html") + f"?outcome=1&matcher={quote(HOSTILE)}")
+    until(page, f"{TOLD} === '1 of 1 queries'")
+    assert page.value("document.getElementById('choice').elements.matcher.value") == HOSTILE
+    assert page.value("document.querySelectorAll('main img:not(.leaflet-image-layer), main b b').length") == 0
+    assert page.faults == []
 
 
 def test_names_with_markup_are_text_in_the_browser_too(page, site):

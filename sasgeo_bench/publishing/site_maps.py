@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The maps of a site that can be moved: the queries and answers of each place, as scripts that a page loads one by one.
+
+A script instead of a JSON file: a page that is opened from a disk may load no other kind of data.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import pandas as pd
+
+from sasgeo_bench.leaderboard.cases import FAILURES, MEANINGS
+from sasgeo_bench.leaderboard.tables import file_stem
+from sasgeo_bench.publishing.site_source import RegionMap, SiteSource
+from sasgeo_bench.tasks.query import base_of
+from sasgeo_bench.texts import plain
+
+MAPS: Final = "maps"
+SOUND: Final = "as it should be"  # neither a failure nor a crash
+OUTCOMES: Final = {SOUND: "right, or rightly none", **{name: MEANINGS[name] for name in FAILURES}}
+_NUMBERS: Final = {name: at for at, name in enumerate(OUTCOMES)}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaceMap:
+    """A place with a map and answers: name of its script in `maps/`, its title, and how many queries it has."""
+
+    region: str
+    file: str
+    title: str
+    queries: int
+
+
+def place_maps(source: SiteSource) -> dict[PlaceMap, str]:
+    """Return the places of a board that have a map and answers, with the text of the script of each.
+
+    Coordinates in a script are metres from the south-western corner of its map.
+    """
+    if not len(source.answers):
+        return {}
+    answers = source.answers.assign(base=source.answers["region"].map(base_of))
+    pictures = {plain(case.query_id): at for at, case in enumerate(source.pictures.cases, start=1)}
+    found = {}
+    for at, item in enumerate(one for one in source.pictures.regions if one.bounds_m is not None):
+        part = answers[answers["base"] == item.of]
+        if not len(part):
+            continue
+        spot = source.spots.get(item.of)
+        title = item.of if spot is None else spot.title
+        place = PlaceMap(
+            region=item.of,
+            file=f"{MAPS}/{file_stem(item.of)}-{at}.js",
+            title=plain(title),
+            queries=int(part["query_id"].nunique()),
+        )
+        found[place] = _script(place, item, part, pictures)
+    return found
+
+
+def _script(place: PlaceMap, item: RegionMap, answers: pd.DataFrame, cases: Mapping[str, int]) -> str:
+    west_m, south_m, east_m, north_m = item.bounds_m or (0.0,) * 4
+    queries = answers.drop_duplicates("query_id").sort_values("query_id", ignore_index=True)
+    number = {query_id: at for at, query_id in enumerate(queries["query_id"])}
+    content: dict[str, Any] = {
+        "picture": f"pictures/{item.file}",
+        "size_m": [east_m - west_m, north_m - south_m],
+        "blocks": {
+            plain(name): [left - west_m, low - south_m, right - west_m, high - south_m]
+            for name, (left, low, right, high) in item.blocks_m.items()
+        },
+        "queries": list(_queries(queries, west_m, south_m)),
+        "cases": {str(number[name]): at for name, at in cases.items() if name in number},
+        "answers": {
+            plain(str(name)): [
+                [number[row["query_id"]], _outcome(row), *_point(row, "fix", west_m, south_m)]
+                for row in part.to_dict("records")
+            ]
+            for name, part in answers.groupby("matcher", sort=True)
+        },
+    }
+    text = json.dumps(content, separators=(",", ":"), allow_nan=False)  # ASCII alone
+    return f"showPlace({json.dumps(place.file)}, {text});\n"
+
+
+def _queries(rows: pd.DataFrame, west_m: float, south_m: float) -> Iterator[list[Any]]:
+    """Yield id, suite, map, what was done to it, whether its place is on the map, side of its view, and true pose."""
+    for row in rows.to_dict("records"):
+        words = [plain(str(row[name])) for name in ("query_id", "suite", "region", "kind")]
+        yield [*words, int(row["is_present"]), round(float(row["view_m"]), 1), *_point(row, "true", west_m, south_m)]
+
+
+def _outcome(row: Mapping[Any, Any]) -> int:
+    """Return the number of an outcome in `OUTCOMES`, -1 for a class that this version does not know."""
+    return _NUMBERS.get(row["failure"] or SOUND, -1)
+
+
+def _point(row: Mapping[Any, Any], what: str, west_m: float, south_m: float) -> list[float | None]:
+    """Return easting, northing and yaw in metres and degrees from the corner; nothing where there is no pose."""
+    easting_m, northing_m, yaw_deg = (float(row[f"{what}_{name}"]) for name in ("easting_m", "northing_m", "yaw_deg"))
+    if math.isnan(easting_m):
+        return []
+    return [round(easting_m - west_m, 1), round(northing_m - south_m, 1), round(yaw_deg, 1)]

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.board import Board
+from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.plugins import shipped_names
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskManifest
@@ -22,7 +23,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.rows import is_unranked, name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.scoring.submission_files import list_submissions, read_card, read_submission, write_submission
+from sasgeo_bench.scoring.submission_files import list_submissions, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
@@ -51,7 +52,7 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     `tell` gets a line on misses and on controls that are not answered. Raise `ConfigError` if the card does not fit the
     board or the runs, or the predictions hold faults; `StoreError` if something cannot be read or written.
     """
-    card = request.card if isinstance(request.card, Card) else read_card(request.card)
+    card = request.card if isinstance(request.card, Card) else read_card_file(request.card)
     if not is_pack(request.board):
         message = f"{request.board} holds no stored results: name those of the board, as in --for docs/results/demo"
         raise StoreError(message)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from sasgeo_bench.cli.console import read_date, say, shown_progress, tell
-from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
+from sasgeo_bench.cli.options import ExtractFolders, Options, Out
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.experiments.board_queries import BoardRequest, draw_board
@@ -31,7 +31,6 @@ class ReleaseOptions(Options):
         Path | None, typer.Option(help="file of the pipeline that made the board; default: the shipped one")
     ] = None
     extracts: ExtractFolders = None
-    region_files: RegionFolders = None
     sealed_seed_file: SealedSeedFile = None
     jobs: Annotated[int, typer.Option(min=1, help="processes that draw the queries of a board")] = 1
     suites: Annotated[
@@ -85,7 +84,6 @@ def _queries_of(options: ReleaseOptions, board: Path) -> BoardTasks:
         out=options.out,
         pipeline=options.pipeline,
         extract_folders=tuple(options.extracts or ()),
-        region_folders=tuple(options.region_files or ()),
         sealed=sealed_seed(options.sealed_seed_file, tell=tell),
         jobs=options.jobs,
     )

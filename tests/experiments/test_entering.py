@@ -2,6 +2,7 @@
 """A matcher enters a published board: it is asked the board's own queries, and its row stands beside the others."""
 
 import datetime as dt
+import re
 from dataclasses import replace
 
 import pandas as pd
@@ -45,6 +46,16 @@ class Shipped(PriorCentre):
     """A matcher that takes a name that is taken."""
 
     card = replace(PriorCentre.card, name="sasgeo")
+
+
+class Lost(PriorCentre):
+    """A matcher that has no answer to anything."""
+
+    card = replace(PriorCentre.card, name="lost")
+
+    def match(self, query, *, top_k):  # noqa: ARG002 - of every matcher
+        message = f"no road\nnear {query.track}"
+        raise KeyError(message)
 
 
 def silent(line):
@@ -228,6 +239,14 @@ def test_all_is_asked_again_on_demand_and_a_changed_matcher_is_told(request_, en
     monkeypatch.setattr(Middle, "card", replace(Middle.card, version="9"))
     enter(plan_entry(request_, tell=silent), into=tmp_path / "middle", tell=lines.append)
     assert any(": all is asked anew, as " in line for line in lines)
+
+
+def test_crashes_are_told_with_an_example_on_one_line(request_, tmp_path):
+    lines = []
+    request = replace(request_, matcher=f"{__name__}:Lost")
+    enter(plan_entry(request, tell=silent), into=tmp_path / "lost", tell=lines.append)
+    (told,) = [line for line in lines if "ended as crash" in line]
+    assert re.fullmatch(r"  \d+ ended as crash, the first with the message [\"'].*no road.*near \w+.*", told)
 
 
 def test_extracts_that_are_missing_are_listed_at_once(request_, monkeypatch):

@@ -26,6 +26,7 @@ from sasgeo_bench.scoring.submission_files import check_submission_folder, is_su
 from sasgeo_bench.tasks.split import HALVES, Split
 from sasgeo_bench.texts import one_line
 
+_WITHOUT: Final = "; or leave their regions out by --without, which counts as misses"
 _LONGEST_MESSAGE: Final = 120  # characters of an example
 
 
@@ -106,7 +107,7 @@ def enter(
         As `check_entry`, a run and a submission do.
     """
     folder = check_entry(entry, into=into)
-    entry_cost.fetch_extracts(entry.plan)
+    entry_cost.fetch_extracts(entry.plan, mend=_WITHOUT)
     tasks, controls = draw_all(entry.plan, tell=tell, progress=progress)
     same = same_queries(entry.stored, [*tasks, *controls], tell=tell)
     plan = replace(entry.plan, only=same)

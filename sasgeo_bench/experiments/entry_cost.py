@@ -14,7 +14,7 @@ from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, base_of
 
-# Measured with the boards `towns` and `modules` on one core of a cloud machine of 2025: a guide, no promise.
+# Measured with the boards `towns` and `modules` on one shared core: a guide, no promise.
 _DRAW_S: Final = 0.1  # of a query
 _BUILD_S: Final = 2.0  # of a map
 _SCORE_S: Final = 0.002  # of a scored row of the board: read, scored, resampled
@@ -81,22 +81,26 @@ def missing_extracts(plan: PipelinePlan) -> tuple[str, ...]:
     return missing_files(extracts, folders=plan.requests[0].extract_folders if plan.requests else ())
 
 
-def fetch_extracts(plan: PipelinePlan) -> None:
-    """Download missing extracts where a server has them; raise `ConfigError` that names all that are still missing."""
+def fetch_extracts(plan: PipelinePlan, *, mend: str = "") -> None:
+    """Download missing extracts where a server has them.
+
+    Raise `ConfigError` that names all that are still missing; `mend` is what else can be done.
+    """
     lost = set(missing_extracts(plan))
     folders = plan.requests[0].extract_folders if plan.requests else ()
-    found = {one.file: one for request in plan.requests for one in request.extracts if one.town is None} if lost else {}
-    failed = []
-    for extract in found.values():
+    named = {one.file: one for request in plan.requests for one in request.extracts if one.town is None} if lost else {}
+    failed: set[str] = set()
+    for extract in named.values():
         names = {extract.file, *(part.file for part in extract.also)} & lost
+        if not names:
+            continue
         try:
-            _ = names and (find_extract(extract, folders=folders), find_parts(extract, folders=folders))
+            find_extract(extract, folders=folders)
+            find_parts(extract, folders=folders)
         except ExtractError:
-            failed += sorted(names)
+            failed |= names
     if failed:
-        raise ConfigError(
-            missing_text(sorted(failed)) + "; or leave their regions out by --without, which counts as misses"
-        )
+        raise ConfigError(missing_text(sorted(failed)) + mend)
 
 
 def missing_text(names: Sequence[str]) -> str:

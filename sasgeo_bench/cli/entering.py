@@ -32,7 +32,9 @@ class EnterOptions(Options):
     ] = None
     again: Annotated[bool, typer.Option("--again", help="ask queries that were answered before, too")] = False
     jobs: Annotated[int, typer.Option(min=1, help="processes of the matcher")] = 1
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what it costs, and stop")] = False
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="check all that can be checked, say what it costs, and stop")
+    ] = False
     out: Out = Path("out")
 
 

@@ -15,6 +15,7 @@ from .geometry.pose import rotation as rotation
 from .geometry.pose import wrap_deg as wrap_deg
 from .matching.belief_fix import fix_of as fix_of
 from .matching.belief_fix import followed as followed
+from .matching.card_file import read_card as read_card
 from .matching.controls.blind import at_place as at_place
 from .matching.controls.blind import is_blind as is_blind
 from .matching.controls.blind import middle_m as middle_m

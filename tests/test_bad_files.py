@@ -38,6 +38,7 @@ from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
 from sasgeo_bench.leaderboard.board_files import check_shape
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
+from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.learned_file import read_learned
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import Card, Submission, TaskManifest, example_card
@@ -54,7 +55,7 @@ from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_r
 from sasgeo_bench.running.testing import TinyPlace
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel as Learnt
 from sasgeo_bench.scoring.entries import find_entries
-from sasgeo_bench.scoring.submission_files import read_card, read_submission, write_submission
+from sasgeo_bench.scoring.submission_files import read_submission, write_submission
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import read_split_file
 from tests.handmade import card_of, full_board, put_board, put_pictures
@@ -284,7 +285,7 @@ FORMATS = {
     "card.toml": Format(
         file="card.toml",
         make=written("card.toml", example_card()),
-        read=lambda folder: read_card(folder / "card.toml"),
+        read=lambda folder: read_card_file(folder / "card.toml"),
     ),
     "learnt.json": Format(
         file="learnt.json",

@@ -72,6 +72,7 @@ OTHERS = {
     r"^pip install -e my-(matcher|segmenter|tracker)$": "done by hand: an installation needs the package registry",
     r"^(sha256sum|install -m 600) ": "programs of the system",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",
+    r"^python answer\.py ": "tests/experiments/test_board_queries.py runs this program on a small board",
     r"^python benchmarks/segmenters\.py ": "minutes; tests/scoring/test_segmenter_program.py makes a small board",
     r"^python benchmarks/image_matchers\.py ": "minutes of matching, on a region with imagery and a task of pictures",
     r"^python benchmarks/open_numbers\.py ": "minutes; tests/baselines/test_tunable.py tries made-up systems",

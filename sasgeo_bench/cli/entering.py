@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command that enters a matcher on a published board."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +11,7 @@ from sasgeo_bench.cli.boards import check_controls, show_board
 from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
-from sasgeo_bench.experiments.entering import EntryRequest, cost_lines, enter, plan_entry
+from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, plan_entry
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,10 +20,6 @@ class EnterOptions(Options):
 
     board: Annotated[Path, typer.Argument(help="stored results of the board, as docs/results/systems")]
     matcher: Annotated[str, typer.Option(help="name of an installed matcher, or module:Class")]
-    card: Annotated[
-        Path | None,
-        typer.Option(help="card that says more than the matcher's own, as authors and code (submit --example-card)"),
-    ] = None
     into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/NAME of the card")] = None
     pipeline: Annotated[
         Path | None, typer.Option(help="file of the pipeline that made the board; default: the shipped one")
@@ -31,8 +27,14 @@ class EnterOptions(Options):
     extracts: ExtractFolders = None
     region_files: RegionFolders = None
     sealed_seed_file: SealedSeedFile = None
+    without: Annotated[
+        list[str] | None, typer.Option(help="region that is not asked and counts as misses; may be repeated")
+    ] = None
+    again: Annotated[bool, typer.Option("--again", help="ask queries that were answered before, too")] = False
     jobs: Annotated[int, typer.Option(min=1, help="processes of the matcher")] = 1
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="say what it costs, and stop")] = False
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="check all that can be checked, say what it costs, and stop")
+    ] = False
     out: Out = Path("out")
 
 
@@ -46,17 +48,20 @@ def enter_command(options: EnterOptions) -> None:
         extract_folders=tuple(options.extracts or ()),
         region_folders=tuple(options.region_files or ()),
         sealed=sealed_seed(options.sealed_seed_file, tell=tell),
+        without=tuple(options.without or ()),
+        jobs=options.jobs,
+        is_again=options.again,
     )
     entry = plan_entry(request, tell=tell)
-    entry = replace(entry, plan=replace(entry.plan, jobs=options.jobs))
+    check_entry(entry, into=options.into)
     for line in cost_lines(entry):
         (say if options.dry_run else tell)(line)
     if options.dry_run:
         return
     with shown_progress() as progress:
-        folder, board = enter(entry, card=options.card, into=options.into, tell=tell, progress=progress)
+        folder, board = enter(entry, into=options.into, tell=tell, progress=progress)
     show_board(board)
     say(folder)
-    tell(f"the board of both, with every figure: {options.out / 'boards' / f'{entry.board}-{folder.name}'}")
+    tell(f"the board of both, without pictures: {options.out / 'boards' / f'{entry.board}-{folder.name}'}")
     tell(f"next: look at your row, then open a pull request with {folder}")
     check_controls(board)

@@ -23,8 +23,8 @@ def new_matcher_command(
     folder: Annotated[Path | None, typer.Option("--into", help="an empty folder; default: one of that name")] = None,
 ) -> None:
     """Write a plugin package that passes check-matcher at once, for you to put your method into."""
-    target = lay_package(name, folder, plugin_files(name), check="check-matcher")
-    tell(f"later: run it, score it, and submit --card {target / 'card.toml'} (docs/howto/matcher.md walks the path)")
+    lay_package(name, folder, plugin_files(name), check="check-matcher")
+    tell(f"later: sasgeo-bench enter docs/results/systems --matcher {name} (docs/howto/matcher.md walks the path)")
 
 
 def lay_package(name: str, folder: Path | None, files: Mapping[str, str], *, check: str) -> Path:

@@ -2,7 +2,7 @@
 """The plan of a pipeline: what is up to date, what is to be drawn, and what each matcher is asked."""
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -16,6 +16,7 @@ from sasgeo_bench.experiments.sealed import Seal, seal_of
 from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.plugins import ORACLE, YARDSTICK, check_names, is_tracker
+from sasgeo_bench.matching.results import STATUSES
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files
@@ -46,7 +47,8 @@ class PipelinePlan:
     """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
     With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
-    cluster to run on instead. `seal` tells of sealed places, None without any.
+    cluster to run on instead. `seal` tells of sealed places, None without any. `only` are the hashes of the queries to
+    ask, all without it; with `is_again`, those that were answered before, too.
     """
 
     spec: PipelineFile
@@ -57,6 +59,8 @@ class PipelinePlan:
     dask: str | None = None
     private: PrivateSeed | None = None
     seal: Seal | None = None
+    only: Mapping[str, str] | None = None
+    is_again: bool = False
 
     @property
     def split(self) -> Split | None:
@@ -441,6 +445,8 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
             dask=plan.dask,
             is_oracle=is_oracle,
             hidden=plan.seed_files,
+            only=plan.only,
+            again=STATUSES if plan.is_again else (),
         )
     )
     if is_oracle and not is_unranked(whole.card.name):

@@ -17,6 +17,7 @@ from sasgeo_bench.leaderboard.board_tables import step_tables
 from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
 from sasgeo_bench.leaderboard.private_board import OnPrivate, seed_of
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables
+from sasgeo_bench.leaderboard.stored_figures import StoredFigures
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
@@ -57,7 +58,7 @@ class ScoreRequest:
     seed of the same pipeline to compare rows with. `kept` is the `board.json` of stored results: it keeps the version
     of their maps, and their results on a private seed where no private board is named; their sealed places, too.
     `sealed` is the record of sealed places (`openings.sealed_record`). `failed` names entries that failed before
-    scoring, and why.
+    scoring, and why. `stored` are figures of entries that are not fitted again.
     """
 
     predictions: Sequence[Path]
@@ -80,6 +81,7 @@ class ScoreRequest:
     kept: Mapping[str, Any] = field(default_factory=dict)
     sealed: Mapping[str, Any] = field(default_factory=dict)
     failed: Mapping[str, str] = field(default_factory=dict)
+    stored: StoredFigures | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

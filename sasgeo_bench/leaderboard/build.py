@@ -66,8 +66,13 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
             is_taught=entry.is_taught,
         )
         for entry in board.entries
+        if request.stored is None or entry.name not in request.stored.names
     ]
-    rejection = evaluate_rejectors(judgings, jobs=request.jobs, failures=failures, tell=tell, progress=progress)
+    is_whole = request.stored is None
+    rejection = evaluate_rejectors(
+        judgings, is_whole=is_whole, jobs=request.jobs, failures=failures, tell=tell, progress=progress
+    )
+    rejection = rejection if request.stored is None else request.stored.joined(rejection)
     figures = pd.concat([part for part in (*ranks, *costs, *rejection.rows) if len(part)], ignore_index=True)
     labels = {one.name: EntryLabel(one.version, one.hash, one.how, board.apart.get(one.name)) for one in board.entries}
     board = _validated(request, replace(board, table=with_entry_labels(figures, labels)), rejection)
@@ -224,8 +229,12 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
     """Return the board with results of rejectors, contrasts, falsifiers and protection levels."""
     failed, scores, draws = board.failures.found, board.scores, request.draws
     held = [item for item in request.contrasts if {item.first, item.second} <= scores.keys() or not failed]
-    findings = hold_contrasts(request.contrasts, scores, rejection.judged, draws=draws, failed=failed)
     falsifiers = hold_falsifiers(held, scores, draws=draws)
+    if request.stored is None:
+        findings = hold_contrasts(request.contrasts, scores, rejection.judged, draws=draws, failed=failed)
+        findings = with_causes(findings, gains_without_stress(falsifiers))
+    else:
+        findings = request.stored.findings
     levels = []
     for name in scores:
         with board.failures.of(f"protection levels of {name}"):
@@ -237,7 +246,7 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
         judged={key: frame for key, frame in rejection.judged.items() if len(frame)},
         remarks=rejection.remarks,
         acceptance=rejection.acceptance,
-        findings=with_causes(findings, gains_without_stress(falsifiers)),
+        findings=findings,
         falsifiers=falsifiers,
         protection=pd.concat(some, ignore_index=True) if some else pd.DataFrame(columns=list(PROTECTION_COLUMNS)),
     )

@@ -64,6 +64,10 @@ class MatcherCard:
         Known limits.
     trained_on : tuple of str
         Places its parameters come from; a row that was trained on a test place is set apart.
+    uses : tuple of str
+        What it looks at besides query and map, as in "imagery".
+    authors, contact, code : tuple of str, str, str
+        Of a submission: who made it, how to reach them, and the https address of the code.
 
     Raises
     ------
@@ -81,6 +85,10 @@ class MatcherCard:
     needs: tuple[Need, ...] = ()
     limits: str = ""
     trained_on: tuple[str, ...] = ()
+    uses: tuple[str, ...] = ()
+    authors: tuple[str, ...] = ()
+    contact: str = ""
+    code: str = ""
 
     def __post_init__(self) -> None:
         """Refuse a card without the facts that a reader of the board needs."""
@@ -94,8 +102,11 @@ class MatcherCard:
         if not self.tracks:
             message = "card: tracks is empty, name retrieval, localization or both"
             raise MatchError(message)
-        for place in self.trained_on:
-            check_line("trained_on", place)
+        for name in ("trained_on", "uses", "authors"):
+            for item in getattr(self, name):
+                check_line(name, item)
+        check_line("contact", self.contact)
+        check_line("code", self.code)
 
 
 def check_said(card: object) -> None:

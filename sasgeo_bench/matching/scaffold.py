@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.matching.card_file import CARD_FILE
 from sasgeo_bench.matching.plugins import KINDS, MATCHERS, shipped_names
-from sasgeo_bench.matching.submission import example_card
+from sasgeo_bench.matching.submission import EXAMPLE
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
@@ -62,7 +63,7 @@ _MATCHER: Final = '''\
 """The matcher {name}: here is where your method goes."""
 
 import numpy as np
-from sasgeo_bench import PRESENT, UNKNOWN, WITHHELD, LayerBits, Match, MatcherCard, Pose, Query, Region, observe
+from sasgeo_bench import PRESENT, UNKNOWN, WITHHELD, LayerBits, Match, Pose, Query, Region, observe, read_card
 
 STEPS = 9  # places a side of the lattice that is searched when no candidates are given
 
@@ -70,17 +71,7 @@ STEPS = 9  # places a side of the lattice that is searched when no candidates ar
 class {cls}:
     """Ranks places by how many seen cells the map has there too. A place to start from, no method to win with."""
 
-    card = MatcherCard(
-        name="{name}",
-        version="0.1.0",
-        title="{title}",
-        source="original",
-        ours="all of it",
-        licence="MIT",
-        tracks=("retrieval", "localization"),
-        needs=("position",),
-        limits="looks at a coarse lattice of places, with the heading of the prior alone",
-    )
+    card = read_card(__file__)  # card.toml, beside this file
 
     def prepare(self, region: Region, learned: str | None) -> None:
         """Keep the map; called once for each one. `learned` is the text that its own `learn` returned."""
@@ -142,9 +133,8 @@ sasgeo-bench check-matcher {name}
 sasgeo-bench run --matcher {name} --tasks out/tasks/clean/town-riverside
 ```
 
-Say in the card (`src/{module}/matcher.py`) where the method comes from, what of it is yours, and what a query must
-tell for it to work; raise its version whenever answers change. Then enter a published board; `--card card.toml` adds
-authors and code:
+Say in the card (`src/{module}/card.toml`) where the method comes from, what of it is yours, and what a query must
+tell for it to work; raise its version whenever answers change. Then enter a published board:
 
 ```bash
 sasgeo-bench enter docs/results/systems --matcher {name}
@@ -157,14 +147,14 @@ def plugin_files(name: str) -> dict[str, str]:
 
     `name` is that of the matcher; raise `ConfigError` if it is not allowed, or taken.
     """
-    return package_files(name, group=MATCHERS, code=_MATCHER, readme=_README) | {"card.toml": example_card(name)}
+    return package_files(name, group=MATCHERS, code=_MATCHER, readme=_README, card=EXAMPLE)
 
 
-def package_files(name: str, *, group: str, code: str, readme: str) -> dict[str, str]:
+def package_files(name: str, *, group: str, code: str, readme: str, card: str | None = None) -> dict[str, str]:
     """Return the text of every file of a new package with a plugin, by its path.
 
-    `group` is that of its entry point; `code` and `readme` are templates. Raise `ConfigError` if the name is not
-    allowed, or taken.
+    `group` is that of its entry point; `code`, `readme` and `card`, where it has one, are templates. Raise
+    `ConfigError` if the name is not allowed, or taken.
     """
     words = _words_of(name, group=group, imported=_imported_names(code))
     files = {
@@ -173,7 +163,7 @@ def package_files(name: str, *, group: str, code: str, readme: str) -> dict[str,
         "src/{module}/__init__.py": '"""The package of the {kind} {name}."""\n',
         "src/{module}/{kind}.py": code,
         "tests/test_conforms.py": _TEST,
-    }
+    } | ({} if card is None else {f"src/{{module}}/{CARD_FILE}": card})
     return {path.format(**words): text.format(**words) for path, text in files.items()}
 
 

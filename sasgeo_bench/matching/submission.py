@@ -8,6 +8,7 @@ from pydantic import BeforeValidator, Field
 
 from sasgeo_bench.config import Document, Line, Short
 from sasgeo_bench.matching.matcher import Need
+from sasgeo_bench.tasks.query import Track
 from sasgeo_bench.tasks.split import HALVES, Half
 from sasgeo_bench.texts import FOLDER, NAME, VERSION
 
@@ -46,12 +47,12 @@ TrainedOn = Annotated[str | list[str] | dict[str, list[str]], BeforeValidator(_t
 
 
 class Card(Document):
-    """Author's description of a method, shown on the board as text.
+    """Author's description of a method: `card.toml`, and shown on the board as text.
 
-    The fields `name` to `licence`, `needs` and `limits` are those of a `MatcherCard`. `trained_on` is "none", or places
-    of the split; by halves, "a" lists the training places of the answers about half a. `trained_elsewhere` describes
-    other training in a line. `uses` lists inputs besides the query and the map, as in "imagery"; `authors`, `contact`
-    and `code` name the authors, a way to reach them, and the address of the code.
+    A class has the same fields as its `MatcherCard`, by `card_file.read_card`, and needs `tracks`. `trained_on` is
+    "none", or places of the split; by halves, "a" lists the training places of the answers about half a.
+    `trained_elsewhere` describes other training in a line. `uses` lists inputs besides the query and the map, as in
+    "imagery"; `authors`, `contact` and `code` name the authors, a way to reach them, and the address of the code.
     """
 
     name: Name
@@ -62,6 +63,7 @@ class Card(Document):
     licence: Short
     trained_on: TrainedOn
     trained_elsewhere: Line | None = None
+    tracks: list[Track] = []
     needs: list[Need] = []
     uses: Annotated[list[Short], Field(max_length=20)] = []
     limits: Line | None = None
@@ -122,28 +124,30 @@ class Submission(Document):
 
 
 def example_card(name: str = "my-matcher") -> str:
-    """Return an example of a card, as TOML."""
-    return _EXAMPLE.format(name=name, halves=_EXAMPLE_BY_HALF)
+    """Return an example of a card, as TOML: that of a new matcher."""
+    return EXAMPLE.format(name=name, title=name.replace("_", " ").replace("-", " ").capitalize())
 
 
-_EXAMPLE: Final = """\
-# What the board says of your method. One line each; see docs/howto/matcher.md.
-name = "{name}"
+EXAMPLE: Final = f"""\
+# What the board says of your method, one line each (docs/howto/matcher.md); the class and a submission read it.
+name = "{{name}}"
 version = "0.1.0"        # raise it whenever answers change
-title = "A matcher of mine"
+title = "{{title}}"
 source = "original"      # or the paper it comes from
 ours = "all of it"       # what of it is your own
 licence = "MIT"          # SPDX name, of the code
 
-# Places of the split that taught it: "none", a list, or one for the answers about each half of a cross-fit:
-# trained_on = {halves}
+tracks = ["retrieval", "localization"]  # what it answers
+needs = ["position"]     # what a query must tell: position, yaw, scale, vectors, image, imagery, training
+uses = []                # what it looks at besides query and map, as in "imagery"
+limits = "looks at a coarse lattice of places, with the heading of the prior alone"
+
+# Places of the split that taught it: "none", or a list. Answers of a file may have one for those about each half of a
+# cross-fit: trained_on = {_EXAMPLE_BY_HALF.replace("{", "{{").replace("}", "}}")}
 trained_on = "none"
 # trained_elsewhere = "10,000 views of Zurich"    # what else taught it
 
-needs = ["position"]     # what a query must tell: position, yaw, scale, vectors, image, imagery, training
-uses = []                # what it looks at besides query and map, as in "imagery"
-# limits = "knows no heading"
 # authors = ["A. Author"]
 # contact = "a.author@example.org"
-# code = "https://example.org/my-matcher"
+# code = "https://example.org/{{name}}"
 """

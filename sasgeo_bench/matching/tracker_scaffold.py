@@ -6,6 +6,7 @@ from typing import Final
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.matching.plugins import MATCHERS, TRACKERS, shipped_names
 from sasgeo_bench.matching.scaffold import package_files
+from sasgeo_bench.matching.submission import EXAMPLE
 
 _TRACKER: Final = '''\
 """The tracker {name}: here is where your method goes."""
@@ -13,7 +14,7 @@ _TRACKER: Final = '''\
 from dataclasses import replace
 
 import numpy as np
-from sasgeo_bench import Fix, MatcherCard, Pose, Prior, Query, Region, advance, load_matcher, start_of, wrap_deg
+from sasgeo_bench import Fix, Pose, Prior, Query, Region, advance, load_matcher, read_card, start_of, wrap_deg
 
 FOUND = np.diag([5.0, 5.0, 3.0]) ** 2  # covariance of a pose that the search finds: m2, m2, deg2
 GATE = 3.4  # largest Mahalanobis distance of a pose that is taken: 99 of 100 right ones are nearer
@@ -26,16 +27,7 @@ PATIENCE = 5  # poses refused in a row before no more is believed than at the st
 class {cls}:
     """Odometry corrected by a search, in a Kalman filter. A place to start from, no method to win with."""
 
-    card = MatcherCard(
-        name="{name}",
-        version="0.1.0",
-        title="{title}",
-        source="original",
-        ours="all of it",
-        licence="MIT",
-        tracks=("sequence",),
-        limits="one hypothesis at a time: where a map repeats itself it may follow the wrong copy",
-    )
+    card = read_card(__file__)  # card.toml, beside this file
 
     def __init__(self) -> None:
         self.matcher = load_matcher("fft_vote")  # a search that ships; put your own here
@@ -103,6 +95,15 @@ class {cls}:
         self.taken, self.refused = self.taken + 1, 0
 '''
 
+_CARD: Final = (
+    EXAMPLE.replace('["retrieval", "localization"]', '["sequence"]')
+    .replace(
+        "looks at a coarse lattice of places, with the heading of the prior alone",
+        "one hypothesis at a time: where a map repeats itself it may follow the wrong copy",
+    )
+    .replace('needs = ["position"]', "needs = []")
+)
+
 _README: Final = """\
 # {title}
 
@@ -115,7 +116,7 @@ sasgeo-bench make-queries --suite flight-clean --regions town-grid --n 1 --up-to
 sasgeo-bench run --matcher {name} --tasks out/tasks/flight-clean/town-grid
 ```
 
-Say in the card (`src/{module}/tracker.py`) where the method comes from and what of it is yours; raise its version
+Say in the card (`src/{module}/card.toml`) where the method comes from and what of it is yours; raise its version
 whenever answers change.
 """
 
@@ -131,4 +132,4 @@ def tracker_files(name: str) -> dict[str, str]:
     if name in shipped_names(MATCHERS):
         message = f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another"
         raise ConfigError(message)
-    return package_files(name, group=TRACKERS, code=_TRACKER, readme=_README)
+    return package_files(name, group=TRACKERS, code=_TRACKER, readme=_README, card=_CARD)

@@ -4,7 +4,7 @@
 import datetime as dt
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
@@ -145,10 +145,7 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
         message = f"{extract.file} is an embedded town: it is made by the build, there is no file to find"
         raise ExtractError(message)
     wrong: list[str] = []
-    places = [folder / extract.file for folder in extract_folders(folders)]
-    if extract.format == "geojson":
-        places += named_files(extract.file, imagery_folders(extracts=folders))
-    for path in places:
+    for path in _places(extract, folders):
         if path.is_file():
             found = sha256_of(path)
             if found in extract.sha256:
@@ -163,10 +160,33 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
     raise ExtractError(_not_found(extract, folders, wrong + failures))
 
 
+def _places(extract: Extract, folders: Sequence[Path]) -> list[Path]:
+    """Return where the file of an extract may lie on this machine."""
+    places = [folder / extract.file for folder in extract_folders(folders)]
+    return places + (
+        named_files(extract.file, imagery_folders(extracts=folders)) if extract.format == "geojson" else []
+    )
+
+
+def missing_files(extracts: Iterable[Extract], *, folders: Sequence[Path] = ()) -> tuple[str, ...]:
+    """Return the names of the files of extracts that are not on this machine; nothing is downloaded or hashed.
+
+    Embedded towns have no file.
+
+    >>> missing_files([Extract(file="nowhere.osm.pbf", date=dt.date(2020, 1, 1), sha256=("0" * 64,))])
+    ('nowhere.osm.pbf',)
+    """
+    named = (one for extract in extracts if extract.town is None for one in (extract, *_parts(extract)))
+    return tuple(sorted({one.file for one in named if not any(path.is_file() for path in _places(one, folders))}))
+
+
 def find_parts(extract: Extract, *, folders: Sequence[Path] = ()) -> tuple[Path, ...]:
     """Find the further files of an extract; raise as `find_extract` does."""
-    parts = (extract.model_copy(update={"file": part.file, "sha256": part.sha256, "urls": ()}) for part in extract.also)
-    return tuple(find_extract(part, folders=folders) for part in parts)
+    return tuple(find_extract(part, folders=folders) for part in _parts(extract))
+
+
+def _parts(extract: Extract) -> list[Extract]:
+    return [extract.model_copy(update={"file": part.file, "sha256": part.sha256, "urls": ()}) for part in extract.also]
 
 
 def _not_found(extract: Extract, folders: Sequence[Path], reasons: Sequence[str]) -> str:

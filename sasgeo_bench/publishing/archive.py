@@ -222,7 +222,8 @@ def score_all(
             has_cases=has_cases,
         )
         record = {} if kept is None else read_board(kept)[0]
-        board = make_board(replace(laid, extras=(figures, pictures), kept=record), tell=tell, progress=progress)
+        extras = (figures, pictures) if request.stored is None else ()  # which need what was fitted for every entry
+        board = make_board(replace(laid, extras=extras, kept=record), tell=tell, progress=progress)
         if results is not None:
             lacks = "" if kept is None else str(read_settings(kept)["dropped"])
             tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())

@@ -15,6 +15,7 @@ from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.publishing.dataset_card import CARD, DATASHEET, card_text, datasheet_text
 from sasgeo_bench.publishing.release_files import (
+    BoardTasks,
     Release,
     ReleaseMap,
     ReleaseTask,
@@ -37,6 +38,7 @@ from sasgeo_bench.regions.region_spec import find_region_file
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew, is_of_region
 from sasgeo_bench.tasks.private_seed import LEAST_BITS
+from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, read_split_file
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.texts import FOLDER, one_line
@@ -52,7 +54,8 @@ class ReleaseRequest:
     Empty `suites` are all that were drawn on the regions, controls left out. `split` is the id or file of the split of
     the queries. `with_truth` includes the truths of test queries. `out` is the root of what is built, `into` the folder
     of the release. `published` is the day of publication, as in 2026-01-31, by default the newest date of a map; `url`
-    the address where the release will be found.
+    the address where the release will be found. `board` has the queries of a published board instead: it names the
+    tasks, and no truths are included.
     """
 
     regions: tuple[str, ...]
@@ -63,6 +66,7 @@ class ReleaseRequest:
     into: Path
     published: str | None = None
     url: str | None = None
+    board: BoardTasks | None = None
 
 
 def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
@@ -98,15 +102,17 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     _check_folder(request.into, request.out)
     split = read_split_file(find_split_file(request.split))
     regions = tuple(dict.fromkeys(request.regions))
-    for name in regions:
-        _check_region(name, split, request.out)
-    tasks = _tasks(regions, request, tell)
+    if request.board is None:
+        for name in regions:
+            _check_region(name, split, request.out)
+    tasks = _tasks(regions, request, tell) if request.board is None else _tasks_of_board(request.board)
     names = sorted({*regions, *(task.map_name for task in tasks)})
     maps = tuple(_map(request.out / "regions" / name) for name in names)
     manifests = {item.name: item.manifest for item in maps}
     for task in tasks:
         _check_task(task, manifests[task.map_name], split)
-    _warn_of_seeds(tasks, tell)
+    if request.board is None:
+        _warn_of_seeds(tasks, tell)
     return Release(
         regions=regions,
         split=split,
@@ -116,6 +122,8 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
         published=_published(request.published, maps),
         url=request.url,
         made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+        board=None if request.board is None else request.board.name,
+        lost=0 if request.board is None else request.board.lost,
     )
 
 
@@ -169,6 +177,19 @@ def _tasks(regions: Sequence[str], request: ReleaseRequest, tell: Tell) -> tuple
     return tuple(sorted(found, key=lambda task: (task.suite, task.map_name)))
 
 
+def _tasks_of_board(board: BoardTasks) -> tuple[ReleaseTask, ...]:
+    """Return the tasks of a board with its queries alone; those that are not drawn as they were are left out."""
+    found = []
+    for folder in board.folders:
+        names = task_files.read_asked(folder)
+        own = frozenset(name for name, asked in names.items() if board.asked.get(name) == asked)
+        only = None if len(own) == len(names) else own
+        if own:
+            about, parts = task_files.read_task(folder), count_parts(folder, only)
+            found.append(ReleaseTask(folder=folder, truth=folder, about=about, parts=parts, only=only))
+    return tuple(sorted(found, key=lambda task: (task.suite, task.map_name)))
+
+
 def _no_queries(suite: str, regions: Sequence[str], out: Path) -> StoreError:
     mend = f"sasgeo-bench make-queries --regions {regions[0]}"
     return StoreError(f"{out / 'tasks'} holds no queries of {suite} on {', '.join(regions)}: {mend}")
@@ -212,7 +233,7 @@ def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None
     check_public(task.about.get(task_files.PRIVATE), str(task.folder))
     if not task_files.is_of_map(task.about, manifest):
         raise StoreError(built_anew(task.map_name))
-    if task.about.get("split") != split.id:
+    if task.about.get("split") != split.id and task.suite != CONTROLS:  # controls of every board have a split of theirs
         message = (
             f"{task.folder} was drawn by split {task.about.get('split')!r}, not by {split.id!r}: name it with --split, "
             "or make the queries again"

@@ -84,10 +84,30 @@ class ReleaseMap:
 
 
 @dataclass(frozen=True, kw_only=True)
+class BoardTasks:
+    """The queries of a published board: its name, its split, the folders of its tasks, and hashes of queries by id.
+
+    `lost` counts queries of the board that are not drawn as they were, and not in the release.
+    """
+
+    name: str
+    split: str
+    folders: tuple[Path, ...]
+    asked: Mapping[str, str]
+    lost: int
+
+    @property
+    def regions(self) -> tuple[str, ...]:
+        """Return the regions that are asked about, whatever the date of their maps."""
+        return tuple(sorted({base_of(folder.name) for folder in self.folders}))
+
+
+@dataclass(frozen=True, kw_only=True)
 class ReleaseTask:
     """One task of a release: folders of the task and of its truths, and the content of `task.json` (`about`).
 
-    `parts` counts the queries of each part; `released` are the parts whose truths are released.
+    `parts` counts the queries of each part; `released` are the parts whose truths are released. `only` are the queries
+    to release, all without it.
     """
 
     folder: Path
@@ -95,6 +115,7 @@ class ReleaseTask:
     about: Mapping[str, Any]
     parts: Mapping[str, int]
     released: frozenset[str] = frozenset()
+    only: frozenset[str] | None = None
 
     @property
     def suite(self) -> str:
@@ -108,8 +129,8 @@ class ReleaseTask:
 
     @property
     def is_whole(self) -> bool:
-        """Return whether all its queries are of one part, so that its file is released as it is."""
-        return len(self.parts) == 1
+        """Return whether all its queries are released and of one part, so that its file is released as it is."""
+        return len(self.parts) == 1 and self.only is None
 
     def file_of(self, part: str, *, kind: str = "queries") -> str:
         """Return the path in the release of a part's queries, or of its truths."""
@@ -123,7 +144,8 @@ class Release:
     """Content of a release, before and after it is written.
 
     `published` is a day as in 2026-01-31, `url` the address of the release, `with_truth` whether it holds all truths;
-    `files` gives size and hash of each file of maps and tasks by its path, once they are copied.
+    `files` gives size and hash of each file of maps and tasks by its path, once they are copied. `board` is the id of
+    the board whose queries they are, if they are one's, `lost` how many of these are not here.
     """
 
     regions: tuple[str, ...]
@@ -135,11 +157,20 @@ class Release:
     made_by: str
     url: str | None = None
     files: Mapping[str, FileRecord] = field(default_factory=dict)
+    board: str | None = None
+    lost: int = 0
 
     @property
     def version(self) -> str:
         """Return the versions of data and tasks, as in 1.1.0; regions do not count."""
         return f"{DATA_VERSION}.{TASK_VERSION}.0"
+
+    @property
+    def truths_said(self) -> str:
+        """Return which truths are in the release."""
+        if self.board is not None:
+            return f"in the stored results of the board {self.board}"
+        return "of all queries" if self.with_truth else "of the test part left out"
 
     @property
     def suites(self) -> tuple[str, ...]:
@@ -169,13 +200,18 @@ class Release:
         return {part: found[part] for part in sorted(found)}
 
 
-def count_parts(task_folder: Path) -> dict[str, int]:
-    """Count the queries of each part of a task without reading views; raise `StoreError` if a column is missing."""
+def count_parts(task_folder: Path, only: Collection[str] | None = None) -> dict[str, int]:
+    """Count the queries of each part of a task, or some of them; raise `StoreError` if a column is missing."""
     path, found = task_folder / task_files.QUERIES, Counter[str]()
     task_files.check_columns(path, FILE_SCHEMA.names)
-    for batch in task_files.read_batches(path, ["part"]):
-        found.update(batch["part"].to_pylist())
+    for batch in task_files.read_batches(path, ["query_id", "part"]):
+        found.update(_of(batch, only)["part"].to_pylist())
     return {part: found[part] for part in sorted(found)}
+
+
+def _of(batch: pa.RecordBatch, only: Collection[str] | None) -> pa.RecordBatch:
+    """Return the rows of some queries, or all."""
+    return batch if only is None else batch.filter(pc.is_in(batch["query_id"], pa.array(sorted(only))))
 
 
 def has_images(task_folder: Path) -> bool:
@@ -269,7 +305,7 @@ def _copy_queries(folder: Path, task: ReleaseTask) -> None:
         return
     for part in task.parts:
         rows = task_files.read_batches(task.folder / task_files.QUERIES, FILE_SCHEMA.names)
-        chosen = (batch.filter(pc.equal(batch["part"], part)) for batch in rows)
+        chosen = (_of(batch.filter(pc.equal(batch["part"], part)), task.only) for batch in rows)
         _write_batches(folder / task.file_of(part), FILE_SCHEMA, chosen)
 
 
@@ -351,11 +387,12 @@ def write_index(folder: Path, release: Release) -> None:
         "made_by": release.made_by,
         "published": release.published,
         "regions": list(release.regions),
+        **({} if release.board is None else {"board": {"id": release.board, "queries_left_out": release.lost}}),
         "split": {"id": split.id, "title": split.title, "kind": split.kind, "buffer_m": split.buffer_m},
         "places": [place.model_dump(mode="json", exclude_defaults=True) for place in places_of(release)],
         "maps": [_map_record(item) for item in release.maps],
         "tasks": [_task_record(task) for task in release.tasks],
-        "truths": "of all queries" if release.with_truth else "of the test part left out",
+        "truths": release.truths_said,
         "licence_url": LICENCE_URL,
     }
     _write_json(folder / INDEX, content)
@@ -391,6 +428,7 @@ def _task_record(task: ReleaseTask) -> dict[str, Any]:
         "suite": task.suite,
         "suite_version": task.about["suite_version"],
         "map": task.map_name,
+        "split": task.about.get("split"),
         "queries": dict(task.parts),
         "truths": sorted(task.released),
         "files": {part: task.file_of(part) for part in task.parts},

@@ -10,7 +10,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.leaderboard.board import Board
+from sasgeo_bench.leaderboard.board import Board, ScoreRequest
+from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.stored_figures import read_stored_figures, why_anew
+from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.plugins import shipped_names
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskManifest
@@ -20,9 +23,10 @@ from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.contestants import AskedTask
+from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.scoring.rows import is_unranked, name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.scoring.submission_files import list_submissions, read_card, read_submission, write_submission
+from sasgeo_bench.scoring.submission_files import list_submissions, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
@@ -51,7 +55,7 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     `tell` gets a line on misses and on controls that are not answered. Raise `ConfigError` if the card does not fit the
     board or the runs, or the predictions hold faults; `StoreError` if something cannot be read or written.
     """
-    card = request.card if isinstance(request.card, Card) else read_card(request.card)
+    card = request.card if isinstance(request.card, Card) else read_card_file(request.card)
     if not is_pack(request.board):
         message = f"{request.board} holds no stored results: name those of the board, as in --for docs/results/demo"
         raise StoreError(message)
@@ -229,15 +233,22 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
     """Check a submission against itself and against tasks, task folders or stored results, if any.
 
     Return its record and all faults, queries without a row among them. Raise `StoreError` if its files differ from its
-    record or something cannot be read, and `ConfigError` if the record is wrong in itself.
+    record or something cannot be read, and `ConfigError` if the record is wrong in itself, or of another board.
     """
     submission = read_submission(folder)
     split = None if submission.split is None else find_split(submission.split)
     places = () if split is None else tuple(split.blocks)
     if not tasks:
         return submission, tuple(submission_faults(folder, submission, None, places=places))
+    board = board_of(tasks)
+    if board and board != submission.board:
+        message = (
+            f"{folder} answers the board {submission.board!r}, and {board!r} is the board of {tasks[0]}: name the "
+            f"results of {submission.board!r} by --for"
+        )
+        raise ConfigError(message)
     with laid_tasks(tasks) as folders:
-        faults = submission_faults(folder, submission, folders, board=board_of(tasks), places=places)
+        faults = submission_faults(folder, submission, folders, places=places)
         return submission, tuple(faults)
 
 
@@ -276,9 +287,33 @@ def with_submissions(
     submitted`. Raise `StoreError` or `ConfigError` if results or submissions are damaged or do not fit; nothing is
     written then.
     """
+    return score_all(_request(stored, submissions, board, tell=tell, root=root, jobs=jobs), tell=tell)
+
+
+def _request(
+    stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell, root: Path, jobs: int
+) -> ScoreRequest:
     if not is_pack(stored):
         message = f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written"
         raise StoreError(message)
     found = submissions_for(board_of([stored]), submissions, tell=tell)
-    request = request_of([stored], board=board, root=root)
-    return score_all(replace(request, submissions=found, jobs=jobs), tell=tell)
+    return replace(request_of([stored], board=board, root=root), submissions=found, jobs=jobs)
+
+
+def beside_stored(
+    stored: Path, submission: Path, board: Path, *, tell: Tell, root: Path = Path("out"), jobs: int = 1
+) -> Board:
+    """Score one submission beside stored results, whose own rejectors and contrasts stand as they are.
+
+    Its figures are those of `with_submissions`, to the last bit; ranks are of all entries together. Figures and
+    pictures are left out. If the stored figures are those of another scorer or rejector, `tell` gets the reason and all
+    is scored anew. Arguments and errors as of `with_submissions`.
+    """
+    request = _request(stored, [submission], board, tell=tell, root=root, jobs=jobs)
+    reason = why_anew(
+        read_board(stored)[0], [rule.card for rule in rules_of(request.rejectors, request.split).values()]
+    )
+    if reason is not None:
+        tell(f"all entries are scored anew: {reason}")
+        return score_all(request, tell=tell)
+    return score_all(replace(request, stored=read_stored_figures(stored)), tell=tell)

@@ -50,7 +50,8 @@ class RunRequest:
     their queries, evenly over places, then suites, then sites; only what `lessons` hold is used. `split` defines
     places and how far apart training and test places must lie. An oracle (`is_oracle`) may train on what it is asked,
     and is never ranked. `hidden` are files that the matcher must not see besides truths and the like, such as that of a
-    private seed.
+    private seed. `only` are the hashes of the queries to ask, by id: others, and flights with one of these, are left
+    out; all are asked without it.
     """
 
     spec: str
@@ -70,6 +71,7 @@ class RunRequest:
     split: Split | None = None
     is_oracle: bool = False
     hidden: Sequence[Path] = ()
+    only: Mapping[str, str] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -357,7 +359,8 @@ def _part(
     imagery = _rendered_imagery(card, region)
     follower = follower_record(card) if _is_of_flights(about) else None
     key = tie_key(key, imagery, None if follower is None else follower["hash"])
-    asked = {name: asked_under(one, key) for name, one in task_files.read_asked(task).items()}
+    drawn = task_files.read_asked(task)
+    asked = {name: asked_under(one, key) for name, one in drawn.items()}
     ties = prediction_files.read_ties(folder) if folder.is_dir() else []
     is_same_task = (before or {}).get("queries_sha256") == about["files"][task_files.QUERIES]["sha256"]
     if not (is_same_task or all(tie.asked for tie in ties)):  # rows of older versions lack the hash of their query
@@ -368,7 +371,13 @@ def _part(
         raise StoreError(message)
     index, count = request.shard
     unit_of = unit_of_task(about)
-    own = [name for name in asked if _shard_of(unit_of(name), count) == index - 1][: request.limit]
+    other = (
+        set()
+        if request.only is None
+        else {unit_of(name) for name, one in drawn.items() if request.only.get(name) != one}
+    )
+    own = [name for name in asked if _shard_of(unit_of(name), count) == index - 1 and unit_of(name) not in other]
+    own = own[: request.limit]
     statuses = {tie.query_id: tie.status for tie in ties if tie.status not in request.again and tie.answers(asked)}
     left = whole_units(own, statuses.keys(), unit_of)
     failed = Counter(statuses[name] for name in set(own) - set(left) if statuses[name] not in SOUND)

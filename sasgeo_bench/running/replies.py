@@ -127,6 +127,10 @@ class _Card(Strictly):
     needs: list[Need]
     limits: Line
     trained_on: Annotated[list[Line], Field(max_length=_MOST_PLACES)]
+    uses: list[Line]
+    authors: list[Line]
+    contact: Line
+    code: Line
 
 
 class _Loaded(Strictly):

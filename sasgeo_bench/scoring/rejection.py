@@ -298,12 +298,18 @@ class RejectionResult:
 
 
 def evaluate_rejectors(
-    tasks: Sequence[RejectionTask], *, jobs: int, failures: Failures, tell: Tell, progress: Progress
+    tasks: Sequence[RejectionTask],
+    *,
+    is_whole: bool = True,
+    jobs: int,
+    failures: Failures,
+    tell: Tell,
+    progress: Progress,
 ) -> RejectionResult:
     """Evaluate all rejectors on the answers of each entry; the number of processes does not affect the result.
 
     Record rejectors that fail on an entry; those that do not apply to it are among the remarks. Raise the error of a
-    rejector that fails on every entry: it is at fault, not the answers.
+    rejector that fails on every entry of a board (`is_whole`): it is at fault, not the answers.
     """
     judged: dict[tuple[str, str], pd.DataFrame] = {}
     rows: list[pd.DataFrame] = []
@@ -331,7 +337,7 @@ def evaluate_rejectors(
             why = why_not(task.scores, is_taught=task.is_taught)
             remarks.append(f"{', '.join(idle)} on {task.matcher}: not applied, {why}")
     for name, listed in errors.items():
-        if name != OWN and len(listed) == len(tasks):
+        if is_whole and name != OWN and len(listed) == len(tasks):
             raise listed[0]
     for remark in remarks:
         tell(remark)

@@ -11,13 +11,13 @@ from typing import Final
 
 import pyarrow as pa
 
-from sasgeo_bench.config import check_document, parse_toml
+from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import file_record, fresh_folder, locked
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, SubmittedFile
+from sasgeo_bench.matching.submission import SCHEMA_VERSION, Submission, SubmittedFile
 from sasgeo_bench.running.prediction_rows import (
     FLOWN_SCHEMA,
     PREDICTION_SCHEMA,
@@ -32,34 +32,9 @@ SUBMISSION: Final = "submission.json"
 PREDICTIONS: Final = "predictions"
 README: Final = "README.md"  # may lie among submissions
 MOST_BYTES: Final = 20_000_000  # of the predictions
-_MOST_CARD_BYTES: Final = 100_000
 _MOST_SUBMISSION_BYTES: Final = 5_000_000
 _TEXTS: Final = ("query_id", "status", "message", ASKED)
 _LEVEL: Final = 19
-
-
-def read_card(path: Path) -> Card:
-    """Read the card that an author wrote.
-
-    Raise StoreError if it cannot be read. Raise ConfigError if a field is wrong; all faults on one line.
-    """
-    text = _text_of(path, _MOST_CARD_BYTES, "a card (submit --example-card prints one)")
-    return parse_toml(text, Card, source=str(path))
-
-
-def _text_of(path: Path, most_bytes: int, noun: str) -> str:
-    try:
-        with path.open("rb") as source:
-            read = source.read(most_bytes + 1)
-        text = read.decode("utf-8-sig")  # some editors write a byte order mark
-    except (UnicodeDecodeError, OSError) as error:
-        fault = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
-        message = f"{path} cannot be read ({fault}): name {noun}"
-        raise StoreError(message) from error
-    if len(read) > most_bytes:
-        message = f"{path} has more than {most_bytes} bytes: name {noun}"
-        raise StoreError(message)
-    return text
 
 
 def predictions_name(name: str) -> str:

@@ -91,15 +91,15 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
 
 def submission_faults(
-    folder: Path, submission: Submission, tasks: Sequence[Path] | None, *, board: str = "", places: Collection[str] = ()
+    folder: Path, submission: Submission, tasks: Sequence[Path] | None, *, places: Collection[str] = ()
 ) -> Iterator[Violation]:
     """Yield the violations of a submission against the tasks of a board: card, rows, then missing rows.
 
-    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `board` is the board's id,
-    empty if unknown. `places` are those of its split; if empty, declared training places are not checked. Files and
-    hashes are checked by `read_submission`. Raise StoreError if a file cannot be read, or a task is of another version.
+    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `places` are those of its
+    split; if empty, declared training places are not checked. Files and hashes are checked by `read_submission`. Raise
+    StoreError if a file cannot be read, or a task is of another version.
     """
-    yield from _card_faults(submission, board, places)
+    yield from _card_faults(submission, places)
     if tasks is None or submission.task_version not in TASK_VERSIONS:
         return
     named = {(item.suite, item.region) for item in submission.tasks}
@@ -126,14 +126,12 @@ def submission_faults(
     yield from _missing(file.name, queries, seen)
 
 
-def _card_faults(submission: Submission, board: str, places: Collection[str]) -> Iterator[Violation]:
-    """Yield the fields of a submission that do not fit a board."""
+def _card_faults(submission: Submission, places: Collection[str]) -> Iterator[Violation]:
+    """Yield the fields of a submission that fit no board, or not its split."""
     if submission.task_version not in TASK_VERSIONS:
         yield Violation(
             SUBMISSION, -1, "task_version", str(submission.task_version), f"{TASK_VERSION}: run and submit again"
         )
-    if board and submission.board != board:
-        yield Violation(SUBMISSION, -1, "board", repr(submission.board), repr(board))
     for place in submission.card.places if places else ():
         if place not in places:
             near = difflib.get_close_matches(place, places, n=1)

@@ -10,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError
+from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
@@ -57,6 +58,14 @@ class Request(Settings):
         suite = find_suite(self.suite)
         taken = [self.choice.takes(variant, track) for variant in suite.variants for track in suite.tracks(variant)]
         return self.count * sum(taken) * len(suite.drawn_by(self.choice.detectors))
+
+    @property
+    def extracts(self) -> tuple[Extract, ...]:
+        """Return the extracts of all maps that the queries are drawn from."""
+        needs = find_suite(self.suite).card.needs
+        dates = aged_dates(self.region) if "older maps" in needs else ()
+        others = [self.elsewhere.pick(None)] if "another region" in needs and self.elsewhere is not None else []
+        return (*map(self.region.pick, (None, *dates)), *others)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,21 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """A matcher enters a published board: it is asked the board's own queries, and its row stands beside the others."""
 
+import datetime as dt
+import re
 from dataclasses import replace
 
+import pandas as pd
 import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.experiments import entering
-from sasgeo_bench.experiments.entering import EntryRequest, cost_lines, enter, plan_entry
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.experiments import board_queries, entering, entry_cost
+from sasgeo_bench.experiments.board_queries import same_queries
+from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, plan_entry
+from sasgeo_bench.experiments.pipeline import draw_all, run_pipeline
+from sasgeo_bench.experiments.pipeline_plan import plan_pipeline, plan_runs
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
-from sasgeo_bench.publishing.submissions import hold_submission
+from sasgeo_bench.osm.locate import Extract
+from sasgeo_bench.publishing import submissions
+from sasgeo_bench.publishing.submissions import beside_stored, hold_submission, with_submissions
+from sasgeo_bench.scoring.contrasts import contrast_frame
 from sasgeo_bench.scoring.submission_files import read_submission
 from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.task_plan import Request
 from tests.experiments.test_pipeline import TEXT as PIPELINE
 from tests.threaded import threaded
 
@@ -23,7 +31,9 @@ pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings")
 
 TEXT = PIPELINE.replace(
     "sites = 1", 'sites = 1\nmatchers = ["random", "prior_centre"]'
-)  # who enters is asked all the same
+).replace(  # who enters is asked all the same
+    '["town-suburb"]', '["town-suburb", "town-riverside"]\nrejectors = ["margin"]'
+)
 
 
 class Middle(PriorCentre):
@@ -38,6 +48,16 @@ class Shipped(PriorCentre):
     card = replace(PriorCentre.card, name="sasgeo")
 
 
+class Lost(PriorCentre):
+    """A matcher that has no answer to anything."""
+
+    card = replace(PriorCentre.card, name="lost")
+
+    def match(self, query, *, top_k):  # noqa: ARG002 - of every matcher
+        message = f"no road\nnear {query.track}"
+        raise KeyError(message)
+
+
 def silent(line):
     del line
 
@@ -46,7 +66,7 @@ def silent(line):
 def request_(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     """A request to enter a board that is stored, with the file of its pipeline."""
     folder = tmp_path_factory.mktemp("entering")
-    out = lay_towns(folder / "out", "town-suburb")
+    out = lay_towns(folder / "out", "town-suburb", "town-riverside")
     (folder / "small.toml").write_text(TEXT, encoding="utf-8")
     spec = parse_toml(TEXT, PipelineFile, source="small.toml")
     with threaded():
@@ -71,8 +91,11 @@ def entered(request_, tmp_path_factory):
 def test_what_it_costs_is_said_before(request_):
     first, *rest = cost_lines(plan_entry(request_, tell=silent))
     assert first.startswith("small: ")
-    assert " queries in 2 tasks" in first  # the suite and the controls
-    assert rest[-1].startswith("  2 maps to build where they are missing, about 4 MB on disk")
+    assert " queries in 3 tasks" in first  # the suite and the controls
+    assert rest[0] == "  drawing about 0 s: 0 queries and 0 maps are not there yet, about 0 MB on disk"
+    assert rest[-1].startswith("  scoring about ")
+    elsewhere = plan_entry(replace(request_, out=request_.out / "elsewhere"), tell=silent)
+    assert " and 3 maps are not there yet, about 6 MB on disk" in [*cost_lines(elsewhere)][1]
 
 
 def test_the_submission_is_sound_and_answers_every_query(request_, entered):
@@ -110,6 +133,7 @@ def test_a_second_time_nothing_is_asked_again(request_, entered, tmp_path):
 def test_a_name_that_is_taken_is_refused_before_anything_is_asked(request_, tmp_path, monkeypatch):
     monkeypatch.setattr(entering, "ask", pytest.fail)
     request = replace(request_, matcher=f"{__name__}:Shipped")
+    monkeypatch.setattr(entering, "draw_all", pytest.fail)
     with pytest.raises(MatchError, match="named 'sasgeo', as a matcher that ships: rename it"):
         enter(plan_entry(request, tell=silent), into=tmp_path / "sasgeo", tell=silent)
     assert not (tmp_path / "sasgeo").exists()
@@ -140,7 +164,7 @@ def test_answers_to_another_board_are_not_replaced(request_, entered, monkeypatc
 def test_a_seed_that_did_not_draw_the_board_is_refused(request_, monkeypatch):
     seed = PrivateSeed("3f" * 16, is_sealed=True)
     about = {"sealed": {"porto": {"drawn_by": "ab" * 32}}}
-    monkeypatch.setattr(entering, "read_board", lambda _: (about, None))
+    monkeypatch.setattr(board_queries, "read_board", lambda _: (about, None))
     with pytest.raises(
         ConfigError, match=f"not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}"
     ):
@@ -151,7 +175,7 @@ def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_
     about = {"sealed": {"town-suburb": {"drawn_by": "ab" * 32}}, "task_version": 3}
     entry = plan_entry(request_, tell=silent)
     assert not any("count as misses" in line for line in cost_lines(entry))
-    monkeypatch.setattr(entering, "read_board", lambda _: (about, None))
+    monkeypatch.setattr(entry_cost, "read_board", lambda _: (about, None))
     told = "\n".join(cost_lines(entry))
     assert "of task version 3, and this program draws version" in told
     assert "are of sealed places, and count as misses without --sealed-seed-file" in told
@@ -160,9 +184,93 @@ def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_
 def test_lines_of_a_matchers_card_are_cut_to_those_of_a_submission():
     long = "word " * 100
     card = replace(Middle.card, source=long, limits=long)
-    made = entering._card_of(card, [], None)
+    made = entering._card_of(card, [], None, source="mine")
     assert made.source.endswith(" ...")
     assert len(made.limits) <= 300
+
+
+def test_a_card_that_no_submission_can_have_is_refused_before_anything_is_drawn(request_, monkeypatch):
+    monkeypatch.setattr(Middle, "card", replace(Middle.card, licence="long " * 20))
+    entry = plan_entry(request_, tell=silent)
+    with pytest.raises(ConfigError, match=r"the card of .*:Middle: 'licence': String should have at most 60 char"):
+        check_entry(entry)
+
+
+def test_what_a_class_says_of_its_authors_is_in_the_submission():
+    card = replace(Middle.card, authors=("A. Author",), code="https://example.org/mine", uses=("imagery",))
+    made = entering._card_of(card, [], None, source="mine")
+    assert (made.authors, made.code, made.uses) == (["A. Author"], "https://example.org/mine", ["imagery"])
+
+
+def test_figures_are_those_of_a_whole_score_to_the_last_bit(request_, entered, tmp_path):
+    folder, board, _ = entered
+    whole = with_submissions(request_.stored, [folder], tmp_path / "whole", tell=silent, root=request_.out)
+    assert {"", "margin"} <= {*board.table["rejector"]}
+    pd.testing.assert_frame_equal(board.table, whole.table, check_exact=True)
+    pd.testing.assert_frame_equal(board.acceptance, whole.acceptance, check_exact=True)
+    pd.testing.assert_frame_equal(contrast_frame(board.findings), contrast_frame(whole.findings), check_exact=True)
+    assert {*board.judged} < {*whole.judged}  # nothing of the others was fitted
+
+
+def test_all_is_scored_anew_where_the_scorer_is_another_one(request_, entered, tmp_path, monkeypatch):
+    monkeypatch.setattr(submissions, "why_anew", lambda *_: "the board is of scorer version 5, this program of 6")
+    lines = []
+    beside_stored(request_.stored, entered[0], tmp_path / "both", tell=lines.append, root=request_.out)
+    assert "all entries are scored anew: the board is of scorer version 5, this program of 6" in lines
+
+
+def test_queries_of_another_version_are_not_asked(request_):
+    entry = plan_entry(request_, tell=silent)
+    tasks, controls = draw_all(entry.plan, tell=silent, progress=None)
+    same = same_queries(request_.stored, [*tasks, *controls], tell=silent)
+    lost = sorted(same)[::3]
+    only = {name: "drawn otherwise" if name in lost else one for name, one in same.items()}
+    runs = plan_runs(replace(entry.plan, only=only, is_again=True), entry.matcher, [*tasks, *controls])
+    left = [name for run in runs for part in run.plan.parts for name in part.left]
+    assert sorted(left) == sorted({*same} - {*lost})
+
+
+def test_all_is_asked_again_on_demand_and_a_changed_matcher_is_told(request_, entered, tmp_path, monkeypatch):
+    del entered
+    lines = []
+    enter(plan_entry(replace(request_, is_again=True), tell=silent), into=tmp_path / "middle", tell=lines.append)
+    assert any(" queries to ask, 0 answered before" in line for line in lines)
+    assert not any("asked anew" in line for line in lines)
+    monkeypatch.setattr(Middle, "card", replace(Middle.card, version="9"))
+    enter(plan_entry(request_, tell=silent), into=tmp_path / "middle", tell=lines.append)
+    assert any(": all is asked anew, as " in line for line in lines)
+
+
+def test_crashes_are_told_with_an_example_on_one_line(request_, tmp_path):
+    lines = []
+    request = replace(request_, matcher=f"{__name__}:Lost")
+    enter(plan_entry(request, tell=silent), into=tmp_path / "lost", tell=lines.append)
+    (told,) = [line for line in lines if "ended as crash" in line]
+    assert re.fullmatch(r"  \d+ ended as crash, the first with the message [\"'].*no road.*near \w+.*", told)
+
+
+def test_extracts_that_are_missing_are_listed_at_once(request_, monkeypatch):
+    entry = plan_entry(request_, tell=silent)
+    lost = Extract(file="nowhere.osm.pbf", date=dt.date(2020, 1, 1), sha256=("0" * 64,))
+    monkeypatch.setattr(Request, "extracts", (lost, lost.model_copy(update={"file": "gone.osm.pbf"})))
+    monkeypatch.setattr(entering, "draw_all", pytest.fail)
+    assert "missing extracts: gone.osm.pbf, nowhere.osm.pbf" in "".join(cost_lines(entry))
+    with pytest.raises(ConfigError, match=r"missing extracts: gone\.osm\.pbf, nowhere\.osm\.pbf: .* by --without"):
+        enter(entry, tell=silent)
+
+
+def test_a_region_that_the_board_has_not_cannot_be_left_out(request_):
+    with pytest.raises(ConfigError, match="--without names vaduz, and the board asks about no such region"):
+        plan_entry(replace(request_, without=("vaduz",)), tell=silent)
+
+
+def test_a_partial_entry_is_said_to_be_one(request_):
+    entry = plan_entry(request_, tell=silent)
+    other = entry.plan.requests[0].region.model_copy(update={"id": "elsewhere"})
+    entry = replace(
+        entry, plan=replace(entry.plan, requests=(replace(entry.plan.requests[0], region=other),), controls=())
+    )
+    assert any(line.startswith("  a partial entry: ") for line in cost_lines(entry))
 
 
 def test_another_text_of_the_pipeline_is_refused(request_, tmp_path):

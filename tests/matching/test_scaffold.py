@@ -12,13 +12,12 @@ from pathlib import Path
 import pytest
 
 import sasgeo_bench
-from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.matcher import Match
 from sasgeo_bench.matching.plugins import MATCHERS, SHIPPED, list_entry_points
 from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
-from sasgeo_bench.matching.submission import Card
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.running.testing import check_matcher
 from sasgeo_bench.tasks.query import Query
@@ -48,9 +47,9 @@ def test_a_package_is_complete_and_names_its_class_everywhere_alike(tmp_path, na
     folder = write_under(tmp_path, name)
     module = name.replace("-", "_")
     files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    package = {f"src/{module}/__init__.py", f"src/{module}/matcher.py"}
-    assert files == {"pyproject.toml", "README.md", "card.toml", "tests/test_conforms.py", *package}
-    assert parse_toml((folder / "card.toml").read_text(), Card, source="card.toml").name == name
+    package = {f"src/{module}/{file}" for file in ("__init__.py", "matcher.py", "card.toml")}
+    assert files == {"pyproject.toml", "README.md", "tests/test_conforms.py", *package}
+    assert read_card_file(folder / "src" / module / "card.toml").name == name
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     assert project["name"] == name.replace("_", "-")
     ((point, value),) = project["entry-points"][MATCHERS].items()
@@ -63,13 +62,14 @@ def test_a_package_is_complete_and_names_its_class_everywhere_alike(tmp_path, na
 
 
 @pytest.mark.parametrize("name", ACCEPTED)
-def test_the_class_of_a_package_can_be_made_and_hides_nothing_that_it_needs(name) -> None:
+def test_the_class_of_a_package_can_be_made_and_hides_nothing_that_it_needs(tmp_path, name) -> None:
     for path, text in plugin_files(name).items():
         if path.endswith(".py"):
             compile(text, path, "exec")
         assert not re.search(r"\{(name|module|cls|title|distribution)\}", text)
-    found: dict[str, object] = {}
-    exec(plugin_files(name)[f"src/{name.replace('-', '_')}/matcher.py"], found)  # noqa: S102 - our own text
+    module = write_under(tmp_path, name) / "src" / name.replace("-", "_") / "matcher.py"
+    found: dict[str, object] = {"__file__": str(module)}
+    exec(module.read_text(), found)  # noqa: S102 - our own text
     (own,) = [value for value in found.values() if getattr(value, "__module__", None) == "builtins"]
     assert own().card.name == name
     assert (found["Match"], found["Query"], found["Pose"], found["Region"]) == (Match, Query, Pose, Region)
@@ -188,5 +188,5 @@ def test_what_is_written_can_be_built_and_names_its_entry_point(tmp_path, name) 
     module = name.replace("-", "_")
     with zipfile.ZipFile(wheel) as archive:
         points = archive.read(f"{module}-0.1.0.dist-info/entry_points.txt").decode()
-        assert f"{module}/matcher.py" in archive.namelist()
+        assert {f"{module}/matcher.py", f"{module}/card.toml"} <= {*archive.namelist()}
     assert re.fullmatch(rf"\[{MATCHERS}\]\n{name} = {module}\.matcher:\w+\n", points)

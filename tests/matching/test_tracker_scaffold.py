@@ -10,6 +10,7 @@ import pytest
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.plugins import TRACKERS
+from sasgeo_bench.matching.scaffold import write_plugin
 from sasgeo_bench.matching.tracker_scaffold import tracker_files
 
 # Some of these would break what is generated if their class were called what the name says.
@@ -19,10 +20,10 @@ TAKEN = ("dead_reckoning", "raster_uniform", "fft_vote", "oracle_pose")
 
 
 @pytest.mark.parametrize("name", ACCEPTED)
-def test_a_package_is_complete_and_names_its_class_everywhere_alike(name) -> None:
+def test_a_package_is_complete_and_names_its_class_everywhere_alike(tmp_path, name) -> None:
     files = tracker_files(name)
     module = name.replace("-", "_")
-    package = {f"src/{module}/__init__.py", f"src/{module}/tracker.py"}
+    package = {f"src/{module}/{file}" for file in ("__init__.py", "tracker.py", "card.toml")}
     assert set(files) == {"pyproject.toml", "README.md", "tests/test_conforms.py", *package}
     project = tomllib.loads(files["pyproject.toml"])["project"]
     ((point, value),) = project["entry-points"][TRACKERS].items()
@@ -33,9 +34,10 @@ def test_a_package_is_complete_and_names_its_class_everywhere_alike(name) -> Non
     assert f'check_tracker("{value}")' in files["tests/test_conforms.py"]
     assert f"check-tracker {name}" in files["README.md"]
     assert not any(re.search(r"\{(name|module|cls|title|distribution)\}", text) for text in files.values())
-    found: dict[str, object] = {}
+    write_plugin(tmp_path / "plugin", files)
+    found: dict[str, object] = {"__file__": str(tmp_path / "plugin" / "src" / module / "tracker.py")}
     exec(files[f"src/{module}/tracker.py"], found)  # noqa: S102 - our own text
-    assert found[own]().card.name == name
+    assert (found[own]().card.name, found[own]().card.tracks) == (name, ("sequence",))
     assert found["Pose"] is Pose
 
 

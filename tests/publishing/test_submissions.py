@@ -476,9 +476,9 @@ def test_every_submission_of_the_repository_is_sound() -> None:
 
 def test_a_submission_for_another_board_is_left_out_and_said(copied, stored, program, tmp_path):
     change_said(copied, lambda said: said.update(board="other"))
-    code, out, _ = program("validate", "--predictions", copied, "--for", stored)
-    assert code == 2
-    assert "board: found 'other', expected 'kept'" in out
+    code, out, err = program("validate", "--predictions", copied, "--for", stored)
+    assert (code, out) == (2, "")
+    assert f"answers the board 'other', and 'kept' is the board of {stored}: name the results of 'other' by" in err
     lines = []
     assert submissions_for("kept", [tmp_path / "submissions"], tell=lines.append) == ()
     assert lines == ["left out: 1 submission for other boards (other)"]

@@ -25,6 +25,10 @@ CARD = {
     "needs": [],
     "limits": "",
     "trained_on": [],
+    "uses": [],
+    "authors": [],
+    "contact": "",
+    "code": "",
 }
 SOUND = {
     "load": {"status": "ok", "card": CARD, "code": "0" * 64, "learns": False},

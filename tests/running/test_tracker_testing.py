@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from sasgeo_bench.matching.scaffold import write_plugin
 from sasgeo_bench.matching.tracker import check_fix
 from sasgeo_bench.matching.tracker_scaffold import tracker_files
 from sasgeo_bench.running import tracker_testing
@@ -111,9 +112,11 @@ def test_a_tracker_of_ordinary_flights_alone_fails_at_each_odd_one(table) -> Non
     assert "frame 0 of 0 to 7: crash: TypeError" in rows[ROWS[11]].found
 
 
-def test_what_new_tracker_writes_finds_its_way(made) -> None:
-    found: dict[str, object] = {}
-    exec(tracker_files("my-tracker")["src/my_tracker/tracker.py"], found)  # noqa: S102 - our own text
+def test_what_new_tracker_writes_finds_its_way(made, tmp_path) -> None:
+    write_plugin(tmp_path / "plugin", tracker_files("my-tracker"))
+    module = tmp_path / "plugin" / "src" / "my_tracker" / "tracker.py"
+    found: dict[str, object] = {"__file__": str(module)}
+    exec(module.read_text(), found)  # noqa: S102 - our own text
     tracker, views = found["MyTracker"](), made.flights[0]
     tracker.prepare(made.region, None)
     tracker.start(views[0].prior)

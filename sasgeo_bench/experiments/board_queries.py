@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The queries of a published board, drawn again by its pipeline and held against the hashes that it stores."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.experiments.entry_cost import fetch_extracts
+from sasgeo_bench.experiments.pipeline import draw_all
+from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, plan_pipeline
+from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
+from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.publishing.archive import laid_tasks, stored_settings
+from sasgeo_bench.publishing.archive_folder import is_pack
+from sasgeo_bench.publishing.release_files import BoardTasks
+from sasgeo_bench.scoring.contestants import AskedTask
+from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.suites.all_suites import PICTURED
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoardRequest:
+    """A request for the queries of a published board.
+
+    `stored` are the results of the board, `out` is the root of what is built. `pipeline` is the file that made the
+    board, the shipped one of its name unless given. `without` are regions whose queries are left out. `jobs` counts
+    processes. The rest is as in `plan_pipeline`.
+    """
+
+    stored: Path
+    out: Path
+    pipeline: Path | None = None
+    extract_folders: tuple[Path, ...] = ()
+    region_folders: tuple[Path, ...] = ()
+    sealed: PrivateSeed | None = None
+    without: tuple[str, ...] = ()
+    jobs: int = 1
+
+
+def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tell) -> PipelinePlan:
+    """Plan to draw all queries of a published board and ask `matchers`; only files of settings are read.
+
+    Raises
+    ------
+    StoreError
+        If there are no stored results, or they are damaged.
+    ConfigError
+        If the pipeline or the seed of sealed places is another one than that of the board, or it cannot be drawn here.
+    MatchError
+        If there is no such matcher.
+    """
+    stored = request.stored
+    if not is_pack(stored):
+        message = f"{stored} holds no stored results: name those of a board, as docs/results/systems"
+        raise StoreError(message)
+    made_by = stored_settings([stored]).pipeline
+    if not made_by.get("id"):
+        message = f"{stored} are stored results of no pipeline, so nobody knows how its queries are drawn"
+        raise ConfigError(message)
+    spec = read_pipeline_file(request.pipeline or find_pipeline_file(str(made_by["id"])))
+    if spec.identity != dict(made_by):
+        message = (
+            f"{stored} was made by another text of the pipeline {made_by['id']!r} than this one: take the version of "
+            "the program that made it, or name the file by --pipeline"
+        )
+        raise ConfigError(message)
+    _check_seed(stored, request.sealed)
+    plan = plan_pipeline(
+        _asking(spec, matchers),
+        out=request.out,
+        tell=tell,
+        extract_folders=request.extract_folders,
+        region_folders=request.region_folders,
+        sealed=request.sealed,
+    )
+    kept = tuple(item for item in plan.requests if item.region.id not in request.without)
+    if len(kept) == len(plan.requests) and request.without:
+        message = f"--without names {', '.join(request.without)}, and the board asks about no such region"
+        raise ConfigError(message)
+    return replace(plan, requests=kept, jobs=request.jobs)
+
+
+def draw_board(request: BoardRequest, *, tell: Tell, progress: Progress | None = None) -> BoardTasks:
+    """Draw the queries of a published board, and return its tasks, for a release; what is there is not drawn again.
+
+    Raise as `plan_board` does, and `ConfigError` if extracts are missing or no query is drawn as it was.
+    """
+    plan = plan_board(request, tell=tell)
+    if plan.split is None or any(item.suite in PICTURED for item in plan.requests):
+        what = "has no split" if plan.split is None else "asks about pictures, which a release does not hold"
+        message = f"the board {plan.spec.id!r} {what}: its queries cannot be released so far"
+        raise ConfigError(message)
+    fetch_extracts(plan)
+    tasks, controls = draw_all(plan, tell=tell, progress=progress)
+    board = asked_tasks(request.stored)
+    names = {(task.about["suite"], task.about["region"]) for task in board}
+    folders = tuple(task for task in [*tasks, *controls] if (task.parent.name, task.name) in names)
+    same = same_queries(request.stored, folders, tell=tell)
+    return BoardTasks(
+        name=plan.spec.id,
+        split=plan.split.spec.id,
+        folders=folders,
+        asked=same,
+        lost=sum(len(task.asked) for task in board) - len(same),
+    )
+
+
+def _check_seed(stored: Path, seed: PrivateSeed | None) -> None:
+    """Refuse a seed that did not draw the sealed places of the board: none of their queries would be the same."""
+    opened = read_board(stored)[0].get("sealed", {})
+    if seed is not None and all(one.get("drawn_by") != seed.commitment for one in opened.values()):
+        message = (
+            f"{stored} was not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}: take the "
+            "seed that was published with the board, or none"
+        )
+        raise ConfigError(message)
+
+
+def _asking(spec: PipelineFile, matchers: Sequence[str]) -> PipelineFile:
+    """Return a pipeline that asks some matchers all of its queries, and compares nothing."""
+    tasks = [task.model_copy(update={"matchers": []}) for task in spec.task]
+    return spec.model_copy(update={"matchers": list(matchers), "task": tasks, "contrast": [], "rejectors": []})
+
+
+def asked_tasks(stored: Path) -> list[AskedTask]:
+    """Return the tasks of a board with the hashes of their queries."""
+    with laid_tasks([stored]) as folders:
+        return [AskedTask.of(folder) for folder in folders]
+
+
+def same_queries(stored: Path, tasks: Sequence[Path], *, tell: Tell) -> dict[str, str]:
+    """Return the hash of each query of a board that tasks hold as the board does, by id; `tell` gets how many.
+
+    Raise `ConfigError` if there is none.
+    """
+    drawn = {name: asked for task in tasks for name, asked in AskedTask.of(task).asked.items()}
+    board = {name: asked for task in asked_tasks(stored) for name, asked in task.asked.items()}
+    same = {name: asked for name, asked in board.items() if drawn.get(name) == asked}
+    if not same:
+        message = (
+            f"none of the {len(board)} queries of {stored} is drawn here as it was: they were drawn by another "
+            "version of the program, or from other extracts; take the version that made the board"
+        )
+        raise ConfigError(message)
+    tell(f"{len(same)} of {counted(len(board), 'query', 'queries')} of the board are drawn as they were")
+    if len(same) < len(board):
+        other = len(drawn.keys() & board.keys() - same.keys())
+        tell(f"  left out: {other} that this version draws otherwise, {len(board) - len(same) - other} not drawn here")
+    return same

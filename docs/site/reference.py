@@ -51,6 +51,7 @@ STAGES: Final = {
     "tasks": "Queries and truths",
     "matching": "Matchers, rejectors and segmenters",
     "running": "Predictions and conformance",
+    "leaderboard": "Boards and queries in a notebook",
 }
 _MODELS: Final[dict[str, tuple[str, Mapping[str, type[BaseModel]]]]] = {
     "Region file": ("`regions/*.toml`", {"": RegionFile, "[[extract]]": Extract, "town": TownEntry}),

@@ -38,9 +38,7 @@ def test_a_board_has_its_tables_as_data_frames(board):
 
 def test_the_tradeoff_has_a_panel_for_each_prior_group_and_names_controls_apart(board):
     figure = board.plot_tradeoff("clean")
-    groups = set(
-        board.scores.loc[board.scores["suite"].eq("clean") & board.scores["track"].eq("localization")].prior_group
-    )
+    asked = board.scores[board.scores["suite"].eq("clean") & board.scores["track"].eq("localization")]
     assert len([chart for chart in figure.axes if chart.get_visible()]) == asked["prior_group"].nunique()
     legend = {label.get_text() for one in figure.findobj(Legend) for label in one.get_texts()}
     assert legend <= set(ranked_matchers(board.leaderboard))

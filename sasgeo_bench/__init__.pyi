@@ -7,6 +7,9 @@ from .cli.queries import make_tasks as make_tasks
 from .cli.regions import build_region as build_region
 from .cli.regions import render_imagery as render_imagery
 from .cli.runs import run as run
+from .datasets.torch import PictureDataset as PictureDataset
+from .datasets.torch import QueryDataset as QueryDataset
+from .datasets.torch import task_pictures as task_pictures
 from .geometry.grid import Grid as Grid
 from .geometry.pose import Pose as Pose
 from .geometry.pose import Prior as Prior

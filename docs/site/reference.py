@@ -49,6 +49,7 @@ STAGES: Final = {
     "search": "Dense pose search",
     "sensing": "Aerial images and segmentation",
     "tasks": "Queries and truths",
+    "datasets": "Datasets of PyTorch",
     "matching": "Matchers, rejectors and segmenters",
     "running": "Predictions and conformance",
     "leaderboard": "Boards and queries in a notebook",

@@ -26,9 +26,9 @@ board
 # %% [markdown]
 # ## One figure, one row
 #
-# `leaderboard` holds every figure with what is needed to read it: how many queries `n`, in how many blocks of ground and
-# in how many places, the 95 % interval, and the ranks that the data leave open. A *suite* is one thing that is done to a
-# view or a map; its *stratum* says which of its queries. `success_25m` is the share of queries answered within 25 m and
+# `leaderboard` holds every figure with what is needed to read it: how many queries `n`, in how many blocks of ground
+# and places, the 95 % interval, and the ranks that the data leave open. A *suite* is one thing that is done to a view
+# or a map; its *stratum* says which of its queries. `success_25m` is the share of queries answered within 25 m and
 # 5 deg.
 
 # %%

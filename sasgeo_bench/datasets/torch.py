@@ -55,8 +55,9 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
         The map that the task is about, for `map`.
     track : {"localization", "retrieval", "sequence"}
         Queries of this track alone.
-    view_cells, map_cells : int
-        Side of `view` and of `map`. Larger views are cut to their middle; what a smaller one does not show is unknown.
+    sides_cells : tuple of int
+        Sides of `view` and of `map`, V and M below. Larger views are cut to their middle; what a smaller one does not
+        show is unknown.
     seed : int
         The order of the items follows from hashes of the seed and of each query's id: the beginning of a dataset is a
         sample of it, and one more query changes the order of no other two.
@@ -100,8 +101,7 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
         *,
         region: Region | None = None,
         track: Track = "localization",
-        view_cells: int = 192,
-        map_cells: int = 512,
+        sides_cells: tuple[int, int] = (192, 512),
         seed: int = 0,
     ) -> None:
         _check_torch()
@@ -110,7 +110,7 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
         if region is not None and base_of(about["region"]) != base_of(region.manifest.id):
             message = f"{folder} is about {about['region']!r}, the region is {region.manifest.id!r}: read the other one"
             raise ConfigError(message)
-        self.view_cells, self.map_cells = view_cells, map_cells
+        self.view_cells, self.map_cells = sides_cells
         self._truths = None if truths is None else _read_truths(folder, Path(truths))
         self._rows = _rows_of(folder, track, seed)
         self.classes = self.query(0).evidence.classes

@@ -65,7 +65,7 @@ def test_items_are_the_queries_of_a_track_each_once_in_the_order_of_their_hashes
 def test_an_item_holds_view_prior_and_truth_of_its_query(torch, folders):
     queries = {query.query_id: query for query in sgb.read_queries(folders.task)}
     truths = {truth.query_id: truth for truth in sgb.read_truths(folders.truths)}
-    dataset = sgb.QueryDataset(folders.task, folders.truths, view_cells=384)
+    dataset = sgb.QueryDataset(folders.task, folders.truths, sides_cells=(384, 8))
     for item in dataset:
         query, truth = queries[item["query_id"]], truths[item["query_id"]]
         edge = (384 - query.evidence.shape[0]) // 2
@@ -80,7 +80,7 @@ def test_an_item_holds_view_prior_and_truth_of_its_query(torch, folders):
 def test_the_map_of_an_item_shows_what_the_view_sees_at_its_pose(torch, folders):
     """A view is sampled from the map by its pose: rebuilt from `map` alone, it is what the whole map shows there."""
     del torch
-    dataset = sgb.QueryDataset(folders.task, folders.truths, region=folders.region, map_cells=1400)
+    dataset = sgb.QueryDataset(folders.task, folders.truths, region=folders.region, sides_cells=(192, 1400))
     item = dataset[0]
     east_m, north_m, yaw_deg, scale = item["pose"].double().tolist()
     side, size_m = 1400, dataset.query(0).evidence.cell_size_m
@@ -97,7 +97,7 @@ def test_the_map_of_an_item_shows_what_the_view_sees_at_its_pose(torch, folders)
 
 
 def test_workers_give_the_same_batches_as_none(torch, folders):
-    dataset = sgb.QueryDataset(folders.task, folders.truths, region=folders.region, map_cells=64)
+    dataset = sgb.QueryDataset(folders.task, folders.truths, region=folders.region, sides_cells=(192, 64))
     loaders = [torch.utils.data.DataLoader(dataset, batch_size=4, num_workers=count) for count in (0, 2)]
     for alone, shared in zip(*loaders, strict=True):
         assert alone.keys() == shared.keys()
@@ -107,7 +107,7 @@ def test_workers_give_the_same_batches_as_none(torch, folders):
 
 
 def test_a_dataset_travels_to_a_worker_that_is_started_anew(torch, folders):
-    dataset = sgb.QueryDataset(folders.task, folders.truths, region=folders.region, map_cells=32)
+    dataset = sgb.QueryDataset(folders.task, folders.truths, region=folders.region, sides_cells=(192, 32))
     again = pickle.loads(pickle.dumps(dataset))  # noqa: S301 - our own
     assert torch.equal(again[1]["map"], dataset[1]["map"])
     assert isinstance(dataset, torch.utils.data.Dataset)

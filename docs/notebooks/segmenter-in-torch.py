@@ -223,7 +223,7 @@ for line, one in zip(charts, unseen[:3], strict=True):
     for chart, (name, picture) in zip(line, shown.items(), strict=True):
         chart.imshow(picture)
         chart.set(xticks=[], yticks=[])
-        chart.set_title(name if line is charts[0] else "", fontsize=9)
+        chart.set_title(name, fontsize=9)
 
 # %% [markdown]
 # These are few pictures and a minute of training: the figures say how such a loop is written, not how well it can be
@@ -231,7 +231,8 @@ for line, one in zip(charts, unseen[:3], strict=True):
 #
 # ## Is a probability one?
 #
-# A matcher weighs evidence by its confidence, so 0.8 should be right in four pixels of five.
+# A matcher weighs evidence by its confidence, so 0.8 should be right in four pixels of five. Below the grey line the
+# network is too sure, above it too modest.
 
 # %%
 said = np.concatenate([chances(networks["small U-Net"], one)[one.labels != sgb.UNKNOWN] for one in unseen])
@@ -241,7 +242,7 @@ counts = np.bincount(bins, minlength=10)
 _, chart = plt.subplots(figsize=(4, 4), layout="constrained")
 chart.plot([0, 1], [0, 1], color="#999999", lw=0.8)
 chart.plot(np.bincount(bins, said, 10) / counts, np.bincount(bins, true, 10) / counts, marker="o")
-chart.set(xlabel="stated probability", ylabel="share that is there", title="unseen town, all classes")
+chart.set(xlabel="stated probability", ylabel="share that is there", title="unseen town and materials")
 
 # %% [markdown]
 # ## Where to go on

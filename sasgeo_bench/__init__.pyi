@@ -7,12 +7,18 @@ from .cli.queries import make_tasks as make_tasks
 from .cli.regions import build_region as build_region
 from .cli.regions import render_imagery as render_imagery
 from .cli.runs import run as run
+from .datasets.torch import PictureDataset as PictureDataset
+from .datasets.torch import QueryDataset as QueryDataset
+from .datasets.torch import task_pictures as task_pictures
 from .geometry.grid import Grid as Grid
 from .geometry.pose import Pose as Pose
 from .geometry.pose import Prior as Prior
 from .geometry.pose import inverse as inverse
 from .geometry.pose import rotation as rotation
 from .geometry.pose import wrap_deg as wrap_deg
+from .leaderboard.query_plot import plot_query as plot_query
+from .leaderboard.stored_board import StoredBoard as StoredBoard
+from .leaderboard.stored_board import read_board as read_board
 from .matching.belief_fix import fix_of as fix_of
 from .matching.belief_fix import followed as followed
 from .matching.card_file import read_card as read_card
@@ -61,6 +67,7 @@ from .regions.evidence import observe as observe
 from .regions.graph import build_graph as build_graph
 from .regions.imagery import Imagery as Imagery
 from .regions.imagery import ImageryWindow as ImageryWindow
+from .regions.preview import plot_region as plot_region
 from .regions.region import MapGraph as MapGraph
 from .regions.region import Region as Region
 from .regions.region_files import read_imagery as read_imagery

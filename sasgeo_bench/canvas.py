@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import matplotlib as mpl
 from matplotlib.artist import Artist
@@ -166,6 +166,12 @@ class PlainFigure(Figure):
             canvas = FigureCanvasAgg(self)
             canvas.print_png(path, metadata={"Title": title, "Copyright": data, "Software": None})
 
+    def _repr_png_(self) -> bytes:
+        """Return the figure as a notebook shows it, whether pyplot is imported or not."""
+        shown = io.BytesIO()
+        self.savefig(shown, format="png")
+        return shown.getvalue()
+
     def savefig(self, fname: Any, **options: Any) -> None:  # noqa: ANN401 - as the figure's own
         """Write the figure; each entry of its metadata is one line."""
         given = options.pop("metadata", None) or {}
@@ -186,8 +192,8 @@ def new_figure(size_inches: tuple[float, float], *, dpi: int = DPI) -> PlainFigu
 
 
 @contextmanager
-def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
-    """Yield the panels of a figure, row by row; write it as .svg or .png when the block ends."""
+def page(path: Path | None, about: Page) -> Iterator[list[list[Axes]]]:
+    """Yield the panels of a figure, row by row; write it as .svg or .png, if there is a path, when the block ends."""
     wide, high = about.panel_inches
     with styled():
         # Larger than needed: `fit` makes it smaller, and too small a figure has no room for panels.
@@ -197,7 +203,13 @@ def page(path: Path, about: Page) -> Iterator[list[list[Axes]]]:
         for chart in charts.flat:
             chart.set_title(broken(chart.get_title("left"), wide, 8.0))
         figure.fit(charts[0, 0], charts[-1, -1], about)
-        figure.write(path, about)
+        if path is not None:
+            figure.write(path, about)
+
+
+def figure_of(chart: Axes) -> Figure:
+    """Return the whole figure that a panel is part of."""
+    return cast("Figure", chart.get_figure(root=True))
 
 
 def panels(charts: Sequence[Sequence[Axes]], count: int) -> Iterator[tuple[int, Axes]]:

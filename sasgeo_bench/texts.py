@@ -4,6 +4,7 @@
 Figures, the terminal and pages have their own: `canvas.py`, `cli/console.py`, `publishing/site.py`.
 """
 
+import html
 import json
 import re
 from collections.abc import Mapping
@@ -52,6 +53,20 @@ def plain(text: str) -> str:
 def plain_lines(text: str) -> str:
     """Return lines of printable characters; only a line feed ends a line."""
     return "\n".join(map(plain, text.split("\n")))
+
+
+def html_facts(title: str, facts: Mapping[str, object]) -> str:
+    """Return a title and named facts as a table of HTML, all texts escaped: how a notebook shows a thing.
+
+    >>> html_facts("town", {"map of": "<b>2025</b>"})
+    '<table><caption>town</caption><tr><th>map of</th><td>&lt;b&gt;2025&lt;/b&gt;</td></tr></table>'
+    """
+    rows = "".join(f"<tr><th>{_html(name)}</th><td>{_html(value)}</td></tr>" for name, value in facts.items())
+    return f"<table><caption>{_html(title)}</caption>{rows}</table>"
+
+
+def _html(text: object) -> str:
+    return html.escape(plain(str(text)))
 
 
 def markdown(text: object) -> str:

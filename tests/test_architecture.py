@@ -17,7 +17,8 @@ HOUSE = (
     # What any program needs.
     *("texts", "errors", "config", "progress", "files", "canvas"),
     # The pipeline.
-    *("geometry", "osm", "regions", "ageing", "search", "sensing", "flights", "tasks", "matching", "sasgeo", "running"),
+    *("geometry", "osm", "regions", "ageing", "search", "sensing", "flights", "tasks"),
+    *("datasets", "matching", "sasgeo", "running"),
     *("scoring", "leaderboard", "publishing", "importers", "experiments", "cli"),
 )
 

@@ -49,8 +49,10 @@ STAGES: Final = {
     "search": "Dense pose search",
     "sensing": "Aerial images and segmentation",
     "tasks": "Queries and truths",
+    "datasets": "Datasets of PyTorch",
     "matching": "Matchers, rejectors and segmenters",
     "running": "Predictions and conformance",
+    "leaderboard": "Boards and queries in a notebook",
 }
 _MODELS: Final[dict[str, tuple[str, Mapping[str, type[BaseModel]]]]] = {
     "Region file": ("`regions/*.toml`", {"": RegionFile, "[[extract]]": Extract, "town": TownEntry}),

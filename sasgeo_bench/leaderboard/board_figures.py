@@ -54,7 +54,7 @@ from sasgeo_bench.scoring.score import FIX_M, single_views
 from sasgeo_bench.scoring.strata import GROUP, queries_of, steps_frame
 from sasgeo_bench.tasks.split import Split
 
-Draw = Callable[[Path], None]
+Draw = Callable[[Path], object]
 Named = Iterator[tuple[str, Draw]]
 
 MOST_STANFORD: Final = 5  # matchers
@@ -133,7 +133,7 @@ def _file_name(*parts: str) -> str:
 
 
 def _each(
-    name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., None], shown: Sequence[str]
+    name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., object], shown: Sequence[str]
 ) -> Named:
     """Yield a figure for each group of rows; prior groups are never together."""
     for key, part in rows.groupby(list(columns), sort=True):

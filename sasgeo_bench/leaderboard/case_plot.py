@@ -2,28 +2,33 @@
 """The picture of one query and its answer; small PNG and WebP pictures for web pages."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import cv2
 import numpy as np
 import shapely
 from matplotlib import patheffects
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle, Rectangle
+from matplotlib.patches import Circle, Patch, Rectangle
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
-from sasgeo_bench.regions.evidence import Evidence, footprint
-from sasgeo_bench.regions.preview import scale_bar
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.evidence import Evidence, LayerBits, footprint, observe
+from sasgeo_bench.regions.preview import paint_overview, pooled, scale_bar
+from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.score import FIX_M
+from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.segmented import Segmented
 from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
@@ -85,6 +90,7 @@ _OTHER: Final = "#0072b2"
 _SIDE: Final = 1.72  # of a small panel, inches
 _MAP: Final = 3.9
 _DPI: Final = 100
+_MOST_CELLS: Final = 560  # of a piece of a map, along a side: more are no more to see
 _HALO: Final = (patheffects.withStroke(linewidth=2.6, foreground="white"),)
 
 
@@ -97,6 +103,15 @@ class MapPart:
     south_m: float
     east_m: float
     north_m: float
+
+    @classmethod
+    def of(cls, layers: NDArray[np.uint8], grid: Grid, manifest: Manifest) -> Self:
+        """Paint layers, shape (C, rows, cols), on their grid; at most `_MOST_CELLS` along a side."""
+        coarse = pooled(layers, most_cells=_MOST_CELLS)
+        step = grid.rows // coarse.shape[1]
+        west_m, south_m, east_m, north_m = grid.window(0, 0, *(side * step for side in coarse.shape[1:])).bounds_m
+        colours = paint_overview(manifest, coarse)
+        return cls(colours=colours, west_m=west_m, south_m=south_m, east_m=east_m, north_m=north_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -171,6 +186,25 @@ class CasePicture:
         if error_m is None or error_deg is None or not self.is_present:
             return False
         return error_m <= FIX_M and error_deg <= SUCCESS_DEG
+
+
+def disc_of(query: Query) -> tuple[float, float, float] | None:
+    """Return the middle and radius of the searched disc, if the search is in a disc."""
+    center_m, radius_m = query.prior.center_m, query.prior.radius_m
+    return None if center_m is None or radius_m is None or query.candidates else (*center_m, radius_m)
+
+
+def seen_at(pose: Pose, view: Evidence, layers: LayerBits, grid: Grid, manifest: Manifest) -> Evidence:
+    """Return the map at a place as a view of the size and classes of `view`."""
+    cells = observe(layers, grid, pose, size_cells=view.shape[0], cell_size_m=view.cell_size_m)
+    return view.replace(cells[[manifest.classes.index(name) for name in view.classes]])
+
+
+def class_keys(shown: Collection[str]) -> list[Artist]:
+    """Return legend entries of classes, in the order of the taxonomy, and of what is unknown."""
+    classes = [item for item in load_taxonomy().classes if item.name in shown]
+    keys: list[Artist] = [Patch(color=item.colour, label=item.name.replace("_", " ")) for item in classes]
+    return [*keys, Patch(color=HIDDEN, label="unknown")]
 
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:

@@ -13,8 +13,9 @@ import pandas as pd
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
 
-from sasgeo_bench.canvas import GREY, page, panels
+from sasgeo_bench.canvas import GREY, figure_of, page, panels
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_plots import (
     ACROSS,
@@ -163,8 +164,11 @@ def draw_forest(path: Path, contrast: Contrast, finding: Finding, places: Sequen
 # --- what is known of the answers -------------------------------------------------------------------------------------
 
 
-def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
-    """Draw risk against coverage from `risk_frame`: a panel for each matcher and mixture, a line for each rejector."""
+def draw_risk(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Figure:
+    """Draw risk against coverage from `risk_frame`: a panel for each matcher and mixture, a line for each rejector.
+
+    Return the figure, written where there is a path.
+    """
     names, rejectors = those_there(rows, shown), sorted(set(rows["rejector"]))
     mixtures = list(dict.fromkeys(rows["mixture"]))
     there = set(zip(rows["matcher"], rows["mixture"], strict=True))
@@ -198,6 +202,7 @@ def draw_risk(path: Path, rows: pd.DataFrame, shown: Sequence[str]) -> None:
             chart.set_ylim(0.0, max(high, 0.02))
             chart.grid(visible=True, color=FAINT, lw=0.6)
             label_outer(chart, number, columns, len(cells), "risk\n(share of accepted)")
+    return figure_of(charts[0][0])
 
 
 def _counts(mine: pd.DataFrame) -> str:

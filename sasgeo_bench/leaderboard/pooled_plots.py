@@ -13,8 +13,9 @@ from typing import Final
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from sasgeo_bench.canvas import page, panels
+from sasgeo_bench.canvas import figure_of, page, panels
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_plots import (
     FAINT,
@@ -35,9 +36,10 @@ from sasgeo_bench.leaderboard.board_plots import (
 )
 from sasgeo_bench.leaderboard.columns import prior_words
 from sasgeo_bench.leaderboard.pooled_tables import LEAST_ERROR_M, MOST_ERROR_M, front_of
+from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.metrics import primary_of
-from sasgeo_bench.scoring.rows import ALL_SUITES
+from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
 from sasgeo_bench.scoring.score import FIX_M
 
 _STRESS: Final = "Present places under stress; of a suite without stresses all of them."
@@ -230,6 +232,85 @@ def _left_out(rows: pd.DataFrame) -> str:
     return f" Not known or without bounds: {'; '.join(lacking)}." if lacking else ""
 
 
+def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -> Figure:
+    """Draw success against the median latency from `price_frame`: a panel for each prior group, controls in grey.
+
+    Those of `shown` have a look each, the others are grey points. Return the figure, written where there is a path.
+    """
+    rows = rows[np.isfinite(rows["latency_s"].to_numpy(float))]
+    is_free = rows["matcher"].map(is_unranked).to_numpy(bool)
+    names, groups = those_there(rows[~is_free], shown), sorted(set(rows["prior_group"]))
+    down, across = panels_across(len(groups))
+    about = BoardPage(
+        title=f"Success against latency: {rows['suites'].iloc[0]}, {rows['track'].iloc[0]}",
+        note=(
+            "Present places. Upright bars: 95 % intervals; level "
+            "bars: from the median latency to the 95th percentile, all suites of the track, as measured where each "
+            "matcher ran. Grey line: the front, where no other matcher is both faster and better. Grey crosses: "
+            "controls, which compete with nobody."
+        ),
+        below="latency of an answer (s), median to 95th percentile",
+        rows=down,
+        columns=across,
+        keys=line_keys(names),
+        panel_inches=(3.4, 2.6),
+    )
+    with page(path, about) as charts:
+        for number, chart in panels(charts, len(groups)):
+            is_here = (rows["prior_group"] == groups[number]).to_numpy(bool)
+            mine, free = rows[is_here & ~is_free], rows[is_here & is_free]
+            panel_title(chart, prior_words(groups[number]), rows[is_here].iloc[0])
+            if len(mine):
+                _prices(chart, mine, [name for name in names if (mine["matcher"] == name).any()], "latency_s")
+            _controls(chart, free)
+            _cost_axis(chart, rows.loc[is_here, ["latency_s", "slow_s"]].to_numpy(float))
+            dress_share(chart)
+            chart.grid(visible=True, color=FAINT, lw=0.6)
+            chart.tick_params(labelleft=number % across == 0)
+        charts[0][0].set_ylabel(PRIMARY[primary_of(str(rows["track"].iloc[0])).name])
+    return figure_of(charts[0][0])
+
+
+def _controls(chart: Axes, rows: pd.DataFrame) -> None:
+    """Draw controls as named grey crosses."""
+    for number, row in enumerate(rows.sort_values("matcher").to_dict("records")):
+        at, away = (row["latency_s"], row["value"]), (4, -9 if number % 2 else 3)  # names of neighbours lie apart
+        chart.plot(*at, color="#999999", marker="x", ms=5, ls="", zorder=1)
+        chart.annotate(row["matcher"], at, away, textcoords="offset points", fontsize=6.5, color="#777777")
+
+
+def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
+    """Draw the difference of each registered contrast with its 95 % interval, in the order of the table.
+
+    Return the figure, written where there is a path.
+    """
+    rows = contrasts[contrasts["n"] > 0].to_dict("records")
+    about = BoardPage(
+        title="Registered contrasts",
+        note=(
+            "First less second on the same queries, with its 95 % interval by places. Blue: decided; grey: not. Grey "
+            "band: differences smaller than was registered to matter. An interval that holds 0 shows neither to be "
+            "better; one within the band is a tie."
+        ),
+        below="difference (shares; of other metrics in their unit)",
+        panel_inches=(4.6, 0.4 + 0.28 * len(rows)),
+    )
+    with page(path, about) as charts:
+        chart = charts[0][0]
+        for at, row in enumerate(rows):
+            chart.barh(at, 2 * row["least"], left=-row["least"], height=0.8, color="#eeeeee")
+            colour = look_of(1).colour if row["outcome"] == "decided" else "#999999"
+            chart.hlines(at, row["lo"], row["hi"], color=colour, lw=1.6)
+            chart.plot(row["difference"], at, marker="s", color=colour, ms=4.5, ls="")
+        chart.axvline(0.0, color="#000000", lw=0.8)
+        labels = [f"{row['name']}: {row['first']} - {row['second']}" for row in rows]
+        chart.set_yticks(range(len(rows)), labels)
+        chart.set_ylim(len(rows) - 0.4, -0.6)
+        chart.tick_params(axis="y", length=0)
+        chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
+    return figure_of(chart)
+
+
 def _prices(chart: Axes, rows: pd.DataFrame, names: Sequence[str], column: str) -> None:
     cost, value = rows[column].to_numpy(float), rows["value"].to_numpy(float)
     front = rows[front_of(cost, value)].sort_values(column)
@@ -249,10 +330,13 @@ def _prices(chart: Axes, rows: pd.DataFrame, names: Sequence[str], column: str) 
         if column == "latency_s" and np.isfinite(row["slow_s"]):
             chart.hlines(row["value"], row[column], row["slow_s"], color=look.colour, lw=0.9, alpha=0.75)
         chart.plot(row[column], row["value"], color=look.colour, marker=look.mark, ms=6, ls="")
-    known = cost[np.isfinite(cost)]
-    if known.min() > 0:
-        ends = np.concatenate((known, rows["slow_s"].to_numpy(float))) if column == "latency_s" else known
-        ends = ends[np.isfinite(ends)]
+    _cost_axis(chart, rows[[column, "slow_s"] if column == "latency_s" else [column]].to_numpy(float))
+
+
+def _cost_axis(chart: Axes, costs: Floats) -> None:
+    """Set a logarithmic axis around costs, of which some may be unknown; a linear one where one is 0."""
+    ends = costs[np.isfinite(costs)]
+    if ends.min() > 0:
         lo, hi = float(ends.min()) / 1.6, float(ends.max()) * 1.6
         ticks_across(chart, _round_numbers(lo, hi), lo, hi)
 

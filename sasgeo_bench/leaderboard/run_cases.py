@@ -10,21 +10,19 @@ from typing import Any, Final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart
+from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart, disc_of, seen_at
 from sasgeo_bench.leaderboard.cases import find_cases, operating_rejector, words_of
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
-from sasgeo_bench.regions.layers import PRESENT, read_layers
-from sasgeo_bench.regions.preview import paint_overview
+from sasgeo_bench.regions.evidence import LayerBits
+from sasgeo_bench.regions.layers import read_layers
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
@@ -42,7 +40,6 @@ from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.sheet import strength_text
 from sasgeo_bench.tasks.split import Split
 
-_MOST_CELLS: Final = 560  # of a piece of a map, along a side: more are no more to see
 _ROOM: Final = 1.25  # around both places
 _LEAST_SIDES: Final = 2.4  # of a view, a piece of a map is at least
 _MOST_LINES: Final = 17
@@ -140,13 +137,13 @@ def read_picture(case: Case, root: Path, about: Mapping[str, Any]) -> CasePictur
     return CasePicture(
         title=_title(case),
         view=query.evidence,
-        part=_map_part(layers, grid, manifest),
+        part=MapPart.of(layers, grid, manifest),
         true=truth.pose,
         is_present=truth.is_present,
         modes=modes,
-        at_true=_seen_at(truth.pose, case, bits, grid, manifest),
-        at_answer=_seen_at(case.fix, case, bits, grid, manifest),
-        disc=_disc(query),
+        at_true=None if truth.pose is None else seen_at(truth.pose, query.evidence, bits, grid, manifest),
+        at_answer=None if case.fix is None else seen_at(case.fix, query.evidence, bits, grid, manifest),
+        disc=disc_of(query),
         lines=_lines(case),
         attribution=_attribution(truth, manifest),
         what=_what(case),
@@ -165,12 +162,6 @@ def _attribution(truth: Truth, manifest: Manifest) -> str:
     return f"{manifest.attribution}; {manifest.imagery.attribution}"
 
 
-def _disc(query: Query) -> tuple[float, float, float] | None:
-    """Return the middle and radius of the searched disc, if the search is in a disc."""
-    center_m, radius_m = query.prior.center_m, query.prior.radius_m
-    return None if center_m is None or radius_m is None or query.candidates else (*center_m, radius_m)
-
-
 def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
     """Return row, column, rows and columns of the part of the map to draw, square unless the map ends."""
     side_m = max(case.query.evidence.size_m)
@@ -185,28 +176,6 @@ def _window(case: Case, grid: Grid) -> tuple[int, int, int, int]:
     row, col = np.clip(corners[0], 0, [grid.rows - 1, grid.cols - 1]).tolist()
     end_row, end_col = np.clip(corners[1] + 1, [row + 1, col + 1], [grid.rows, grid.cols]).tolist()
     return (row, col, end_row - row, end_col - col)
-
-
-def _map_part(layers: NDArray[np.uint8], grid: Grid, manifest: Manifest) -> MapPart:
-    """Return layers as colours, at most `_MOST_CELLS` along a side."""
-    step = max(1, min(-(-max(grid.shape) // _MOST_CELLS), *grid.shape))
-    rows, cols = (side // step for side in grid.shape)
-    parts = layers[:, : rows * step, : cols * step].reshape(len(layers), rows, step, cols, step)
-    is_there = (parts == PRESENT).any(axis=(2, 4))
-    coarse = np.where(is_there, np.uint8(PRESENT), parts.max(axis=(2, 4)))
-    west_m, south_m, east_m, north_m = grid.window(0, 0, rows * step, cols * step).bounds_m
-    colours = paint_overview(manifest, coarse)
-    return MapPart(colours=colours, west_m=west_m, south_m=south_m, east_m=east_m, north_m=north_m)
-
-
-def _seen_at(pose: Pose | None, case: Case, bits: LayerBits, grid: Grid, manifest: Manifest) -> Evidence | None:
-    """Return the map at a place, of the classes that were looked for."""
-    if pose is None:
-        return None
-    view = case.query.evidence
-    cells = observe(bits, grid, pose, size_cells=view.shape[0], cell_size_m=view.cell_size_m)
-    kept = cells[[manifest.classes.index(name) for name in view.classes]]
-    return Evidence(classes=view.classes, cells=kept, cell_size_m=view.cell_size_m)
 
 
 def _title(case: Case) -> str:

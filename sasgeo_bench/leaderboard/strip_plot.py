@@ -10,7 +10,6 @@ import pandas as pd
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
@@ -19,18 +18,17 @@ from sasgeo_bench.leaderboard.case_plot import (
     ANSWERED,
     TRUE,
     CasePicture,
+    class_keys,
     draw_map,
     draw_panel,
     draw_picture,
     pixels_of,
 )
 from sasgeo_bench.leaderboard.run_cases import RunCases, picture_of
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.query import BY, PERCEIVED
-from sasgeo_bench.tasks.sheet import HIDDEN
 
 _SIDE_INCHES: Final = 2.3
 _DPI: Final = 100
@@ -159,12 +157,7 @@ def _keys(rows: Sequence[CasePicture]) -> list[Artist]:
     seen = [item for row in rows for item in (row.view, row.at_true, row.at_answer) if item is not None]
     shown = {name for item in seen for name, cells in zip(item.classes, item.cells, strict=True) if PRESENT in cells}
     shown |= {name for row in rows if row.segmented is not None for name in row.segmented.classes}
-    keys += [
-        Patch(color=item.colour, label=item.name.replace("_", " "))
-        for item in load_taxonomy().classes
-        if item.name in shown
-    ]
-    return [*keys, Patch(color=HIDDEN, label="unknown")]
+    return [*keys, *class_keys(shown)]
 
 
 def _known(view: Evidence) -> Evidence:

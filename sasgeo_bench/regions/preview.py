@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw `preview.png`: a region as a map with legend, scale, north arrow, date and attribution."""
+"""A region as a map with legend, scale, north arrow, date and attribution: `preview.png`, and a figure."""
 
 from pathlib import Path
 from textwrap import wrap
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.canvas import PlainFigure
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
-from sasgeo_bench.regions.region import Manifest
+from sasgeo_bench.regions.region import Manifest, Region
 
 # Painted in this order: land first, then what lies on it, then what runs over it.
 PAINT_ORDER: Final = (
@@ -29,6 +29,7 @@ _GROUND: Final = "#fbfaf5"
 _UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")
 _STRIPE_CELLS: Final = 12
 _DPI: Final = 110
+_MOST_CELLS: Final = 1024  # of a figure, along a side: more are no more to see
 _LEGEND_INCHES: Final = 2.9
 _MAP_INCHES: Final = 9.6
 _LEAST_INCHES: Final = 4.6
@@ -40,8 +41,58 @@ _ARROW_INCHES: Final = 0.3
 _EDGE: Final = "#d81b60"
 
 
+def plot_region(region: Region) -> Figure:
+    """Draw the semantic layers of a region, with legend, scale, north arrow, date and attribution.
+
+    A notebook shows the figure; `figure.savefig("town.png")` writes it. Of a large region at most 1024 cells a side are
+    drawn, and what is thin stays visible.
+
+    Parameters
+    ----------
+    region : Region
+        A built region, or a part of one (`Region.cuts`).
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A figure of its own, unknown to pyplot: nothing has to be closed.
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> import sasgeo_bench as sgb
+    >>> with TemporaryDirectory() as folder:
+    ...     figure = plot_region(sgb.tiny_place(Path(folder)).region)
+    >>> figure.texts[-1].get_text()
+    '(c) OpenStreetMap contributors, ODbL'
+    """
+    return _drawn(region.manifest, pooled(region.layers, most_cells=_MOST_CELLS))
+
+
 def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]) -> None:
     """Draw a region to a PNG; `overview` is a coarse level of the layers, uint8 of shape (C, rows, cols)."""
+    _drawn(manifest, overview).savefig(
+        path, metadata={"Title": manifest.title, "Copyright": manifest.attribution, "Software": None}, format="png"
+    )
+
+
+def pooled(layers: NDArray[np.uint8], *, most_cells: int) -> NDArray[np.uint8]:
+    """Return coarser layers, at most `most_cells` along a side: present where any cell is, else the largest value.
+
+    Rows and columns that fill no whole cell at the lower and right edge are left out.
+
+    >>> pooled(np.array([[[0, 0, 1, 0]], [[0, 0, 255, 0]]], dtype=np.uint8).repeat(2, axis=1), most_cells=2).tolist()
+    [[[0, 1]], [[0, 255]]]
+    """
+    sides = layers.shape[1:]
+    step = max(1, min(-(-max(sides) // most_cells), *sides))
+    rows, cols = (side // step for side in sides)
+    parts = layers[:, : rows * step, : cols * step].reshape(len(layers), rows, step, cols, step)
+    is_there = (parts == PRESENT).any(axis=(2, 4))
+    return np.where(is_there, np.uint8(PRESENT), parts.max(axis=(2, 4)))
+
+
+def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     rows, cols = overview.shape[1:]
     scale = _MAP_INCHES / max(rows, cols)
     width, height = max(cols * scale, 2.0), max(rows * scale, _LEAST_INCHES)
@@ -59,9 +110,7 @@ def write_preview(path: Path, *, manifest: Manifest, overview: NDArray[np.uint8]
     _draw_strip(figure, total, width_m=side_m[0], m_per_inch=m_per_inch)
     _words(figure, manifest, total)
     _legend(figure, manifest, overview, left=(width + 0.45) / total[0], top=1 - _TITLE_INCHES / total[1])
-    figure.savefig(
-        path, metadata={"Title": manifest.title, "Copyright": manifest.attribution, "Software": None}, format="png"
-    )
+    return figure
 
 
 def _draw_edge(chart: Axes, manifest: Manifest) -> None:

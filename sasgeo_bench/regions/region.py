@@ -17,7 +17,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.imagery import Imagery, OrthoRecord
-from sasgeo_bench.texts import FOLDER
+from sasgeo_bench.texts import FOLDER, html_facts
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -212,6 +212,20 @@ class Region:
     def classes(self) -> tuple[str, ...]:
         """Return class names in band order."""
         return self.manifest.classes
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of a region; nothing more of it is read. `sgb.plot_region` draws it."""
+        about = self.manifest
+        facts = {
+            "map of": about.extract.date,
+            "scenes": ", ".join(about.scenes),
+            "grid": f"{about.rows} x {about.cols} cells of {about.cell_size_m:g} m, EPSG:{about.epsg}",
+            "mapped": about.coverage.to_text(),
+            "objects": ", ".join(f"{name} {count:,}" for name, count in about.counts.items() if count),
+            "imagery": "none" if about.imagery is None else about.imagery.attribution,
+            "data": about.attribution,
+        }
+        return html_facts(f"{about.title} ({about.id})", facts)
 
     def layer(self, class_name: str) -> NDArray[np.uint8]:
         """Return the raster of one class, shape (rows, cols); no other is read, for a country's take a gigabyte."""

@@ -12,8 +12,9 @@ import shapely
 
 from sasgeo_bench.errors import ConfigError, PoseError, ShapeError
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
+from sasgeo_bench.texts import html_facts
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -246,6 +247,21 @@ class Query(_Question):
     vectors: "gpd.GeoDataFrame | None" = None
     frames: tuple[Frame, ...] = ()
     step: Step | None = None
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of a query; `sgb.plot_query` draws it."""
+        view, (rows, cols) = self.evidence, self.evidence.shape
+        seen = [name for name, cells in zip(view.classes, view.cells, strict=True) if (cells == PRESENT).any()]
+        facts = {
+            "asked": f"{self.track}, {self.suite} on {self.region}, {self.part}",
+            "prior group": self.prior_group,
+            "view": f"{rows} x {cols} cells of {view.cell_size_m:g} m, {view.unknown_share:.0%} unknown",
+            "classes seen": ", ".join(seen) or "none",
+            "observed": f"{self.observed_on} {self.season}".strip(),
+            "pictures": len(self.frames),
+            "candidates": len(self.candidates),
+        }
+        return html_facts(f"query {self.query_id}", facts)
 
     def __post_init__(self) -> None:
         """Check the vectors."""

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A board from its folder as data frames and figures: what a notebook reads."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.files.parquet import read_frame
+from sasgeo_bench.leaderboard import board_files
+from sasgeo_bench.leaderboard.board_files import ACCEPTANCE, MEND, PROTECTION, SCORES
+from sasgeo_bench.leaderboard.plot_tables import MOST_MATCHERS, ranked_matchers, risk_frame, shown_matchers
+from sasgeo_bench.leaderboard.plots import draw_risk
+from sasgeo_bench.leaderboard.pooled_plots import draw_contrasts, draw_tradeoff
+from sasgeo_bench.leaderboard.pooled_tables import price_frame
+from sasgeo_bench.scoring.rejection import OWN, own_confidence
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
+from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
+from sasgeo_bench.texts import html_facts
+
+_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredBoard:
+    """Tables of a board, as they lie in its folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Where it was read.
+    about : mapping
+        Content of `board.json`: pipeline, versions, entries with their cards, tasks.
+    leaderboard : DataFrame
+        Every figure with its interval: a row for each matcher, rejector, suite, stratum and metric.
+    scores : DataFrame
+        A row for each matcher and query.
+    contrasts : DataFrame
+        Registered contrasts: difference, interval, verdict.
+    controls, falsifiers : DataFrame
+        Checks of the benchmark itself, and of its suites.
+    acceptance, protection : DataFrame
+        Figures of rejectors at absent places, and of protection levels; empty where the board has none.
+    """
+
+    folder: Path
+    about: Mapping[str, Any]
+    leaderboard: pd.DataFrame = field(repr=False)
+    scores: pd.DataFrame = field(repr=False)
+    contrasts: pd.DataFrame = field(repr=False)
+    controls: pd.DataFrame = field(repr=False)
+    falsifiers: pd.DataFrame = field(repr=False)
+    acceptance: pd.DataFrame = field(repr=False)
+    protection: pd.DataFrame = field(repr=False)
+
+    def plot_tradeoff(self, suite: str | None = None, *, track: str = "localization") -> Figure:
+        """Draw success with its 95 % interval against the median latency, a panel for each prior group.
+
+        Matchers compare on the queries of one suite, by default the one that most of them were asked. Controls are
+        grey. Of more than eight matchers the best eight have a colour; the others are grey, too. Groups are apart,
+        because who knows more finds more. Raise `ConfigError` if the board has no latencies of that suite and track.
+        """
+        ranked, asked = ranked_matchers(self.leaderboard), self.scores[self.scores["track"] == track]
+        counts = asked[asked["matcher"].isin(ranked)].groupby("suite")["matcher"].nunique()
+        chosen = suite or (str(counts.idxmax()) if len(counts) else "")
+        some = _by_matcher(asked[asked["suite"] == chosen])
+        rows = price_frame(self.leaderboard, some, [*ranked, *filter(is_unranked, some)])
+        rows = rows[rows["latency_s"].notna()]
+        if rows.empty:
+            known = ", ".join(sorted(set(asked["suite"]))) or "none"
+            message = f"{self.folder} has no latencies of {chosen!r}, {track}: its suites of that track are {known}"
+            raise ConfigError(message)
+        return draw_tradeoff(None, rows, self._shown(rows["matcher"]))
+
+    def plot_contrasts(self) -> Figure:
+        """Draw the difference of each registered contrast with its 95 % interval; grey is what would not matter.
+
+        Raise `ConfigError` if none was registered.
+        """
+        if self.contrasts.empty:
+            message = f"{self.folder} has no registered contrasts: a pipeline file registers them"
+            raise ConfigError(message)
+        return draw_contrasts(None, self.contrasts)
+
+    def plot_risk(self, prior_group: str, *, suite: str = ALL_SUITES, track: str = "localization") -> Figure:
+        """Draw how many of the accepted fixes are false, by how many are accepted: each matcher's own confidence.
+
+        Raise `ConfigError` if no matcher gives a confidence there, or every place of the suite is present.
+        """
+        shown = self._shown(self.scores["matcher"])
+        own = {(name, OWN): own_confidence(frame) for name, frame in _by_matcher(self.scores).items() if name in shown}
+        rows = risk_frame(own, shown)
+        for column, value in (("suite", suite), ("track", track), ("prior_group", prior_group), ("mixture", AS_DRAWN)):
+            rows = rows[rows[column] == value]
+        if rows.empty:
+            message = (
+                f"{self.folder} has no confidences on {suite!r}, {track}, {prior_group!r}: the columns suite, track "
+                "and prior_group of its leaderboard list what there is"
+            )
+            raise ConfigError(message)
+        return draw_risk(None, rows, shown)
+
+    def _shown(self, matchers: "pd.Series[str]") -> tuple[str, ...]:
+        """Return at most eight of some matchers that have a colour, the best if there are more."""
+        return shown_matchers(self.leaderboard[self.leaderboard["matcher"].isin(set(matchers))], ())[:MOST_MATCHERS]
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows of a board."""
+        pipeline, entries, tasks = (self.about.get(name) or () for name in ("pipeline", "entries", "tasks"))
+        failed = [str(one.get("name")) for one in entries if one.get("failed_controls")]
+        facts = {
+            "pipeline": dict(pipeline).get("id", "none"),
+            "entries": ", ".join(str(one.get("name")) for one in entries),
+            "suites": ", ".join(sorted({str(one.get("suite")) for one in tasks})),
+            "maps": len({str(one.get("region")) for one in tasks}),
+            "scored": counted(len(self.scores), "answer"),
+            "contrasts": len(self.contrasts),
+            "failed controls": ", ".join(failed) or "none",
+            "scorer version": self.about.get("scorer_version"),
+            "data": self.about.get("attribution"),
+        }
+        return html_facts(f"board {self.folder.name}", facts)
+
+
+def _by_matcher(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the scored rows of each matcher."""
+    return {str(name): frame for name, frame in scores.groupby("matcher", sort=False)}
+
+
+def read_board(path: str | Path) -> StoredBoard:
+    """Read the tables of a board, or of stored results, as data frames.
+
+    Parameters
+    ----------
+    path : str or Path
+        Folder of a board, as in `out/boards/demo` or `docs/results/modules`.
+
+    Returns
+    -------
+    StoredBoard
+        Its tables, and the figures that they make.
+
+    Raises
+    ------
+    StoreError
+        If there is no board, or a table is damaged.
+
+    Examples
+    --------
+    >>> board = read_board("docs/results/towns")  # doctest: +SKIP
+    >>> board.contrasts[["name", "difference", "lo", "hi", "verdict"]]  # doctest: +SKIP
+    >>> board.plot_tradeoff().savefig("tradeoff.png")  # doctest: +SKIP
+    """
+    folder = Path(path)
+    about, leaderboard = board_files.read_board(folder)
+    tables = {}
+    for name in _TABLES:
+        file = folder / f"{name}.parquet"
+        tables[name] = read_frame(file, mend=MEND) if file.is_file() else pd.DataFrame()
+        if name in (SCORES, "contrasts"):
+            board_files.check_shape(name, tables[name])
+    board_files.check_shape("leaderboard", leaderboard)
+    return StoredBoard(folder=folder, about=about, leaderboard=leaderboard, **tables)

@@ -26,6 +26,7 @@ GENERATED = {
     ".git",
     ".venv",
     ".venv-oldest",
+    ".venv-wheel",
     "out",
     "dist",
     "__pycache__",
@@ -199,7 +200,7 @@ def test_every_step_of_the_workflow_is_a_target_of_the_makefile() -> None:
     jobs = yaml.safe_load(read(".github/workflows/checks.yml"))["jobs"]
     runs = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
     phony = re.search(r"^\.PHONY: (.*)$", read("Makefile"), flags=re.MULTILINE)[1].split()
-    assert sorted(runs) == ["make check", "make docs", "make test", "make test-oldest"]
+    assert sorted(runs) == ["make check", "make docs", "make test", "make test-oldest", "make test-wheel"]
     assert {run.removeprefix("make ") for run in runs} <= set(phony)
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.matching.results import SOUND
@@ -118,6 +118,8 @@ def run(options: RunOptions) -> RunReport:
     if options.dry_run:
         options.say(plan.to_text())
         return RunReport(counts={}, messages={}, folders=tuple(part.folder for part in plan.parts))
+    left = sum(len(part.left) for part in plan.parts)
+    options.tell(f"{plan.card.name}: {counted(left, 'query', 'queries')} to ask")
     report = runner.run(plan, tell=options.tell, progress=options.progress)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
     options.tell(f"{plan.card.name} {plan.card.version}: {counts}")
@@ -136,7 +138,7 @@ def run_command(options: RunOptions) -> None:
     for line in lines:
         say(line)
     if report.counts and not report.counts.keys() & SOUND:
-        tell(f"no query was answered, so the command ends with status {CONTESTANT_FAILED}; the rows are kept")
+        complain(f"no query was answered, so the command ends with status {CONTESTANT_FAILED}; the rows are kept")
         raise typer.Exit(CONTESTANT_FAILED)
 
 

@@ -69,15 +69,13 @@ class Lines:
         self._current = label
 
     def advance(self, label: str, count: int) -> None:
-        """Print progress and time left, if the last line is old enough."""
+        """Print progress and time left, if something is left and the last line is old enough."""
         self._done[label] += count
-        self._current = label
+        self._current = label if self._done[label] < self._begun[label][1] else ""
         now = time.monotonic()
-        if now - self._last_s >= self._every_s:
+        if self._current and now - self._last_s >= self._every_s:
             self._last_s = now
             self._tell(self.state())
-        if self._done[label] == self._begun[label][1]:
-            self._current = ""
 
     def state(self) -> str:
         """Progress of the work that began or moved on last; empty where none is under way."""
@@ -85,7 +83,7 @@ class Lines:
             return ""
         (begun, total), done = self._begun[self._current], self._done[self._current]
         text = f"{self._current}: {done} of {total}"
-        if not 0 < done < total:
+        if not done:
             return text
         left_s = (time.monotonic() - begun) / done * (total - done)
         return f"{text}, about {duration_text(left_s)} left"

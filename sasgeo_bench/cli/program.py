@@ -129,11 +129,12 @@ def _with_outlets(command: Callable[..., None]) -> Callable[..., None]:
             typer.Option(envvar=LOG, help="file to append every line to, with its time, those of --quiet too"),
         ] = None,
     ) -> None:
+        """Open the outlets as the flags say."""
         open_outlets(quiet=quiet, log=log)
 
     @wraps(command)
     def called(*, quiet: bool, log: Path | None, **words: Any) -> None:  # noqa: ANN401 - whatever the flags hold
-        """Open the outlets, and carry out the command."""
+        """Read the flags of every command, and carry out this one."""
         flags(quiet=quiet, log=log)
         with heartbeat():
             command(**words)

@@ -45,34 +45,39 @@ def duration_text(seconds: float) -> str:
 class Lines:
     """Progress as a line every ten seconds.
 
-    The time left assumes that the items to come take as long as those that are done; nothing is said of it before one
-    is done.
+    The time left assumes that the items to come take as long as those since the first, which waits for a process that
+    starts or a map that is read.
 
     >>> lines = Lines(lambda line: print(line.split(", about")[0]), every_s=0.0)
     >>> lines.begin("rejectors", 16)
     >>> lines.state()
     'rejectors: 0 of 16'
-    >>> lines.advance("rejectors", 4)
-    rejectors: 4 of 16
+    >>> for _ in range(2):
+    ...     lines.advance("rejectors", 1)
+    rejectors: 1 of 16
+    rejectors: 2 of 16
     """
 
     def __init__(self, tell: Tell, *, every_s: float | None = None) -> None:
         self._tell, self._every_s = tell, EVERY_S if every_s is None else every_s
-        self._begun: dict[str, tuple[float, int]] = {}
+        self._totals: dict[str, int] = {}
         self._done: dict[str, int] = {}
+        self._firsts: dict[str, tuple[float, int]] = {}  # when the first were done, and how many
         self._last_s = time.monotonic()
         self._current = ""
 
     def begin(self, label: str, total: int) -> None:
         """Begin to count."""
-        self._begun[label], self._done[label] = (time.monotonic(), total), 0
+        self._totals[label], self._done[label] = total, 0
+        self._firsts.pop(label, None)
         self._current = label
 
     def advance(self, label: str, count: int) -> None:
         """Print progress and time left, if something is left and the last line is old enough."""
         self._done[label] += count
-        self._current = label if self._done[label] < self._begun[label][1] else ""
+        self._current = label if self._done[label] < self._totals[label] else ""
         now = time.monotonic()
+        self._firsts.setdefault(label, (now, count))
         if self._current and now - self._last_s >= self._every_s:
             self._last_s = now
             self._tell(self.state())
@@ -81,11 +86,12 @@ class Lines:
         """Progress of the work that began or moved on last; empty where none is under way."""
         if not self._current:
             return ""
-        (begun, total), done = self._begun[self._current], self._done[self._current]
+        total, done = self._totals[self._current], self._done[self._current]
         text = f"{self._current}: {done} of {total}"
-        if not done:
+        since_s, first = self._firsts.get(self._current, (0.0, 0))
+        if done == first:
             return text
-        left_s = (time.monotonic() - begun) / done * (total - done)
+        left_s = (time.monotonic() - since_s) / (done - first) * (total - done)
         return f"{text}, about {duration_text(left_s)} left"
 
 

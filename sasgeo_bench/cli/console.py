@@ -29,6 +29,7 @@ EXIT_USER: Final = 2  # exit status
 CONTESTANT_FAILED: Final = 4
 PIPE_WIDTH: Final = 200
 LOG: Final = "SASGEO_LOG"  # variable with the file that lines are appended to
+_FIRST_S: Final = 3.0  # a command that is silent for longer says that it is at work
 _LONGEST_SILENCE_S: Final = 60.0
 
 
@@ -103,7 +104,10 @@ def note(text: str) -> None:
 
 @contextmanager
 def heartbeat() -> Iterator[None]:
-    """Say that the program is at work whenever it has been silent: after ten seconds, then ever more seldom."""
+    """Say that the program is at work and how far it is, whenever it is silent.
+
+    That is after three seconds if it has said nothing yet, else after ten; in a longer silence ever more seldom.
+    """
     begun_s = _heard.last_s = time.monotonic()
     stop, every_s = Event(), progress.EVERY_S
     beats = Thread(target=_beat, args=(stop, begun_s, every_s), daemon=True)
@@ -116,7 +120,7 @@ def heartbeat() -> Iterator[None]:
 
 
 def _beat(stop: Event, begun_s: float, every_s: float) -> None:
-    pause_s, heard_s = every_s, begun_s
+    pause_s, heard_s = min(_FIRST_S, every_s), begun_s
     while not stop.wait(max(_heard.last_s + pause_s - time.monotonic(), 0.1)):
         if _heard.last_s != heard_s:
             pause_s, heard_s = every_s, _heard.last_s

@@ -61,7 +61,6 @@ def end_with_checks(plugin: str, checks: Iterable[Check]) -> None:
     for check in checks:
         failed += check.outcome == "fail"
         table.add_row(check.name, check.outcome, check.found)
-        (complain if check.outcome == "fail" else tell)(f"{plugin}: {check.name}: {check.outcome}")
     print_table(table)
     if failed:
         complain(f"{plugin}: {counted(failed, 'check')} failed")

@@ -118,8 +118,6 @@ def run(options: RunOptions) -> RunReport:
     if options.dry_run:
         options.say(plan.to_text())
         return RunReport(counts={}, messages={}, folders=tuple(part.folder for part in plan.parts))
-    left = sum(len(part.left) for part in plan.parts)
-    options.tell(f"{plan.card.name}: {counted(left, 'query', 'queries')} to ask")
     report = runner.run(plan, tell=options.tell, progress=options.progress)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
     options.tell(f"{plan.card.name} {plan.card.version}: {counts}")

@@ -73,7 +73,6 @@ def publish(
         with _sound(board):
             for name, table in {LEADERBOARD: files.board, **files.tables}.items():
                 check_shape(name, table)
-            tell("drawing the plots of the site")
             source = _source(files, tell)
             pages = site_pages(source)
         with site_lock(board, target, tell=tell):

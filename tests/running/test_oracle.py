@@ -68,5 +68,6 @@ def test_a_line_of_progress_says_how_many_and_how_long():
     assert [line.split(",")[0] for line in lines] == [
         f"clean/vaduz: {count} of 4" for count in range(1, 4)
     ]  # the end needs no line
-    assert all(re.fullmatch(r"about \d+ s left", line.split(", ")[1]) for line in lines)
+    assert all(re.fullmatch(r"about \d+ s left", line.split(", ")[1]) for line in lines[1:])
+    assert lines[0] == "clean/vaduz: 1 of 4"  # the first waits for what starts
     assert progress.state() == ""

@@ -30,6 +30,7 @@ CONTESTANT_FAILED: Final = 4
 PIPE_WIDTH: Final = 200
 LOG: Final = "SASGEO_LOG"  # variable with the file that lines are appended to
 _FIRST_S: Final = 3.0  # a command that is silent for longer says that it is at work
+_LATE: Final = 1.5  # times the usual pause between two lines of progress
 _LONGEST_SILENCE_S: Final = 60.0
 
 
@@ -106,7 +107,7 @@ def note(text: str) -> None:
 def heartbeat() -> Iterator[None]:
     """Say that the program is at work and how far it is, whenever it is silent.
 
-    That is after three seconds if it has said nothing yet, else after ten; in a longer silence ever more seldom.
+    That is after three seconds if it has said nothing yet, else after fifteen; in a longer silence ever more seldom.
     """
     begun_s = _heard.last_s = time.monotonic()
     stop, every_s = Event(), progress.EVERY_S
@@ -123,7 +124,7 @@ def _beat(stop: Event, begun_s: float, every_s: float) -> None:
     pause_s, heard_s = min(_FIRST_S, every_s), begun_s
     while not stop.wait(max(_heard.last_s + pause_s - time.monotonic(), 0.1)):
         if _heard.last_s != heard_s:
-            pause_s, heard_s = every_s, _heard.last_s
+            pause_s, heard_s = _LATE * every_s, _heard.last_s
         if time.monotonic() - heard_s < pause_s:
             continue
         state = _heard.counts.state() if _heard.counts is not None else ""

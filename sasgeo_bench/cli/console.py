@@ -49,7 +49,7 @@ errors = _PlainConsole(stderr=True, soft_wrap=True, highlight=False)
 class _Heard:
     """What the user of this process has heard so far."""
 
-    last_s: float = 0.0  # when the last line was printed
+    last_s: float = 0.0  # when the last line was told, if to the log alone
     result: str = ""  # last line of a quiet command's result
     counts: progress.Lines | None = None
 
@@ -90,6 +90,7 @@ def open_outlets(*, quiet: bool, log: Path | None) -> None:
 
 def note(text: str) -> None:
     """Append lines to the log, if there is one, each with its time."""
+    _heard.last_s = time.monotonic()
     path = os.environ.get(LOG)
     if not path:
         return
@@ -98,7 +99,7 @@ def note(text: str) -> None:
         with Path(path).open("a", encoding="utf-8") as file:  # one write a line: other processes append to it as well
             file.write("".join(f"{now} {plain(line)}\n" for line in text.splitlines()))
     except OSError as error:
-        del os.environ[LOG]
+        os.environ.pop(LOG, None)
         message = f"--log {path} cannot be written ({error.strerror}): name a file in a folder of yours"
         raise StoreError(message) from error
 
@@ -120,6 +121,15 @@ def heartbeat() -> Iterator[None]:
         stop.set()
 
 
+@contextmanager
+def _complaining() -> Iterator[None]:
+    """Print an error of a thread, which nobody else would catch, as a line."""
+    try:
+        yield
+    except StoreError as error:
+        complain(f"sasgeo-bench: {error}")
+
+
 def _beat(stop: Event, begun_s: float, every_s: float) -> None:
     pause_s, heard_s = min(_FIRST_S, every_s), begun_s
     while not stop.wait(max(_heard.last_s + pause_s - time.monotonic(), 0.1)):
@@ -128,7 +138,8 @@ def _beat(stop: Event, begun_s: float, every_s: float) -> None:
         if time.monotonic() - heard_s < pause_s:
             continue
         state = _heard.counts.state() if _heard.counts is not None else ""
-        tell(f"at work for {progress.duration_text(time.monotonic() - begun_s)}" + (f"; {state}" if state else ""))
+        with _complaining():
+            tell(f"at work for {progress.duration_text(time.monotonic() - begun_s)}" + (f"; {state}" if state else ""))
         heard_s, pause_s = _heard.last_s, min(2 * pause_s, _LONGEST_SILENCE_S)
 
 
@@ -156,7 +167,6 @@ def tell(line: str) -> None:
 
 def complain(line: str) -> None:
     """Print one line on what went wrong to stderr; a quiet command does so, too."""
-    _heard.last_s = time.monotonic()
     errors.print(plain(line))
     note(line)
 
@@ -164,7 +174,6 @@ def complain(line: str) -> None:
 def say(result: object) -> None:
     """Print a result to stdout: a path, or some lines; the last one alone, and in the end, if the command is quiet."""
     text = plain_lines(str(result))
-    _heard.last_s = time.monotonic()
     if progress.QUIET in os.environ:
         _heard.result = next((line for line in reversed(text.splitlines()) if line.strip()), _heard.result)
     else:

@@ -43,6 +43,16 @@ def test_a_quiet_command_prints_errors_and_the_last_line_of_its_result(capsys):
     assert capsys.readouterr() == ("first\nsecond\n\nlast\n", "on the way\na fault\n")
 
 
+def test_a_quiet_command_is_not_silent_to_its_log(monkeypatch):
+    """Else signs of life would follow each other without a pause."""
+    with outlets():
+        open_outlets(quiet=True, log=None)
+        for outlet in (tell, say, complain):
+            monkeypatch.setattr(console._heard, "last_s", 0.0)
+            outlet("a line")
+            assert console._heard.last_s > 0.0
+
+
 @pytest.mark.parametrize("quiet", [False, True])
 def test_a_log_gets_every_line_and_keeps_what_it_held(tmp_path, monkeypatch, quiet):
     monkeypatch.setattr("sys.argv", ["sasgeo-bench", "doctor"])

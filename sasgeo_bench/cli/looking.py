@@ -83,7 +83,6 @@ def inspect_command(
     if Path(target).is_dir() and is_run(Path(target)):
         grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
         chosen = make_split(read_split_file(find_split_file(options.split)), grids)
-        tell(f"reading the answers in {target}")
         cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=options.rejector or (), tell=tell)
         _inspect_run(cases, out, query, options.strip)
         return

@@ -50,7 +50,6 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules = rules_of(request.rejectors, request.split)
     failures = Failures(log_beside(request.board), tell=lambda _: None)  # reported with the board, or raised
-    tell("reading answers and truths")
     ranks = None
     while ranks is None:  # once more for each time that the comparison of entries fails because of some of them
         contest = _contest(request, failures, tell)

@@ -17,7 +17,7 @@ SOURCES := sasgeo_bench baselines benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo list-regions build-region queries leaderboard test test-quick test-torch test-oldest check bench ageing figures docs lock clean
+.PHONY: help install demo list-regions build-region queries leaderboard test test-quick test-torch test-oldest test-wheel check bench ageing figures docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
@@ -64,10 +64,10 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 
 # Three workers for two processors: now and then a test waits for a process that it has started.
 # Hundreds of processes import the same modules: none of them compiles them again.
-test test-quick test-torch test-oldest: export PYTHONDONTWRITEBYTECODE :=
+test test-quick test-torch test-oldest test-wheel: export PYTHONDONTWRITEBYTECODE :=
 # The workers fill the processors already: threads of linear algebra and of image warps would wait for each other.
-test test-quick test-torch test-oldest: export OMP_NUM_THREADS := 1
-test test-quick test-torch test-oldest: export OPENCV_FOR_THREADS_NUM := 1
+test test-quick test-torch test-oldest test-wheel: export OMP_NUM_THREADS := 1
+test test-quick test-torch test-oldest test-wheel: export OPENCV_FOR_THREADS_NUM := 1
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 3 --dist loadfile -p no:benchmark -rs $(ARGS)
@@ -86,6 +86,23 @@ test-oldest: ## run the tests of test-quick with the oldest dependencies that py
 	$(UV) pip install --quiet --python .venv-oldest/bin/python -r .venv-oldest/oldest.txt
 	$(UV) pip install --quiet --python .venv-oldest/bin/python --no-deps --no-build-isolation -e . -e baselines
 	.venv-oldest/bin/python -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
+
+# The wheels are built from the unpacked sdist, which then loses the code: the tests can find the installed packages alone.
+# Left out are tests of the repository's own files, which the installed packages do not change.
+test-wheel: $(STAMP) ## build the sdist and the wheels in dist/, and run the tests of test-quick on the wheels, in .venv-wheel
+	rm -rf dist
+	$(VENV_PYTHON) -m hatchling build -t sdist -d $(CURDIR)/dist
+	mkdir dist/unpacked
+	tar -xzf dist/sasgeo_bench-*.tar.gz -C dist/unpacked --strip-components=1
+	cd dist/unpacked && $(CURDIR)/$(VENV_PYTHON) -m hatchling build -t wheel -d $(CURDIR)/dist
+	cd dist/unpacked/baselines && $(CURDIR)/$(VENV_PYTHON) -m hatchling build -d $(CURDIR)/dist
+	rm -r dist/unpacked/sasgeo_bench dist/unpacked/baselines/sasgeo_baselines
+	$(PYTHON) -m venv --clear .venv-wheel
+	.venv-wheel/bin/python -m pip --disable-pip-version-check install --quiet --require-hashes -r requirements.lock
+	.venv-wheel/bin/python -m pip --disable-pip-version-check install --quiet --no-deps dist/*.whl
+	.venv-wheel/bin/python -m pip check
+	cd dist/unpacked && $(CURDIR)/.venv-wheel/bin/python -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" \
+	  --hypothesis-profile=quick --ignore=tests/test_repository.py --ignore=tests/test_docs.py --pyargs sasgeo_bench tests $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)
@@ -133,5 +150,5 @@ lock: ## resolve requirements.lock and requirements-docs.lock anew from pyprojec
 	  --output-file requirements-docs.lock $(ARGS)
 
 clean: ## remove .venv and caches; keeps what was built in $(OUT)
-	rm -rf $(VENV) .venv-oldest .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
+	rm -rf $(VENV) .venv-oldest .venv-wheel .pytest_cache .mypy_cache .ruff_cache .hypothesis .benchmarks dist
 	find $(SOURCES) -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -9,9 +9,12 @@ from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from signal import SIG_DFL, SIGINT, signal
 from threading import Thread
-from typing import Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
 
 EVERY_S = 10.0  # read when progress begins to be shown, so that a test can silence it on a slow machine
+QUIET: Final = "SASGEO_QUIET"  # variable that is set while nothing is to be shown but results and errors
+_MINUTE_S: Final = 60.0
+_HOUR_S: Final = 3600.0
 
 Tell = Callable[[str], None]
 
@@ -28,47 +31,96 @@ class Progress(Protocol):
         ...
 
 
+def duration_text(seconds: float) -> str:
+    """Say a duration in the unit that fits it.
+
+    >>> [duration_text(seconds) for seconds in (4.2, 89.0, 200.0, 9000.0)]
+    ['4 s', '89 s', '3 min', '2.5 h']
+    """
+    if seconds < 2 * _MINUTE_S:
+        return f"{seconds:.0f} s"
+    return f"{seconds / _MINUTE_S:.0f} min" if seconds < 2 * _HOUR_S else f"{seconds / _HOUR_S:.1f} h"
+
+
 class Lines:
     """Progress as a line every ten seconds.
 
-    >>> lines = Lines(lambda line: print(line.split(",")[0]), every_s=0.0)
+    The time left assumes that the items to come take as long as those since the first, which waits for a process that
+    starts or a map that is read.
+
+    >>> lines = Lines(lambda line: print(line.split(", about")[0]), every_s=0.0)
     >>> lines.begin("rejectors", 16)
-    >>> lines.advance("rejectors", 4)
-    rejectors: 4 of 16
+    >>> lines.state()
+    'rejectors: 0 of 16'
+    >>> for _ in range(2):
+    ...     lines.advance("rejectors", 1)
+    rejectors: 1 of 16
+    rejectors: 2 of 16
     """
 
     def __init__(self, tell: Tell, *, every_s: float | None = None) -> None:
         self._tell, self._every_s = tell, EVERY_S if every_s is None else every_s
-        self._begun: dict[str, tuple[float, int]] = {}
+        self._totals: dict[str, int] = {}
         self._done: dict[str, int] = {}
+        self._firsts: dict[str, tuple[float, int]] = {}  # when the first were done, and how many
         self._last_s = time.monotonic()
+        self._current = ""
 
     def begin(self, label: str, total: int) -> None:
         """Begin to count."""
-        self._begun[label], self._done[label] = (time.monotonic(), total), 0
+        self._totals[label], self._done[label] = total, 0
+        self._firsts.pop(label, None)
+        self._current = label
 
     def advance(self, label: str, count: int) -> None:
-        """Print progress, speed and time left, if the last line is old enough."""
-        now, (begun, total) = time.monotonic(), self._begun[label]
+        """Print progress and time left, if something is left and the last line is old enough."""
         self._done[label] += count
-        if now - self._last_s < self._every_s:
-            return
-        self._last_s = now
-        done = self._done[label]
-        rate = done / max(now - begun, 1e-9)
-        self._tell(f"{label}: {done} of {total}, {rate:.1f} a second, {(total - done) / rate:.0f} s left")
+        self._current = label if self._done[label] < self._totals[label] else ""
+        now = time.monotonic()
+        self._firsts.setdefault(label, (now, count))
+        if self._current and now - self._last_s >= self._every_s:
+            self._last_s = now
+            self._tell(self.state())
+
+    def state(self) -> str:
+        """Progress of the work that began or moved on last; empty where none is under way."""
+        if not self._current:
+            return ""
+        total, done = self._totals[self._current], self._done[self._current]
+        text = f"{self._current}: {done} of {total}"
+        since_s, first = self._firsts.get(self._current, (0.0, 0))
+        if done == first:
+            return text
+        left_s = (time.monotonic() - since_s) / (done - first) * (total - done)
+        return f"{text}, about {duration_text(left_s)} left"
 
 
 Item = TypeVar("Item")
 Found = TypeVar("Found")
 
 
-def spread(work: Callable[[Item], Found], items: Sequence[Item], *, jobs: int = 1) -> Iterator[Found]:
+def spread(
+    work: Callable[[Item], Found],
+    items: Sequence[Item],
+    *,
+    jobs: int = 1,
+    label: str = "",
+    progress: Progress | None = None,
+) -> Iterator[Found]:
     """Yield `work(item)` for each item, in order, computed by several processes if there are several jobs and items.
 
-    Another process must be able to import `work`, and to receive items and send results. The first error is raised
-    here.
+    `progress` counts the items that are done, under `label`. Another process must be able to import `work`, and to
+    receive items and send results. The first error is raised here.
     """
+    if progress is not None:
+        progress.begin(label, len(items))
+    for found in _found(work, items, jobs):
+        if progress is not None:
+            progress.advance(label, 1)
+        yield found
+
+
+def _found(work: Callable[[Item], Found], items: Sequence[Item], jobs: int) -> Iterator[Found]:
     if jobs == 1 or len(items) < 2:  # noqa: PLR2004 - one item is no work to share
         yield from map(work, items)
         return

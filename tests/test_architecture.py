@@ -8,8 +8,10 @@ from pathlib import Path
 
 import pytest
 
+import sasgeo_bench
+
 PACKAGE = "sasgeo_bench"
-ROOT = Path(__file__).parents[1] / PACKAGE
+ROOT = Path(sasgeo_bench.__file__).parent
 
 # A room is a folder, or a file beside the folders. What stands above may be imported, what stands below may not; a file
 # that is added to a folder edits nothing here.

@@ -71,6 +71,7 @@ ONLY_PARSED = {
 OTHERS = {
     r"^pip install -e my-(matcher|segmenter|tracker)$": "done by hand: an installation needs the package registry",
     r"^(sha256sum|install -m 600) ": "programs of the system",
+    r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",
     r"^python answer\.py ": "tests/experiments/test_board_queries.py runs this program on a small board",
     r"^python benchmarks/segmenters\.py ": "minutes; tests/scoring/test_segmenter_program.py makes a small board",

@@ -2,6 +2,7 @@
 """The repository around the code: licences, the lock file, the Makefile, the documents and what a wheel holds."""
 
 import ast
+import json
 import os
 import re
 import subprocess
@@ -26,6 +27,7 @@ GENERATED = {
     ".git",
     ".venv",
     ".venv-oldest",
+    ".venv-wheel",
     "out",
     "dist",
     "__pycache__",
@@ -36,6 +38,10 @@ GENERATED = {
     ".ruff_cache",
 }
 MAX_FILE_BYTES = 500_000
+
+# Of the attributes of a deposit that Zenodo documents.
+ZENODO_REQUIRED = ("title", "upload_type", "description", "creators", "access_right", "license")
+ZENODO_OPTIONAL = ("version", "language", "keywords", "references", "notes", "related_identifiers", "publication_date")
 
 # Distributions whose module has another name.
 IMPORTED_AS = {
@@ -199,7 +205,7 @@ def test_every_step_of_the_workflow_is_a_target_of_the_makefile() -> None:
     jobs = yaml.safe_load(read(".github/workflows/checks.yml"))["jobs"]
     runs = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
     phony = re.search(r"^\.PHONY: (.*)$", read("Makefile"), flags=re.MULTILINE)[1].split()
-    assert sorted(runs) == ["make check", "make docs", "make test", "make test-oldest"]
+    assert sorted(runs) == ["make check", "make docs", "make test", "make test-oldest", "make test-wheel"]
     assert {run.removeprefix("make ") for run in runs} <= set(phony)
 
 
@@ -276,10 +282,34 @@ def test_the_baselines_ask_for_the_package_by_its_name() -> None:
     assert asked == {project()["name"], "lightgbm", "networkx", "scikit-learn"}
 
 
-def test_the_version_to_cite_is_that_of_the_package() -> None:
-    version = project()["version"]
-    assert re.search(r"^version: (.*)$", read("CITATION.cff"), flags=re.MULTILINE)[1] == version
-    assert re.search(r"version = \{(.*)\}", read("README.md"))[1] == version
+def test_every_citation_says_what_the_package_says_of_itself() -> None:
+    package, cff, zenodo = project(), yaml.safe_load(read("CITATION.cff")), json.loads(read(".zenodo.json"))
+    for name in ("version", "license", "keywords"):
+        assert cff[name] == zenodo[name] == package[name], name
+    assert cff["title"] == zenodo["title"]
+    assert cff["authors"] == zenodo["creators"] == package["authors"]
+    (reference,) = cff["references"]
+    assert zenodo["references"][0].endswith(f": {reference['title']}")
+    for name, value in (("version", package["version"]), ("title", cff["title"])):
+        assert re.search(rf"{name} += \{{(.*)\}}", read("README.md"))[1] == value
+    assert project("baselines/pyproject.toml")["version"] == package["version"]
+
+
+def test_zenodo_can_read_what_the_repository_says_of_itself() -> None:
+    content = json.loads(read(".zenodo.json"))
+    assert set(ZENODO_REQUIRED) <= content.keys() <= {*ZENODO_REQUIRED, *ZENODO_OPTIONAL}
+    assert (content["upload_type"], content["access_right"]) == ("software", "open")
+    assert all(set(one) <= {"name", "affiliation", "orcid", "gnd"} for one in content["creators"])
+
+
+def test_an_image_installs_from_the_lock_and_runs_as_a_user_without_rights() -> None:
+    steps = re.findall(r"^([A-Z]+) (.*)$", read("Containerfile"), flags=re.MULTILINE)
+    names = [name for name, _ in steps]
+    assert names.index("USER") < names.index("COPY")
+    assert ("USER", "sasgeo") in steps
+    assert ("VOLUME", "/work/out") in steps
+    assert [text.startswith("make install") for name, text in steps if name == "RUN"] == [False, True]
+    assert set(read(".dockerignore").split()) >= {".git", ".venv*", "dist", "out"}
 
 
 @pytest.mark.parametrize("folder", SHIPPED)

@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from markdown_it import MarkdownIt
 from rich.table import Table
 
+import sasgeo_bench
 from sasgeo_bench.canvas import PlainFigure, page
 from sasgeo_bench.cli.console import Bars, errors, print_table, say, tell
 from sasgeo_bench.geometry.pose import Pose
@@ -319,10 +320,11 @@ def test_a_page_has_the_same_tags_whatever_its_texts_are(text):
 def callers():
     """Files of the package by the names of the functions and classes that they call."""
     found = {}
-    for path in (ROOT / "sasgeo_bench").rglob("*.py"):
+    package = Path(sasgeo_bench.__file__).parent
+    for path in package.rglob("*.py"):
         text = path.read_text(encoding="utf-8")
         for name in set(re.findall(r"\b(\w+)\(", text)) - set(re.findall(r"\bdef (\w+)\(", text)):
-            found.setdefault(name, set()).add(path.relative_to(ROOT / "sasgeo_bench").as_posix())
+            found.setdefault(name, set()).add(path.relative_to(package).as_posix())
     return found
 
 

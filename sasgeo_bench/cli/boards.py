@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, print_table, read_day, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError, counted
@@ -273,12 +273,12 @@ def _how_to_publish(folder: Path) -> str:
 def check_controls(board: Board) -> None:
     """End with a status that a script sees where a control or a contestant failed; the board is written though."""
     for name, why in board.failures.found.items():
-        tell(f"failed, and so not on the board: {name}: {why}")
+        complain(f"failed, and so not on the board: {name}: {why}")
     unseen = segmenter_lines({"tasks": board.tasks})
     for line in unseen:
-        tell(line)
+        complain(line)
     if board.failures.found and board.failures.log.is_file():
-        tell(f"where it failed stands in {board.failures.log}")
+        complain(f"where it failed stands in {board.failures.log}")
     failed = [item for item in board.verdicts if not item.holds]
     if any(item.is_of_board for item in failed):
         raise typer.Exit(CONTROL_FAILED)
@@ -295,5 +295,7 @@ def show_board(board: Board) -> None:
         for row in table.rows:
             shown.add_row(*map(text_of, row.cells))
         print_table(shown)
-    for line in (*control_lines(board.verdicts), *warnings_of(board.table)):
+    for line in control_lines(board.verdicts):
+        (tell if all(item.holds for item in board.verdicts) else complain)(line)
+    for line in warnings_of(board.table):
         tell(line)

@@ -1,25 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two outlets of a command, progress bars, and reading of dates."""
+"""The outlets of a command (stdout, stderr, a log file), its progress, and reading of dates."""
 
 import datetime as dt
+import math
+import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event, Thread
 from types import TracebackType
 from typing import Any, Final, Self
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
 from rich.table import Table
 from rich.text import Text
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench import progress
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.texts import plain, plain_lines
 
 EXIT_USER: Final = 2  # exit status
 CONTESTANT_FAILED: Final = 4
 PIPE_WIDTH: Final = 200
+LOG: Final = "SASGEO_LOG"  # variable with the file that lines are appended to
+_FIRST_S: Final = 3.0  # a command that is silent for longer says that it is at work
+_LATE: Final = 1.5  # times the usual pause between two lines of progress
+_LONGEST_SILENCE_S: Final = 60.0
 
 
 class _PlainConsole(Console):
@@ -31,6 +43,104 @@ class _PlainConsole(Console):
 
 
 errors = _PlainConsole(stderr=True, soft_wrap=True, highlight=False)
+
+
+@dataclass
+class _Heard:
+    """What the user of this process has heard so far."""
+
+    last_s: float = 0.0  # when the last line was told, if to the log alone
+    result: str = ""  # last line of a quiet command's result
+    counts: progress.Lines | None = None
+
+
+_heard = _Heard()
+
+
+@contextmanager
+def outlets() -> Iterator[None]:
+    """Restore the outlets in the end, however `open_outlets` changed them, and print what a quiet command held back.
+
+    The settings are variables of the environment, which the processes of `--jobs` inherit.
+    """
+    before = {name: os.environ.get(name) for name in (progress.QUIET, LOG)}
+    try:
+        yield
+        if _heard.result:
+            typer.echo(_heard.result)
+    finally:
+        _heard.result, _heard.counts = "", None
+        for name, value in before.items():
+            os.environ.pop(name, None)
+            os.environ.update({} if value is None else {name: value})
+
+
+def open_outlets(*, quiet: bool, log: Path | None) -> None:
+    """Print errors and the last line of the result alone, if it is to be quiet; append every line to a log.
+
+    Raise a `ConfigError` if the log cannot be written.
+    """
+    os.environ.pop(progress.QUIET, None)  # it may say 0
+    if quiet:
+        os.environ[progress.QUIET] = "1"
+    if log is not None:
+        os.environ[LOG] = str(log.absolute())
+        note("sasgeo-bench " + " ".join(sys.argv[1:]))
+
+
+def note(text: str) -> None:
+    """Append lines to the log, if there is one, each with its time."""
+    _heard.last_s = time.monotonic()
+    path = os.environ.get(LOG)
+    if not path:
+        return
+    now = dt.datetime.now(dt.UTC).isoformat(timespec="seconds")
+    try:
+        with Path(path).open("a", encoding="utf-8") as file:  # one write a line: other processes append to it as well
+            file.write("".join(f"{now} {plain(line)}\n" for line in text.splitlines()))
+    except OSError as error:
+        os.environ.pop(LOG, None)
+        message = f"--log {path} cannot be written ({error.strerror}): name a file in a folder of yours"
+        raise StoreError(message) from error
+
+
+@contextmanager
+def heartbeat() -> Iterator[None]:
+    """Say that the program is at work and how far it is, whenever it is silent.
+
+    That is after three seconds if it has said nothing yet, else after fifteen; in a longer silence ever more seldom.
+    """
+    begun_s = _heard.last_s = time.monotonic()
+    stop, every_s = Event(), progress.EVERY_S
+    beats = Thread(target=_beat, args=(stop, begun_s, every_s), daemon=True)
+    if every_s < math.inf:
+        beats.start()
+    try:
+        yield
+    finally:
+        stop.set()
+
+
+@contextmanager
+def _complaining() -> Iterator[None]:
+    """Print an error of a thread, which nobody else would catch, as a line."""
+    try:
+        yield
+    except StoreError as error:
+        complain(f"sasgeo-bench: {error}")
+
+
+def _beat(stop: Event, begun_s: float, every_s: float) -> None:
+    pause_s, heard_s = min(_FIRST_S, every_s), begun_s
+    while not stop.wait(max(_heard.last_s + pause_s - time.monotonic(), 0.1)):
+        if _heard.last_s != heard_s:
+            pause_s, heard_s = _LATE * every_s, _heard.last_s
+        if time.monotonic() - heard_s < pause_s:
+            continue
+        state = _heard.counts.state() if _heard.counts is not None else ""
+        with _complaining():
+            tell(f"at work for {progress.duration_text(time.monotonic() - begun_s)}" + (f"; {state}" if state else ""))
+        heard_s, pause_s = _heard.last_s, min(2 * pause_s, _LONGEST_SILENCE_S)
 
 
 def read_date(text: str | None) -> dt.date | None:
@@ -48,19 +158,34 @@ def read_day(text: str, *, flag: str) -> dt.date:
 
 
 def tell(line: str) -> None:
-    """Print one line to stderr."""
+    """Print one line to stderr, unless the command is quiet."""
+    if progress.QUIET in os.environ:
+        note(line)
+    else:
+        complain(line)
+
+
+def complain(line: str) -> None:
+    """Print one line on what went wrong to stderr; a quiet command does so, too."""
     errors.print(plain(line))
+    note(line)
 
 
 def say(result: object) -> None:
-    """Print a result to stdout: a path, or some lines."""
-    typer.echo(plain_lines(str(result)))
+    """Print a result to stdout: a path, or some lines; the last one alone, and in the end, if the command is quiet."""
+    text = plain_lines(str(result))
+    if progress.QUIET in os.environ:
+        _heard.result = next((line for line in reversed(text.splitlines()) if line.strip()), _heard.result)
+    else:
+        typer.echo(text)
+    note(text)
 
 
-class Bars:
-    """Progress as a bar for each piece of work, for a terminal."""
+class Bars(progress.Lines):
+    """Progress as a bar for each piece of work, for a terminal; as lines in the log."""
 
     def __init__(self) -> None:
+        super().__init__(note)
         columns = (
             TextColumn("{task.description}", markup=False),
             BarColumn(),
@@ -68,7 +193,7 @@ class Bars:
             TextColumn("{task.fields[rate]}"),
             TimeRemainingColumn(),
         )
-        self._bars = Progress(*columns, console=errors)
+        self._bars = RichProgress(*columns, console=errors)
         self._tasks: dict[str, TaskID] = {}
 
     def __enter__(self) -> Self:
@@ -84,10 +209,12 @@ class Bars:
 
     def begin(self, label: str, total: int) -> None:
         """Add a bar."""
+        super().begin(label, total)
         self._tasks[label] = self._bars.add_task(plain(label), total=total, rate="")
 
     def advance(self, label: str, count: int) -> None:
         """Move a bar on."""
+        super().advance(label, count)
         task = self._tasks[label]
         self._bars.advance(task, count)
         speed = self._bars.tasks[self._bars.task_ids.index(task)].speed
@@ -95,12 +222,14 @@ class Bars:
 
 
 @contextmanager
-def shown_progress() -> Iterator[Bars | None]:
-    """Yield bars on a terminal, None elsewhere: lines do there."""
-    if not sys.stderr.isatty():
-        yield None
+def shown_progress() -> Iterator[progress.Progress]:
+    """Yield bars on a terminal, lines elsewhere."""
+    if not sys.stderr.isatty() or progress.QUIET in os.environ:
+        _heard.counts = progress.Lines(tell)
+        yield _heard.counts
         return
     with Bars() as bars:
+        _heard.counts = bars
         yield bars
 
 
@@ -109,4 +238,4 @@ def print_table(table: Table) -> None:
     console = _PlainConsole(highlight=False, width=None if sys.stdout.isatty() else PIPE_WIDTH)
     with console.capture() as captured:
         console.print(table)
-    typer.echo("\n".join(line.rstrip() for line in captured.get().splitlines()) + "\n")
+    say("\n".join(line.rstrip() for line in captured.get().splitlines()) + "\n")

@@ -10,7 +10,7 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
+from sasgeo_bench.cli.console import EXIT_USER, print_table, say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
 from sasgeo_bench.errors import ConfigError, counted
@@ -21,6 +21,7 @@ from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels
 from sasgeo_bench.leaderboard.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
 from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.progress import spread
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
@@ -324,7 +325,11 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
             f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
         )
         raise ConfigError(message)
-    maps = {region: constellations(read_features(out / "regions" / region)) for region in built}
+    with shown_progress() as progress:
+        read = spread(
+            lambda name: read_features(out / "regions" / name), built, label="regions read", progress=progress
+        )
+        maps = dict(zip(built, map(constellations, read), strict=True))
     faults = [
         f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"
         for item in search_split(split, maps)

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import EXIT_USER, print_table, say, tell
+from sasgeo_bench.cli.console import EXIT_USER, complain, print_table, say, tell
 from sasgeo_bench.errors import counted
 from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
 from sasgeo_bench.running.checks import Check
@@ -63,5 +63,5 @@ def end_with_checks(plugin: str, checks: Iterable[Check]) -> None:
         table.add_row(check.name, check.outcome, check.found)
     print_table(table)
     if failed:
-        tell(f"{plugin}: {counted(failed, 'check')} failed")
+        complain(f"{plugin}: {counted(failed, 'check')} failed")
         raise typer.Exit(EXIT_USER)

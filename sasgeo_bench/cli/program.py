@@ -2,18 +2,23 @@
 """The program `sasgeo-bench`: parses, calls, prints."""
 
 import ast
+import inspect
 import sys
+import traceback
 import warnings
-from functools import cache
+from collections.abc import Callable
+from functools import cache, wraps
 from importlib import import_module, metadata, resources
+from pathlib import Path
 from typing import Annotated, Any, Final, TextIO
 
 import typer
 from typer.core import TyperGroup
 
-from sasgeo_bench.cli.console import EXIT_USER, say, tell
+from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say, tell
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
+from sasgeo_bench.progress import QUIET
 from sasgeo_bench.texts import one_line
 
 EXIT_INTERRUPTED: Final = 130
@@ -80,6 +85,18 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     },
 }
 
+# Command -> what is kept of it when it is interrupted, and how to go on; the others write all or nothing.
+KEPT: Final = {
+    "build-region": "regions that were built are kept; the same command builds the others",
+    "render-imagery": "images that were rendered are kept; the same command renders the others",
+    "make-queries": "tasks that were drawn are kept; the same command draws them again, with the same queries",
+    "segment": "tasks that were segmented are kept; the same command goes on with the others",
+    "run": "answers so far are kept; the same command asks the other queries",
+    "enter": "queries and answers so far are kept; the same command goes on from there",
+    "leaderboard": "queries and answers so far are kept; the same command goes on from there",
+}
+_NOTHING: Final = "nothing is half-written, and what was there before is kept; run it again"
+
 
 class _Group(TyperGroup):
     """Commands whose code is read when they run; help about all of them reads none."""
@@ -94,8 +111,37 @@ def load(name: str) -> Any:  # noqa: ANN401 - typer makes its commands of a clas
     """The command of a name, as typer makes it of the function behind it."""
     file = next(group[name] for group in COMMANDS.values() if name in group)
     alone = typer.Typer(add_completion=False)
-    alone.command(name)(with_flags(getattr(import_module(f"sasgeo_bench.cli.{file}"), _function_of(name))))
+    function = getattr(import_module(f"sasgeo_bench.cli.{file}"), _function_of(name))
+    alone.command(name)(_with_outlets(with_flags(function)))
     return typer.main.get_command(alone)
+
+
+def _with_outlets(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the flags that every command has, and let it show that it is at work."""
+
+    def flags(
+        *,
+        quiet: Annotated[
+            bool, typer.Option("--quiet", envvar=QUIET, help="print errors and the last line of the result alone")
+        ] = False,
+        log: Annotated[
+            Path | None,
+            typer.Option(envvar=LOG, help="file to append every line to, with its time, those of --quiet too"),
+        ] = None,
+    ) -> None:
+        """Open the outlets as the flags say."""
+        open_outlets(quiet=quiet, log=log)
+
+    @wraps(command)
+    def called(*, quiet: bool, log: Path | None, **words: Any) -> None:  # noqa: ANN401 - whatever the flags hold
+        """Read the flags of every command, and carry out this one."""
+        flags(quiet=quiet, log=log)
+        with heartbeat():
+            command(**words)
+
+    own, more = (list(inspect.signature(item).parameters.values()) for item in (command, flags))
+    called.__signature__ = inspect.Signature([*own, *more])  # type: ignore[attr-defined]
+    return called
 
 
 def help_of(file: str, name: str) -> str:
@@ -161,25 +207,35 @@ def _tell_usage(error: Any) -> None:  # noqa: ANN401 - see _UsageError
         return
     text = error.format_message().strip().removesuffix(".")
     command = error.ctx.command_path if error.ctx is not None else "sasgeo-bench"
-    tell(f"sasgeo-bench: {one_line(f'{text[:1].lower()}{text[1:]}')} (see '{command} --help')")
+    complain(f"sasgeo-bench: {one_line(f'{text[:1].lower()}{text[1:]}')} (see '{command} --help')")
 
 
 def main() -> None:
     """Run the program: 0 done, 2 the user's mistake or the disk's refusal on one line, 1 our bug with a traceback."""
     warnings.showwarning = _warn
+    with outlets():
+        status = _status()
+        note(f"ended with status {status}")
+    sys.exit(status)
+
+
+def _status() -> int:
+    """Run the command that the words name, and return its status; say in one line what went wrong."""
     try:
-        sys.exit(app(prog_name="sasgeo-bench", standalone_mode=False) or 0)
+        status = int(app(prog_name="sasgeo-bench", standalone_mode=False) or 0)
     except _UsageError as error:
         _tell_usage(error)
-        sys.exit(EXIT_USER)
+        return EXIT_USER
     except SasgeoError as error:
-        tell(f"sasgeo-bench: {error}")
-        sys.exit(EXIT_USER)
+        complain(f"sasgeo-bench: {error}")
+        return EXIT_USER
     except OSError as error:  # any fault without a message of its own, such as a name that is too long
         line = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
-        tell(f"sasgeo-bench: {one_line(line)}")
-        sys.exit(EXIT_USER)
-    except SystemExit as leaving:
-        if leaving.code == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this exit without a word
-            tell("sasgeo-bench: interrupted; what was finished is kept, nothing is half-written: run it again")
+        complain(f"sasgeo-bench: {one_line(line)}")
+        return EXIT_USER
+    except Exception:
+        note(traceback.format_exc())
         raise
+    if status == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this status without a word
+        complain(f"sasgeo-bench: interrupted; {KEPT.get(sys.argv[1], _NOTHING)}")
+    return status

@@ -4,18 +4,17 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 from typing import Annotated, get_args
 
 import typer
 
-from sasgeo_bench.cli.console import say, tell
+from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import Tell, spread
+from sasgeo_bench.progress import Lines, Tell, spread
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
 from sasgeo_bench.tasks.query import PROFILE, Detector, PriorGroup
@@ -60,7 +59,7 @@ class QueryOptions(Options):
     up_to: Annotated[bool, typer.Option("--up-to", help="fewer sites where a region does not hold n")] = False
     skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False
-    jobs: Annotated[int, typer.Option(min=1, help="regions at once")] = 1
+    jobs: Annotated[int, typer.Option(min=1, help="tasks drawn at once")] = 1
 
 
 @takes(QueryOptions)
@@ -105,14 +104,17 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
         for item in requests:
             options.say(_in_words(item))
         return tuple(map(_folder, requests))
-    by_region = [list(items) for _, items in groupby(requests, key=lambda item: item.region.id)]
-    made = spread(partial(_make_all, skip=options.skip, tell=options.tell), by_region, jobs=options.jobs)
+    make = partial(_make, skip=options.skip, tell=options.tell)
+    made = spread(
+        make, requests, jobs=options.jobs, label="tasks drawn", progress=options.progress or Lines(options.tell)
+    )
     return tuple(folder for folders in made for folder in folders)
 
 
 def make_queries_command(options: QueryOptions) -> None:
     """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
-    make_tasks(**vars(options) | {"say": say, "tell": tell})
+    with shown_progress() as progress:
+        make_tasks(**vars(options) | {"say": say, "tell": tell, "progress": progress})
 
 
 def _folder(request: Request) -> Path:
@@ -147,14 +149,12 @@ def _in_words(request: Request) -> str:
     return f"{request.suite} on {request.region.id}: {most}, {_folder(request)}"
 
 
-def _make_all(requests: list[Request], *, skip: bool, tell: Tell) -> list[Path]:
-    """Make the tasks of one region in turn."""
-    folders = []
-    for request in requests:
-        try:
-            folders += [made.folder for made in build.make_tasks(request, tell=tell)]
-        except ConfigError as error:
-            if not skip:
-                raise
-            tell(f"{request.suite} on {request.region.id}: passed over, {error}")
-    return folders
+def _make(request: Request, *, skip: bool, tell: Tell) -> list[Path]:
+    """Make the tasks of one suite on one region."""
+    try:
+        return [made.folder for made in build.make_tasks(request, tell=tell)]
+    except ConfigError as error:
+        if not skip:
+            raise
+        tell(f"{request.suite} on {request.region.id}: passed over, {error}")
+        return []

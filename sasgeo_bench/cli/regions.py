@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from sasgeo_bench.cli.console import read_date, say, tell
+from sasgeo_bench.cli.console import read_date, say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.progress import spread
+from sasgeo_bench.progress import Lines, spread
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
@@ -70,7 +70,8 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
     if options.dry_run:
         options.say("\n".join(plan.to_text() for plan in plans))
     else:
-        for _ in spread(partial(build.build_region, tell=options.tell), plans, jobs=options.jobs):
+        work, progress = partial(build.build_region, tell=options.tell), options.progress or Lines(options.tell)
+        for _ in spread(work, plans, jobs=options.jobs, label="regions built", progress=progress):
             pass
     return tuple(plan.folder for plan in plans)
 
@@ -138,15 +139,19 @@ def render_imagery(options: RenderOptions) -> tuple[Path, ...]:
         extract_folders=options.extracts or (),
         tell=options.tell,
     )
-    return tuple(spread(render, specs, jobs=options.jobs))
+    progress = options.progress or Lines(options.tell)
+    return tuple(spread(render, specs, jobs=options.jobs, label="regions rendered", progress=progress))
 
 
 def render_imagery_command(options: RenderOptions) -> None:
     """Render reference imagery of built regions: OUT/regions/<id>/ortho.tif, of any date, in a look no query has."""
-    for path in render_imagery(**vars(options) | {"say": say, "tell": tell}):
+    with shown_progress() as progress:
+        paths = render_imagery(**vars(options) | {"tell": tell, "progress": progress})
+    for path in paths:
         say(path)
 
 
 def build_region_command(options: BuildOptions) -> None:
     """Build regions from dated extracts: layers, features, graph, imagery and preview in OUT/regions/<id>/."""
-    build_region(**vars(options) | {"say": say, "tell": tell})
+    with shown_progress() as progress:
+        build_region(**vars(options) | {"say": say, "tell": tell, "progress": progress})

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.matching.results import SOUND
@@ -136,7 +136,7 @@ def run_command(options: RunOptions) -> None:
     for line in lines:
         say(line)
     if report.counts and not report.counts.keys() & SOUND:
-        tell(f"no query was answered, so the command ends with status {CONTESTANT_FAILED}; the rows are kept")
+        complain(f"no query was answered, so the command ends with status {CONTESTANT_FAILED}; the rows are kept")
         raise typer.Exit(CONTESTANT_FAILED)
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
 from sasgeo_bench.cli.matchers import end_with_checks, lay_package
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
@@ -81,7 +81,9 @@ def segment_command(options: SegmentOptions) -> None:
     for folder in folders:
         say(folder)
     if any(FAILED_PICTURES in read_task(folder) for folder in folders):
-        tell(f"pictures failed, so the command ends with status {CONTESTANT_FAILED}; it tries them again when repeated")
+        complain(
+            f"pictures failed, so the command ends with status {CONTESTANT_FAILED}; it tries them again when repeated"
+        )
         raise typer.Exit(CONTESTANT_FAILED)
 
 

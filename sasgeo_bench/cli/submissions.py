@@ -7,7 +7,7 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import EXIT_USER, say, tell
+from sasgeo_bench.cli.console import EXIT_USER, complain, say, tell
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.matching.submission import example_card
 from sasgeo_bench.publishing.archive import laid_tasks
@@ -97,7 +97,7 @@ def _show(faults: Iterable[Violation], predictions: Path) -> None:
         more = counted(missing - MOST_MISSING, "more query", "more queries")
         say(f"{predictions.name}, query_id: found no row for {more}, expected one for every query")
     if count:
-        tell(f"{predictions}: {counted(count, 'violation')}")
+        complain(f"{predictions}: {counted(count, 'violation')}")
         raise typer.Exit(EXIT_USER)
 
 

@@ -10,7 +10,7 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, say
+from sasgeo_bench.cli.console import print_table, say, tell
 from sasgeo_bench.cli.options import Out
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.lookalike import SIDE_M, find_lookalike, sheet_of
@@ -93,6 +93,7 @@ def lookalike_command(
     mapped = find_region(region, out=out)
     seen = mapped if world is None else find_region(world, out=out)
     known = check_classes(model or ScorerModel.by_hand(mapped.classes), mapped.classes)
+    tell(f"searching {region} for the place that is most like another")
     found = find_lookalike(mapped, seen, known, side_m=side_m)
     for table in (_numbers(found.scores), _numbers(found.terms)):
         print_table(table)

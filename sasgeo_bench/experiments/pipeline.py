@@ -112,10 +112,10 @@ def run_pipeline(
 
 def draw_all(plan: PipelinePlan, *, tell: Tell, progress: Progress | None) -> tuple[list[Path], list[Path]]:
     """Draw what is missing of a pipeline's queries and of its controls, and return the folders of both."""
-    drawn = _draw(plan.requests, tell, jobs=plan.jobs)
+    drawn = _draw(plan.requests, tell, jobs=plan.jobs, progress=progress)
     _render(plan, tell)
     tasks = [*_with_evidence(plan, drawn, tell=tell, progress=progress), *_draw_paper(plan, tell)]
-    return tasks, _draw(plan.controls, tell, jobs=1)
+    return tasks, _draw(plan.controls, tell, jobs=1, progress=progress)
 
 
 def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: Sequence[Path], tell: Tell) -> None:
@@ -182,11 +182,11 @@ def ask(spec: str, runs: Sequence[Run], *, tell: Tell, progress: Progress | None
     return folders
 
 
-def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int) -> list[Path]:
+def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int, progress: Progress | None) -> list[Path]:
     """Draw every request that a region carries, unless it is up to date, and return the task folders."""
     tasks: list[Path] = []
     lacking: list[str] = []
-    for drawn in carry_out(requests, jobs=jobs):
+    for drawn in carry_out(requests, jobs=jobs, progress=progress):
         for line in drawn.lines:
             tell(line)
         tasks += drawn.folders

@@ -25,6 +25,7 @@ from pydantic import (
 from sasgeo_bench.config import Document, Line
 from sasgeo_bench.errors import ExtractError
 from sasgeo_bench.files.folders import sha256_of
+from sasgeo_bench.progress import QUIET
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 IMAGERY_VARIABLE: Final = "SASGEO_IMAGERY"
@@ -207,7 +208,7 @@ def _download(extract: Extract, url: str) -> Path:
         message = f"{url} cannot be reached"
         raise ExtractError(message)
     folder = cache_folder()
-    load = pooch.HTTPDownloader(timeout=_SILENT_S, progressbar=sys.stderr.isatty())
+    load = pooch.HTTPDownloader(timeout=_SILENT_S, progressbar=sys.stderr.isatty() and QUIET not in os.environ)
     pooch.get_logger().setLevel("WARNING")  # else it prints the path of its temporary file
     try:
         folder.mkdir(parents=True, exist_ok=True)

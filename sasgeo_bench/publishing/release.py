@@ -29,7 +29,7 @@ from sasgeo_bench.publishing.release_files import (
     write_sums,
     write_texts,
 )
-from sasgeo_bench.publishing.release_metadata import write_croissant, write_stac
+from sasgeo_bench.publishing.release_metadata import write_croissant, write_stac, write_zenodo
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import cog_faults
@@ -83,6 +83,7 @@ def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
         tell("writing the STAC catalog, Croissant metadata, the card and the datasheet")
         write_stac(folder, release)
         write_croissant(folder, release)
+        write_zenodo(folder, release)
         write_index(folder, release)
         write_texts(folder, release, {CARD: card_text(release), DATASHEET: datasheet_text(release)})
         write_sums(folder, release.files)

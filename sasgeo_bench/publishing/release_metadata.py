@@ -94,7 +94,10 @@ if TYPE_CHECKING:
     import mlcroissant as mlc
     import pystac
 
+AUTHORS: Final = "The sasgeo-bench authors"
 CROISSANT: Final = "croissant.json"
+ZENODO: Final = "zenodo.json"
+_KEYWORDS: Final = ["map localization", "UAV", "OpenStreetMap", "geolocalization"]
 PARQUET: Final = "application/x-parquet"
 _MEDIA_TYPES: Final = {
     ".parquet": PARQUET,
@@ -140,16 +143,13 @@ def write_croissant(folder: Path, release: Release) -> None:
     metadata = mlc.Metadata(
         ctx=mlc.Context(conforms_to=versions(_CONFORMS_TO), rdf=mlc.Rdf(context={**mlc.Rdf().context, **_NEW_TERMS})),
         name="sasgeo-bench",
-        description=(
-            f"Semantic maps of {len(release.regions)} regions and {release.queries} queries for map localization of "
-            f"UAVs without GNSS, made from dated OpenStreetMap extracts. {ATTRIBUTION}"
-        ),
+        description=_description(release),
         license=[LICENCE_URL],
         url=release.url,
         version=release.version,
         date_published=dt.datetime.fromisoformat(release.published),
-        keywords=["map localization", "UAV", "OpenStreetMap", "geolocalization"],
-        creators=[mlc.Organization(name="The sasgeo-bench authors")],
+        keywords=_KEYWORDS,
+        creators=[mlc.Organization(name=AUTHORS)],
         cite_as=cite_as(release),
         data_biases=["OpenStreetMap is denser in some countries than in others."],
         personal_sensitive_information=["None: names and ids of the accounts that edited the map are not kept."],
@@ -159,12 +159,39 @@ def write_croissant(folder: Path, release: Release) -> None:
     (folder / CROISSANT).write_text(json_text(metadata.to_json()), encoding="utf-8")
 
 
+def write_zenodo(folder: Path, release: Release) -> None:
+    """Write the metadata of a deposit at Zenodo, which gives a release its DOI."""
+    content = {
+        "title": f"sasgeo-bench, dataset release {release.version}",
+        "upload_type": "dataset",
+        "description": _description(release),
+        "creators": [{"name": AUTHORS}],
+        "license": LICENCE,
+        "version": release.version,
+        "publication_date": release.published,
+        "access_right": "open",
+        "language": "eng",
+        "keywords": _KEYWORDS,
+        "notes": ATTRIBUTION,
+    }
+    related = [{"identifier": release.url, "relation": "isIdenticalTo"}] if release.url else []
+    text = json_text(content | ({"related_identifiers": related} if related else {}))
+    (folder / ZENODO).write_text(text, encoding="utf-8")
+
+
+def _description(release: Release) -> str:
+    return (
+        f"Semantic maps of {len(release.regions)} regions and {release.queries} queries for map localization of "
+        f"UAVs without GNSS, made from dated OpenStreetMap extracts. {ATTRIBUTION}"
+    )
+
+
 def cite_as(release: Release) -> str:
     """Return the citation of a release as BibTeX."""
     year = release.published[:4]
     return (
         f"@misc{{sasgeo_bench_{year}, title = {{sasgeo-bench, dataset release {release.version}}}, "
-        f"author = {{{{The sasgeo-bench authors}}}}, year = {{{year}}}, "
+        f"author = {{{{{AUTHORS}}}}}, year = {{{year}}}, "
         f"note = {{Data {ATTRIBUTION}}}}}"
     )
 
@@ -364,7 +391,7 @@ def _providers(release: Release) -> list["pystac.Provider"]:
     roles = pystac.ProviderRole
     return [
         pystac.Provider("OpenStreetMap contributors", roles=[roles.LICENSOR, roles.PRODUCER], url=COPYRIGHT_URL),
-        pystac.Provider("The sasgeo-bench authors", description=release.made_by, roles=[roles.PROCESSOR]),
+        pystac.Provider(AUTHORS, description=release.made_by, roles=[roles.PROCESSOR]),
     ]
 
 

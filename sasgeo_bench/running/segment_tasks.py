@@ -155,15 +155,11 @@ def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None
             learned=_learned(wanted, loaded, group, tell) if loaded.learns else None,
             is_recalibrated=wanted.is_recalibrated,
         )
-        label = f"{sight.name}, {group.name}"
-        if progress is not None:
-            progress.begin(label, len(group.asked))
-        for folder, lines in spread(partial(_segmented, sight), group.asked, jobs=wanted.jobs):
+        work, label = partial(_segmented, sight), f"{sight.name}, {group.name}"
+        for folder, lines in spread(work, group.asked, jobs=wanted.jobs, label=label, progress=progress):
             made.append(folder)
             for line in lines:
                 tell(line)
-            if progress is not None:
-                progress.advance(label, 1)
     return tuple(made)
 
 

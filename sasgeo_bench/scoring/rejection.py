@@ -316,9 +316,8 @@ def evaluate_rejectors(
     accepted: list[pd.DataFrame] = []
     errors: dict[str, list[Exception]] = {}
     remarks: list[str] = []
-    progress.begin(JUDGED, len(tasks))
-    for task, results in zip(tasks, spread(_evaluated, tasks, jobs=jobs), strict=True):
-        progress.advance(JUDGED, 1)
+    found_by_task = spread(_evaluated, tasks, jobs=jobs, label=JUDGED, progress=progress)
+    for task, results in zip(tasks, found_by_task, strict=True):
         for name, found in results.items():
             if isinstance(found, Exception):
                 failures.note(f"{task.matcher} x {name}", found)

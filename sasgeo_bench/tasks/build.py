@@ -17,7 +17,7 @@ import numpy as np
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import fresh_folder, locked
-from sasgeo_bench.progress import Tell, spread
+from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import read_bits
@@ -388,12 +388,13 @@ class Drawn:
     lack: str | None = None
 
 
-def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
+def carry_out(requests: Sequence[Request], *, jobs: int = 1, progress: Progress | None = None) -> Iterator[Drawn]:
     """Draw the tasks of requests with several processes, whose number changes no query; yield results in order.
 
-    Tasks that are up to date stay. Raise a StoreError if a folder cannot be written or holds foreign files.
+    Tasks that are up to date stay. `progress` counts the requests. Raise a StoreError if a folder cannot be written or
+    holds foreign files.
     """
-    yield from spread(_carry_out, requests, jobs=jobs)
+    yield from spread(_carry_out, requests, jobs=jobs, label="tasks drawn", progress=progress)
 
 
 def _carry_out(request: Request) -> Drawn:

@@ -344,6 +344,23 @@ def test_mlcroissant_finds_no_issue_and_loads_records_of_every_set(written: Path
     assert all(file_record(written / path).sha256 == found for path, found in hashes.items())
 
 
+def test_the_metadata_of_a_deposit_say_what_the_release_says(written: Path, source: Path, tmp_path: Path) -> None:
+    content, index, croissant = (
+        json.loads((written / name).read_text(encoding="utf-8"))
+        for name in ("zenodo.json", "release.json", "croissant.json")
+    )
+    assert content["title"].endswith(index["version"])
+    assert content["version"] == index["version"]
+    assert content["publication_date"] == index["published"]
+    assert content["license"] == "ODbL-1.0"
+    assert content["creators"] == [{"name": croissant["creator"]["name"]}]
+    assert content["description"] == croissant["description"]
+    assert "related_identifiers" not in content
+    _release(source, tmp_path / FOLDER, url="https://example.org/mine")
+    content = json.loads((tmp_path / FOLDER / "zenodo.json").read_text(encoding="utf-8"))
+    assert content["related_identifiers"] == [{"identifier": "https://example.org/mine", "relation": "isIdenticalTo"}]
+
+
 def test_sha256sum_checks_every_file(written: Path) -> None:
     command = ["sha256sum", "-c", "--strict", "SHA256SUMS"]
     done = subprocess.run(command, cwd=written, capture_output=True, text=True, check=True)  # noqa: S603 - of PATH

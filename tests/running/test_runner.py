@@ -179,7 +179,7 @@ def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task
     command = command_of(SIGNALLED.format(number=int(signal.SIGINT)), task, tmp_path, "--jobs", str(jobs))
     process = subprocess.run(command, cwd=place, env=env_with(place), capture_output=True, text=True)  # noqa: S603, PLW1510
     assert process.returncode == 130, process.stderr
-    assert "interrupted; what was finished is kept" in process.stderr.splitlines()[-1]
+    assert "interrupted; answers so far are kept" in process.stderr.splitlines()[-1]
     assert 0 < len(prediction_files.ids_done(folder, task_files.read_asked(task))) < len(task_files.read_ids(task))
     run_all(request_of(task, tmp_path, name="Slow"))
     assert table(folder) == table(undisturbed[1])

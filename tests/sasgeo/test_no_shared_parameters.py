@@ -13,7 +13,9 @@ from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[2] / "sasgeo_bench"
+import sasgeo_bench
+
+PACKAGE = Path(sasgeo_bench.__file__).parent
 GENERATOR = ("perturbations/*.py", "suites/*.py")
 UNIT = re.compile(r"_(m|m2|deg|share|years|cells)$", re.IGNORECASE)
 QUOTES = re.compile(r"\b(warp|wave|wavelength|gap|twin|lure|generator|perturbation|suite)s?\b", re.IGNORECASE)

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import DTYPES, make_features
-from sasgeo_bench.regions.layers import OUTSIDE, burn, burn_layers, make_paint
+from sasgeo_bench.regions.layers import OUTSIDE, burn, burn_layers, cog_faults, make_paint, write_layers
 
 GRID = Grid(epsg=32632, west_m=0.0, north_m=40.0, cell_size_m=1.0, rows=40, cols=50)
 EVERYWHERE = shapely.box(-1e6, -1e6, 1e6, 1e6)
@@ -122,3 +122,21 @@ def test_overviews_do_not_break_thin_lines():
     wide = burn_layers(make_paint(path, ("path_track",), EVERYWHERE, least_width_m=4.0), coarse)[0]
     assert (wide == 1).any(axis=0).all()
     assert not (thin == 1).any(axis=0).all()
+
+
+def test_a_level_that_is_one_block_wide_is_tiled_all_the_same(tmp_path):
+    tall = Grid(epsg=32632, west_m=0.0, north_m=4352.0, cell_size_m=1.0, rows=4352, cols=2048)  # overview: 512 wide
+
+    def paint(_):
+        return lambda window: np.zeros((1, *window.shape), np.uint8)
+
+    write_layers(tmp_path / "tall.tif", tall, ("building",), paint)
+    assert cog_faults(tmp_path / "tall.tif") == []
+
+
+def test_strips_are_a_fault_of_a_cloud_optimized_file(tmp_path):
+    with rasterio.open(
+        tmp_path / "a.tif", "w", driver="GTiff", height=1024, width=600, count=1, dtype="uint8", tiled=False
+    ) as target:
+        target.write(np.zeros((1, 1024, 600), np.uint8))
+    assert "is not tiled" in cog_faults(tmp_path / "a.tif")[0]

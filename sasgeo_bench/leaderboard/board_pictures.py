@@ -113,7 +113,8 @@ def pictures_extra(
     answers = {}
     if has_cases:
         failures = _failures(board, contrasts)
-        answers = {ANSWERS: answers_frame(board, failures, ranked_matchers(board.table))}
+        placed = answers_frame(board, failures, ranked_matchers(board.table))
+        answers = {ANSWERS: placed} if len(placed) else {}
         _add_strips(found, board, asked, root)
         _add_flights(found, board, asked, root)
         shown = failures[failures["matcher"].isin(shown_matchers(board.table, contrasts))]

@@ -99,7 +99,7 @@ class Registration:
         if math.isnan(self.detectable):
             return ""
         if math.isinf(self.detectable):
-            return "; so few places cannot show any difference"
+            return "; nothing can be shown unless more queries differ than a pilot says, or twice what matters"
         last, first = (
             "none" if math.isinf(least) else f"{least:.3f}" for least in (self.detectable, self.detectable_first)
         )

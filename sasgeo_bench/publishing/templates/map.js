@@ -2,7 +2,7 @@
 // The map page: queries of a place on its picture, one of them in detail, and the same part of the map at each pose.
 "use strict";
 
-const COLOURS = ["#009e73", "#cc3311", "#e69f00", "#882255", "#332288", "#56b4e9", "#d55e00", "#555555", "#999999"];
+const COLOURS = ["#009e73", "#cc3311", "#e69f00", "#882255", "#332288", "#56b4e9", "#999933", "#555555", "#bbbbbb"];
 const TRUE = "#000000";
 const SIDE_PX = 300;
 const [ID, SUITE, REGION, KIND, PRESENT, VIEW_M, EAST] = [0, 1, 2, 3, 4, 5, 6]; // of a query
@@ -49,7 +49,7 @@ async function openPlace() {
   if (!map) {
     map = L.map("map", { crs: L.CRS.Simple, minZoom: -5, maxZoom: 3, zoomSnap: 0.25, attributionControl: true });
     map.attributionControl.setPrefix("Leaflet").addAttribution("(c) OpenStreetMap contributors, ODbL");
-    L.control.scale({ imperial: false }).addTo(map);
+    L.control.scale({ imperial: false, position: "topright" }).addTo(map);
   }
   map.eachLayer((layer) => layer.remove());
   const [width, height] = place.size_m;
@@ -140,7 +140,7 @@ function show(number) {
   const { query, fix, kind, number: index } = shown[at];
   const matcher = field("matcher").value;
   const truth = query.slice(EAST);
-  facts.append(row("Suite", `${query[SUITE]}, ${query[KIND]}`), row("Searched map", query[REGION]), row("Query", query[ID]));
+  facts.append(row("Suite", `${query[SUITE]}, ${query[KIND]}`), row("Searched map", query[REGION] + (query[REGION] === field("place").value ? "" : `; the picture shows ${field("place").value}`)), row("Query", query[ID]));
   facts.append(row("Answer", !fix.length ? "none" : truth.length ? `${away(fix, truth).toFixed(1)} m from where the view was taken` : "given"));
   if (!query[PRESENT]) facts.append(row("Place", "not on the searched map: the right answer is none"));
   if (truth.length) {

@@ -155,7 +155,7 @@ def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=Non
         extras=[
             Extra(
                 figures={"age-real-age-localization-r500-weak-s3.svg": draw},
-                tables={"answers": answers_of(shares)},
+                tables={"answers": answers_of([*shares, "__proto__"])},  # a name that means something in JavaScript
             )
         ],
         contrasts=[

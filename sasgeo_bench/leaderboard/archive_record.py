@@ -207,7 +207,8 @@ class _Picture(_Record):
     suite: str = ""
 
 
-_Bounds = Annotated[list[float], Field(min_length=4, max_length=4)]  # west, south, east, north
+_Metres = Annotated[float, Field(ge=-1e8, le=1e8)]
+_Bounds = Annotated[list[_Metres], Field(min_length=4, max_length=4)]  # west, south, east, north
 
 
 class _Block(_Record):

@@ -58,16 +58,19 @@ def read_card_file(path: Path) -> Card:
 
     Raise StoreError if it cannot be read. Raise ConfigError if a field is wrong; all faults on one line.
     """
-    noun = "a card (submit --example-card prints one)"
+    noun = "write a card there, or name one (submit --example-card prints one)"
+    if path.exists() and not path.is_file():  # a pipe would be waited for
+        message = f"{path} is no plain file: {noun}"
+        raise StoreError(message)
     try:
         with path.open("rb") as source:
             read = source.read(_MOST_BYTES + 1)
         text = read.decode("utf-8-sig")  # some editors write a byte order mark
     except (UnicodeDecodeError, OSError) as error:
         fault = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
-        message = f"{path} cannot be read ({fault}): name {noun}"
+        message = f"{path} cannot be read ({fault}): {noun}"
         raise StoreError(message) from error
     if len(read) > _MOST_BYTES:
-        message = f"{path} has more than {_MOST_BYTES} bytes: name {noun}"
+        message = f"{path} has more than {_MOST_BYTES} bytes: {noun}"
         raise StoreError(message)
     return parse_toml(text, Card, source=str(path))

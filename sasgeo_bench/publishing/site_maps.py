@@ -10,8 +10,10 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import numpy as np
 import pandas as pd
 
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.cases import FAILURES, MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem
 from sasgeo_bench.publishing.site_source import RegionMap, SiteSource
@@ -19,6 +21,8 @@ from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.texts import plain
 
 MAPS: Final = "maps"
+_POSE: Final = ("easting_m", "northing_m", "yaw_deg")
+_MOST_M: Final = 1e8  # of any coordinate on Earth
 SOUND: Final = "as it should be"  # neither a failure nor a crash
 OUTCOMES: Final = {SOUND: "right, or rightly none", **{name: MEANINGS[name] for name in FAILURES}}
 _NUMBERS: Final = {name: at for at, name in enumerate(OUTCOMES)}
@@ -41,6 +45,7 @@ def place_maps(source: SiteSource) -> dict[PlaceMap, str]:
     """
     if not len(source.answers):
         return {}
+    _check(source.answers)
     answers = source.answers.assign(base=source.answers["region"].map(base_of))
     pictures = {plain(case.query_id): at for at, case in enumerate(source.pictures.cases, start=1)}
     found = {}
@@ -60,6 +65,19 @@ def place_maps(source: SiteSource) -> dict[PlaceMap, str]:
     return found
 
 
+def _check(answers: pd.DataFrame) -> None:
+    """Refuse poses that lie nowhere on Earth or lack a part, and views without a side."""
+    poses = [answers[[f"{what}_{name}" for name in _POSE]].to_numpy(float) for what in ("true", "fix")]
+    view_m = answers["view_m"].to_numpy(float)
+    is_sound = (view_m > 0) & (view_m < _MOST_M)
+    for pose in poses:
+        is_sound &= np.isnan(pose).all(axis=1) | (np.abs(pose) < _MOST_M).all(axis=1)
+    if not is_sound.all():
+        row = int(np.argmin(is_sound))
+        message = f"answers.parquet holds a view or a pose that lies nowhere, in row {row}: score it again"
+        raise StoreError(message)
+
+
 def _script(place: PlaceMap, item: RegionMap, answers: pd.DataFrame, cases: Mapping[str, int]) -> str:
     west_m, south_m, east_m, north_m = item.bounds_m or (0.0,) * 4
     queries = answers.drop_duplicates("query_id").sort_values("query_id", ignore_index=True)
@@ -67,19 +85,22 @@ def _script(place: PlaceMap, item: RegionMap, answers: pd.DataFrame, cases: Mapp
     content: dict[str, Any] = {
         "picture": f"pictures/{item.file}",
         "size_m": [east_m - west_m, north_m - south_m],
-        "blocks": {
-            plain(name): [left - west_m, low - south_m, right - west_m, high - south_m]
+        "blocks": [
+            [plain(name), left - west_m, low - south_m, right - west_m, high - south_m]
             for name, (left, low, right, high) in item.blocks_m.items()
-        },
+        ],
         "queries": list(_queries(queries, west_m, south_m)),
         "cases": {str(number[name]): at for name, at in cases.items() if name in number},
-        "answers": {
-            plain(str(name)): [
-                [number[row["query_id"]], _outcome(row), *_point(row, "fix", west_m, south_m)]
-                for row in part.to_dict("records")
+        "answers": [  # pairs: no name of a matcher means anything to the language of the script
+            [
+                plain(str(name)),
+                [
+                    [number[row["query_id"]], _outcome(row), *_point(row, "fix", west_m, south_m)]
+                    for row in part.to_dict("records")
+                ],
             ]
             for name, part in answers.groupby("matcher", sort=True)
-        },
+        ],
     }
     text = json.dumps(content, separators=(",", ":"), allow_nan=False)  # ASCII alone
     return f"showPlace({json.dumps(place.file)}, {text});\n"
@@ -99,7 +120,7 @@ def _outcome(row: Mapping[Any, Any]) -> int:
 
 def _point(row: Mapping[Any, Any], what: str, west_m: float, south_m: float) -> list[float | None]:
     """Return easting, northing and yaw in metres and degrees from the corner; nothing where there is no pose."""
-    easting_m, northing_m, yaw_deg = (float(row[f"{what}_{name}"]) for name in ("easting_m", "northing_m", "yaw_deg"))
+    easting_m, northing_m, yaw_deg = (float(row[f"{what}_{name}"]) for name in _POSE)
     if math.isnan(easting_m):
         return []
     return [round(easting_m - west_m, 1), round(northing_m - south_m, 1), round(yaw_deg, 1)]

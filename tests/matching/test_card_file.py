@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """`card.toml` beside a module is the card of its class, of its submission and of its row."""
 
+import os
+
 import pytest
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
@@ -42,3 +44,9 @@ def test_what_is_wrong_is_said_with_the_file(tmp_path):
         read_card(write(tmp_path, "licence", "# licence"))
     with pytest.raises(MatchError, match="tracks is empty"):
         read_card(write(tmp_path, "tracks =", "# tracks ="))
+
+
+def test_a_pipe_is_no_card_and_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "card.toml")
+    with pytest.raises(StoreError, match=r"card\.toml is no plain file: write a card there, or name one"):
+        read_card_file(tmp_path / "card.toml")

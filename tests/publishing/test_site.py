@@ -2,6 +2,7 @@
 """Tables of a site: every page has its own name, ties are told, what is registered is said in words."""
 
 import json
+import math
 import re
 from dataclasses import replace
 
@@ -11,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table, summary
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
@@ -311,7 +313,21 @@ def test_a_place_has_its_answers_in_metres_from_the_corner_of_its_map():
     assert (place.region, place.queries) == ("vaduz", 3)
     said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
     assert said["queries"][0] == ["q0", "real-age", "vaduz@2015-07-27", "S1", 1, 128.0, 100.0, 200.0, 90.0]
-    assert said["answers"] == {MARKUP: [[0, 0, 100.0, 200.0, 90.0], [1, 1, 400.0, 200.0, 90.0], [2, -1]]}
+    assert said["answers"] == [[MARKUP, [[0, 0, 100.0, 200.0, 90.0], [1, 1, 400.0, 200.0, 90.0], [2, -1]]]]
     assert said["cases"] == {"1": 1}
     assert script.isascii()
     assert place_maps(replace(whole, answers=pd.DataFrame())) == {}
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("true_northing_m", math.nan), ("fix_easting_m", math.inf), ("view_m", 0.0), ("view_m", 1e308)],
+)
+def test_answers_that_lie_nowhere_are_refused_by_row(column, value):
+    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
+    answers = answers_of(["mine"])
+    answers.loc[1, column] = value
+    with pytest.raises(
+        StoreError, match=r"^answers\.parquet holds a view or a pose that lies nowhere, in row 1: score"
+    ):
+        place_maps(replace(source(), answers=answers, pictures=Pictures(regions=(item,))))

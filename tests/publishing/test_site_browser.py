@@ -259,6 +259,7 @@ def test_names_with_markup_on_the_map_are_text(page, site):
     page.open(address(site, "map.html") + f"?outcome=1&matcher={quote(HOSTILE)}")
     until(page, f"{TOLD} === '1 of 1 queries'")
     assert page.value("document.getElementById('choice').elements.matcher.value") == HOSTILE
+    assert "__proto__" in page.value("document.getElementById('facts').textContent")
     assert page.value("document.querySelectorAll('main img:not(.leaflet-image-layer), main b b').length") == 0
     assert page.faults == []
 

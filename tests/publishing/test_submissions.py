@@ -264,7 +264,7 @@ def test_a_name_that_is_on_the_board_is_refused(stored, files, mistake, monkeypa
     ("text", "fault"),
     [
         (b"name = [", "not valid TOML"),
-        (b"\xff\xfe\x00", "it is no UTF-8: name a card"),
+        (b"\xff\xfe\x00", "it is no UTF-8: write a card there, or name one"),
         (b"# " + b"x" * 200_000, "has more than 100000 bytes"),
     ],
 )

@@ -11,7 +11,7 @@ const field = (name) => choice.elements[name];
 const outcomes = Array.from(field("outcome").options, (one) => one.text).slice(2);
 const wanted = new URLSearchParams(location.search);
 const scripts = new Map(); // file -> content of a place
-let place, map, dots, detail, shown = [], at = -1;
+let place, answers, map, dots, detail, shown = [], at = -1;
 
 function showPlace(file, content) { scripts.set(file, content); }
 
@@ -44,7 +44,8 @@ const latlng = (east, north) => L.latLng(north, east);
 async function openPlace() {
   const option = field("place").selectedOptions[0];
   place = await load(option.dataset.file);
-  fill(field("matcher"), Object.keys(place.answers), "");
+  answers = new Map(place.answers);
+  fill(field("matcher"), [...answers.keys()], "");
   fill(field("suite"), [...new Set(place.queries.map((one) => one[SUITE]))].sort(), "all");
   if (!map) {
     map = L.map("map", { crs: L.CRS.Simple, minZoom: -5, maxZoom: 3, zoomSnap: 0.25, attributionControl: true });
@@ -55,7 +56,7 @@ async function openPlace() {
   const [width, height] = place.size_m;
   const bounds = L.latLngBounds(latlng(0, 0), latlng(width, height));
   L.imageOverlay(place.picture, bounds, { alt: `Map of ${option.text}` }).addTo(map);
-  for (const [name, [west, south, east, north]] of Object.entries(place.blocks)) {
+  for (const [name, west, south, east, north] of place.blocks) {
     L.rectangle([latlng(west, south), latlng(east, north)], { color: "#444444", weight: 1, dashArray: "3 5", fill: false, interactive: false }).addTo(map).getElement()?.setAttribute("aria-label", `Block ${name}`);
   }
   dots = L.layerGroup().addTo(map);
@@ -67,7 +68,7 @@ async function openPlace() {
 function chosen() {
   const [suite, outcome] = [field("suite").value, field("outcome").value];
   const fits = (kind) => outcome === "" || (outcome === "failures" ? kind !== 0 : kind === Number(outcome));
-  return (place.answers[field("matcher").value] || [])
+  return (answers.get(field("matcher").value) || [])
     .map(([number, kind, ...fix]) => ({ number, kind, fix, query: place.queries[number] }))
     .filter((one) => fits(one.kind) && (!suite || one.query[SUITE] === suite));
 }
@@ -119,7 +120,7 @@ const away = (one, other) => Math.hypot(one[0] - other[0], one[1] - other[1]);
 
 function rivals(number) {
   const mine = field("matcher").value;
-  const found = Object.entries(place.answers).filter(([name]) => name !== mine).map(([name, rows]) => {
+  const found = [...answers].filter(([name]) => name !== mine).map(([name, rows]) => {
     const row = rows.find((one) => one[0] === number);
     return row && { name, kind: row[1], fix: row.slice(2) };
   });

@@ -75,10 +75,11 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
         region_folders=request.region_folders,
         sealed=request.sealed,
     )
-    kept = tuple(item for item in plan.requests if item.region.id not in request.without)
-    if len(kept) == len(plan.requests) and request.without:
-        message = f"--without names {', '.join(request.without)}, and the board asks about no such region"
+    unknown = sorted({*request.without} - {item.region.id for item in plan.requests})
+    if unknown:
+        message = f"--without names {', '.join(unknown)}, and the board asks about no such region"
         raise ConfigError(message)
+    kept = tuple(item for item in plan.requests if item.region.id not in request.without)
     return replace(plan, requests=kept, jobs=request.jobs)
 
 

@@ -9,6 +9,7 @@ from sasgeo_bench.errors import ConfigError, ExtractError, counted
 from sasgeo_bench.experiments.pipeline_plan import PipelinePlan
 from sasgeo_bench.leaderboard.board_files import read_board, read_scores
 from sasgeo_bench.osm.locate import FOLDERS_VARIABLE, find_extract, find_parts, missing_files
+from sasgeo_bench.progress import duration_text
 from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks import task_files
@@ -20,7 +21,6 @@ _BUILD_S: Final = 2.0  # of a map
 _SCORE_S: Final = 0.002  # of a scored row of the board: read, scored, resampled
 _FIT_S: Final = 0.006  # of a query and a rejector
 _MAP_MB: Final = 2  # of a built map, on average over the shipped regions and their dates
-_MINUTE_S, _HOUR_S = 60.0, 3600.0
 
 
 def cost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask]) -> Iterator[str]:
@@ -35,7 +35,7 @@ def cost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask]) -> 
     maps = sum(not (plan.out / "regions" / region).is_dir() for region in {region for _, region in names})
     count = sum(left.values())
     yield (
-        f"  drawing about {_duration(count * _DRAW_S + maps * _BUILD_S)}: {counted(count, 'query', 'queries')} and "
+        f"  drawing about {duration_text(count * _DRAW_S + maps * _BUILD_S)}: {counted(count, 'query', 'queries')} and "
         f"{counted(maps, 'map')} are not there yet, about {maps * _MAP_MB} MB on disk"
     )
     scores = read_scores(stored)
@@ -43,12 +43,10 @@ def cost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask]) -> 
     means = sorted((float(some.mean()), str(name)) for name, some in ranked.groupby("matcher")["latency_s"])
     if means and means[-1][0] > 0:
         (fast_s, fast), (slow_s, slow) = means[0], means[-1]
-        yield (
-            f"  asking about {_duration(queries * fast_s)} at the speed of {fast}, {_duration(queries * slow_s)} at "
-            f"that of {slow}; --jobs divides it"
-        )
+        fast_text, slow_text = (duration_text(queries * seconds) for seconds in (fast_s, slow_s))
+        yield f"  asking about {fast_text} at the speed of {fast}, {slow_text} at that of {slow}; --jobs divides it"
     seconds = len(scores) * _SCORE_S + queries * (_SCORE_S + _FIT_S * len(read_board(stored)[0].get("rejectors", ())))
-    yield f"  scoring about {_duration(seconds)}"
+    yield f"  scoring about {duration_text(seconds)}"
 
 
 def lost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask]) -> Iterator[str]:
@@ -114,14 +112,3 @@ def missing_text(names: Sequence[str]) -> str:
 
 def _is_there(tasks: Path, suite: str, region: str) -> bool:
     return (tasks / suite / region / task_files.TASK).is_file()
-
-
-def _duration(seconds: float) -> str:
-    """Return a duration in words.
-
-    >>> _duration(20), _duration(600), _duration(5000)
-    ('20 s', '10 minutes', '1.4 hours')
-    """
-    if seconds < 1.5 * _MINUTE_S:
-        return f"{seconds:.0f} s"
-    return f"{seconds / _MINUTE_S:.0f} minutes" if seconds < _HOUR_S else f"{seconds / _HOUR_S:.1f} hours"

@@ -35,6 +35,7 @@ PROTECTION: Final = "protection"
 ACCEPTANCE: Final = "acceptance"
 SCORES: Final = "scores"
 ANSWERS: Final = "answers"
+TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION, ANSWERS)  # beside the master
 BOARD: Final = "board.json"
 FIGURES: Final = "figures"
 PICTURES: Final = "pictures"

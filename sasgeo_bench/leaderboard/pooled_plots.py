@@ -244,7 +244,7 @@ def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -
     about = BoardPage(
         title=f"Success against latency: {rows['suites'].iloc[0]}, {rows['track'].iloc[0]}",
         note=(
-            "Present places. Upright bars: 95 % intervals; level "
+            "The queries that the first figure of the suite counts. Upright bars: 95 % intervals; level "
             "bars: from the median latency to the 95th percentile, all suites of the track, as measured where each "
             "matcher ran. Grey line: the front, where no other matcher is both faster and better. Grey crosses: "
             "controls, which compete with nobody."
@@ -288,9 +288,9 @@ def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:
     about = BoardPage(
         title="Registered contrasts",
         note=(
-            "First less second on the same queries, with its 95 % interval by places. Blue: decided; grey: not. Grey "
-            "band: differences smaller than was registered to matter. An interval that holds 0 shows neither to be "
-            "better; one within the band is a tie."
+            "First less second on the same queries, with its 95 % interval by places. Blue: decided; grey: all "
+            "else, also where the interval leaves out 0 and the test, adjusted by Holm, does not. Grey band: "
+            "differences smaller than was registered to matter; an interval within it rules out those that do."
         ),
         below="difference (shares; of other metrics in their unit)",
         panel_inches=(4.6, 0.4 + 0.28 * len(rows)),

@@ -4,7 +4,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard import board_files
-from sasgeo_bench.leaderboard.board_files import ACCEPTANCE, MEND, PROTECTION, SCORES
+from sasgeo_bench.leaderboard.board_files import ANSWERS, MEND, SCORES, TABLES
 from sasgeo_bench.leaderboard.plot_tables import MOST_MATCHERS, ranked_matchers, risk_frame, shown_matchers
 from sasgeo_bench.leaderboard.plots import draw_risk
 from sasgeo_bench.leaderboard.pooled_plots import draw_contrasts, draw_tradeoff
@@ -21,8 +21,6 @@ from sasgeo_bench.scoring.rejection import OWN, own_confidence
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
 from sasgeo_bench.texts import html_facts
-
-_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,6 +43,8 @@ class StoredBoard:
         Checks of the benchmark itself, and of its suites.
     acceptance, protection : DataFrame
         Figures of rejectors at absent places, and of protection levels; empty where the board has none.
+    answers : DataFrame
+        True place and fix of each query of each ranked matcher, and the class of its failure; empty of stored results.
     """
 
     folder: Path
@@ -56,6 +56,7 @@ class StoredBoard:
     falsifiers: pd.DataFrame = field(repr=False)
     acceptance: pd.DataFrame = field(repr=False)
     protection: pd.DataFrame = field(repr=False)
+    answers: pd.DataFrame = field(repr=False)
 
     def plot_tradeoff(self, suite: str | None = None, *, track: str = "localization") -> Figure:
         """Draw success with its 95 % interval against the median latency, a panel for each prior group.
@@ -158,10 +159,10 @@ def read_board(path: str | Path) -> StoredBoard:
     folder = Path(path)
     about, leaderboard = board_files.read_board(folder)
     tables = {}
-    for name in _TABLES:
+    for name in TABLES:
         file = folder / f"{name}.parquet"
         tables[name] = read_frame(file, mend=MEND) if file.is_file() else pd.DataFrame()
-        if name in (SCORES, "contrasts"):
+        if name in (SCORES, "contrasts", ANSWERS):
             board_files.check_shape(name, tables[name])
     board_files.check_shape("leaderboard", leaderboard)
     return StoredBoard(folder=folder, about=about, leaderboard=leaderboard, **tables)

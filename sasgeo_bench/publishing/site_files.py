@@ -30,6 +30,7 @@ from sasgeo_bench.leaderboard.board_files import (
     MEND,
     PROTECTION,
     SCORES,
+    TABLES,
     read_board,
 )
 from sasgeo_bench.leaderboard.board_pictures import KINDS
@@ -95,7 +96,6 @@ def _fault_of(item: ET.Element) -> str | None:
 PICTURES: Final = "pictures"
 FILES: Final = "files"
 MOST_BYTES: Final = 3_000_000  # of the pages of a site with their figures; a larger one is reported
-_TABLES: Final = ("contrasts", "falsifiers", "controls", SCORES, ACCEPTANCE, PROTECTION, ANSWERS)
 _OFFERED: Final = {  # files for download, with descriptions
     f"{LEADERBOARD}.parquet": "the master: every figure with its interval, ranks, n, blocks and places",
     f"{LEADERBOARD}.csv": "the same for a spreadsheet",
@@ -148,7 +148,7 @@ def read_board_files(folder: Path) -> BoardFiles:
             folder=folder,
             about=about,
             board=board,
-            tables={name: _read_table(folder / f"{name}.parquet") for name in _TABLES},
+            tables={name: _read_table(folder / f"{name}.parquet") for name in TABLES},
             figures=tuple(_read_figures(folder / FIGURES)),
             downloads=tuple(_read_downloads(folder)),
             pictures=_read_pictures(folder / PICTURES),

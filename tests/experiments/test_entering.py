@@ -259,7 +259,7 @@ def test_extracts_that_are_missing_are_listed_at_once(request_, monkeypatch):
         enter(entry, tell=silent)
 
 
-@pytest.mark.parametrize("beside", [(), ("town-grid",)])  # one that is known hides no other
+@pytest.mark.parametrize("beside", [(), ("town-suburb",)])  # one that is known hides no other
 def test_a_region_that_the_board_has_not_cannot_be_left_out(request_, beside):
     with pytest.raises(ConfigError, match="--without names vaduz, and the board asks about no such region"):
         plan_entry(replace(request_, without=("vaduz", *beside)), tell=silent)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A matcher enters a published board: the board's queries are drawn, it is asked, and a submission is written."""
 
+import difflib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -8,7 +9,7 @@ from textwrap import shorten
 from typing import Final
 
 from sasgeo_bench.config import LONGEST_LINE, check_document
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments import entry_cost
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, plan_board, same_queries
 from sasgeo_bench.experiments.pipeline import ask, draw_all
@@ -27,7 +28,9 @@ from sasgeo_bench.tasks.split import HALVES, Split
 from sasgeo_bench.texts import one_line
 
 _WITHOUT: Final = "; or leave their regions out by --without, which counts as misses"
+_LIKE: Final = 0.7  # names that are more alike are taken for a slip of the pen
 _LONGEST_MESSAGE: Final = 120  # characters of an example
+_MOST_KINDS: Final = 5  # of errors that are told
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,8 +125,10 @@ def enter(
     )
     both = plan.out / "boards" / f"{entry.board}-{card.name}"
     board = beside_stored(entry.stored, folder, both, tell=tell, root=plan.out, jobs=plan.jobs)
+    if card.trained_elsewhere:
+        tell(f"{card.name}: trained elsewhere than in the places of the split, not set apart: {card.trained_elsewhere}")
     for line in failure_lines(board.predictions.get(card.name, {}).values()):
-        tell(line)
+        tell(f"{card.name}: {line}")
     return folder, board
 
 
@@ -138,19 +143,22 @@ def _changed(plan: RunPlan) -> Iterator[str]:
 
 
 def failure_lines(predictions: Iterable[Prediction]) -> Iterator[str]:
-    """Yield how many queries ended in each way but a sound one, with the first message as it was written.
+    """Yield how many queries ended in each way but a sound one, with the first message of each kind of error.
 
-    >>> lost = [Prediction(query_id=name, status="crash", message="no road", candidates=()) for name in "ab"]
-    >>> list(failure_lines(lost))
-    ["  2 ended as crash, the first with the message 'no road'"]
+    >>> said = ["ValueError: no road", "ValueError: no sea", "KeyError: 'x'"]
+    >>> lost = [Prediction(query_id=one, status="crash", message=one, candidates=()) for one in said]
+    >>> for line in failure_lines(lost):
+    ...     print(line)
+    2 ended as crash, the first with the message 'ValueError: no road'
+    1 ended as crash, the first with the message "KeyError: 'x'"
     """
-    failed: dict[str, list[str]] = {}
+    failed: dict[tuple[str, str], list[str]] = {}
     for item in predictions:
         if item.status not in SOUND:
-            failed.setdefault(item.status, []).append(item.message)
-    for status, messages in sorted(failed.items()):
+            failed.setdefault((item.status, item.message.partition(":")[0]), []).append(item.message)
+    for (status, _), messages in sorted(failed.items(), key=lambda one: -len(one[1]))[:_MOST_KINDS]:
         first = shorten(one_line(messages[0]), _LONGEST_MESSAGE, placeholder=" ...")
-        yield f"  {len(messages)} ended as {status}, the first with the message {first!r}"
+        yield f"{len(messages)} ended as {status}, the first with the message {first!r}"
 
 
 def _check_same_board(folder: Path, board: str) -> None:
@@ -172,10 +180,15 @@ def _line(text: str) -> str:
 def _card_of(card: MatcherCard, runs: Sequence[Run], split: Split | None, *, source: str) -> Card:
     """Return the card of a submission from that of the matcher, with the places that taught its runs.
 
-    Raise `ConfigError`, naming `source`, if a field is too long for a submission.
+    Raise `ConfigError`, naming `source`, if a field is too long for a submission, or a place is nearly one of the
+    split: by such a slip a row would escape being set apart.
     """
     known = () if split is None else split.blocks
     own, others = ([name for name in card.trained_on if (name in known) == is_own] for is_own in (True, False))
+    for name in others:
+        for near in difflib.get_close_matches(name, known, n=1, cutoff=_LIKE):
+            message = f"the card of {source}: trained_on names {name!r}, no place of the split: did you mean {near!r}?"
+            raise ConfigError(message)
     places = {run.name: run.plan.training_set.places if run.plan.training_set else () for run in runs}
     taught = {name: sorted({*some, *own}) for name, some in places.items()}
     by_half = {half: taught.get(f"half {half}", sorted(own)) for half in HALVES}

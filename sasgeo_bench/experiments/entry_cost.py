@@ -55,7 +55,7 @@ def lost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask]) -> 
     if about.get("task_version") != TASK_VERSION:
         yield (
             f"  the board is of task version {about.get('task_version')}, and this program draws version "
-            f"{TASK_VERSION}: queries that changed in between are not asked and count as misses (CHANGELOG.md)"
+            f"{TASK_VERSION}: those that changed in between, if any, are not asked and count as misses"
         )
     closed = set(about.get("sealed", {})) if seal is None or seal.seed is None else set()
     drawn = {item.region.id for item in (*plan.requests, *plan.controls)}

@@ -26,7 +26,7 @@ from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.scoring.rows import is_unranked, name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.scoring.submission_files import list_submissions, read_submission, write_submission
+from sasgeo_bench.scoring.submission_files import is_submission, list_submissions, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
@@ -81,6 +81,8 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     )
     asked = {name: one for task in tasks for name, one in task.asked.items()}
     folder = request.into or FOLDER / card.name
+    if is_submission(folder):
+        tell(f"{folder}: the submission that was there is replaced")
     write_submission(folder, submission, list(rows.values()), asked)
     for line in _remarks(submission):
         tell(line)

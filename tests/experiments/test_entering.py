@@ -48,6 +48,12 @@ class Shipped(PriorCentre):
     card = replace(PriorCentre.card, name="sasgeo")
 
 
+class Slip(PriorCentre):
+    """A matcher whose card has a slip of the pen."""
+
+    card = replace(PriorCentre.card, name="slip", trained_on=("munchen",))
+
+
 class Lost(PriorCentre):
     """A matcher that has no answer to anything."""
 
@@ -246,7 +252,7 @@ def test_crashes_are_told_with_an_example_on_one_line(request_, tmp_path):
     request = replace(request_, matcher=f"{__name__}:Lost")
     enter(plan_entry(request, tell=silent), into=tmp_path / "lost", tell=lines.append)
     (told,) = [line for line in lines if "ended as crash" in line]
-    assert re.fullmatch(r"  \d+ ended as crash, the first with the message [\"'].*no road.*near \w+.*", told)
+    assert re.fullmatch(r"\S+: \d+ ended as crash, the first with the message [\"'].*no road.*near \w+.*", told)
 
 
 def test_extracts_that_are_missing_are_listed_at_once(request_, monkeypatch):
@@ -299,3 +305,9 @@ def test_the_command_says_what_it_costs_and_stops(request_, program):
     code, out, err = program(*words, "--dry-run", "--out", request_.out)
     assert (code, err) == (0, "")
     assert out.splitlines()[0].startswith("small: ")
+
+
+def test_a_slip_in_a_training_place_does_not_untrain_a_matcher(request_):
+    entry = plan_entry(replace(request_, matcher=f"{__name__}:Slip"), tell=silent)
+    with pytest.raises(ConfigError, match=r"names 'munchen', no place of the split: did you mean 'munich'\?"):
+        check_entry(entry)

@@ -33,7 +33,7 @@ def build_once(side_km: int, extracts: list[Path]) -> tuple[float, float]:
     out = Path(tempfile.mkdtemp(prefix="sasgeo-bench-"))
     try:
         start, start_cpu = time.perf_counter(), time.process_time()
-        build_region(plan_build(spec, out=out, extract_folders=extracts), tell=lambda _: None, with_preview=False)
+        build_region(plan_build(spec, out=out, extract_folders=extracts), tell=lambda _: None)
         return time.perf_counter() - start, time.process_time() - start_cpu
     finally:
         shutil.rmtree(out)

@@ -107,7 +107,7 @@ def lay_towns(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 def _build(out: Path, name: str) -> None:
     plan = plan_build(read_region_file(find_region_file(name)), out=out)
-    build_region(plan, tell=lambda _: None, with_preview=False)
+    build_region(plan, tell=lambda _: None)
 
 
 def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:

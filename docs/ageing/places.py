@@ -46,7 +46,7 @@ def stock_of(spec: RegionFile, blocks: Sequence[Block], *, is_newest: bool, out:
     dates = [item.date for item in spec.extract]
     plan = plan_build(spec, out=out, date=max(dates) if is_newest else min(dates))
     if not plan.is_current:
-        build_region(plan, tell=_tell, with_preview=False)
+        build_region(plan, tell=_tell)
     features = read_region(plan.folder).features
     seen = features[features["is_visible"]]
     area = shapely.union_all([block.polygon() for block in blocks])

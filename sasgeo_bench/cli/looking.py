@@ -22,8 +22,10 @@ from sasgeo_bench.leaderboard.run_cases import RunCases, find_flight, is_run, pi
 from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.progress import spread
+from sasgeo_bench.regions.layers import read_overview
+from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
-from sasgeo_bench.regions.region_files import differing_files, read_features, read_manifest
+from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_features, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.build import check_task, has_truths
@@ -98,12 +100,23 @@ def inspect_command(
         _inspect_split(target, out, folders)
         return
     manifest = read_manifest(region_folder)
-    print_table(_summary(manifest, region_folder))
+    print_table(_summary(manifest, region_folder, _preview(manifest, region_folder, out)))
     print_table(_class_table(manifest))
     if (reasons := _reasons(manifest)).row_count:
         print_table(reasons)
     for line in differing_files(region_folder):
         tell(f"warning: {line}")
+
+
+def _preview(manifest: Manifest, folder: Path, out: Path) -> Path:
+    """Return the picture of a map: that of the build, or one drawn now, for maps on the way to queries have none."""
+    if PREVIEW in manifest.files:
+        return folder / PREVIEW
+    path = _sheet(out, "map", folder.name)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    overview = read_overview(folder / LAYERS, longest_cells=PREVIEW_CELLS)
+    write_preview(path, manifest=manifest, overview=overview)
+    return path
 
 
 def _refuse_strip(target: str, strip: int | None) -> None:
@@ -246,7 +259,7 @@ def _inspect_split(target: str, out: Path, folders: list[Path]) -> None:
     say(f"map of parts: {path}")
 
 
-def _summary(manifest: Manifest, folder: Path) -> Table:
+def _summary(manifest: Manifest, folder: Path, preview: Path) -> Table:
     extract, coverage = manifest.extract, manifest.coverage
     graph = ", ".join(f"{name} {count}" for name, count in manifest.graph_counts.items())
     table = Table(box=None, show_header=False, pad_edge=False)
@@ -263,7 +276,7 @@ def _summary(manifest: Manifest, folder: Path) -> Table:
     if manifest.imagery is not None:
         table.add_row("imagery", manifest.imagery.to_text())
     table.add_row("graph", graph)
-    table.add_row("preview", str(folder / "preview.png"))
+    table.add_row("preview", str(preview))
     table.add_row("licence", f"{manifest.licence}, {manifest.attribution}")
     return table
 

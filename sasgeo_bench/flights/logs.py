@@ -112,7 +112,7 @@ def read_flight(
     >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
     >>> with tempfile.TemporaryDirectory() as out:
     ...     spec = read_region_file(find_region_file("town-suburb"))
-    ...     _ = build_region(plan_build(spec, out=Path(out)), tell=lambda _: None, with_preview=False)
+    ...     _ = build_region(plan_build(spec, out=Path(out)), tell=lambda _: None)
     ...     region = read_region(Path(out) / "regions" / "town-suburb")
     ...     west, south, east, north = region.manifest.bounds_lonlat
     ...     path = Path(out) / "flight.csv"

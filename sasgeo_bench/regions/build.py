@@ -48,7 +48,6 @@ from sasgeo_bench.regions.region import (
 )
 from sasgeo_bench.regions.region_spec import RegionFile
 
-PREVIEW_CELLS: Final = 2048
 CUT_AWAY: Final = "cut away"  # reason why ground of an edited map is unknown
 _OFFSET_SEED: Final = 0  # of the tiles drawn anew for an interval: the same pictures give the same bytes
 
@@ -59,6 +58,7 @@ class BuildPlan:
 
     `source` is None for an embedded town, which is made during the build; `more` are further files of the extract.
     `pictures` are the checked pictures that become the imagery; none are looked for if the region is up to date.
+    `with_preview` adds a picture of the layers, which takes longer than all else of a small region.
     """
 
     spec: RegionFile
@@ -70,6 +70,7 @@ class BuildPlan:
     is_current: bool
     more: tuple[Path, ...] = ()
     pictures: tuple[Picture, ...] = ()
+    with_preview: bool = False
 
     def to_text(self) -> str:
         """Describe inputs, grid, outputs and their size before compression, in several lines."""
@@ -108,14 +109,15 @@ def plan_build(
     date: dt.date | None = None,
     extract_folders: Sequence[Path] = (),
     imagery_folders: Sequence[Path] = (),
+    with_preview: bool = False,
 ) -> BuildPlan:
     """Find the inputs of a build, and whether its result is up to date; write nothing.
 
     The region goes to `out/regions/<id>`, that of an older date to `out/regions/<id>@<date>`; without `date` the newest
     extract is taken. `extract_folders` are searched before SASGEO_EXTRACTS and the user's cache, `imagery_folders`
-    before SASGEO_IMAGERY and the folders `imagery` beside those of extracts. Raise `ConfigError` if the region has no
-    extract of that date, `ExtractError` if the extract is not found, `ImageryError` if a picture is not found or cannot
-    be used.
+    before SASGEO_IMAGERY and the folders `imagery` beside those of extracts. A region that lacks a wanted preview is
+    not up to date. Raise `ConfigError` if the region has no extract of that date, `ExtractError` if the extract is not
+    found, `ImageryError` if a picture is not found or cannot be used.
     """
     extract = spec.pick(date)
     source = None if extract.town else find_extract(extract, folders=extract_folders)
@@ -123,7 +125,7 @@ def plan_build(
     is_newest = extract == spec.pick(None)
     folder = out / "regions" / (spec.id if is_newest else f"{spec.id}@{extract.date.isoformat()}")
     inputs = _inputs_sha256(spec, extract, sha256_of(source) if source else "")
-    grid, is_current = spec.grid(), _is_current(folder, inputs)
+    grid, is_current = spec.grid(), _is_current(folder, inputs, with_preview=with_preview)
     return BuildPlan(
         spec=spec,
         extract=extract,
@@ -137,6 +139,7 @@ def plan_build(
             check_picture(find_imagery(entry, folders=imagery_folders, extracts=extract_folders), entry, grid)
             for entry in (() if is_current else spec.imagery)
         ),
+        with_preview=with_preview,
     )
 
 
@@ -157,7 +160,7 @@ def package_version() -> str:
     return metadata.version("sasgeo-bench")
 
 
-def _is_current(folder: Path, inputs_sha256: str) -> bool:
+def _is_current(folder: Path, inputs_sha256: str, *, with_preview: bool) -> bool:
     try:
         manifest = region_files.read_manifest(folder)
     except StoreError:
@@ -166,19 +169,18 @@ def _is_current(folder: Path, inputs_sha256: str) -> bool:
         (folder / name).is_file() and (folder / name).stat().st_size == record.bytes
         for name, record in manifest.files.items()
     )
-    return sizes_hold and manifest.inputs_sha256 == inputs_sha256
+    is_shown = region_files.PREVIEW in manifest.files or not with_preview
+    return sizes_hold and is_shown and manifest.inputs_sha256 == inputs_sha256
 
 
-def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> Manifest:
+def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
     """Build the region of a plan unless it is up to date; `tell` receives a line for each step.
 
     A failed build leaves an earlier region as it was. Raise `ExtractError` or `CoverageError` if the extract is damaged
     or does not cover the bounds, `StoreError` if the folder cannot be written.
     """
     name = plan.folder.name
-    manifest = _write_unless_current(
-        plan, tell, lambda scratch: _build_into(scratch, plan, tell, with_preview=with_preview)
-    )
+    manifest = _write_unless_current(plan, tell, lambda scratch: _build_into(scratch, plan, tell))
     if manifest is None:
         tell(f"{name}: up to date, nothing to do")
         return region_files.read_manifest(plan.folder)
@@ -187,7 +189,7 @@ def build_region(plan: BuildPlan, *, tell: Tell, with_preview: bool = True) -> M
     return manifest
 
 
-def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: bool) -> Manifest:
+def _build_into(scratch: Path, plan: BuildPlan, tell: Tell) -> Manifest:
     name = plan.folder.name
     if len(plan.pictures) < len(plan.spec.imagery):
         message = f"{plan.folder} was changed after it was found up to date: build it again"
@@ -209,7 +211,7 @@ def _build_into(scratch: Path, plan: BuildPlan, tell: Tell, *, with_preview: boo
         f" of {plan.grid.rows} x {plan.grid.cols} cells"
     )
     imagery = _write_imagery(scratch, plan, reading, tell) if plan.pictures else None
-    return _write_into(scratch, plan, extract, reading, imagery=imagery, with_preview=with_preview)
+    return _write_into(scratch, plan, extract, reading, imagery=imagery)
 
 
 def _read(plan: BuildPlan, source: Path) -> Reading:
@@ -267,7 +269,6 @@ def _write_into(
     reading: Reading,
     *,
     imagery: OrthoRecord | None = None,
-    with_preview: bool,
 ) -> Manifest:
     """Burn the layers, make the graph, and write all files of a region."""
     classes = plan.spec.class_names
@@ -279,8 +280,8 @@ def _write_into(
         region_files.write_tables(scratch, reading.features, graph)
         manifest = make_manifest(plan, extract, reading, graph)
         layers.result()
-    if with_preview:
-        from sasgeo_bench.regions.preview import write_preview  # noqa: PLC0415 - only a picture needs matplotlib
+    if plan.with_preview:
+        from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview  # noqa: PLC0415 - only a picture needs matplotlib
 
         overview = read_overview(scratch / region_files.LAYERS, longest_cells=PREVIEW_CELLS)
         write_preview(scratch / region_files.PREVIEW, manifest=manifest, overview=overview)
@@ -309,7 +310,8 @@ def build_edited(
     cut = "" if coverage is None else coverage.wkt
     inputs = hashlib.sha256(f"{base.manifest.inputs_sha256}/{note}/{fingerprint(features)}{cut}".encode()).hexdigest()
     spec = plan.spec.model_copy(update={"id": name, "title": f"{plan.spec.title} ({suffix})"})
-    edited = replace(plan, spec=spec, folder=plan.folder.parent / name, inputs_sha256=inputs, pictures=())
+    folder = plan.folder.parent / name
+    edited = replace(plan, spec=spec, folder=folder, inputs_sha256=inputs, pictures=(), with_preview=False)
     record = base.manifest
     reading = Reading(
         features=features,
@@ -324,9 +326,7 @@ def build_edited(
         | ({} if coverage is None else {CUT_AWAY: base.coverage.area - coverage.area}),
         cuts=record.coverage.cuts,
     )
-    _write_unless_current(
-        edited, lambda _: None, lambda scratch: _write_into(scratch, edited, record.extract, reading, with_preview=True)
-    )
+    _write_unless_current(edited, lambda _: None, lambda scratch: _write_into(scratch, edited, record.extract, reading))
     return edited.folder
 
 
@@ -348,7 +348,7 @@ def build_made(spec: RegionFile, reading: Reading, *, out: Path, tell: Tell) -> 
         is_current=False,
     )
     record = ExtractRecord(file=extract.file, sha256=content, bytes=0, date=extract.date, osm_timestamp=None)
-    _write_unless_current(plan, tell, lambda scratch: _write_into(scratch, plan, record, reading, with_preview=True))
+    _write_unless_current(plan, tell, lambda scratch: _write_into(scratch, plan, record, reading))
     return plan.folder
 
 
@@ -362,7 +362,7 @@ def _write_unless_current(plan: BuildPlan, tell: Tell, write: Callable[[Path], M
     """Let `write` fill the folder of a region; return None if it is up to date, perhaps by a build we waited for."""
     try:
         with locked(plan.folder, tell=tell):
-            if _is_current(plan.folder, plan.inputs_sha256):
+            if _is_current(plan.folder, plan.inputs_sha256, with_preview=plan.with_preview):
                 return None
             with fresh_folder(plan.folder) as scratch:
                 return write(scratch)

@@ -29,6 +29,7 @@ _GROUND: Final = "#fbfaf5"
 _UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")
 _STRIPE_CELLS: Final = 12
 _DPI: Final = 110
+PREVIEW_CELLS: Final = 2048  # of `preview.png`, along the longest side
 _MOST_CELLS: Final = 1024  # of a figure, along a side: more are no more to see
 _LEGEND_INCHES: Final = 2.9
 _MAP_INCHES: Final = 9.6

@@ -72,7 +72,7 @@ def tiny_place(path: str | Path) -> TinyPlace:
     ((1024, 1024), ['localization', 'retrieval'])
     """
     folder = Path(path)
-    build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent, with_preview=False)
+    build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent)
     queries: list[Query] = []
     truths: list[Truth] = []
     wanted = Wanted(suites=_SUITES, regions=(TOWN,), split="crossfit", count=1, seed=1, out=folder, may_be_fewer=True)

@@ -71,7 +71,7 @@ def tiny_flights(path: str | Path) -> TinyFlights:
     (3, 1, 'sequence')
     """
     folder = Path(path)
-    build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent, with_preview=False)
+    build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent)
     wanted = Wanted(
         suites=(_SUITE,),
         regions=(TOWN,),

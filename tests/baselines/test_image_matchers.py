@@ -36,7 +36,7 @@ def region(tmp_path_factory: pytest.TempPathFactory) -> sgb.Region:
     hamlet = make_hamlet(tmp_path_factory.mktemp("hamlet"))
     out = tmp_path_factory.mktemp("out")
     plan = plan_build(hamlet.spec(), out=out, extract_folders=[hamlet.folder], imagery_folders=[hamlet.folder])
-    build_region(plan, tell=lambda _: None, with_preview=False)
+    build_region(plan, tell=lambda _: None)
     return sgb.read_region(plan.folder)
 
 

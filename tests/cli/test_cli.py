@@ -11,6 +11,8 @@ import pytest
 
 from sasgeo_bench.cli.program import COMMANDS, help_of
 from sasgeo_bench.config import shipped_dir
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.region_spec import read_region_file
 
 PROGRAM = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()"]
 
@@ -82,6 +84,16 @@ def test_a_region_is_built_inspected_and_verified(program, tmp_path):
     assert code == 2
     assert out.startswith("out/regions/own/preview.png: 1 bytes, the manifest says ")
     assert program("inspect", "own")[2] == f"warning: {out}"
+
+
+def test_inspect_draws_a_map_that_was_built_on_the_way_to_queries(program, tmp_path):
+    spec = read_region_file(Path(small_town(tmp_path)))
+    build_region(plan_build(spec, out=tmp_path / "out"), tell=lambda _: None)
+    code, out, err = program("inspect", spec.id)
+    assert code == 0, err
+    (drawn,) = (tmp_path / "out/sheets").glob("*.png")
+    assert f"out/sheets/{drawn.name}" in out
+    assert program("verify", spec.id)[0] == 0
 
 
 def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):

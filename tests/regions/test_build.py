@@ -39,7 +39,7 @@ def small(name: str = "town-suburb", **changes: object):
 
 
 def built(out: Path, spec, **options: object):
-    plan = plan_build(spec, out=out, **options)
+    plan = plan_build(spec, out=out, with_preview=True, **options)
     return plan, build_region(plan, tell=lambda _: None)
 
 
@@ -55,7 +55,7 @@ def built_once(tmp_path_factory):
 def there(built_once, tmp_path):
     """The folder of the small region, built in the test's own root; and its manifest."""
     shutil.copytree(built_once, tmp_path, dirs_exist_ok=True)
-    plan = plan_build(small(), out=tmp_path)
+    plan = plan_build(small(), out=tmp_path, with_preview=True)
     assert plan.is_current
     return plan, read_manifest(plan.folder)
 
@@ -111,6 +111,18 @@ def test_layers_may_be_read_when_they_are_first_used_or_never(there):
     for read in (lambda: never.layers, never.known, lambda: never.layer("building")):
         with pytest.raises(StoreError, match="build the region again"):
             read()
+
+
+def test_a_map_on_the_way_to_queries_has_no_preview_until_one_is_wanted(tmp_path):
+    plan = plan_build(small(), out=tmp_path)
+    manifest = build_region(plan, tell=lambda _: None)
+    assert {path.name for path in plan.folder.iterdir()} == FILES - {"preview.png"}
+    assert plan_build(small(), out=tmp_path).is_current
+    shown, again = built(tmp_path, small())
+    assert not shown.is_current
+    assert {path.name for path in plan.folder.iterdir()} == FILES
+    assert (again.fingerprint, again.inputs_sha256) == (manifest.fingerprint, manifest.inputs_sha256)
+    assert plan_build(small(), out=tmp_path).is_current
 
 
 def test_every_file_carries_the_attribution(there):

@@ -43,7 +43,7 @@ def built(hamlet: Hamlet, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def build(hamlet: Hamlet, out: Path) -> Path:
     folders = {"extract_folders": [hamlet.folder], "imagery_folders": [hamlet.folder]}
     plan = plan_build(hamlet.spec(), out=out, **folders)
-    build_region(plan, tell=lambda _: None, with_preview=False)
+    build_region(plan, tell=lambda _: None)
     return plan.folder
 
 
@@ -317,7 +317,7 @@ def test_a_real_mosaic_lies_on_its_map(name, most_m, tiles, tmp_path):
         plan = plan_build(spec, out=tmp_path)
     except (ExtractError, ImageryError) as error:
         pytest.skip(f"real imagery: {error}")
-    manifest = build_region(plan, tell=lambda _: None, with_preview=False)
+    manifest = build_region(plan, tell=lambda _: None)
     assert manifest.classes == ("building",)
     assert manifest.imagery.share > 0.98
     assert max(abs(manifest.imagery.offset.east_m), abs(manifest.imagery.offset.north_m)) < most_m

@@ -49,7 +49,7 @@ def state_of(folder):
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     out = tmp_path_factory.mktemp("rendered")
-    build_region(plan_build(spec(), out=out), tell=silent, with_preview=False)
+    build_region(plan_build(spec(), out=out), tell=silent)
     before = region_files.read_manifest(out / "regions" / TOWN)
     render(out)
     return out, before
@@ -198,7 +198,7 @@ def test_a_region_that_is_not_built_is_refused_and_no_file_is_made(tmp_path):
 def test_real_imagery_is_not_replaced(tmp_path):
     hamlet = make_hamlet(tmp_path / "files")
     plan = plan_build(hamlet.spec(), out=tmp_path, extract_folders=(hamlet.folder,), imagery_folders=(hamlet.folder,))
-    build_region(plan, tell=silent, with_preview=False)
+    build_region(plan, tell=silent)
     before = state_of(plan.folder)
     with pytest.raises(ImageryError, match="hamlet has imagery of its own"):
         render_imagery(plan.folder, plan.folder, COARSE, tell=silent)

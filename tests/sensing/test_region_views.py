@@ -27,7 +27,7 @@ def hamlet(tmp_path_factory):
 def built(place, out):
     folders = {"extract_folders": [place.folder], "imagery_folders": [place.folder]}
     plan = plan_build(place.spec(), out=out, **folders)
-    build_region(plan, tell=lambda _: None, with_preview=False)
+    build_region(plan, tell=lambda _: None)
     return read_region(plan.folder)
 
 

@@ -129,7 +129,7 @@ def town(tmp_path_factory, lay_towns) -> TownOf:
             ]
             spec = spec.model_copy(update={"id": f"{spec.id}-{size}", "size_m": (side_m, side_m), "extract": extracts})
         plan = plan_build(spec, out=out, date=date)
-        build_region(plan, tell=lambda _: None, with_preview=False)
+        build_region(plan, tell=lambda _: None)
         return read_region(plan.folder)
 
     return built

@@ -49,7 +49,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, out = tmp_path_factory.mktemp("hamlet"), tmp_path_factory.mktemp("out")
     spec = make_hamlet(folder).spec()
     plan = plan_build(spec, out=out, extract_folders=[folder], imagery_folders=[folder])
-    build_region(plan, tell=lambda _: None, with_preview=False)
+    build_region(plan, tell=lambda _: None)
     make_tasks(request_of(spec, out, folder), tell=lambda _: None)
     return out
 

@@ -116,6 +116,11 @@ class Book:
         marks = marks_of(entry, is_control=matcher in self.controls)
         return Cell(text=matcher, href=self.matcher_pages.get(matcher, ""), marks=marks)
 
+    def short_name(self, matcher: str) -> Cell:
+        """Return the name of a matcher with its link, and of its marks those that praise or warn, or name a control."""
+        cell = self.name_cell(matcher)
+        return replace(cell, marks=tuple(one for one in cell.marks if one.tone != "plain" or matcher in self.controls))
+
     def suite_cell(self, suite: str) -> Cell:
         """Return the name of a suite with a link to its page."""
         return Cell(text=suite, href=self.suite_pages.get(suite, ""))
@@ -417,13 +422,11 @@ def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
         has_mean = len(shown) > 1 and len(whole - book.controls) > 1
         rows = _heads(book, shown, primary, width=len(shown) + has_mean)
         for name in order:
-            cells = [_short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
+            cells = [short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
             if has_mean:
                 cells.append(number_cell(means[name] if name in whole else math.nan))
             tone = "head" if name in book.controls else "plain"
-            first = book.name_cell(name)
-            marks = tuple(mark for mark in first.marks if mark.tone != "plain" or name in book.controls)
-            rows.append(Row(cells=(replace(first, marks=marks), *cells), tone=tone))
+            rows.append(Row(cells=(book.short_name(name), *cells), tone=tone))
         yield Table(
             name=file_stem("summary", track, prior_group),
             title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
@@ -461,8 +464,11 @@ def _count(book: Book, key: Key, primary: str) -> int:
     return max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
 
 
-def _short_cell(row: Record | None, *, is_rivalled: bool) -> Cell:
-    """Return a cell as in "0.750 [0.30, 0.95] (2-3)"."""
+def short_cell(row: Record | None, *, is_rivalled: bool) -> Cell:
+    """Return a figure, its interval and its rank as in "0.750 [0.30, 0.95] (2-3)".
+
+    It leads where it `is_rivalled` and may have the first rank.
+    """
     if row is None:
         return Cell(text="-")
     if not row["is_applicable"]:

@@ -71,6 +71,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "dates": "Dates of the maps",
     "suites": "Suites that were drawn there",
     "scenes": "Kind of place, as its region file says",
+    "kind of place": "Places of one kind, as their region files say; a place with several kinds counts in each",
     "method": "How the level is computed",
     "absence": "Kind of absent places, suite: kind; all: all of them",
     "absent": "Absent places among the queries",
@@ -114,6 +115,11 @@ MARKS: Final[dict[str, str]] = {  # words next to names and ranks
     "tie": "shares ranks with others, who are named below the table; neighbouring ties differ in colour",
 }
 CONTROL: Final = Mark(text="control", meaning="no rival: it shows what a figure means that nobody earned")
+FEW: Final = Mark(
+    text="few",
+    meaning=f"fewer than {LEAST_PLACES} places: nobody is ranked, and other places of the kind may well differ",
+    tone="warn",
+)
 _TONES: Final = {RUN_HERE: "plain", REPRODUCED: "good", NOT_REPRODUCED: "warn", AS_SUBMITTED: "warn"}
 
 

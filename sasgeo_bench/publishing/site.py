@@ -17,6 +17,7 @@ from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sec
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
+from sasgeo_bench.leaderboard.scene_tables import scene_tables
 from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
@@ -169,6 +170,7 @@ FAILURES: Final = (  # in the order they are shown; others follow
 )
 _NAMES: Final = {  # pages that every site has or may have, in the order of the navigation
     "index.html": "Board",
+    "kinds-of-place.html": "Kinds of place",
     "suites.html": "Suites",
     "matchers.html": "Matchers",
     "rejection.html": "Rejection",
@@ -200,10 +202,12 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     templates = _environment()
     book = Book.of(source.board, source.about, source.scores)
     maps = place_maps(source)
+    scenes = tuple(scene_tables(source.scenes, book)) if len(source.scenes) else ()
     rejection = rejection_tables(source.board)
     protection = protection_tables(source.protection)
     acceptance = acceptance_tables(source.acceptance)
     optional = {
+        "kinds-of-place.html": scenes,
         "rejection.html": rejection or protection,
         "figures.html": source.figures,
         "map.html": maps,
@@ -221,6 +225,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     }
     special = {
         "index.html": _index(source, book, sections),
+        "kinds-of-place.html": {"tables": scenes},
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
         "rejection.html": {"tables": rejection, "acceptance": acceptance, "protection": protection, "kinds": kinds},
@@ -260,6 +265,7 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
     prices = {table.name.replace("summary", "price", 1) for table in overview}
     return {
         "sections": sections,
+        "has_scenes": len(source.scenes) > 0,
         "words_of": {item.prior_group: item.prior for item in sections},
         "overview": overview,
         "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),

@@ -63,6 +63,20 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
     yield from _bins(scores, role != CONTROL)
 
 
+def is_counted(queries: pd.DataFrame) -> Bools:
+    """Return a mask of the queries of one suite that its first figure counts, shape (N,).
+
+    Present places under stress, or all present ones where nothing is stressed.
+
+    >>> asked = pd.DataFrame({"role": ["control", "stress", "stress"], "is_present": [True, True, False]})
+    >>> is_counted(asked).tolist(), is_counted(asked[:1]).tolist()
+    ([False, True, False], [True])
+    """
+    present = queries["is_present"].to_numpy(bool)
+    stress = present & (queries["role"] == STRESS).to_numpy(bool)
+    return stress if stress.any() else present
+
+
 def step_name(kind: str, step: float, view_cells: int) -> str:
     """Return the name of one step of a kind at one view size, as "G1 5, 96 cells"."""
     return f"{kind} {step:g}, {view_cells} cells"

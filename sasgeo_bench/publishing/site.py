@@ -228,7 +228,13 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "kinds-of-place.html": {"tables": scenes},
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
-        "rejection.html": {"tables": rejection, "acceptance": acceptance, "protection": protection, "kinds": kinds},
+        "rejection.html": {
+            "tables": rejection,
+            "acceptance": acceptance,
+            "protection": protection,
+            "kinds": kinds,
+            "filters": _filters((*rejection, *acceptance, *protection), "matcher", "rejector"),
+        },
         "figures.html": {"kinds": kinds},
         "map.html": {"places": list(maps), "outcomes": ANSWER_OUTCOMES, "classes": load_taxonomy().classes},
         "failures.html": {"groups": groups_of(source.pictures.cases), "total": len(source.pictures.cases)},
@@ -281,6 +287,15 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }
+
+
+def _filters(tables: Sequence[Table], *terms: str) -> list[tuple[str, str, list[str], dict[str, str]]]:
+    """Return choices of the values of some columns of text, by name."""
+    found: dict[str, dict[str, None]] = {term: {} for term in terms}
+    for table in tables:
+        for at, column in enumerate(table.columns):
+            found.get(column.term, {}).update(dict.fromkeys(row.cells[at].text for row in table.rows))
+    return [(term.capitalize(), term, sorted(values), {}) for term, values in found.items() if values]
 
 
 def _has_rivals(table: Table) -> bool:

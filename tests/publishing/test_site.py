@@ -15,6 +15,7 @@ from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table, summary
 from sasgeo_bench.leaderboard.columns import MEANINGS
+from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
 from sasgeo_bench.publishing.site import contrasts_of
 from sasgeo_bench.publishing.site_maps import place_maps
@@ -23,6 +24,7 @@ from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import Case, Pictures, RegionMap, SiteSource, Spot
 from sasgeo_bench.scoring.contrasts import contrast_frame
 from sasgeo_bench.scoring.controls import Falsifier, falsifier_frame
+from sasgeo_bench.scoring.rows import Row, to_frame
 from sasgeo_bench.scoring.verdicts import Finding
 from tests.handmade import BOUNDS_M, HOSTILE, MARKUP, about_of, answers_of, card_of, entry_of, many_rows
 
@@ -235,6 +237,22 @@ def test_the_drawings_of_a_site_say_what_they_show_and_whose_data_it_is(tmp_path
     assert {"Liechtenstein", "building", "vanishes, of the older map", "0.1"} <= {*texts["rates.svg"]}
     for found in texts.values():
         assert "Data: (c) OpenStreetMap contributors, ODbL" in found
+
+
+def test_rejectors_of_controls_come_last_however_good_their_order_is():
+    facts = {"suite": "all suites", "track": "localization", "prior_group": "r500-weak-s3", "stratum": "as drawn"}
+    facts |= {"n": 9, "answered": 9, "missing": 0, "blocks": 2, "places": 2, "unit": "1", "better": "lower"}
+    areas = {("oracle_pose", "own"): 0.0, ("raster", "margin"): 0.3, ("graph", "own"): 0.2, ("random", "own"): 0.9}
+    rows = [
+        Row(matcher=name[0], rejector=name[1], metric="aurc", value=value, **facts) for name, value in areas.items()
+    ]
+    (table,) = rejection_tables(to_frame(rows))
+    assert [(row.cells[0].text, row.tone) for row in table.rows] == [
+        ("graph", "plain"),
+        ("raster", "plain"),
+        ("oracle_pose", "control"),
+        ("random", "control"),
+    ]
 
 
 def test_words_of_files_are_plain():

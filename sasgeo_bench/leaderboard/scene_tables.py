@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import pandas as pd
 
-from sasgeo_bench.leaderboard.board_tables import Book, short_cell
-from sasgeo_bench.leaderboard.columns import FEW, column, prior_words, words
+from sasgeo_bench.leaderboard.board_tables import Book
+from sasgeo_bench.leaderboard.columns import FEW, column, prior_words, suite_card, suite_words, words
+from sasgeo_bench.leaderboard.overview import short_cell
 from sasgeo_bench.leaderboard.tables import Cell, Column, Key, Record, Row, Table, file_stem, plain_cell
 from sasgeo_bench.scoring.scenes import AS_USED, SCENES
 from sasgeo_bench.scoring.strata import ALL, GROUP
 from sasgeo_bench.scoring.verdicts import LEAST_PLACES
 from sasgeo_bench.tasks.query import BY
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
 _Found = Mapping[str, Mapping[str, Record]]  # kind of place -> matcher -> row
 
@@ -77,7 +77,7 @@ def _heads(found: _Found, kinds: list[str]) -> Iterator[Row]:
 
 def _notes(suite: str, strength: float | None) -> Iterator[str]:
     """Yield what is done in a suite, and which of its views are meant where these are not all."""
-    card = EVERY_SUITE[suite.partition(BY)[0]].card
-    yield f"{card.title}. {card.what}"
-    if strength is not None:
+    yield suite_words(suite)
+    card = suite_card(suite)
+    if card is not None and strength is not None:
         yield f"Only views of strength {strength:g} ({card.strength_unit}), which is what a user meets."

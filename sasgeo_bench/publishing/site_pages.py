@@ -11,7 +11,7 @@ import pandas as pd
 from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, strata_tables, suite_table
-from sasgeo_bench.leaderboard.columns import column, prior_words
+from sasgeo_bench.leaderboard.columns import column, prior_words, suite_card
 from sasgeo_bench.leaderboard.rejection_tables import rejection_of
 from sasgeo_bench.leaderboard.tables import (
     Cell,
@@ -31,7 +31,6 @@ from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.query import base_of
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks.suites.base import SuiteCard
 
 _AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
@@ -86,14 +85,13 @@ def suites_of(source: SiteSource, book: Book) -> tuple[SuitePage, ...]:
 
 
 def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
-    suite = EVERY_SUITE.get(name)
     keys = [key for key in book.matchers if key[0] == name]
     starts = tuple(f"{file_stem(kind, name, track)}-" for kind in KINDS for _, track, _ in keys)
     tasks = [str(task["region"]) for task in source.about.get("tasks", ()) if task["suite"] == name]
     return SuitePage(
         name=name,
         page=page,
-        card=None if suite is None else suite.card,
+        card=suite_card(name),
         tables=tuple(
             table for key in keys for table in (suite_table(book, key, book.matchers[key]), *strata_tables(book, key))
         ),

@@ -11,6 +11,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import quote
 
+import cv2
 import pytest
 
 from sasgeo_bench.publishing.build import publish
@@ -204,6 +205,31 @@ def test_a_tip_is_shown_whole_under_the_pointer(page, site):
         f"(() => {{ const box = {tip}.getBoundingClientRect();"
         f" return {tip}.contains(document.elementFromPoint(box.left + 12, box.top + 8)); }})()"
     )
+
+
+def test_a_shadow_shows_where_a_narrow_table_goes_on_and_keys_scroll_it(page, site, tmp_path):
+    page.width(320)
+    page.open(address(site))
+    box = "document.querySelector('.tablebox')"
+    page.value(f"{box}.focus()")
+    assert page.value(f"{box}.scrollWidth > {box}.clientWidth && document.activeElement === {box}")
+
+    def edges(name):
+        """Mean brightness of a strip at the left and at the right edge of the table, inside its outline."""
+        page.shoot(tmp_path / name)
+        at = f"{box}.getBoundingClientRect()"
+        sides = f"[{at}.left, {at}.right, {at}.top + scrollY, {at}.bottom + scrollY]"
+        left, right, top, bottom = map(round, page.value(sides))
+        pixels = cv2.imread(str(tmp_path / name), cv2.IMREAD_GRAYSCALE)[top:bottom]
+        return pixels[:, left : left + 6].mean(), pixels[:, right - 6 : right].mean()
+
+    left, right = edges("begin.png")
+    page.press("ArrowRight")
+    until(page, f"{box}.scrollLeft > 0")
+    page.value(f"{box}.scrollLeft = 9999")
+    left_then, right_then = edges("end.png")
+    assert left_then < left - 10
+    assert right < right_then - 10
 
 
 def test_failures_turn_by_key_and_by_link(page, site):

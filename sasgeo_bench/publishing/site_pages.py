@@ -140,7 +140,7 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
         entry=entry,
         cell=book.name_cell(name),
         card=card,
-        trained=_trained(card.get("trained_on")),
+        trained=_trained(card.get("trained_on"), entry.get("learned") or ()),
         training=tuple(_training(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
@@ -149,12 +149,24 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
     )
 
 
-def _trained(stated: object) -> str:
+_NO_PLACE: Final = "no place that its card names"
+
+
+def _trained(stated: object, learned: Sequence[Mapping[str, Any]]) -> str:
+    """Return where an entry was trained: by its author on the places that its card names, and by the runner."""
+    named = _stated(stated)
+    if not learned:
+        return named
+    runner = f"by the runner, in {counted(len(learned), 'training')} listed below"
+    return runner if named == _NO_PLACE else f"{named}; {runner}"
+
+
+def _stated(places: object) -> str:
     """Return the training places that a card names: "none", some, or some for each half."""
-    if isinstance(stated, Mapping):
-        return "; ".join(f"half {half}: {_trained(places)}" for half, places in stated.items())
-    places = [] if isinstance(stated, str) or not isinstance(stated, Sequence) else list(map(str, stated))
-    return ", ".join(places) or "no place that its card names"
+    if isinstance(places, Mapping):
+        return "; ".join(f"half {half}: {_stated(some)}" for half, some in places.items())
+    named = [] if isinstance(places, str) or not isinstance(places, Sequence) else list(map(str, places))
+    return ", ".join(named) or _NO_PLACE
 
 
 def _training(entry: Mapping[str, Any]) -> Iterator[str]:

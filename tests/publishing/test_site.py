@@ -296,6 +296,25 @@ def test_places_that_a_card_names_are_words_and_not_letters(said, words):
     assert page.trained == words
 
 
+@pytest.mark.parametrize(
+    ("places", "words"),
+    [
+        ("none", "by the runner, in 2 trainings listed below"),
+        (["porto"], "porto; by the runner, in 2 trainings listed below"),
+    ],
+)
+def test_a_card_that_names_no_place_does_not_deny_what_the_runner_trained(places, words):
+    one = {"file": "a.json", "trained_on": ["munich"], "pairs": 24, "asked": ["clean/vaduz"]}
+    learner = {"card": card_of("graph", trained_on=places), "learned": [one, one | {"trained_on": ["prague"]}]}
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": learner})
+    (page,) = matchers_of(given, book_of(given))
+    assert page.trained == words
+    assert [line.partition(";")[0] for line in page.training] == [
+        "Trained on 24 queries of munich",
+        "Trained on 24 queries of prague",
+    ]
+
+
 def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
     rows = {"suite": KEY[0], "track": KEY[1], "prior_group": KEY[2], "matcher": "graph", "status": "ok"}
     rows |= {

@@ -406,7 +406,8 @@ def _boards() -> Iterator[str]:
     yield "# Published boards"
     yield _ENTERING.format(version=TASK_VERSION)
     head = ("Board", "About", "Queries", "Suites", "Places", "Asking", "Extracts", "Disk", "Sealed", "Task version")
-    yield from table(head, sorted(map(_board, sorted(RESULTS.glob("*/pack.json"))), key=lambda row: row[2]))
+    rows = [_board(pack) for pack in sorted(RESULTS.glob("*/pack.json"))]
+    yield from table(head, sorted(rows, key=lambda row: row[2]))
 
 
 def _board(pack: Path) -> tuple[str, str, int, int, int, str, str, str, str, int]:

@@ -91,6 +91,20 @@ def test_every_suite_is_in_the_reference(pages):
     assert [name for name in EVERY_SUITE if f"\n## {name}\n" not in pages["reference/suites.md"]] == []
 
 
+def test_every_published_board_is_in_the_reference_fewest_queries_first_with_where_to_begin(pages):
+    page = pages["reference/boards.md"]
+    rows = [line.strip("| ").split(" | ") for line in page.splitlines() if line.startswith("| [`")]
+    names = [row[0].split("`")[1] for row in rows]
+    assert sorted(names) == sorted(path.parent.name for path in (DOCS / "results").glob("*/pack.json"))
+    queries = dict(zip(names, (int(row[2]) for row in rows), strict=True))
+    assert list(queries.values()) == sorted(queries.values())
+    downloads = {name for name, row in zip(names, rows, strict=True) if row[6] != "none"}
+    assert set(names) - downloads == {"towns"}  # where to begin without a network,
+    pictured = {"systems-pictures", "aerial", "aerial-soft"}
+    assert min(downloads - pictured, key=queries.__getitem__) == "systems-objects"  # and with one
+    assert "**Begin with `systems-objects`**" in page
+
+
 def test_what_a_docstring_says_of_several_parameters_is_said_of_each():
     class Both:
         """Return nothing.

@@ -17,7 +17,8 @@ from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_tables import Book, summary
+from sasgeo_bench.leaderboard.board_tables import Book
+from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
 from sasgeo_bench.leaderboard.tables import text_of

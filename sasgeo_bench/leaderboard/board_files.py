@@ -92,7 +92,7 @@ def write_board(
                 for part in (Extra(tables=tables, texts=texts), *extras):
                     _write_part(scratch, part, metadata)
                 for name in (one for one in _AS_CSV if one in tables):
-                    tables[name].map(csv_cell).to_csv(scratch / f"{name}.csv", index=False, lineterminator="\n")
+                    (scratch / f"{name}.csv").write_text(csv_text(tables[name]), encoding="utf-8", newline="")
                 content = {name: value for name, value in content.items() if name != "failed" or value}
                 (scratch / BOARD).write_text(json_text(content), encoding="utf-8")
     except SasgeoError:
@@ -103,6 +103,15 @@ def write_board(
             "again; a board that was there is as it was"
         )
         raise StoreError(message) from error
+
+
+def csv_text(table: pd.DataFrame) -> str:
+    """Return a table for a spreadsheet, with an apostrophe before a text that it would take for a formula.
+
+    >>> csv_text(pd.DataFrame({"matcher": ["=1+1"], "value": [0.5]})).splitlines()
+    ['matcher,value', "'=1+1,0.5"]
+    """
+    return str(table.map(csv_cell).to_csv(index=False, lineterminator="\n"))
 
 
 def _write_part(folder: Path, part: Extra, metadata: Mapping[str, str]) -> None:

@@ -2,7 +2,8 @@
 """Every table of a board as a value: Markdown, LaTeX, a terminal and the site show the same ones."""
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
@@ -25,13 +26,11 @@ from sasgeo_bench.leaderboard.tables import (
     page_names,
     plain_cell,
     rank_cell,
-    rank_text,
-    sort_key,
     ties_of,
 )
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
-from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, is_bin, is_step
+from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, MOST_STEPS, STRESS, is_bin, is_step
 from sasgeo_bench.tasks.query import SEQUENCE
 
 SHOWN_COSTS: Final = (  # and of the table of costs
@@ -56,8 +55,9 @@ MOST_COLUMNS: Final = 8  # matchers next to each other: as many as a screen of 1
 class Book:
     """Figures of a board that take every answer, by entry and queries; and the names of the pages that show them.
 
-    `controls` are the entries that are never ranked. `counted` are the kinds of stress that the first figure of a table
-    counts, `lost` the entries without a sound answer, and how often; both are empty without scored queries.
+    `controls` are the entries that are never ranked. `counted` names the kinds and steps of stress that the
+    first figure of a table counts, `lost` the entries without a sound answer, and how often; both are empty without
+    scored queries.
     """
 
     figures: Mapping[tuple[str, ...], Record]
@@ -67,7 +67,7 @@ class Book:
     controls: frozenset[str]
     matcher_pages: Mapping[str, str]
     suite_pages: Mapping[str, str]
-    counted: Mapping[Key, tuple[str, ...]]
+    counted: Mapping[Key, str]
     lost: Mapping[Key, str]
 
     @classmethod
@@ -116,6 +116,11 @@ class Book:
         marks = marks_of(entry, is_control=matcher in self.controls)
         return Cell(text=matcher, href=self.matcher_pages.get(matcher, ""), marks=marks)
 
+    def short_name(self, matcher: str) -> Cell:
+        """Return the name of a matcher with its link, and of its marks those that praise or warn, or name a control."""
+        cell = self.name_cell(matcher)
+        return replace(cell, marks=tuple(one for one in cell.marks if one.tone != "plain" or matcher in self.controls))
+
     def suite_cell(self, suite: str) -> Cell:
         """Return the name of a suite with a link to its page."""
         return Cell(text=suite, href=self.suite_pages.get(suite, ""))
@@ -131,10 +136,19 @@ def _by_group(scores: pd.DataFrame) -> Iterator[tuple[Key, pd.DataFrame]]:
             yield (str(suite), str(track), str(prior)), rows
 
 
-def _counted(rows: pd.DataFrame) -> tuple[str, ...]:
-    """Return the kinds of stress with the place on the map, which the first figure counts, if there are any."""
-    kinds = rows.loc[(rows["role"] == STRESS) & rows["is_present"].astype(bool), "kind"]
-    return tuple(sorted(map(str, kinds.unique())))
+def _counted(rows: pd.DataFrame) -> str:
+    """Return the kinds of stress that the first figure counts, if there are any, with the steps that it pools.
+
+    As in "S1 at 2, 5, 10 (years between map and world)".
+    """
+    some = rows[(rows["role"] == STRESS) & rows["is_present"].astype(bool)]
+    kinds = {str(kind): sorted(set(mine.get("strength", ()))) for kind, mine in some.groupby("kind", sort=True)}
+    ladders = {kind: steps for kind, steps in kinds.items() if 1 < len(steps) <= MOST_STEPS}
+    texts = (
+        f"{kind} at {', '.join(f'{step:g}' for step in ladders[kind])}" if kind in ladders else kind for kind in kinds
+    )
+    units = sorted({re.split("[:;]", str(unit))[0] for unit in some["strength_unit"]}) if ladders else []
+    return "; ".join(texts) + (f" ({', '.join(units)})" if units else "")
 
 
 def _lost(rows: pd.DataFrame) -> str:
@@ -188,7 +202,7 @@ def _section(book: Book, key: Key) -> Section:
         prior_group=prior_group,
         prior=prior_words(prior_group),
         suite_page=book.suite_pages[suite],
-        counted=", ".join(book.counted.get(key, ())),
+        counted=book.counted.get(key, ""),
         for_nothing=_for_nothing(book, key),
         attainable=_attainable(book, key),
         table=replace(table, notes=tuple(lines)),
@@ -389,85 +403,3 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
             columns=(*words("matcher"), *(column(primary, title=title) for title in titles)),
             rows=rows,
         )
-
-
-def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
-    """Yield who is good at what, of some suites or of all: a matcher a line, a suite a column, figure and rank.
-
-    The first lines say of each suite how many queries count, what can be reached and what guessing and the controls
-    reach. Suites with more ranked matchers come first, so do matchers that were asked about more of them. A cell leads
-    where its rank may be the first of several.
-    """
-    groups = sorted({key[1:] for key in book.matchers if not suites or key[0] in suites})
-    for track, prior_group in groups:
-        primary = primary_of(track).name
-        keys = [key for key in book.matchers if key[1:] == (track, prior_group) and (not suites or key[0] in suites)]
-        names = sorted({name for key in keys for name in book.matchers[key]})
-        by_suite = {key: {name: book.main(key, name, primary) for name in names} for key in keys}
-        ranked = {key: sum(map(_is_ranked, rows.values())) for key, rows in by_suite.items()}
-        shown = sorted((key for key in keys if any(by_suite[key].values())), key=lambda key: (-ranked[key], key))
-        found = {name: [by_suite[key][name] for key in shown] for name in names}
-        means = {name: _mean_value(rows) for name, rows in found.items()}
-        order = sorted(
-            (name for name in names if any(row is not None for row in found[name])),
-            key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
-        )
-        columns = [column(primary, title=key[0]) for key in shown]
-        whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
-        has_mean = len(shown) > 1 and len(whole - book.controls) > 1
-        rows = _heads(book, shown, primary, width=len(shown) + has_mean)
-        for name in order:
-            cells = [_short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
-            if has_mean:
-                cells.append(number_cell(means[name] if name in whole else math.nan))
-            tone = "head" if name in book.controls else "plain"
-            first = book.name_cell(name)
-            marks = tuple(mark for mark in first.marks if mark.tone != "plain" or name in book.controls)
-            rows.append(Row(cells=(replace(first, marks=marks), *cells), tone=tone))
-        yield Table(
-            name=file_stem("summary", track, prior_group),
-            title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
-            columns=(*words("matcher"), *columns, *([column("mean")] if has_mean else [])),
-            rows=tuple(rows),
-        )
-
-
-def _is_ranked(row: Record | None) -> bool:
-    return row is not None and not is_unranked(str(row["matcher"])) and not pd.isna(row["rank_best"])
-
-
-def _mean_value(rows: Sequence[Record | None]) -> float:
-    values = [float(row["value"]) for row in rows if row is not None and not math.isnan(row["value"])]
-    return sum(values) / len(values) if values else -1.0
-
-
-def _heads(book: Book, keys: Sequence[Key], primary: str, *, width: int) -> list[Row]:
-    """Return lines above the matchers: how many queries count, and a ceiling below 1 and chance where there is one."""
-    lines = {"queries": [plain_cell(_count(book, key, primary)) for key in keys]}
-    for title, metric in (("at most", CEILING.name), ("chance", CHANCE.name)):
-        rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
-        lines[title] = [number_cell(math.nan if row is None else float(row["value"])) for row in rows]
-    no_mean = [Cell(text="-")] * (width - len(keys))
-    return [
-        Row(cells=(Cell(text=title), *cells, *no_mean), tone="head")
-        for title, cells in lines.items()
-        if any(cell.text not in ("-", "1.000") for cell in cells)
-    ]
-
-
-def _count(book: Book, key: Key, primary: str) -> int:
-    """Return how many queries count: a matcher that does not answer the track has a row of all, stressed or not."""
-    rows = [row for name in book.matchers[key] if (row := book.main(key, name, primary)) is not None]
-    return max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
-
-
-def _short_cell(row: Record | None, *, is_rivalled: bool) -> Cell:
-    """Return a cell as in "0.750 [0.30, 0.95] (2-3)"."""
-    if row is None:
-        return Cell(text="-")
-    if not row["is_applicable"]:
-        return Cell(text="n/a")
-    value, leads = float(row["value"]), is_rivalled and _is_ranked(row) and int(row["rank_best"]) == 1
-    ends = [] if math.isnan(row["lo"]) else [f"[{row['lo']:.2f}, {row['hi']:.2f}]"]
-    details = (*ends, f"({rank_text(row)})")
-    return Cell(text=number_text(value), key=sort_key(value), tone="leading" if leads else "plain", details=details)

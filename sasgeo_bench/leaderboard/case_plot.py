@@ -22,9 +22,8 @@ from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, footprint, observe
-from sasgeo_bench.regions.preview import paint_overview, pooled, scale_bar
+from sasgeo_bench.regions.preview import GROUND, class_keys, paint_overview, pooled, scale_bar
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.scoring.pose import SUCCESS_DEG
 from sasgeo_bench.scoring.score import FIX_M
@@ -200,11 +199,13 @@ def seen_at(pose: Pose, view: Evidence, layers: LayerBits, grid: Grid, manifest:
     return view.replace(cells[[manifest.classes.index(name) for name in view.classes]])
 
 
-def class_keys(shown: Collection[str]) -> list[Artist]:
-    """Return legend entries of classes, in the order of the taxonomy, and of what is unknown."""
-    classes = [item for item in load_taxonomy().classes if item.name in shown]
-    keys: list[Artist] = [Patch(color=item.colour, label=item.name.replace("_", " ")) for item in classes]
-    return [*keys, Patch(color=HIDDEN, label="unknown")]
+def evidence_keys(shown: Collection[str]) -> list[Artist]:
+    """Return legend entries of classes, in the order of the taxonomy, of none of them, and of what is unknown."""
+    rest = {"none of these classes": GROUND, "unknown": HIDDEN}
+    return [
+        *class_keys(shown),
+        *(Patch(facecolor=colour, edgecolor="#666666", lw=0.4, label=name) for name, colour in rest.items()),
+    ]
 
 
 def case_pixels(case: CasePicture) -> NDArray[np.uint8]:

@@ -9,7 +9,9 @@ from sasgeo_bench.leaderboard.tables import DAGGER, Column, Mark
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, REPRODUCED, RUN_HERE
 from sasgeo_bench.scoring.verdicts import LEAST_PLACES
-from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.query import BY, PriorGroup
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.suites.base import SuiteCard
 
 _UNKNOWN: Final = "no meaning is written down for this column"
 _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
@@ -71,6 +73,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "dates": "Dates of the maps",
     "suites": "Suites that were drawn there",
     "scenes": "Kind of place, as its region file says",
+    "kind of place": "Places of one kind, as their region files say; a place with several kinds counts in each",
     "method": "How the level is computed",
     "absence": "Kind of absent places, suite: kind; all: all of them",
     "absent": "Absent places among the queries",
@@ -83,7 +86,14 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "exceeded": "Share with an error beyond the level, available or not, with its 95 % interval",
     "supports": "Risk that the misleading ones among the available support",
 }
-MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS
+_OF_CONTRASTS: Final = {  # metrics of registered contrasts alone
+    "primary": "Share of queries that are right",
+    "interaction": "Share of queries that are right under stress, less that on the controls of the same sites: what "
+    "the stress adds to the difference",
+    "shift": "Share of queries that are right, less that on the views of the same sites by the detector `published`: "
+    "what another detector adds to the difference",
+}
+MEANINGS: Final = {metric.name: metric.meaning for metric in METRICS} | _OTHER_COLUMNS | _OF_CONTRASTS
 NOTE: Final = (
     "Intervals are 95 %: a bootstrap over places, then blocks, then sites ({draws} draws), never narrower than over "
     f"blocks alone, nor than Wilson's with as many trials as there are sites; {DAGGER} marks those where Wilson's is "
@@ -114,6 +124,11 @@ MARKS: Final[dict[str, str]] = {  # words next to names and ranks
     "tie": "shares ranks with others, who are named below the table; neighbouring ties differ in colour",
 }
 CONTROL: Final = Mark(text="control", meaning="no rival: it shows what a figure means that nobody earned")
+FEW: Final = Mark(
+    text="few",
+    meaning=f"fewer than {LEAST_PLACES} places: nobody is ranked, and other places of the kind may well differ",
+    tone="warn",
+)
 _TONES: Final = {RUN_HERE: "plain", REPRODUCED: "good", NOT_REPRODUCED: "warn", AS_SUBMITTED: "warn"}
 
 
@@ -148,6 +163,22 @@ def prior_words(name: str) -> str:
         return PriorGroup.parse(name).words
     except ConfigError:
         return name
+
+
+def suite_card(suite: str) -> SuiteCard | None:
+    """Return the card of a suite of this version, whichever segmenter made its evidence; None for any other."""
+    found = EVERY_SUITE.get(suite.partition(BY)[0])
+    return None if found is None else found.card
+
+
+def suite_words(suite: str) -> str:
+    """Return the title of a suite and what is done in it; "" for one that this version does not know.
+
+    >>> suite_words("aerial+pixel_forest").partition(". ")[0]
+    'Pictures from straight above (P1)'
+    """
+    card = suite_card(suite)
+    return "" if card is None else f"{card.title}. {card.what}"
 
 
 def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:

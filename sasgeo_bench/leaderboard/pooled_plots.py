@@ -7,6 +7,7 @@ Each function writes a .svg or .png; `shown` are the matchers in the order of th
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from itertools import cycle
 from pathlib import Path
 from typing import Final
 
@@ -14,6 +15,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from sasgeo_bench.canvas import figure_of, page, panels
 from sasgeo_bench.errors import counted
@@ -42,6 +44,8 @@ from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
 from sasgeo_bench.scoring.score import FIX_M
 
+_CONTROL: Final = "#888888"
+_CONTROL_MARKS: Final = ("x", "+", "1", "2", "3", "4")
 _STRESS: Final = "Present places under stress; of a suite without stresses all of them."
 _MOST_ASKED: Final = (
     "A panel has the matchers that were asked all of its queries; no answer is a miss, and in the denominator."
@@ -240,19 +244,20 @@ def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -
     rows = rows[np.isfinite(rows["latency_s"].to_numpy(float))]
     is_free = rows["matcher"].map(is_unranked).to_numpy(bool)
     names, groups = those_there(rows[~is_free], shown), sorted(set(rows["prior_group"]))
+    controls = _control_keys(sorted(set(rows.loc[is_free, "matcher"])))
     down, across = panels_across(len(groups))
     about = BoardPage(
         title=f"Success against latency: {rows['suites'].iloc[0]}, {rows['track'].iloc[0]}",
         note=(
             "The queries that the first figure of the suite counts. Upright bars: 95 % intervals; level "
             "bars: from the median latency to the 95th percentile, all suites of the track, as measured where each "
-            "matcher ran. Grey line: the front, where no other matcher is both faster and better. Grey crosses: "
-            "controls, which compete with nobody."
+            "matcher ran. Grey line: the front, where no other matcher is both faster and better. Controls "
+            "compete with nobody."
         ),
         below="latency of an answer (s), median to 95th percentile",
         rows=down,
         columns=across,
-        keys=line_keys(names),
+        keys=[*line_keys(names), *controls],
         panel_inches=(3.4, 2.6),
     )
     with page(path, about) as charts:
@@ -262,7 +267,7 @@ def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -
             panel_title(chart, prior_words(groups[number]), rows[is_here].iloc[0])
             if len(mine):
                 _prices(chart, mine, [name for name in names if (mine["matcher"] == name).any()], "latency_s")
-            _controls(chart, free)
+            _controls(chart, free, controls)
             _cost_axis(chart, rows.loc[is_here, ["latency_s", "slow_s"]].to_numpy(float))
             dress_share(chart)
             chart.grid(visible=True, color=FAINT, lw=0.6)
@@ -271,12 +276,19 @@ def draw_tradeoff(path: Path | None, rows: pd.DataFrame, shown: Sequence[str]) -
     return figure_of(charts[0][0])
 
 
-def _controls(chart: Axes, rows: pd.DataFrame) -> None:
-    """Draw controls as named grey crosses."""
-    for number, row in enumerate(rows.sort_values("matcher").to_dict("records")):
-        at, away = (row["latency_s"], row["value"]), (4, -9 if number % 2 else 3)  # names of neighbours lie apart
-        chart.plot(*at, color="#999999", marker="x", ms=5, ls="", zorder=1)
-        chart.annotate(row["matcher"], at, away, textcoords="offset points", fontsize=6.5, color="#777777")
+def _control_keys(names: Sequence[str]) -> list[Line2D]:
+    """Return the legend of controls: a grey mark each, since names beside marks would lie on each other."""
+    return [
+        Line2D([], [], color=_CONTROL, marker=mark, ms=6, ls="", label=f"{name} (control)")
+        for name, mark in zip(names, cycle(_CONTROL_MARKS), strict=False)
+    ]
+
+
+def _controls(chart: Axes, rows: pd.DataFrame, keys: Sequence[Line2D]) -> None:
+    """Draw the controls of a panel in the looks of their legend."""
+    for key in keys:
+        mine = rows[rows["matcher"] == str(key.get_label()).removesuffix(" (control)")]
+        chart.plot(mine["latency_s"], mine["value"], color=_CONTROL, marker=key.get_marker(), ms=6, ls="", zorder=1)
 
 
 def draw_contrasts(path: Path | None, contrasts: pd.DataFrame) -> Figure:

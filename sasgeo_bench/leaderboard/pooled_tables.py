@@ -25,7 +25,7 @@ from sasgeo_bench.scoring.pose import Ranks, hits, rank_pose
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE
-from sasgeo_bench.scoring.strata import ALL, GROUP, STRESS
+from sasgeo_bench.scoring.strata import ALL, GROUP, STRESS, is_counted
 from sasgeo_bench.tasks.query import Truth
 
 Scores = Mapping[str, pd.DataFrame]
@@ -66,13 +66,6 @@ def _is_able(frame: pd.DataFrame) -> bool:
     return bool((frame["status"] != NOT_APPLICABLE).any())
 
 
-def _is_whole(first: pd.DataFrame) -> Bools:
-    """Return the rows of a suite's panel: present places under stress, or all present ones without stress."""
-    present = first["is_present"].to_numpy(bool)
-    stress = present & (first["role"] == STRESS).to_numpy(bool)
-    return stress if stress.any() else present
-
-
 def _suites(scores: Scores, shown: Sequence[str]) -> Iterator[tuple[dict[str, Any], dict[str, pd.DataFrame]]]:
     """Yield the keys of a panel and the rows of its matchers, for each suite, track and prior group."""
     mine = {name: scores[name] for name in shown if name in scores}
@@ -82,7 +75,7 @@ def _suites(scores: Scores, shown: Sequence[str]) -> Iterator[tuple[dict[str, An
         for name, frame in mine.items():
             is_mine = [frame[column].to_numpy() == value for column, value in zip(GROUP, key, strict=True)]
             rows = frame[np.logical_and.reduce(is_mine)]
-            some[name] = rows[_is_whole(rows)]
+            some[name] = rows[is_counted(rows)]
         alike = _alike(some)
         if alike:
             first = next(iter(alike.values()))
@@ -259,7 +252,7 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
 
 def _counted(frame: pd.DataFrame) -> pd.DataFrame:
     """Return the rows that the first figure of each suite counts, of places that are on the map."""
-    parts = [part[_is_whole(part)] for _, part in frame.groupby(["suite", "track"], sort=False)]
+    parts = [part[is_counted(part)] for _, part in frame.groupby(["suite", "track"], sort=False)]
     return pd.concat(parts, ignore_index=True) if parts else frame
 
 

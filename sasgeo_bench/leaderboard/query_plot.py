@@ -16,11 +16,11 @@ from sasgeo_bench.leaderboard.case_plot import (
     TRUE,
     CasePicture,
     MapPart,
-    class_keys,
     disc_of,
     draw_map,
     draw_panel,
     draw_picture,
+    evidence_keys,
     seen_at,
 )
 from sasgeo_bench.leaderboard.columns import prior_words
@@ -152,4 +152,4 @@ def _keys(case: CasePicture, region: Region) -> list[Artist]:
     else:
         keys.append(Line2D([], [], color=_CANDIDATE, marker="x", ms=5, ls="", label="candidate"))
     bands = [*zip(region.classes, region.layers, strict=True), *zip(case.view.classes, case.view.cells, strict=True)]
-    return [*keys, *class_keys({name for name, cells in bands if (cells == PRESENT).any()})]
+    return [*keys, *evidence_keys({name for name, cells in bands if (cells == PRESENT).any()})]

@@ -53,7 +53,10 @@ def _rejection_rows(board: pd.DataFrame) -> pd.DataFrame:
 
 
 def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: bool = False) -> Table:
-    """Return rejectors, the best first; `has_queries` adds a column of the track and prior group of each line."""
+    """Return rejectors, the best first and those of controls last, whose order of answers nobody earned.
+
+    `has_queries` adds a column of the track and prior group of each line.
+    """
     rows = []
     for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
         matcher, rejector, track, prior_group = map(str, key)
@@ -63,9 +66,10 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
         queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
         figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
         cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
-        surest = by_name.get("aurc")
-        rows.append((math.inf if surest is None else float(surest["value"]), matcher, rejector, Row(cells=cells)))
-    rows.sort(key=lambda row: row[:3])
+        area, is_control = by_name.get("aurc"), is_unranked(matcher)
+        row = Row(cells=cells, tone="control" if is_control else "plain")
+        rows.append((is_control, math.inf if area is None else float(area["value"]), matcher, rejector, row))
+    rows.sort(key=lambda row: row[:4])
     return Table(
         name=name,
         title=title,

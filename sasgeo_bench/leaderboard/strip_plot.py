@@ -18,10 +18,10 @@ from sasgeo_bench.leaderboard.case_plot import (
     ANSWERED,
     TRUE,
     CasePicture,
-    class_keys,
     draw_map,
     draw_panel,
     draw_picture,
+    evidence_keys,
     pixels_of,
 )
 from sasgeo_bench.leaderboard.run_cases import RunCases, picture_of
@@ -157,7 +157,7 @@ def _keys(rows: Sequence[CasePicture]) -> list[Artist]:
     seen = [item for row in rows for item in (row.view, row.at_true, row.at_answer) if item is not None]
     shown = {name for item in seen for name, cells in zip(item.classes, item.cells, strict=True) if PRESENT in cells}
     shown |= {name for row in rows if row.segmented is not None for name in row.segmented.classes}
-    return [*keys, *class_keys(shown)]
+    return [*keys, *evidence_keys(shown)]
 
 
 def _known(view: Evidence) -> Evidence:

@@ -10,10 +10,21 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import pandas as pd
+
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import SITE, resolve_link
-from sasgeo_bench.leaderboard.board_files import ANSWERS, BOARD_FILES, FIGURES, LEADERBOARD, check_shape, read_board
+from sasgeo_bench.leaderboard.board_files import (
+    ANSWERS,
+    BOARD_FILES,
+    FIGURES,
+    LEADERBOARD,
+    SCORES,
+    check_shape,
+    csv_text,
+    read_board,
+)
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.progress import Progress, Tell
@@ -32,15 +43,32 @@ from sasgeo_bench.publishing.site_files import (
 )
 from sasgeo_bench.publishing.site_pages import places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
-from sasgeo_bench.publishing.site_source import Case, Picture, Pictures, RegionMap, SiteFigure, SiteSource, Spot
+from sasgeo_bench.publishing.site_source import (
+    Case,
+    Download,
+    Picture,
+    Pictures,
+    RegionMap,
+    SiteFigure,
+    SiteSource,
+    Spot,
+)
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.scenes import scene_frame
+from sasgeo_bench.scoring.score import COLUMNS as SCORED
+from sasgeo_bench.scoring.strata import GROUP
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 from sasgeo_bench.tasks.task_files import PRIVATE
 from sasgeo_bench.texts import one_line
 
 _MAP: Final = "places.svg"
 _RATES: Final = "ageing-rates.svg"
+_OF_SCENES: Final = (
+    *(*GROUP, "kind_of_place", "matcher", "metric", "n", "blocks", "places"),
+    *("value", "lo", "hi", "lo_blocks", "hi_blocks", "interval", "rank_best", "rank_worst"),
+)
 
 
 def publish(
@@ -73,7 +101,9 @@ def publish(
         with _sound(board):
             for name, table in {LEADERBOARD: files.board, **files.tables}.items():
                 check_shape(name, table)
-            source = _source(files, tell)
+            scenes = _scenes(files)
+            files = replace(files, downloads=(*files.downloads, *_scenes_file(scenes)))
+            source = replace(_source(files, tell), scenes=scenes)
             pages = site_pages(source)
         with site_lock(board, target, tell=tell):
             written = write_site(
@@ -160,6 +190,23 @@ def _source(files: BoardFiles, tell: Tell) -> SiteSource:
         rates_figure=drawn[_RATES],
         map_figure=drawn.get(_MAP),
     )
+
+
+def _scenes(files: BoardFiles) -> pd.DataFrame:
+    """Return success by kind of place from the board's own scored rows; empty where these do not tell."""
+    scores = files.tables[SCORES]
+    if not set(SCORED) <= set(scores):
+        return pd.DataFrame()
+    apart = {str(entry["name"]) for entry in files.about.get("entries", ()) if entry.get("set_apart")}
+    by_matcher = {str(name): rows for name, rows in scores.groupby("matcher", sort=False)}
+    return scene_frame(by_matcher, draws=int(files.about.get("draws", DRAWS)), excluded=apart)
+
+
+def _scenes_file(scenes: pd.DataFrame) -> Iterator[Download]:
+    if len(scenes):
+        table = scenes.rename(columns={"stratum": "kind_of_place"})[list(_OF_SCENES)]
+        what = "success by kind of place, with intervals by places and by blocks"
+        yield Download(file="kinds-of-place.csv", data=csv_text(table).encode(), what=what)
 
 
 def _name_of(files: BoardFiles) -> str:

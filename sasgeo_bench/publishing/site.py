@@ -13,10 +13,12 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of, summary
-from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE
+from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of
+from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE, column
+from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
+from sasgeo_bench.leaderboard.scene_tables import scene_tables
 from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
@@ -34,9 +36,11 @@ from sasgeo_bench.publishing.site_pages import (
 from sasgeo_bench.publishing.site_source import Case, SiteSource
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import Verdict
+from sasgeo_bench.scoring.verdicts import LOWER
 from sasgeo_bench.tasks.query import SEQUENCE
 from sasgeo_bench.texts import plain
 
+_OF_SHARES: Final = frozenset({"primary", "interaction", "shift"})  # metrics whose meaning is a name that all know
 _TOLD: Final = frozenset({"decided", "cause open", "decided, small"})  # in which one is better
 OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decided", "not tested")  # as on the page
 
@@ -45,7 +49,8 @@ OUTCOMES: Final = ("decided", "cause open", "decided, small", "null", "not decid
 class ContrastSummary:
     """A registered contrast in plain words.
 
-    `outcome` is one of `OUTCOMES`; `because` says why neither is better, empty where one is.
+    `outcome` is one of `OUTCOMES`; `because` says why neither is better, empty where one is. `ends` say who is better
+    where the difference is below 0, and where it is above, `side` on which of the two it lies.
     `unstressed` compares both where they should not differ, empty if nothing was measured there; `bar` spans from
     -`reach` to `reach`, with `least` of it on both sides of the middle too small to matter, in per cent.
     """
@@ -55,6 +60,8 @@ class ContrastSummary:
     headline: str
     because: str
     difference: str
+    side: str
+    ends: tuple[str, str]
     sentence: str
     facts: tuple[str, ...]
     unstressed: str
@@ -92,6 +99,8 @@ def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
         headline=_headline(row, verdict, outcome),
         because="" if outcome in _TOLD else verdict.partition(": ")[2] or verdict,
         difference=_difference_text(row) if int(row["n"]) else "",
+        side=_side(row),
+        ends=_ends(row),
         sentence=_sentence(row, least),
         facts=tuple(_contrast_facts(row, source, contrast)),
         unstressed="" if falsifier is None else _unstressed(falsifier),
@@ -111,16 +120,32 @@ def _headline(row: Record, verdict: str, outcome: str) -> str:
     return f"{first} against {second}"
 
 
+def _ends(row: Record) -> tuple[str, str]:
+    """Return who is better where first less second is below 0, and where it is above."""
+    first, second = str(row["first"]), str(row["second"])
+    return (first, second) if row["metric"] in LOWER else (second, first)
+
+
+def _side(row: Record) -> str:
+    below, above = _ends(row)
+    return f"above 0: {above} ahead" if float(row["difference"]) >= 0 else f"below 0: {below} ahead"
+
+
 def _sentence(row: Record, least: float) -> str:
     """Return the difference with its interval, in words that state which direction is good."""
     if not int(row["n"]):
         return "No query of this board counts for it."
     values = f"{number_text(float(row['first_value']))} against {number_text(float(row['second_value']))}"
-    what = "share of queries that are right" if row["metric"] == "primary" else str(row["metric"])
+    below, above = _ends(row)
+    metric = str(row["metric"])
+    meaning = column(metric).meaning
+    what = f"{meaning[0].lower()}{meaning[1:]}" if metric in _OF_SHARES else f"{metric} ({meaning})"
+    good = "less is better" if metric in LOWER else "more is better"
     most = number_text(float(row["attainable"]))
     return (
-        f"Difference {_difference_text(row)} in the {what}: {values}. At most {most} could be gained. "
-        f"The least difference registered as one that matters is {number_text(least)}."
+        f"Difference {_difference_text(row)} in the {what}: {values}; {good}. Above 0 {above} is ahead, below 0 "
+        f"{below}. At most {most} could be gained. The least difference registered as one that matters is "
+        f"{number_text(least)}."
     )
 
 
@@ -169,6 +194,7 @@ FAILURES: Final = (  # in the order they are shown; others follow
 )
 _NAMES: Final = {  # pages that every site has or may have, in the order of the navigation
     "index.html": "Board",
+    "kinds-of-place.html": "Kinds of place",
     "suites.html": "Suites",
     "matchers.html": "Matchers",
     "rejection.html": "Rejection",
@@ -200,10 +226,12 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     templates = _environment()
     book = Book.of(source.board, source.about, source.scores)
     maps = place_maps(source)
+    scenes = tuple(scene_tables(source.scenes, book)) if len(source.scenes) else ()
     rejection = rejection_tables(source.board)
     protection = protection_tables(source.protection)
     acceptance = acceptance_tables(source.acceptance)
     optional = {
+        "kinds-of-place.html": scenes,
         "rejection.html": rejection or protection,
         "figures.html": source.figures,
         "map.html": maps,
@@ -216,14 +244,22 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "source": source,
         "about": source.about,
         "book": book,
+        "there": there,
         "navigation": [(name, _NAMES[name]) for name in there],
         "note": NOTE.format(draws=source.about.get("draws", "?")),
     }
     special = {
         "index.html": _index(source, book, sections),
+        "kinds-of-place.html": {"tables": scenes},
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
-        "rejection.html": {"tables": rejection, "acceptance": acceptance, "protection": protection, "kinds": kinds},
+        "rejection.html": {
+            "tables": rejection,
+            "acceptance": acceptance,
+            "protection": protection,
+            "kinds": kinds,
+            "filters": _filters((*rejection, *acceptance, *protection), "matcher", "rejector"),
+        },
         "figures.html": {"kinds": kinds},
         "map.html": {"places": list(maps), "outcomes": ANSWER_OUTCOMES, "classes": load_taxonomy().classes},
         "failures.html": {"groups": groups_of(source.pictures.cases), "total": len(source.pictures.cases)},
@@ -275,6 +311,15 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }
+
+
+def _filters(tables: Sequence[Table], *terms: str) -> list[tuple[str, str, list[str], dict[str, str]]]:
+    """Return choices of the values of some columns of text, by name."""
+    found: dict[str, dict[str, None]] = {term: {} for term in terms}
+    for table in tables:
+        for at, one in enumerate(table.columns):
+            found.get(one.term, {}).update(dict.fromkeys(row.cells[at].text for row in table.rows))
+    return [(term.capitalize(), term, sorted(values), {}) for term, values in found.items() if values]
 
 
 def _has_rivals(table: Table) -> bool:

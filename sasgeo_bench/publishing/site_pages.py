@@ -11,7 +11,7 @@ import pandas as pd
 from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, strata_tables, suite_table
-from sasgeo_bench.leaderboard.columns import column, prior_words
+from sasgeo_bench.leaderboard.columns import column, prior_words, suite_card
 from sasgeo_bench.leaderboard.rejection_tables import rejection_of
 from sasgeo_bench.leaderboard.tables import (
     Cell,
@@ -31,7 +31,6 @@ from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.query import base_of
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks.suites.base import SuiteCard
 
 _AREAS: Final = ("available", "misleading", "hazardous", "exceeded")
@@ -86,14 +85,13 @@ def suites_of(source: SiteSource, book: Book) -> tuple[SuitePage, ...]:
 
 
 def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
-    suite = EVERY_SUITE.get(name)
     keys = [key for key in book.matchers if key[0] == name]
     starts = tuple(f"{file_stem(kind, name, track)}-" for kind in KINDS for _, track, _ in keys)
     tasks = [str(task["region"]) for task in source.about.get("tasks", ()) if task["suite"] == name]
     return SuitePage(
         name=name,
         page=page,
-        card=None if suite is None else suite.card,
+        card=suite_card(name),
         tables=tuple(
             table for key in keys for table in (suite_table(book, key, book.matchers[key]), *strata_tables(book, key))
         ),
@@ -142,7 +140,7 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
         entry=entry,
         cell=book.name_cell(name),
         card=card,
-        trained=_trained(card.get("trained_on")),
+        trained=_trained(card.get("trained_on"), entry.get("learned") or ()),
         training=tuple(_training(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
@@ -151,12 +149,24 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
     )
 
 
-def _trained(stated: object) -> str:
+_NO_PLACE: Final = "no place that its card names"
+
+
+def _trained(stated: object, learned: Sequence[Mapping[str, Any]]) -> str:
+    """Return where an entry was trained: by its author on the places that its card names, and by the runner."""
+    named = _stated(stated)
+    if not learned:
+        return named
+    runner = f"by the runner, in {counted(len(learned), 'training')} listed below"
+    return runner if named == _NO_PLACE else f"{named}; {runner}"
+
+
+def _stated(places: object) -> str:
     """Return the training places that a card names: "none", some, or some for each half."""
-    if isinstance(stated, Mapping):
-        return "; ".join(f"half {half}: {_trained(places)}" for half, places in stated.items())
-    places = [] if isinstance(stated, str) or not isinstance(stated, Sequence) else list(map(str, stated))
-    return ", ".join(places) or "no place that its card names"
+    if isinstance(places, Mapping):
+        return "; ".join(f"half {half}: {_stated(some)}" for half, some in places.items())
+    named = [] if isinstance(places, str) or not isinstance(places, Sequence) else list(map(str, places))
+    return ", ".join(named) or _NO_PLACE
 
 
 def _training(entry: Mapping[str, Any]) -> Iterator[str]:

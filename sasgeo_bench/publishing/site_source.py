@@ -137,7 +137,8 @@ class SiteSource:
 
     `title` is that of the board's pipeline where it is known, `about` the content of `board.json`. `reasons` states why
     each contrast was registered. `spots` are positions of regions, as far as they are known; `parts` holds place, and
-    half or part of the split, of each region; `rates` is measured ageing.
+    half or part of the split, of each region; `rates` is measured ageing. `scenes` is success by kind of place
+    (`scenes.scene_frame`).
     """
 
     name: str
@@ -152,6 +153,7 @@ class SiteSource:
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)
     acceptance: pd.DataFrame = field(default_factory=pd.DataFrame)
     answers: pd.DataFrame = field(default_factory=pd.DataFrame)
+    scenes: pd.DataFrame = field(default_factory=pd.DataFrame)
     registered: tuple[Contrast, ...] = ()
     reasons: Mapping[str, str] = field(default_factory=dict)
     figures: tuple[SiteFigure, ...] = ()

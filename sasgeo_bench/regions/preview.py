@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A region as a map with legend, scale, north arrow, date and attribution: `preview.png`, and a figure."""
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from textwrap import wrap
 from typing import Final
@@ -25,7 +26,7 @@ PAINT_ORDER: Final = (
     *("farmland", "green", "water", "parking", "building", "field_boundary", "path_track", "waterway", "coastline"),
     *("road_minor", "road_major", "railway", "bridge"),
 )
-_GROUND: Final = "#fbfaf5"
+GROUND: Final = "#fbfaf5"
 _UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")
 _STRIPE_CELLS: Final = 12
 _DPI: Final = 110
@@ -147,7 +148,7 @@ def paint_overview(manifest: Manifest, overview: NDArray[np.uint8]) -> NDArray[n
     """Return the colours of a map, shape (rows, cols, 3), 0..1."""
     rows, cols = overview.shape[1:]
     picture = np.empty((rows, cols, 3))
-    picture[:] = to_rgb(_GROUND)
+    picture[:] = to_rgb(GROUND)
     colours = {item.name: to_rgb(item.colour) for item in load_taxonomy().classes}
     for name in PAINT_ORDER:
         if name in manifest.classes:
@@ -215,20 +216,27 @@ def _words(figure: Figure, manifest: Manifest, total: tuple[float, float]) -> No
     figure.text(0.3 / total[0], 0.14 / total[1], manifest.attribution, ha="left", va="bottom", fontsize=9)
 
 
+def class_keys(shown: Collection[str]) -> list[Patch]:
+    """Return the legend entries of classes by their titles, in the order of the taxonomy.
+
+    Where `shown` maps names to texts, these follow the titles.
+
+    >>> [key.get_label() for key in class_keys({"building": " (9)", "road_major": " (1)"})]
+    ['major road (1)', 'building (9)']
+    """
+    more = shown if isinstance(shown, Mapping) else {}
+    return [
+        Patch(facecolor=item.colour, edgecolor="#666666", lw=0.4, label=item.title + more.get(item.name, ""))
+        for item in load_taxonomy().classes
+        if item.name in shown
+    ]
+
+
 def _legend(figure: Figure, manifest: Manifest, overview: NDArray[np.uint8], *, left: float, top: float) -> None:
     """Draw the classes that occur, with their number of objects, and explain the hatching."""
-    titles = {item.name: (item.title, item.colour) for item in load_taxonomy().classes}
-    entries: list[Patch | Line2D] = [
-        Patch(
-            facecolor=titles[name][1],
-            edgecolor="#666666",
-            lw=0.4,
-            label=f"{titles[name][0]}  ({manifest.counts[name]:,})",
-        )
-        for name in manifest.classes
-        if manifest.counts.get(name)
-    ]
-    if len(manifest.classes) < len(titles):
+    found = {name: manifest.counts.get(name, 0) for name in manifest.classes}
+    entries: list[Patch | Line2D] = [*class_keys({name: f"  ({count:,})" for name, count in found.items() if count})]
+    if len(manifest.classes) < len(load_taxonomy().classes):
         entries.append(Patch(facecolor="none", edgecolor="none", label="all other classes: unknown"))
     if (overview[0] == OUTSIDE).any():
         hatched = Patch(

@@ -15,11 +15,10 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import Page, page, without_ticks
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import north_arrow, scale_bar
+from sasgeo_bench.regions.preview import GROUND, class_keys, north_arrow, scale_bar
 from sasgeo_bench.regions.region import Manifest
-from sasgeo_bench.tasks.sheet import GROUND, HIDDEN, paint
+from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
 UNIT: Final = "nats for 100 m\u00b2"
 _MOST_CELLS: Final = 900  # of a picture's side
@@ -87,7 +86,7 @@ def draw_weights(path: Path, sheet: WeightSheet) -> None:
     weights = _blocks(filled, factor).max(axis=(1, 3))
     side_m = (region.cols * region.cell_size_m, region.rows * region.cell_size_m)
     scale = _MAP_INCHES / max(side_m)
-    keys = _class_keys(
+    keys = class_keys(
         {name: f"  {sheet.class_weights[name]:.2f}" for name in region.classes if region.counts.get(name)}
     )
     if np.isnan(sheet.weights).any():
@@ -127,11 +126,3 @@ def colour_bar(chart: Axes, mapped: ScalarMappable) -> None:
     """Draw the colour bar of weights below a panel."""
     drawn = chart.figure.colorbar(mapped, ax=chart, location="bottom", extend="max", aspect=45, panchor=False)
     drawn.set_label(f"w = \u03c3\u03bd, {UNIT} that are mapped and seen")
-
-
-def _class_keys(values: Mapping[str, str]) -> list[Patch]:
-    return [
-        Patch(facecolor=item.colour, edgecolor="#666666", lw=0.4, label=item.title + values[item.name])
-        for item in load_taxonomy().classes
-        if item.name in values
-    ]

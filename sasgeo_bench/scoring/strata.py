@@ -15,7 +15,7 @@ from sasgeo_bench.tasks.query import PUBLISHED
 ALL: Final = "all"
 STRESS: Final = "stress"
 CONTROL: Final = "control"
-_MOST_STEPS: Final = 24  # more are no steps: each query has its own random strength
+MOST_STEPS: Final = 24  # more are no steps: each query has its own random strength
 DRIFT: Final = "odometer_drift"  # of flights
 _EDGES: Final = {  # fixed, to keep boards comparable
     "unknown_share": (0.0, 0.2, 0.4, 0.6, 1.0),
@@ -50,7 +50,7 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
         mine = kind == one
         yield one, mine
         steps = sorted({(step, size) for step, size in zip(strength[mine], cells[mine], strict=True)})
-        if 1 < len(steps) <= _MOST_STEPS:
+        if 1 < len(steps) <= MOST_STEPS:
             for step, size in steps:
                 yield step_name(one, step, size), mine & (strength == step) & (cells == size)
     sizes = sorted(set(cells[role == CONTROL]))
@@ -61,6 +61,20 @@ def strata(scores: pd.DataFrame) -> Iterator[tuple[str, Bools]]:
     for name in sorted(set(detector)) if len(set(detector)) > 1 else ():
         yield f"detector {name}", detector == name
     yield from _bins(scores, role != CONTROL)
+
+
+def is_counted(queries: pd.DataFrame) -> Bools:
+    """Return a mask of the queries of one suite that its first figure counts, shape (N,).
+
+    Present places under stress, or all present ones where nothing is stressed.
+
+    >>> asked = pd.DataFrame({"role": ["control", "stress", "stress"], "is_present": [True, True, False]})
+    >>> is_counted(asked).tolist(), is_counted(asked[:1]).tolist()
+    ([False, True, False], [True])
+    """
+    present = queries["is_present"].to_numpy(bool)
+    stress = present & (queries["role"] == STRESS).to_numpy(bool)
+    return stress if stress.any() else present
 
 
 def step_name(kind: str, step: float, view_cells: int) -> str:

@@ -26,6 +26,7 @@ from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, strata
 from sasgeo_bench.scoring.verdicts import LEAST_PLACES
 
 INTERVALS: Final = "intervals of suites"  # what progress is shown of
+Parts = Callable[[pd.DataFrame], Iterator[tuple[str, Bools]]]  # queries of a suite -> names and masks of its strata
 _WHOLE: Final = frozenset({ALL, STRESS, CONTROL})  # strata that also get quantiles of errors
 
 
@@ -35,12 +36,13 @@ def leaderboard(
     draws: int = DRAWS,
     excluded: Collection[str] = (),
     done: Callable[[], None] = lambda: None,
+    parts: Parts = strata,
 ) -> pd.DataFrame:
     """Return the metrics of every matcher on every suite, track, prior group and stratum, with the columns of `Row`.
 
     `scored` holds rows of `score.score_task` by matcher, all for the same queries. Matchers in `excluded` have no rank
-    and are no rivals; controls never are. `done` is called after each suite, track and prior group. Raise MetricError
-    if two matchers were scored on different queries.
+    and are no rivals; controls never are. `done` is called after each suite, track and prior group. `parts` yields the
+    strata of the queries of one of these. Raise MetricError if two matchers were scored on different queries.
     """
     frames = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in scored.items()}
     if not frames:
@@ -57,7 +59,7 @@ def leaderboard(
         index = [at for at, other in enumerate(keys) if other == key]
         groups.append((key, {name: frame.iloc[index] for name, frame in frames.items()}))
     unranked = frozenset({*excluded, *filter(is_unranked, scored)})
-    return to_frame(in_threads(lambda item: _rows_of_group(*item, draws, unranked), groups, done))
+    return to_frame(in_threads(lambda item: _rows_of_group(*item, draws, unranked, parts), groups, done))
 
 
 def leaderboards(
@@ -69,19 +71,20 @@ def leaderboards(
     """
     keys = {key for frame in scored.values() for key in frame[[*GROUP]].itertuples(index=False)}
     progress.begin(INTERVALS, len(keys))
+    return [
+        leaderboard(some, draws=draws, excluded=excluded, done=lambda: progress.advance(INTERVALS, 1))
+        for some in asked_alike(scored)
+    ]
+
+
+def asked_alike(scored: Mapping[str, pd.DataFrame]) -> Iterator[dict[str, pd.DataFrame]]:
+    """Yield the rows of each set of suites that the same matchers were asked, by matcher."""
     suites_of = {name: set(frame["suite"]) for name, frame in scored.items()}
     asked_by: dict[tuple[str, ...], list[str]] = {}
     for suite in sorted({suite for suites in suites_of.values() for suite in suites}):
         asked_by.setdefault(tuple(name for name in scored if suite in suites_of[name]), []).append(suite)
-    return [
-        leaderboard(
-            {name: scored[name][scored[name]["suite"].isin(suites)] for name in names},
-            draws=draws,
-            excluded=excluded,
-            done=lambda: progress.advance(INTERVALS, 1),
-        )
-        for names, suites in asked_by.items()
-    ]
+    for names, suites in asked_by.items():
+        yield {name: scored[name][scored[name]["suite"].isin(suites)] for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +170,7 @@ class _Cell:
 
 
 def _rows_of_group(
-    key: GroupKey, frames: dict[str, pd.DataFrame], draws: int, unranked: Collection[str]
+    key: GroupKey, frames: dict[str, pd.DataFrame], draws: int, unranked: Collection[str], parts: Parts
 ) -> Iterator[Row]:
     able = {name: frame for name, frame in frames.items() if not (frame["status"] == NOT_APPLICABLE).all()}
     for name, frame in frames.items():
@@ -178,7 +181,7 @@ def _rows_of_group(
         return
     group = _Group.of(key, able, unranked)
     counted = {metric.name: metric.counts(group.first) for metric in means_of(key.track)}
-    for stratum, inside in strata(group.first):
+    for stratum, inside in parts(group.first):
         by_count: dict[bytes, list[MeanMetric]] = {}
         for metric in means_of(key.track):
             mask = inside & counted[metric.name]

@@ -20,12 +20,11 @@ from numpy.typing import NDArray
 from sasgeo_bench.canvas import PlainFigure
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import PAINT_ORDER
+from sasgeo_bench.regions.preview import GROUND, PAINT_ORDER
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, PriorGroup, Query, Truth
 from sasgeo_bench.tasks.suites.rivals import IN_DISC, LEAD, LISTED, RIVALS, TRUTH_LISTED
 
-GROUND: Final = "#fbfaf5"
 HIDDEN: Final = "#9e9e9e"
 ONLY_SEEN: Final = "#c2185b"
 ONLY_MAPPED: Final = "#1565c0"

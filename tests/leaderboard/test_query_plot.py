@@ -6,6 +6,7 @@ from io import BytesIO
 
 import pytest
 from matplotlib import image
+from matplotlib.legend import Legend
 from matplotlib.lines import Line2D
 
 import sasgeo_bench as sgb
@@ -69,3 +70,15 @@ def test_texts_of_a_region_and_a_query_are_escaped_for_a_notebook(tiny):
     for shown in (region._repr_html_(), query._repr_html_()):
         assert "<script" not in shown
         assert shown.count("&lt;script&gt;") == 2
+
+
+def test_a_query_and_its_region_name_classes_alike_and_every_colour_has_a_name(tiny):
+    query, truth = first_of(tiny, "localization")
+    of_query, of_region = (
+        {label.get_text() for one in figure.findobj(Legend) for label in one.get_texts()}
+        for figure in (sgb.plot_query(query, tiny.region, truth), sgb.plot_region(tiny.region))
+    )
+    classes = {text.partition("  (")[0] for text in of_region if "  (" in text}
+    assert {"major road", "building"} <= classes
+    assert classes <= of_query
+    assert {"none of these classes", "unknown"} <= of_query

@@ -12,7 +12,7 @@ from matplotlib.text import Text
 import sasgeo_bench as sgb
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.leaderboard.plot_tables import ranked_matchers
-from sasgeo_bench.scoring.rows import UNRANKED
+from sasgeo_bench.scoring.rows import is_unranked
 
 TOWNS = Path(__file__).parents[2] / "docs" / "results" / "towns"
 GROUP = "r500-weak-s3"
@@ -41,9 +41,20 @@ def test_the_tradeoff_has_a_panel_for_each_prior_group_and_names_controls_apart(
     asked = board.scores[board.scores["suite"].eq("clean") & board.scores["track"].eq("localization")]
     assert len([chart for chart in figure.axes if chart.get_visible()]) == asked["prior_group"].nunique()
     legend = {label.get_text() for one in figure.findobj(Legend) for label in one.get_texts()}
-    assert legend <= set(ranked_matchers(board.leaderboard))
-    assert not legend & set(UNRANKED)
-    assert "prior_centre" in texts(figure)
+    ranked = set(ranked_matchers(board.leaderboard))
+    controls = {name.removesuffix(" (control)") for name in legend - ranked}
+    assert {"prior_centre", "random"} <= controls
+    assert all(map(is_unranked, controls))
+    assert not controls & set(texts(figure))  # no name beside a mark, where it would lie on its neighbour's
+
+
+def test_each_control_of_the_tradeoff_has_a_mark_of_its_own(board):
+    figure = board.plot_tradeoff("clean")
+    (keys,) = [one.legend_handles for one in figure.findobj(Legend)]
+    marks = {key.get_label(): key.get_marker() for key in keys if key.get_label().endswith(" (control)")}
+    assert len(set(marks.values())) == len(marks) > 1
+    drawn = {line.get_marker() for chart in figure.axes for line in chart.lines if len(line.get_xdata())}
+    assert set(marks.values()) <= drawn
 
 
 def test_the_suite_of_the_tradeoff_is_the_one_that_most_matchers_were_asked(board):

@@ -13,8 +13,10 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table, summary
+from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
+from sasgeo_bench.leaderboard.overview import summary
+from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
 from sasgeo_bench.publishing.site import contrasts_of
 from sasgeo_bench.publishing.site_maps import place_maps
@@ -23,6 +25,7 @@ from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import Case, Pictures, RegionMap, SiteSource, Spot
 from sasgeo_bench.scoring.contrasts import contrast_frame
 from sasgeo_bench.scoring.controls import Falsifier, falsifier_frame
+from sasgeo_bench.scoring.rows import Row, to_frame
 from sasgeo_bench.scoring.verdicts import Finding
 from tests.handmade import BOUNDS_M, HOSTILE, MARKUP, about_of, answers_of, card_of, entry_of, many_rows
 
@@ -237,6 +240,22 @@ def test_the_drawings_of_a_site_say_what_they_show_and_whose_data_it_is(tmp_path
         assert "Data: (c) OpenStreetMap contributors, ODbL" in found
 
 
+def test_rejectors_of_controls_come_last_however_good_their_order_is():
+    facts = {"suite": "all suites", "track": "localization", "prior_group": "r500-weak-s3", "stratum": "as drawn"}
+    facts |= {"n": 9, "answered": 9, "missing": 0, "blocks": 2, "places": 2, "unit": "1", "better": "lower"}
+    areas = {("oracle_pose", "own"): 0.0, ("raster", "margin"): 0.3, ("graph", "own"): 0.2, ("random", "own"): 0.9}
+    rows = [
+        Row(matcher=name[0], rejector=name[1], metric="aurc", value=value, **facts) for name, value in areas.items()
+    ]
+    (table,) = rejection_tables(to_frame(rows))
+    assert [(row.cells[0].text, row.tone) for row in table.rows] == [
+        ("graph", "plain"),
+        ("raster", "plain"),
+        ("oracle_pose", "control"),
+        ("random", "control"),
+    ]
+
+
 def test_words_of_files_are_plain():
     assert file_stem("board", *KEY) == "board-real-age-localization-r500-weak-s3"
     assert file_stem("../..", "..") == "page"
@@ -275,6 +294,25 @@ def test_places_that_a_card_names_are_words_and_not_letters(said, words):
     given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": {"card": card}})
     (page,) = matchers_of(given, book_of(given))
     assert page.trained == words
+
+
+@pytest.mark.parametrize(
+    ("places", "words"),
+    [
+        ("none", "by the runner, in 2 trainings listed below"),
+        (["porto"], "porto; by the runner, in 2 trainings listed below"),
+    ],
+)
+def test_a_card_that_names_no_place_does_not_deny_what_the_runner_trained(places, words):
+    one = {"file": "a.json", "trained_on": ["munich"], "pairs": 24, "asked": ["clean/vaduz"]}
+    learner = {"card": card_of("graph", trained_on=places), "learned": [one, one | {"trained_on": ["prague"]}]}
+    given = source(table=many_rows(1).assign(matcher="graph"), entries={"graph": learner})
+    (page,) = matchers_of(given, book_of(given))
+    assert page.trained == words
+    assert [line.partition(";")[0] for line in page.training] == [
+        "Trained on 24 queries of munich",
+        "Trained on 24 queries of prague",
+    ]
 
 
 def test_a_table_says_which_stress_it_counts_and_who_gave_no_sound_answer():
@@ -331,3 +369,60 @@ def test_answers_that_lie_nowhere_are_refused_by_row(column, value):
         StoreError, match=r"^answers\.parquet holds a view or a pose that lies nowhere, in row 1: score"
     ):
         place_maps(replace(source(), answers=answers, pictures=Pictures(regions=(item,))))
+
+
+def test_false_fixes_stand_beside_the_success_of_a_suite_with_absent_places():
+    absent = many_rows(3).assign(metric="answered_absent", stratum="all", n=30, rank_best=pd.NA, rank_worst=pd.NA)
+    (table,) = summary(book_of(source(pd.concat([many_rows(3), absent], ignore_index=True))))
+    assert [column.name for column in table.columns] == ["matcher", "real-age", "real-age: false fixes"]
+    heads, first, *_ = table.rows
+    assert [cell.text for cell in heads.cells] == ["queries", "80", "30"]
+    assert (first.cells[2].details, first.cells[2].tone) == (("[0.90, 1.00]",), "plain")  # no rank, and nobody leads
+    assert "Lower is better" in table.columns[2].meaning
+    assert any(note.startswith("false fixes: Share of absent places that were answered") for note in table.notes)
+
+
+def test_a_ceiling_below_one_is_explained_with_the_oracle_that_passes_it():
+    most = many_rows(3).assign(metric="ceiling", value=0.625)
+    (table,) = summary(book_of(source(pd.concat([many_rows(3), most], ignore_index=True))))
+    assert [cell.text for cell in table.rows[1].cells] == ["at most", "0.625"]
+    assert table.notes[-1].endswith("An oracle is told the answer and passes it.")
+    (plain,) = summary(book_of(source()))
+    assert not any(note.startswith("at most") for note in plain.notes)
+
+
+def test_the_column_of_a_suite_says_what_is_done_and_which_steps_its_figure_pools():
+    rows = {"suite": KEY[0], "track": KEY[1], "prior_group": KEY[2], "matcher": "graph", "status": "ok"}
+    rows |= {"role": ["control", *["stress"] * 3], "kind": ["control", "S1", "S1", "S2"], "is_present": True}
+    rows |= {"strength": [0.0, 10.0, 2.0, 5.0], "strength_unit": "years, about: age_years is what they are"}
+    given = source(table=many_rows(2), scores=pd.DataFrame(rows))
+    (table,) = summary(book_of(given))
+    assert table.columns[1].meaning.startswith("Real ageing (S1). The map is that of an extract")
+    assert table.columns[1].meaning.endswith("Counted, each query alike: S1 at 2, 10; S2 (years, about)")
+    (section,) = sections_of(book_of(given))
+    assert section.context.startswith("Stress that is counted: S1 at 2, 10; S2 (years, about).")
+
+
+@pytest.mark.parametrize(
+    ("metric", "difference", "side", "sentence"),
+    [
+        (
+            "primary",
+            0.1,
+            "above 0: graph ahead",
+            "in the share of queries that are right: 0.700 against 0.600; more is",
+        ),
+        (
+            "e_aurc",
+            0.1,
+            "above 0: raster ahead",
+            "in the e_aurc (AURC less that of the best order of the same answers)",
+        ),
+        ("e_aurc", -0.1, "below 0: graph ahead", "less is better. Above 0 raster is ahead, below 0 graph."),
+    ],
+)
+def test_a_contrast_says_who_is_ahead_and_what_its_metric_is(metric, difference, side, sentence):
+    finding = replace(FINDING, metric=metric, difference=difference, is_lower_better=metric != "primary")
+    (told,) = contrasts_of(source(findings=[finding]))
+    assert told.side == side
+    assert sentence in told.sentence

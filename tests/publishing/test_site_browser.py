@@ -11,6 +11,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import quote
 
+import cv2
 import pytest
 
 from sasgeo_bench.publishing.build import publish
@@ -143,6 +144,20 @@ def test_what_is_filtered_and_sorted_stands_in_the_address_and_is_shown_again_fr
     assert page.value(SHOWN) == ["occlusion", "occlusion", "real-age", "real-age"]
 
 
+def test_lines_of_rejectors_are_filtered_by_matcher_and_the_address_keeps_it(page, site):
+    page.open(address(site, "rejection.html"))
+    names = "[...document.querySelectorAll('tbody tr:not([hidden]) th')].map((one) => one.textContent)"
+    assert page.value(names) == ["graph", "raster"]
+    page.value(
+        "((one) => { one.value = 'raster'; one.dispatchEvent(new Event('change', {bubbles: true})); })"
+        "(document.querySelector('select[name=matcher]'))"
+    )
+    assert page.value(names) == ["raster"]
+    assert page.value("document.querySelector('output').textContent") == "1 of 2 lines shown"
+    page.open(page.value("location.href"))
+    assert page.value(names) == ["raster"]
+
+
 def test_ties_are_told_beside_the_ranks_and_below_the_table(page, site):
     page.open(address(site))
     rows = page.value(
@@ -190,6 +205,31 @@ def test_a_tip_is_shown_whole_under_the_pointer(page, site):
         f"(() => {{ const box = {tip}.getBoundingClientRect();"
         f" return {tip}.contains(document.elementFromPoint(box.left + 12, box.top + 8)); }})()"
     )
+
+
+def test_a_shadow_shows_where_a_narrow_table_goes_on_and_keys_scroll_it(page, site, tmp_path):
+    page.width(320)
+    page.open(address(site))
+    box = "document.querySelector('.tablebox')"
+    page.value(f"{box}.focus()")
+    assert page.value(f"{box}.scrollWidth > {box}.clientWidth && document.activeElement === {box}")
+
+    def edges(name):
+        """Mean brightness of a strip at the left and at the right edge of the table, inside its outline."""
+        page.shoot(tmp_path / name)
+        at = f"{box}.getBoundingClientRect()"
+        sides = f"[{at}.left, {at}.right, {at}.top + scrollY, {at}.bottom + scrollY]"
+        left, right, top, bottom = map(round, page.value(sides))
+        pixels = cv2.imread(str(tmp_path / name), cv2.IMREAD_GRAYSCALE)[top:bottom]
+        return pixels[:, left : left + 6].mean(), pixels[:, right - 6 : right].mean()
+
+    left, right = edges("begin.png")
+    page.press("ArrowRight")
+    until(page, f"{box}.scrollLeft > 0")
+    page.value(f"{box}.scrollLeft = 9999")
+    left_then, right_then = edges("end.png")
+    assert left_then < left - 10
+    assert right < right_then - 10
 
 
 def test_failures_turn_by_key_and_by_link(page, site):

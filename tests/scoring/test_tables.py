@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.leaderboard.board_tables import Book, summary
+from sasgeo_bench.leaderboard.board_tables import Book
+from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown, tables_of, warnings_of
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts

@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import GREY, Page, page, panels, without_ticks
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.preview import class_keys
 from sasgeo_bench.tasks.sheet import HIDDEN, Panel, paint
 
 # Okabe and Ito's colours, distinct for colour-blind readers; marks and dashes differ too.
@@ -49,7 +49,10 @@ def draw_example(path: Path, panel: Panel, *, data: str) -> None:
         data=data,
         columns=4,
         panel_inches=(2.3, 2.3),
-        keys=_class_keys(query.evidence),
+        keys=[
+            *class_keys(query.evidence.classes),
+            Patch(facecolor=HIDDEN, edgecolor="#666666", lw=0.4, label="unknown: cropped or occluded"),
+        ],
         dpi=_DPI,
     )
     with page(path, about) as charts:
@@ -71,15 +74,6 @@ def _mask(evidence: Evidence) -> NDArray[np.float64]:
     known = (evidence.cells != UNKNOWN).any(axis=0)[..., None]
     white, grey = (np.array(mpl.colors.to_rgb(name)) for name in (_SEEN, HIDDEN))
     return np.asarray(np.where(known, white, grey))
-
-
-def _class_keys(evidence: Evidence) -> list[Patch]:
-    keys = [
-        Patch(facecolor=item.colour, edgecolor="#666666", lw=0.4, label=item.title.lower())
-        for item in load_taxonomy().classes
-        if item.name in evidence.classes
-    ]
-    return [*keys, Patch(facecolor=HIDDEN, edgecolor="#666666", lw=0.4, label="unknown: cropped or occluded")]
 
 
 # --- ablation -------------------------------------------------------------------------------------------------------

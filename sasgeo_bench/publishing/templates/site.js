@@ -68,14 +68,25 @@ for (const kind of ["pointerover", "focusin"]) {
   document.addEventListener(kind, () => document.body.classList.remove("calm"));
 }
 
+// What is filtered: sections by what they say of themselves, else the lines of tables by their columns.
+function filtered() {
+  const groups = Array.from(document.querySelectorAll("section.group"), (part) => ({ part, facts: new Map(Object.entries(part.dataset)) }));
+  if (groups.length) return { what: "tables", parts: groups };
+  const lines = Array.from(document.querySelectorAll("table"), (table) => {
+    const names = Array.from(table.tHead.rows[0].cells, (cell) => (cell.querySelector("button") || cell).textContent);
+    return Array.from(table.querySelectorAll("tbody tr"), (part) => ({ part, facts: new Map(names.map((name, at) => [name, part.cells[at].textContent.trim()])) }));
+  }).flat();
+  return { what: "lines", parts: lines };
+}
+
 const form = document.querySelector("form.filter");
 if (form) {
-  const groups = Array.from(document.querySelectorAll("section.group"));
+  const { what, parts } = filtered();
   const filter = () => {
     const wanted = Array.from(form.querySelectorAll("select"), (one) => [one.name, one.value]);
-    for (const group of groups) group.hidden = !wanted.every(([name, value]) => !value || group.dataset[name] === value);
-    const shown = groups.filter((group) => !group.hidden).length;
-    form.querySelector("output").textContent = `${shown} of ${groups.length} tables shown`;
+    for (const { part, facts } of parts) part.hidden = !wanted.every(([name, value]) => !value || !facts.has(name) || facts.get(name) === value);
+    const shown = parts.filter(({ part }) => !part.hidden).length;
+    form.querySelector("output").textContent = `${shown} of ${parts.length} ${what} shown`;
   };
   for (const one of form.querySelectorAll("select")) {
     const wanted = asked.get(one.name);

@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import pandas as pd
 import pyarrow as pa
+from pandas.api.types import is_numeric_dtype
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import (
@@ -111,7 +112,9 @@ def csv_text(table: pd.DataFrame) -> str:
     >>> csv_text(pd.DataFrame({"matcher": ["=1+1"], "value": [0.5]})).splitlines()
     ['matcher,value', "'=1+1,0.5"]
     """
-    return str(table.map(csv_cell).to_csv(index=False, lineterminator="\n"))
+    texts = {name: column for name, column in table.items() if not is_numeric_dtype(column)}
+    safe = {str(name): column.map({one: csv_cell(one) for one in column.unique()}) for name, column in texts.items()}
+    return str(table.assign(**safe).to_csv(index=False, lineterminator="\n"))
 
 
 def _write_part(folder: Path, part: Extra, metadata: Mapping[str, str]) -> None:

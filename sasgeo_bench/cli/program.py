@@ -15,13 +15,13 @@ from typing import Annotated, Any, Final, TextIO
 import typer
 from typer.core import TyperGroup
 
+from sasgeo_bench.cli import EXIT_INTERRUPTED, is_interrupt
 from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say, tell
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.progress import QUIET
 from sasgeo_bench.texts import one_line
 
-EXIT_INTERRUPTED: Final = 130
 HELP: Final = (
     "Build regions from OpenStreetMap extracts, draw queries, run matchers, score them, publish boards. Results go to "
     "stdout, everything else to stderr."
@@ -233,9 +233,11 @@ def _status() -> int:
         line = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
         complain(f"sasgeo-bench: {one_line(line)}")
         return EXIT_USER
-    except Exception:
-        note(traceback.format_exc())
-        raise
+    except BaseException as error:
+        if not is_interrupt(error):
+            note(traceback.format_exc())
+            raise
+        status = EXIT_INTERRUPTED
     if status == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this status without a word
-        complain(f"sasgeo-bench: interrupted; {KEPT.get(sys.argv[1], _NOTHING)}")
+        complain(f"sasgeo-bench: interrupted; {KEPT.get(' '.join(sys.argv[1:2]), _NOTHING)}")
     return status

@@ -92,7 +92,7 @@ KEPT: Final = {
     "make-queries": "tasks that were drawn are kept; the same command draws them again, with the same queries",
     "segment": "tasks that were segmented are kept; the same command goes on with the others",
     "run": "answers so far are kept; the same command asks the other queries",
-    "enter": "queries and answers so far are kept; the same command goes on from there, with --again from the start",
+    "enter": "queries and answers so far are kept; the same command goes on from there",
     "leaderboard": "queries and answers so far are kept; the same command goes on from there",
 }
 _NOTHING: Final = "nothing is half-written, and what was there before is kept; run it again"

@@ -20,9 +20,7 @@ class EnterOptions(Options):
 
     board: Annotated[Path, typer.Argument(help="stored results of the board, as docs/results/systems")]
     matcher: Annotated[str, typer.Option(help="name of an installed matcher, or module:Class")]
-    into: Annotated[
-        Path | None, typer.Option(help="folder to write; default: submissions/BOARD/NAME, NAME being that of the card")
-    ] = None
+    into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/BOARD/NAME")] = None
     pipeline: Annotated[
         Path | None, typer.Option(help="file of the pipeline that made the board; default: the shipped one")
     ] = None

@@ -21,7 +21,13 @@ from sasgeo_bench.matching.results import SOUND, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive import stored_settings
-from sasgeo_bench.publishing.submissions import FOLDER, SubmitRequest, beside_stored, check_card, make_submission
+from sasgeo_bench.publishing.submissions import (
+    SubmitRequest,
+    beside_stored,
+    check_card,
+    default_folder,
+    make_submission,
+)
 from sasgeo_bench.running.plan import RunPlan
 from sasgeo_bench.running.prediction_files import begin_round, end_round, open_round
 from sasgeo_bench.scoring.submission_files import check_submission_folder, is_submission, read_submission
@@ -99,7 +105,7 @@ def check_entry(entry: Entry, *, into: Path | None = None) -> CheckedEntry:
     found = plan_runs(entry.plan, entry.matcher, [])[0].plan
     card = _card_of(found.card, [], entry.plan.split, source=entry.matcher)
     check_card(card, entry.stored, source=entry.matcher)
-    folder = into or FOLDER / entry.board / card.name
+    folder = into or default_folder(entry.board, card.name)
     check_submission_folder(folder, card.name)
     _check_same_board(folder, entry.board)
     return CheckedEntry(folder, found)

@@ -2,9 +2,8 @@
 """The program `sasgeo-bench`: a file for each family of commands."""
 
 import sys
-from typing import Final
 
-EXIT_INTERRUPTED: Final = 130
+from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, is_interrupt
 
 
 def main() -> None:
@@ -18,16 +17,3 @@ def main() -> None:
             raise
         sys.stderr.write("sasgeo-bench: interrupted before it began; run it again\n")
         sys.exit(EXIT_INTERRUPTED)
-
-
-def is_interrupt(error: BaseException | None) -> bool:
-    """Return whether an error is Ctrl-C, or what a library made of it while it was being imported.
-
-    >>> error = RuntimeError("cannot be imported")
-    >>> error.__cause__ = KeyboardInterrupt()
-    >>> is_interrupt(error)
-    True
-    """
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None

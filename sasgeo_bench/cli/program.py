@@ -15,8 +15,8 @@ from typing import Annotated, Any, Final, TextIO
 import typer
 from typer.core import TyperGroup
 
-from sasgeo_bench.cli import EXIT_INTERRUPTED, is_interrupt
 from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say, tell
+from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, is_interrupt
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.progress import QUIET

@@ -6,6 +6,7 @@ from typing import Any, Final
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.submission import Card
 
@@ -41,7 +42,7 @@ def read_card(module: str | Path) -> MatcherCard:
     >>> class MyMatcher:  # in matcher.py, with card.toml in the same folder
     ...     card = read_card(__file__)  # doctest: +SKIP
     """
-    path = Path(module).with_name(CARD_FILE)
+    path = given_path(module).with_name(CARD_FILE)
     found = read_card_file(path)
     if found.is_by_half:
         message = (

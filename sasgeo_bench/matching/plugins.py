@@ -247,6 +247,9 @@ def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any pl
 
 def _find(spec: str, group: str) -> Callable[[], Any]:
     """Return the class behind a name or module:Class."""
+    if not isinstance(spec, str):
+        message = f"{one_line(repr(spec))} is no name of a {KINDS[group]}: name one as a text, or module:Class"
+        raise MatchError(message)
     if ":" not in spec:
         return _from_entry_point(spec, group)
     module, _, name = spec.partition(":")

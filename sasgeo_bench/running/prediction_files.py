@@ -15,6 +15,7 @@ from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import read_schema, read_table, write_table
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import (
@@ -207,7 +208,7 @@ def read_predictions(path: str | Path) -> Iterator[Prediction]:
     StoreError
         If there is none, or a file cannot be read.
     """
-    parts = parts_of(Path(path))
+    parts = parts_of(given_path(path))
     if not parts:
         message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
         raise StoreError(message)

@@ -7,6 +7,7 @@ from typing import Final
 from sasgeo_bench.texts import plain
 
 MOST_MESSAGE: Final = 2000  # characters
+_SHORT: Final = 60  # characters of a wrong value
 
 
 def counted(count: int, one: str, many: str = "") -> str:
@@ -26,6 +27,19 @@ def named(names: Sequence[str], one: str, *, most: int = 3) -> str:
     """
     more = ", ..." if len(names) > most else ""
     return f"{counted(len(names), one)} ({', '.join(names[:most])}{more})"
+
+
+def check_given(value: object, kind: type, how: str) -> None:
+    """Raise `ConfigError` unless an argument is of a kind; `how` says where one is got.
+
+    >>> check_given("5", float, "say it as a number")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: expected a float, got '5': say it as a number
+    """
+    if not isinstance(value, kind):
+        message = f"expected a {kind.__name__}, got {plain(repr(value))[:_SHORT]}: {how}"
+        raise ConfigError(message)
 
 
 class SasgeoError(Exception):

@@ -13,6 +13,7 @@ import sasgeo_baselines
 
 import sasgeo_bench as sgb
 from sasgeo_bench.cli.program import load
+from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.matching.scaffold import plugin_files
 from sasgeo_bench.regions.region_files import read_region
 
@@ -146,3 +147,32 @@ def test_features_and_graph_of_a_stored_region_are_read_when_they_are_first_aske
     assert region.graph.nodes is region.graph.nodes
     assert region.features is region.features
     assert entered == ["read", "read"]
+
+
+READERS = (
+    "read_board",
+    "read_card",
+    "read_imagery",
+    "read_predictions",
+    "read_queries",
+    "read_region",
+    "read_task",
+    "read_truths",
+    "build_region",
+    "load_matcher",
+    "load_rejector",
+    "load_segmenter",
+    "load_tracker",
+    "plot_region",
+)
+
+
+@pytest.mark.parametrize("name", READERS)
+@pytest.mark.parametrize("given", [5, 1.5, None, b"x", object(), "nowhere", "a\0b", "file", "folder"])
+def test_what_is_no_folder_or_no_name_is_refused_in_a_line_of_ours(tmp_path, monkeypatch, name, given):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("x", encoding="utf-8")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(SasgeoError) as refused:
+        next(iter(getattr(sgb, name)(given)))  # a reader of rows begins when the first is asked for
+    assert "\n" not in str(refused.value)

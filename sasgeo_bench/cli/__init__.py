@@ -1,6 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """The program `sasgeo-bench`: a file for each family of commands."""
 
-from sasgeo_bench.cli.program import main
+import sys
 
-__all__ = ["main"]
+from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, is_interrupt
+
+
+def main() -> None:
+    """Run the program; an interrupt while it is still being imported is one line as well."""
+    try:
+        from sasgeo_bench.cli import program  # noqa: PLC0415 - takes a third of a second, in which users press Ctrl-C
+
+        program.main()
+    except BaseException as error:
+        if not is_interrupt(error):
+            raise
+        sys.stderr.write("sasgeo-bench: interrupted before it began; run it again\n")
+        sys.exit(EXIT_INTERRUPTED)

@@ -20,7 +20,7 @@ class EnterOptions(Options):
 
     board: Annotated[Path, typer.Argument(help="stored results of the board, as docs/results/systems")]
     matcher: Annotated[str, typer.Option(help="name of an installed matcher, or module:Class")]
-    into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/NAME of the card")] = None
+    into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/BOARD/NAME")] = None
     pipeline: Annotated[
         Path | None, typer.Option(help="file of the pipeline that made the board; default: the shipped one")
     ] = None
@@ -39,7 +39,7 @@ class EnterOptions(Options):
 
 
 def enter_command(options: EnterOptions) -> None:
-    """Enter a board: draw its queries, ask your matcher, show its row beside the others, write SUBMISSIONS/NAME."""
+    """Enter a board: draw its queries, ask your matcher, show its row, write submissions/BOARD/NAME."""
     request = EntryRequest(
         stored=options.board,
         matcher=options.matcher,
@@ -53,8 +53,8 @@ def enter_command(options: EnterOptions) -> None:
         is_again=options.again,
     )
     entry = plan_entry(request, tell=tell)
-    check_entry(entry, into=options.into)
-    for line in cost_lines(entry):
+    checked = check_entry(entry, into=options.into)
+    for line in cost_lines(entry, checked.run):
         (say if options.dry_run else tell)(line)
     if options.dry_run:
         return

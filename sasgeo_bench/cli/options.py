@@ -6,7 +6,7 @@ field is a keyword of the function alone.
 """
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import wraps
 from pathlib import Path
@@ -15,8 +15,10 @@ from typing import Annotated, Any, Final, ParamSpec, TypeVar, cast, get_args, ge
 import typer
 from typer.models import ParameterInfo
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, check_given
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.texts import one_line
 
 Words = ParamSpec("Words")
 Object = TypeVar("Object")
@@ -155,12 +157,21 @@ def _read(value: Any, name: str, kind: Any) -> Any:  # noqa: ANN401 - whatever t
     inner, info = get_args(kind)[:2]
     kinds = (inner, *get_args(inner), *(part for one in get_args(inner) for part in get_args(one)))
     is_list = any(get_origin(one) is list for one in kinds)
-    if value is None:
+    if value is None and type(None) in kinds:
         return None
+    if value is None:
+        message = f"{name} is None, and must be given"
+        raise ConfigError(message)
     if is_list and isinstance(value, str | Path):
         value = [value]
+    if is_list and not isinstance(value, Iterable):
+        message = f"{name} must be a list, got {one_line(repr(value))}"
+        raise ConfigError(message)
     if Path in kinds:
-        value = [Path(one) for one in value] if is_list else Path(value)
+        value = [given_path(one) for one in value] if is_list else given_path(value)
+    elif str in kinds:
+        for one in value if is_list else [value]:
+            check_given(one, str, f"{name} is made of texts")
     if isinstance(info, ParameterInfo) and info.min is not None and value < info.min:
         message = f"{name} must be at least {info.min:g}, got {value:g}"
         raise ConfigError(message)

@@ -16,12 +16,12 @@ import typer
 from typer.core import TyperGroup
 
 from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say, tell
+from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, is_interrupt
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.progress import QUIET
 from sasgeo_bench.texts import one_line
 
-EXIT_INTERRUPTED: Final = 130
 HELP: Final = (
     "Build regions from OpenStreetMap extracts, draw queries, run matchers, score them, publish boards. Results go to "
     "stdout, everything else to stderr."
@@ -92,7 +92,7 @@ KEPT: Final = {
     "make-queries": "tasks that were drawn are kept; the same command draws them again, with the same queries",
     "segment": "tasks that were segmented are kept; the same command goes on with the others",
     "run": "answers so far are kept; the same command asks the other queries",
-    "enter": "queries and answers so far are kept; the same command goes on from there, with --again from the start",
+    "enter": "queries and answers so far are kept; the same command goes on from there",
     "leaderboard": "queries and answers so far are kept; the same command goes on from there",
 }
 _NOTHING: Final = "nothing is half-written, and what was there before is kept; run it again"
@@ -233,9 +233,11 @@ def _status() -> int:
         line = f"{error.strerror or error}; check the path, your rights and the free space: {error.filename or ''}"
         complain(f"sasgeo-bench: {one_line(line)}")
         return EXIT_USER
-    except Exception:
-        note(traceback.format_exc())
-        raise
+    except BaseException as error:
+        if not is_interrupt(error):
+            note(traceback.format_exc())
+            raise
+        status = EXIT_INTERRUPTED
     if status == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this status without a word
-        complain(f"sasgeo-bench: interrupted; {KEPT.get(sys.argv[1], _NOTHING)}")
+        complain(f"sasgeo-bench: interrupted; {KEPT.get(' '.join(sys.argv[1:2]), _NOTHING)}")
     return status

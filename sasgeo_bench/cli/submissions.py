@@ -36,7 +36,7 @@ def submit_command(
             "--for", help="stored results of the board, as docs/results/systems; leaderboard --results stores some"
         ),
     ] = None,
-    into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/NAME of the card")] = None,
+    into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/BOARD/NAME")] = None,
     example: Annotated[bool, typer.Option("--example-card", help="print a card to begin with, and stop")] = False,
 ) -> None:
     """Put predictions, card, versions and hashes into a folder that validate accepts: SUBMISSIONS/NAME."""

@@ -17,6 +17,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, ImageError
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits, observe
@@ -105,7 +106,7 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
         seed: int = 0,
     ) -> None:
         _check_torch()
-        folder = Path(task)
+        folder = given_path(task)
         about = task_files.read_task(folder)
         if region is not None and base_of(about["region"]) != base_of(region.manifest.id):
             message = f"{folder} is about {about['region']!r}, the region is {region.manifest.id!r}: read the other one"
@@ -244,7 +245,7 @@ def task_pictures(task: str | Path, truths: str | Path) -> Sequence[LabelledImag
     >>> pictures = task_pictures("out/tasks/aerial/town-grid", "out/truth/aerial/town-grid")  # doctest: +SKIP
     >>> crops = PictureDataset(pictures, crop_px=128)  # doctest: +SKIP
     """
-    folder = Path(task)
+    folder = given_path(task)
     about = task_files.read_task(folder)
     if not about.get("frames"):
         message = f"{folder} has no pictures: name a task of a suite such as aerial"

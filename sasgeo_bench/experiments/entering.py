@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
-from typing import Final
+from typing import Final, NamedTuple
 
 from sasgeo_bench.config import LONGEST_LINE, check_document
 from sasgeo_bench.errors import ConfigError, StoreError
@@ -21,8 +21,15 @@ from sasgeo_bench.matching.results import SOUND, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive import stored_settings
-from sasgeo_bench.publishing.submissions import FOLDER, SubmitRequest, beside_stored, check_card, make_submission
+from sasgeo_bench.publishing.submissions import (
+    SubmitRequest,
+    beside_stored,
+    check_card,
+    default_folder,
+    make_submission,
+)
 from sasgeo_bench.running.plan import RunPlan
+from sasgeo_bench.running.prediction_files import begin_round, end_round, open_round
 from sasgeo_bench.scoring.submission_files import check_submission_folder, is_submission, read_submission
 from sasgeo_bench.tasks.split import HALVES, Split
 from sasgeo_bench.texts import one_line
@@ -38,7 +45,7 @@ class EntryRequest(BoardRequest):
     """A request to enter a board.
 
     `matcher` is a name or module:Class; `without` are regions whose queries are not asked and count as misses. With
-    `is_again`, queries that were answered before are asked, too.
+    `is_again`, queries that were answered before are asked, too; if that was cut off, it goes on where it was.
     """
 
     matcher: str
@@ -52,6 +59,7 @@ class Entry:
     stored: Path
     plan: PipelinePlan
     matcher: str
+    is_again: bool = False
 
     @property
     def board(self) -> str:
@@ -62,21 +70,31 @@ class Entry:
 def plan_entry(request: EntryRequest, *, tell: Tell) -> Entry:
     """Plan to ask a matcher all queries of a published board; raise as `plan_board` does."""
     plan = plan_board(request, matchers=[request.matcher], tell=tell)
-    return Entry(stored=request.stored, plan=replace(plan, is_again=request.is_again), matcher=request.matcher)
+    return Entry(stored=request.stored, plan=plan, matcher=request.matcher, is_again=request.is_again)
 
 
-def cost_lines(entry: Entry) -> Iterator[str]:
-    """Yield what it costs to enter, which queries will be misses, and which extracts are missing."""
+class CheckedEntry(NamedTuple):
+    """An entry that can be made: the folder of its submission, and the plan of the matcher's runs, without tasks."""
+
+    folder: Path
+    run: RunPlan
+
+
+def cost_lines(entry: Entry, run: RunPlan | None = None) -> Iterator[str]:
+    """Yield what it costs to enter, which queries will be misses, and which extracts are missing.
+
+    `run` is that of `check_entry`: what it has answered is not asked again.
+    """
     tasks = asked_tasks(entry.stored)
-    yield from entry_cost.cost_lines(entry.plan, entry.stored, tasks)
+    yield from entry_cost.cost_lines(entry.plan, entry.stored, tasks, run, is_again=entry.is_again)
     yield from entry_cost.lost_lines(entry.plan, entry.stored, tasks)
     missing = entry_cost.missing_extracts(entry.plan)
     if missing:
         yield f"  {entry_cost.missing_text(missing)} (those with an address are downloaded where it answers)"
 
 
-def check_entry(entry: Entry, *, into: Path | None = None) -> Path:
-    """Return the folder of the submission, after checking all that can be checked before anything is drawn.
+def check_entry(entry: Entry, *, into: Path | None = None) -> CheckedEntry:
+    """Return the folder of the submission and the run, after checking all that can be checked before drawing.
 
     The matcher is loaded in its own process. Raise `MatchError` if it cannot be, or its name is one that ships;
     `ConfigError` if its name is on the board, or its card is no card of a submission; `StoreError` if `into` holds
@@ -87,10 +105,10 @@ def check_entry(entry: Entry, *, into: Path | None = None) -> Path:
     found = plan_runs(entry.plan, entry.matcher, [])[0].plan
     card = _card_of(found.card, [], entry.plan.split, source=entry.matcher)
     check_card(card, entry.stored, source=entry.matcher)
-    folder = into or FOLDER / card.name
+    folder = into or default_folder(entry.board, card.name)
     check_submission_folder(folder, card.name)
     _check_same_board(folder, entry.board)
-    return folder
+    return CheckedEntry(folder, found)
 
 
 def enter(
@@ -99,7 +117,7 @@ def enter(
     """Draw the queries of a board, ask the matcher, write the submission, and score it beside the stored answers.
 
     What was drawn or answered before is not done again. Return the folder of the submission (`into`, or
-    submissions/<name>) and the board of both, which is written to out/boards/<board>-<name>/.
+    submissions/<board>/<name>) and the board of both, which is written to out/boards/<board>-<name>/.
 
     Raises
     ------
@@ -109,16 +127,18 @@ def enter(
     MatchError, StoreError
         As `check_entry`, a run and a submission do.
     """
-    folder = check_entry(entry, into=into)
+    folder, run = check_entry(entry, into=into)
     entry_cost.fetch_extracts(entry.plan, mend=_WITHOUT)
     tasks, controls = draw_all(entry.plan, tell=tell, progress=progress)
     same = same_queries(entry.stored, [*tasks, *controls], tell=tell)
-    plan = replace(entry.plan, only=same)
+    since_ns = (begin_round if entry.is_again else open_round)(run.run_folder)
+    plan = replace(entry.plan, only=same, since_ns=since_ns)
     runs = plan_runs(plan, entry.matcher, [*tasks, *controls])
     planned = runs[0].plan
     for line in _changed(planned):
         tell(line)
     ask(entry.matcher, runs, tell=tell, progress=progress)
+    end_round(run.run_folder)
     card = _card_of(planned.card, runs, plan.split, source=entry.matcher)
     make_submission(
         SubmitRequest(predictions=planned.run_folder, card=card, board=entry.stored, into=folder), tell=tell

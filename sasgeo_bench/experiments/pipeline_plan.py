@@ -16,7 +16,6 @@ from sasgeo_bench.experiments.sealed import Seal, seal_of
 from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.plugins import ORACLE, YARDSTICK, check_names, is_tracker
-from sasgeo_bench.matching.results import STATUSES
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files
@@ -48,7 +47,7 @@ class PipelinePlan:
 
     With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
     cluster to run on instead. `seal` tells of sealed places, None without any. `only` are the hashes of the queries to
-    ask, all without it; with `is_again`, those that were answered before, too.
+    ask, all without it; those whose answer was written before the stamp `since_ns` are asked again.
     """
 
     spec: PipelineFile
@@ -60,7 +59,7 @@ class PipelinePlan:
     private: PrivateSeed | None = None
     seal: Seal | None = None
     only: Mapping[str, str] | None = None
-    is_again: bool = False
+    since_ns: int = 0
 
     @property
     def split(self) -> Split | None:
@@ -446,7 +445,7 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
             is_oracle=is_oracle,
             hidden=plan.seed_files,
             only=plan.only,
-            again=STATUSES if plan.is_again else (),
+            since_ns=plan.since_ns,
         )
     )
     if is_oracle and not is_unranked(whole.card.name):

@@ -87,7 +87,11 @@ def _opened(name: str, parent: int | None) -> int:
 
 @contextmanager
 def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
-    """Hold the lock of a folder; a second run says so and waits. Raise `StoreError` if the lock cannot be made."""
+    """Hold the lock of a folder; a second run says so and waits. Raise `StoreError` if the lock cannot be made.
+
+    The file of the lock is removed while it is still held. Whoever waits for it then holds a file without a name, sees
+    that, and tries again by the name (`filelock`, since 3.21).
+    """
     lock = FileLock(folder.parent / f".{folder.name}.lock")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -102,6 +106,8 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
     try:
         yield
     finally:
+        with suppress(OSError):
+            Path(lock.lock_file).unlink()
         lock.release()
 
 

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from sasgeo_bench.canvas import GREY, Page, new_figure, styled
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, check_given
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.leaderboard.case_plot import (
     TRUE,
@@ -69,6 +69,10 @@ def plot_query(query: Query, region: Region, truth: Truth | None = None) -> Figu
     >>> [chart.get_title("left").partition(",")[0] for chart in figure.axes]
     ['view', 'map at the true place', 'map']
     """
+    check_given(query, Query, "read_queries reads those of a task")
+    check_given(region, Region, "read_region reads one from its folder")
+    if truth is not None:
+        check_given(truth, Truth, "read_truths reads those of a task")
     _check(query, region, truth)
     case = _content(query, region, truth)
     panels = [("view", case.view), ("map at the true place", case.at_true)][: 1 + (case.at_true is not None)]

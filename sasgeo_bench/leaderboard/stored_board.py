@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.files.parquet import read_frame
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.leaderboard import board_files
 from sasgeo_bench.leaderboard.board_files import ANSWERS, MEND, SCORES, TABLES
 from sasgeo_bench.leaderboard.plot_tables import MOST_MATCHERS, ranked_matchers, risk_frame, shown_matchers
@@ -156,7 +157,7 @@ def read_board(path: str | Path) -> StoredBoard:
     >>> board.contrasts[["name", "difference", "lo", "hi", "verdict"]]  # doctest: +SKIP
     >>> board.plot_tradeoff().savefig("tradeoff.png")  # doctest: +SKIP
     """
-    folder = Path(path)
+    folder = given_path(path)
     about, leaderboard = board_files.read_board(folder)
     tables = {}
     for name in TABLES:

@@ -5,11 +5,13 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.config import parse_toml
-from sasgeo_bench.errors import MatchError, StoreError
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.submission import Card
 
 CARD_FILE: Final = "card.toml"
+_EXAMPLE: Final = "submit --example-card prints a sound one"
 _MOST_BYTES: Final = 100_000
 
 
@@ -40,7 +42,7 @@ def read_card(module: str | Path) -> MatcherCard:
     >>> class MyMatcher:  # in matcher.py, with card.toml in the same folder
     ...     card = read_card(__file__)  # doctest: +SKIP
     """
-    path = Path(module).with_name(CARD_FILE)
+    path = given_path(module).with_name(CARD_FILE)
     found = read_card_file(path)
     if found.is_by_half:
         message = (
@@ -50,7 +52,11 @@ def read_card(module: str | Path) -> MatcherCard:
         raise MatchError(message)
     given = found.model_dump(exclude={"trained_on", "trained_elsewhere"})
     fields: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one or "" for name, one in given.items()}
-    return MatcherCard(**fields, trained_on=(*found.places, *filter(None, [found.trained_elsewhere])))
+    try:
+        return MatcherCard(**fields, trained_on=(*found.places, *filter(None, [found.trained_elsewhere])))
+    except MatchError as error:
+        message = f"{path}: {str(error).removeprefix('card: ')}"
+        raise MatchError(message) from error
 
 
 def read_card_file(path: Path) -> Card:
@@ -58,7 +64,7 @@ def read_card_file(path: Path) -> Card:
 
     Raise StoreError if it cannot be read. Raise ConfigError if a field is wrong; all faults on one line.
     """
-    noun = "write a card there, or name one (submit --example-card prints one)"
+    noun = f"write a card there, or name one ({_EXAMPLE})"
     if path.exists() and not path.is_file():  # a pipe would be waited for
         message = f"{path} is no plain file: {noun}"
         raise StoreError(message)
@@ -73,4 +79,8 @@ def read_card_file(path: Path) -> Card:
     if len(read) > _MOST_BYTES:
         message = f"{path} has more than {_MOST_BYTES} bytes: {noun}"
         raise StoreError(message)
-    return parse_toml(text, Card, source=str(path))
+    try:
+        return parse_toml(text, Card, source=str(path))
+    except ConfigError as error:
+        message = f"{error}: correct it there ({_EXAMPLE})"
+        raise ConfigError(message) from error

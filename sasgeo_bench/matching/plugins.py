@@ -10,7 +10,7 @@ from functools import lru_cache, partial
 from importlib.metadata import Distribution, EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, Final
 
-from sasgeo_bench.errors import MatchError
+from sasgeo_bench.errors import MatchError, SasgeoError
 from sasgeo_bench.texts import message_of, one_line
 
 if TYPE_CHECKING:
@@ -225,6 +225,13 @@ def _check(spec: str, plugin: object, card_type: type, group: str, verbs: Sequen
     if missing:
         message = f"{spec}: {type(plugin).__name__} is not a {KINDS[group]}, it has no {' and no '.join(missing)}"
         raise MatchError(message)
+    name = str(getattr(card, "name", ""))
+    if ":" not in spec and name != spec:
+        message = (
+            f"{spec}: its card is named {one_line(name)!r}, and rows are found by one name: give the entry "
+            "point (pyproject.toml) and the card (card.toml) the same, and install it again"
+        )
+        raise MatchError(message)
     if group == TRACKERS and "sequence" not in getattr(card, "tracks", ()):
         message = f"{spec}: card: tracks lacks 'sequence', which is what a tracker follows: tracks=(\"sequence\",)"
         raise MatchError(message)
@@ -235,20 +242,21 @@ def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any pl
     try:
         return target()
     except (Exception, SystemExit) as error:  # a plugin that ends the program must not look like a good end
-        message = f"{spec}: cannot be made ({message_of(error)})"
-        raise MatchError(message) from error
+        raise _failed(spec, "cannot be made", error) from error
 
 
 def _find(spec: str, group: str) -> Callable[[], Any]:
     """Return the class behind a name or module:Class."""
+    if not isinstance(spec, str):
+        message = f"{one_line(repr(spec))} is no name of a {KINDS[group]}: name one as a text, or module:Class"
+        raise MatchError(message)
     if ":" not in spec:
         return _from_entry_point(spec, group)
     module, _, name = spec.partition(":")
     try:
         return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
     except (Exception, SystemExit) as error:
-        message = f"{one_line(spec)}: cannot be imported ({message_of(error)})"
-        raise MatchError(message) from error
+        raise _failed(one_line(spec), "cannot be imported", error) from error
 
 
 def _known(name: str, group: str) -> EntryPoint:
@@ -302,5 +310,9 @@ def _from_entry_point(name: str, group: str) -> Callable[[], Any]:
     try:
         return point.load()  # type: ignore[no-any-return]
     except (Exception, SystemExit) as error:
-        message = f"{name}: {point.value} of {_home(point)} cannot be imported ({message_of(error)})"
-        raise MatchError(message) from error
+        raise _failed(name, f"{point.value} of {_home(point)} cannot be imported", error) from error
+
+
+def _failed(spec: str, what: str, error: BaseException) -> MatchError:
+    """Return the error for a plugin whose code fails; one of ours, as of its card, says all there is to say."""
+    return MatchError(f"{spec}: {error}" if isinstance(error, SasgeoError) else f"{spec}: {what} ({message_of(error)})")

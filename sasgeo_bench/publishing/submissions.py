@@ -40,7 +40,7 @@ class SubmitRequest:
     """A request for a submission.
 
     `predictions` is a file of predictions or the folder of a matcher's runs, `card` a card or a TOML file, `board` the
-    stored results of the board, `into` the folder to write (submissions/<name> by default).
+    stored results of the board, `into` the folder to write (submissions/<board>/<name> by default).
     """
 
     predictions: Path
@@ -80,13 +80,18 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
         attribution=ATTRIBUTION,
     )
     asked = {name: one for task in tasks for name, one in task.asked.items()}
-    folder = request.into or FOLDER / card.name
+    folder = request.into or default_folder(submission.board, card.name)
     if is_submission(folder):
         tell(f"{folder}: the submission that was there is replaced")
     write_submission(folder, submission, list(rows.values()), asked)
     for line in _remarks(submission):
         tell(line)
     return folder
+
+
+def default_folder(board: str, name: str) -> Path:
+    """Return the folder of a submission unless another is named: one matcher may answer several boards."""
+    return FOLDER / board / name
 
 
 def check_card(card: Card, board: Path, *, source: str) -> Split | None:

@@ -17,6 +17,7 @@ from matplotlib.patches import Patch, Polygon, Rectangle
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.errors import check_given
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
 from sasgeo_bench.regions.region import Manifest, Region
@@ -59,6 +60,11 @@ def plot_region(region: Region) -> Figure:
     matplotlib.figure.Figure
         A figure of its own, unknown to pyplot: nothing has to be closed.
 
+    Raises
+    ------
+    ConfigError
+        If it is no region.
+
     Examples
     --------
     >>> from tempfile import TemporaryDirectory
@@ -68,6 +74,7 @@ def plot_region(region: Region) -> Figure:
     >>> figure.texts[-1].get_text()
     '(c) OpenStreetMap contributors, ODbL'
     """
+    check_given(region, Region, "read_region reads one from its folder")
     return _drawn(region.manifest, pooled(region.layers, most_cells=_MOST_CELLS))
 
 

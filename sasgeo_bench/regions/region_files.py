@@ -16,6 +16,7 @@ from sasgeo_bench.errors import ConfigError, GridError, StoreError
 from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, read_frame, read_table, write_frame
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.osm.features import check_features
 from sasgeo_bench.regions.imagery import ORTHO, Imagery
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, Manifest, MapGraph, Region
@@ -111,7 +112,7 @@ def read_region(
     """
     from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
 
-    folder = Path(path)
+    folder = given_path(path)
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])
@@ -153,7 +154,7 @@ def read_imagery(path: str | Path) -> Imagery | None:
 
     Raise `StoreError` if the folder is no region, or its imagery is missing or changed.
     """
-    folder = Path(path)
+    folder = given_path(path)
     imagery = _imagery(folder, read_manifest(folder))
     if imagery is not None:
         imagery.check()

@@ -43,8 +43,9 @@ class RunRequest:
     `spec` is a matcher's name or module:Class; `tasks` are folders out/tasks/<suite>/<region>, whose rows go to
     out/runs/<matcher>/<hash>/<suite>/<region> below `out`. `jobs` counts processes at once; `dask` is the address of a
     scheduler, or local:N for N processes on this machine, with `jobs` 1. `shard` is (i, n), from 1: the i-th of n parts
-    of the queries; `limit` bounds the queries of each task. Rows with a status in `again` are asked again. Without
-    `is_shut_in`, trusted code runs without isolation, and `run.json` says so.
+    of the queries; `limit` bounds the queries of each task. Queries are asked again whose row has a status in `again`
+    or was written before the stamp `since_ns`. Without `is_shut_in`, trusted code runs without isolation, and
+    `run.json` says so.
 
     `train` are tasks with truths, of places that are not asked, for a matcher with a `learn`; `most_trained` bounds
     their queries, evenly over places, then suites, then sites; only what `lessons` hold is used. `split` defines
@@ -64,6 +65,7 @@ class RunRequest:
     shard: tuple[int, int] = (1, 1)
     limit: int | None = None
     again: Sequence[str] = ()
+    since_ns: int = 0
     is_shut_in: bool = True
     train: Sequence[Path] = ()
     most_trained: int = 200
@@ -361,7 +363,7 @@ def _part(
     key = tie_key(key, imagery, None if follower is None else follower["hash"])
     drawn = task_files.read_asked(task)
     asked = {name: asked_under(one, key) for name, one in drawn.items()}
-    ties = prediction_files.read_ties(folder) if folder.is_dir() else []
+    ties = prediction_files.read_ties(folder, since_ns=request.since_ns) if folder.is_dir() else []
     is_same_task = (before or {}).get("queries_sha256") == about["files"][task_files.QUERIES]["sha256"]
     if not (is_same_task or all(tie.asked for tie in ties)):  # rows of older versions lack the hash of their query
         message = (

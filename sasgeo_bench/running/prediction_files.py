@@ -15,6 +15,7 @@ from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import read_schema, read_table, write_table
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import (
@@ -31,7 +32,9 @@ from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
 from sasgeo_bench.texts import json_text, one_line
 
 RUN: Final = "run.json"
+ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is asked again
 _MEND: Final = "write it again, or remove it where it is a part of a run"
+_MEND_ROUND: Final = "remove it and enter with --again"
 _MEND_RUN: Final = "remove it and run again, its parts are kept"
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
 
@@ -54,8 +57,45 @@ def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mappin
 
 def _stamp_ns(folder: Path) -> int:
     """Return the time now, or just after the last part if a clock was set back: a later name is a newer row."""
-    before = (_PART.fullmatch(path.name) for path in folder.glob("part-*.parquet"))
-    return max(time.time_ns(), 1 + max((int(found[1]) for found in before if found), default=0))
+    return max(time.time_ns(), 1 + max(map(_written_ns, folder.glob("part-*.parquet")), default=0))
+
+
+def _written_ns(part: Path) -> int:
+    """Return the stamp in the name of a part, 0 if it has none."""
+    found = _PART.fullmatch(part.name)
+    return int(found[1]) if found else 0
+
+
+def begin_round(run: Path) -> int:
+    """Begin to ask all of a run again, or go on with a round that was cut; return its stamp.
+
+    `run` is the folder of all tasks of a run. Earlier rows stay until newer ones replace them. Raise `StoreError` if
+    the record of the round cannot be read or written.
+    """
+    since_ns = open_round(run)
+    if since_ns == 0 and run.is_dir():
+        since_ns = max(time.time_ns(), 1 + max(map(_written_ns, run.rglob("part-*.parquet")), default=0))
+        with fresh_file(run / ROUND, mend="check your rights and the free space") as scratch:
+            scratch.write_text(json_text({"since_ns": since_ns}), encoding="utf-8")
+    return since_ns
+
+
+def open_round(run: Path) -> int:
+    """Return the stamp of the round that a run is in, since which rows count; 0 if all rows do. Raise `StoreError`."""
+    path = run / ROUND
+    if not path.is_file():
+        return 0
+    content = read_json(path, mend=_MEND_ROUND)
+    since_ns = content.get("since_ns") if isinstance(content, dict) else None
+    if not isinstance(since_ns, int):
+        message = f"{path} is damaged (since_ns is {since_ns!r}): {_MEND_ROUND}"
+        raise StoreError(message)
+    return since_ns
+
+
+def end_round(run: Path) -> None:
+    """End the round of a run: all its rows count from now on, newer ones first."""
+    (run / ROUND).unlink(missing_ok=True)
 
 
 def parts_of(path: Path) -> list[Path]:
@@ -168,7 +208,7 @@ def read_predictions(path: str | Path) -> Iterator[Prediction]:
     StoreError
         If there is none, or a file cannot be read.
     """
-    parts = parts_of(Path(path))
+    parts = parts_of(given_path(path))
     if not parts:
         message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
         raise StoreError(message)
@@ -283,10 +323,15 @@ def _is_ours(path: Path) -> bool:
         return False
 
 
-def read_ties(folder: Path) -> list[Tie]:
-    """Read the links of a run's rows to their queries, as written; raise `StoreError` if a part cannot be read."""
+def read_ties(folder: Path, *, since_ns: int = 0) -> list[Tie]:
+    """Read the links of a run's rows to their queries, as written; raise `StoreError` if a part cannot be read.
+
+    Parts that were written before the stamp `since_ns` are left out.
+    """
     found: list[Tie] = []
     for part in parts_of(folder):
+        if _written_ns(part) < since_ns:
+            continue
         table = read_part(part)
         if differing_columns(table):
             message = f"{part} holds no predictions: move it out of the run's folder"
@@ -305,12 +350,13 @@ def tie_of(row: Mapping[str, Any]) -> Tie:
     return Tie(str(row["query_id"]), str(row["status"]), str(row.get(ASKED) or ""))
 
 
-def ids_done(folder: Path, asked: Mapping[str, str], *, again: Iterable[str] = ()) -> set[str]:
-    """Return the ids of queries that a run has answered as they are now; rows with a status in `again` do not count.
+def ids_done(folder: Path, asked: Mapping[str, str], *, again: Iterable[str] = (), since_ns: int = 0) -> set[str]:
+    """Return the ids of queries that a run has answered as they are now.
 
-    `asked` must include the training (`asked_in`). Raise `StoreError` if a part cannot be read.
+    Rows with a status in `again` do not count, nor those that were written before the stamp `since_ns`. `asked` must
+    include the training (`asked_in`). Raise `StoreError` if a part cannot be read.
     """
-    ties = read_ties(folder) if folder.is_dir() else []
+    ties = read_ties(folder, since_ns=since_ns) if folder.is_dir() else []
     return {tie.query_id for tie in ties if tie.status not in set(again) and tie.answers(asked)}
 
 

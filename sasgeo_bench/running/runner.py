@@ -210,7 +210,9 @@ def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
     """Return the queries still pending after the locks were acquired; drop tasks without any."""
     found = []
     for part in parts:
-        done = prediction_files.ids_done(part.folder, part.asked, again=plan.request.again)
+        done = prediction_files.ids_done(
+            part.folder, part.asked, again=plan.request.again, since_ns=plan.request.since_ns
+        )
         left = whole_units(part.left, done, unit_of_task(part.about))
         if left:
             found.append(replace(part, left=left))

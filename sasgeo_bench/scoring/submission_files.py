@@ -103,21 +103,33 @@ def is_submission(folder: Path) -> bool:
 
 
 def list_submissions(folder: Path) -> tuple[Path, ...]:
-    """Return a submission itself, or all in a folder by name, without hidden files and the README.
+    """Return a submission itself, or all in a folder, without hidden files and the README.
 
-    Raise StoreError if there is no such folder, or something in it is no submission.
+    Those of a board may lie in a folder of their own, as in submissions/<board>/<name>. Raise StoreError if there is no
+    such folder, or something in it is no submission.
     """
     if is_submission(folder):
         return (folder,)
     if not folder.is_dir():
         message = f"{folder} is no folder of submissions: name one, or a submission itself"
         raise StoreError(message)
-    found = tuple(path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.name != README)
+    found = tuple(path for inner in _visible(folder) for path in _of_board(inner) or (inner,))
     other = next((path for path in found if not is_submission(path)), None)
     if other is not None:
         message = f"{other} is no submission, for it holds no {SUBMISSION}: remove it, or make it by 'submit'"
         raise StoreError(message)
     return found
+
+
+def _visible(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.name != README]
+
+
+def _of_board(folder: Path) -> list[Path]:
+    """Return what lies in a folder of submissions; nothing of any other folder, of a link, or of a file."""
+    is_plain = folder.is_dir() and not folder.is_symlink() and not is_submission(folder)
+    inner = _visible(folder) if is_plain else []
+    return inner if any(map(is_submission, inner)) else []
 
 
 def read_submission(folder: Path) -> Submission:

@@ -20,6 +20,7 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
 from sasgeo_bench.tasks.frames import LABEL_SCHEMA, LABELS, label_row
@@ -196,7 +197,7 @@ def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Qu
 
 def read_task(folder: str | Path) -> dict[str, Any]:
     """Read `task.json`; raise a StoreError if it is missing, damaged or of another version."""
-    path = Path(folder) / TASK
+    path = given_path(folder) / TASK
     if not path.is_file():
         message = f"{folder} holds no {TASK}: make the queries first"
         raise StoreError(message)
@@ -386,7 +387,7 @@ def read_view_bytes(folder: Path) -> dict[str, int]:
 
 def read_queries(folder: str | Path) -> Iterator[Query]:
     """Yield the queries of a task in the order of their ids, a row group in memory at a time."""
-    path = Path(folder) / QUERIES
+    path = given_path(folder) / QUERIES
     for row in _rows(path, QUERY_SCHEMA):
         yield _made(path, query_of, row)
 
@@ -404,7 +405,7 @@ def read_heads(folder: Path) -> Iterator[Head]:
 
 def read_truths(folder: str | Path) -> Iterator[Truth]:
     """Yield the truths of a task in the order of the query ids."""
-    path = Path(folder) / TRUTH
+    path = given_path(folder) / TRUTH
     for row in _rows(path, TRUTH_SCHEMA):
         yield _made(path, truth_of, row)
 

@@ -3,6 +3,8 @@
 
 import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 from threading import Event
 
@@ -138,6 +140,35 @@ def test_an_interrupted_command_says_what_is_kept_and_how_to_go_on(program, monk
     assert err == ("sasgeo-bench: interrupted; regions that were built are kept; the same command builds the others\n")
     told = "sasgeo-bench: interrupted; nothing is half-written, and what was there before is kept; run it again\n"
     assert program("doctor")[2] == told
+
+
+# Strikes when a module is imported, once: as an interrupt, or as what Python 3.11 makes of one in a class body.
+STRUCK = """
+import sys
+from sasgeo_bench.cli import main
+
+class Striking:
+    def find_spec(self, name, path=None, target=None):
+        if name == {module!r} and sys.meta_path.pop(0):
+            {strike}
+
+sys.meta_path.insert(0, Striking())
+main()
+"""
+
+
+@pytest.mark.parametrize("strike", ["raise KeyboardInterrupt", "raise RuntimeError('x') from KeyboardInterrupt()"])
+@pytest.mark.parametrize(
+    ("module", "told"),
+    [("typer", "interrupted before it began; run it again"), ("rasterio", "interrupted; regions that were built are")],
+)
+def test_an_interrupted_import_is_one_line(tmp_path, strike, module, told):
+    words = [sys.executable, "-c", STRUCK.format(module=module, strike=strike), "build-region", "town-grid"]
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    ended = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+    assert (ended.returncode, ended.stdout) == (130, "")
+    (line,) = ended.stderr.splitlines()
+    assert line.startswith(f"sasgeo-bench: {told}")
 
 
 def test_what_is_kept_is_said_of_commands_that_there_are():

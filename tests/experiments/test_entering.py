@@ -2,7 +2,9 @@
 """A matcher enters a published board: it is asked the board's own queries, and its row stands beside the others."""
 
 import datetime as dt
+import os
 import re
+import sys
 from dataclasses import replace
 
 import pandas as pd
@@ -11,9 +13,9 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.experiments import board_queries, entering, entry_cost
-from sasgeo_bench.experiments.board_queries import same_queries
+from sasgeo_bench.experiments.board_queries import asked_tasks, same_queries
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, plan_entry
-from sasgeo_bench.experiments.pipeline import draw_all, run_pipeline
+from sasgeo_bench.experiments.pipeline import ask, draw_all, run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline, plan_runs
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
@@ -95,13 +97,59 @@ def entered(request_, tmp_path_factory):
 
 
 def test_what_it_costs_is_said_before(request_):
-    first, *rest = cost_lines(plan_entry(request_, tell=silent))
+    first, drawing, asking, scoring, whole = cost_lines(plan_entry(request_, tell=silent))
     assert first.startswith("small: ")
     assert " queries in 3 tasks" in first  # the suite and the controls
-    assert rest[0] == "  drawing about 0 s: 0 queries and 0 maps are not there yet, about 0 MB on disk"
-    assert rest[-1].startswith("  scoring about ")
+    assert drawing == "  nothing is left to draw"
+    assert re.match(r"  asking \d+ queries .+, and what the matcher itself takes: no entry of the board is", asking)
+    assert scoring.startswith("  scoring ")
+    assert whole.startswith("  in all ")
     elsewhere = plan_entry(replace(request_, out=request_.out / "elsewhere"), tell=silent)
-    assert " and 3 maps are not there yet, about 6 MB on disk" in [*cost_lines(elsewhere)][1]
+    assert " 3 tasks and 3 maps are not there yet, about 6 MB on disk" in [*cost_lines(elsewhere)][1]
+
+
+def test_more_than_the_matcher_counts_and_a_busy_machine_takes_longer(request_, monkeypatch):
+    """Each map takes a process that starts and prepares; a load of 7 with 2 processors takes four times as long."""
+    entry = plan_entry(replace(request_, out=request_.out / "elsewhere"), tell=silent)
+    tasks, run = asked_tasks(entry.stored), check_entry(entry).run
+    whole = entry_cost.open_tasks(entry.plan, tasks, run, is_again=False)
+    stages = [entry_cost._drawing(entry.plan, whole), entry_cost._asking(entry.stored, whole, run)]
+    maps = len({task.region for task in whole})
+    assert stages[0].least_s > maps * (entry_cost._TASK_S + entry_cost._MAP_S)
+    assert stages[1].least_s >= maps * entry_cost._START_S
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    for load, factor in ((0.5, 1.0), (7.0, 4.0)):
+        monkeypatch.setattr(os, "getloadavg", lambda load=load: (load, 0.0, 0.0))
+        line = [*cost_lines(entry, run)][1]
+        assert entry_cost.Span(stages[0].least_s, factor * stages[0].most_s).to_text() in line
+
+
+def test_entries_of_the_board_tell_how_long_it_takes(request_, monkeypatch):
+    """Those that are like the matcher: none that follows flights alone."""
+    monkeypatch.setattr(entry_cost, "is_unranked", lambda _: False)
+    entry = plan_entry(request_, tell=silent)
+    left = {"localization": 100.0, "sequence": 100.0}
+    names = [name for _, name in entry_cost._costs(entry.stored, left, 3, check_entry(entry).run)]
+    assert {"random", "prior_centre"} <= {*names}
+    rows = entry_cost.read_scores(entry.stored)
+    flown = rows.assign(track=rows["track"].where(rows["matcher"] != "random", "sequence"), latency_s=1.0)
+    monkeypatch.setattr(entry_cost, "read_scores", lambda _: flown)
+    costs = {name: seconds for seconds, name in entry_cost._costs(entry.stored, left, 3, None)}
+    assert "random" not in costs
+    assert costs["prior_centre"] == pytest.approx(200 + 3 * (entry_cost._START_S + 1), abs=0.5)
+    line = [*cost_lines(entry)][2]
+    assert re.match(r"  asking \d+ queries .+, as the middle half of \d entries of the board", line)
+
+
+def test_an_entry_that_is_answered_is_said_to_need_scoring_alone(request_, entered):
+    del entered
+    entry = plan_entry(request_, tell=silent)
+    _, drawing, asking, scoring, whole, *_ = cost_lines(entry, check_entry(entry).run)
+    assert drawing == "  nothing is left to draw"
+    assert asking == "  nothing is left to ask: what is drawn here as on the board has answers"
+    assert scoring.removeprefix("  scoring ") == whole.removeprefix("  in all ").partition(":")[0]
+    again = replace(entry, is_again=True)
+    assert [*cost_lines(again, check_entry(again).run)][2].startswith("  asking ")
 
 
 def test_the_submission_is_sound_and_answers_every_query(request_, entered):
@@ -231,7 +279,7 @@ def test_queries_of_another_version_are_not_asked(request_):
     same = same_queries(request_.stored, [*tasks, *controls], tell=silent)
     lost = sorted(same)[::3]
     only = {name: "drawn otherwise" if name in lost else one for name, one in same.items()}
-    runs = plan_runs(replace(entry.plan, only=only, is_again=True), entry.matcher, [*tasks, *controls])
+    runs = plan_runs(replace(entry.plan, only=only, since_ns=sys.maxsize), entry.matcher, [*tasks, *controls])
     left = [name for run in runs for part in run.plan.parts for name in part.left]
     assert sorted(left) == sorted({*same} - {*lost})
 
@@ -245,6 +293,30 @@ def test_all_is_asked_again_on_demand_and_a_changed_matcher_is_told(request_, en
     monkeypatch.setattr(Middle, "card", replace(Middle.card, version="9"))
     enter(plan_entry(request_, tell=silent), into=tmp_path / "middle", tell=lines.append)
     assert any(": all is asked anew, as " in line for line in lines)
+
+
+def test_a_round_that_was_cut_goes_on_where_it_was(request_, entered, tmp_path, monkeypatch):
+    del entered
+    entry, lines = plan_entry(replace(request_, is_again=True), tell=silent), []
+    asked = []
+
+    def cut(spec, runs, **words):
+        plan = runs[0].plan
+        asked.extend(plan.parts[0].left)
+        ask(spec, [replace(runs[0], plan=replace(plan, parts=plan.parts[:1]))], **words)
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(entering, "ask", cut)
+        with pytest.raises(KeyboardInterrupt):
+            enter(entry, into=tmp_path / "middle", tell=silent)
+    whole = sum(len(task.asked) for task in asked_tasks(request_.stored))
+    assert 0 < len(asked) < whole
+    enter(entry, into=tmp_path / "middle", tell=lines.append)
+    assert any(f": {whole - len(asked)} queries to ask, {len(asked)} answered before" in line for line in lines)
+    lines.clear()
+    enter(plan_entry(request_, tell=silent), into=tmp_path / "middle", tell=lines.append)
+    assert any(f": 0 queries to ask, {whole} answered before" in line for line in lines)
 
 
 def test_crashes_are_told_with_an_example_on_one_line(request_, tmp_path):

@@ -18,6 +18,7 @@ from sasgeo_bench.matching.plugins import (
     list_entry_points,
     load_matcher,
 )
+from sasgeo_bench.matching.submission import example_card
 
 SOUND = """
 from sasgeo_bench.matching.matcher import WITHHELD, MatcherCard
@@ -140,29 +141,50 @@ def refusal(spec: str) -> str:
 
 
 def test_a_matcher_is_made_by_its_name_and_listed_with_where_it_comes_from(own) -> None:
-    own(mine="mine:Sound", another="mine:Sound")
-    made = load_matcher("mine")
+    own(sound="mine:Sound", another="mine:Sound")
+    made = load_matcher("sound")
     assert (type(made).__module__, type(made).__name__) == ("mine", "Sound")
     assert isinstance(made.card, MatcherCard)
     points = list_entry_points()
-    assert {"mine": "x-own", "another": "x-own", "raster_uniform": SHIPPED[1]}.items() <= {
+    assert {"sound": "x-own", "another": "x-own", "raster_uniform": SHIPPED[1]}.items() <= {
         name: point.dist.name for name, point in points.items()
     }.items()
     assert list(points) == sorted(points)
 
 
+def test_a_card_that_is_not_named_as_its_entry_point_is_refused(own) -> None:
+    """Else its rows stand under a name that no command knows."""
+    own(another="mine:Sound")
+    said = refusal("another")
+    assert said.startswith("another: its card is named 'sound', and rows are found by one name: give the entry point")
+
+
+def test_a_fault_of_a_card_is_told_with_file_key_and_mend(own, install, tmp_path) -> None:
+    own()
+    text = "from sasgeo_bench import read_card\nclass Carded:\n    card = read_card(__file__)\n"
+    install("a-carded", {"carded": "carded:Carded"}, carded=text)
+    path = tmp_path / "a-carded" / "card.toml"
+    path.write_text(example_card("carded").replace("licence", "license"), encoding="utf-8")
+    for spec in ("carded", "carded:Carded"):
+        said = refusal(spec)
+        assert said.startswith(f"{spec}: {path}: unknown key 'license', did you mean 'licence'?; 'licence' is missing")
+        assert said.endswith(": correct it there (submit --example-card prints a sound one)")
+    path.write_text(example_card("carded").replace("tracks =", "# tracks ="), encoding="utf-8")
+    assert refusal("carded") == f"carded: {path}: tracks is empty, name retrieval, localization or both"
+
+
 @pytest.mark.parametrize("ours", SHIPPED)
 def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install, ours) -> None:
     # By name alone the outsider would come first, by the place on the import path too.
-    install(ours, {"shared": "built_in:Sound"}, built_in=SOUND)
-    install("an-outsider", {"shared": "outside:Sound"}, outside=SOUND)
-    with pytest.warns(UserWarning, match="two plugins are named 'shared'") as told:
+    install(ours, {"sound": "built_in:Sound"}, built_in=SOUND)
+    install("an-outsider", {"sound": "outside:Sound"}, outside=SOUND)
+    with pytest.warns(UserWarning, match="two plugins are named 'sound'") as told:
         points = list_entry_points()
-    assert points["shared"].value == "built_in:Sound"
+    assert points["sound"].value == "built_in:Sound"
     (said,) = (str(item.message) for item in told)
     assert f"{ours} is used, an-outsider (outside:Sound) is not" in said
     with pytest.warns(UserWarning, match="two plugins"):
-        assert type(load_matcher("shared")).__module__ == "built_in"
+        assert type(load_matcher("sound")).__module__ == "built_in"
 
 
 @pytest.mark.parametrize("order", [("b-second", "a-first"), ("a-first", "b-second")])
@@ -170,13 +192,13 @@ def test_of_two_outsiders_with_one_name_neither_is_used_and_one_line_names_both(
     for name in order:
         module = name.replace("-", "_")
         install(name, {"mine": f"{module}:Sound"}, **{module: SOUND})
-    install("x-own", {"other": "other:Sound"}, other=SOUND)
+    install("x-own", {"sound": "other:Sound"}, other=SOUND)
     words = "two plugins are named 'mine': a-first (a_first:Sound) and b-second (b_second:Sound), so neither is used"
     warnings.simplefilter("ignore")
     assert refusal("mine").startswith(words)
     with pytest.raises(MatchError, match="two plugins are named 'mine'"):
         check_names(matchers=["mine"])
-    assert type(load_matcher("other")).__module__ == "other"  # which costs nobody else
+    assert type(load_matcher("sound")).__module__ == "other"  # which costs nobody else
     assert type(load_matcher("b_second:Sound")).__module__ == "b_second"
 
 
@@ -239,11 +261,11 @@ def test_one_matcher_that_two_packages_name_alike_is_no_clash(install) -> None:
         ("mine:MatchIsNoVerb", "MatchIsNoVerb is not a matcher, it has no match"),
         ("mine:NoCard", "card is a NoneType, expected a sasgeo_bench.matching.matcher.MatcherCard"),
         ("mine:CardIsADict", "card is a dict, expected a sasgeo_bench.matching.matcher.MatcherCard"),
-        ("mine:NoLicence", "cannot be made (MatchError: card: licence is empty, say it in one line)"),
+        ("mine:NoLicence", "wrong: card: licence is empty, say it in one line"),
     ],
 )
 def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, words) -> None:
-    own(wrong=value, right="mine:Sound")
+    own(wrong=value, sound="mine:Sound")
     install(
         "z-broken",
         {},
@@ -257,7 +279,7 @@ def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, wo
     if "imported" in words:
         assert f"{value} of x-own" in told
     # One that is broken costs the others nothing.
-    assert load_matcher("right").card.name == "sound"
+    assert load_matcher("sound").card.name == "sound"
     assert "wrong" in list_entry_points()
 
 

@@ -66,7 +66,11 @@ def install(tmp_path, monkeypatch):
 def test_a_segmenter_is_found_by_its_name_or_its_class(install) -> None:
     install("x_own", mine="segmenter_of_the_test:Mine", learns="segmenter_of_the_test:Learns")
     assert {"mine", "learns"} <= {*list_entry_points(SEGMENTERS)}
-    for spec, learns in (("mine", False), ("learns", True), ("segmenter_of_the_test:Mine", False)):
+    for spec, learns in (
+        ("mine", False),
+        ("segmenter_of_the_test:Learns", True),
+        ("segmenter_of_the_test:Mine", False),
+    ):
         made = load_segmenter(spec)
         assert isinstance(made, Segmenter)
         assert isinstance(made, LearningSegmenter) == learns

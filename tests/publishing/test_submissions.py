@@ -157,12 +157,12 @@ def put_table(folder, table, **options):
 
 def test_what_submit_writes_validate_accepts(stored, files, program):
     code, out, err = program(*flags(files, stored))
-    assert (code, out) == (0, "submissions/mine\n"), err
+    assert (code, out) == (0, "submissions/kept/mine\n"), err
     assert "the suite 'controls' is not answered" in err
-    code, out, err = program("validate", "--predictions", "submissions/mine", "--for", stored)
+    code, out, err = program("validate", "--predictions", "submissions/kept/mine", "--for", stored)
     assert code == 0, err
-    assert out == "submissions/mine: a sound submission of mine 1 to kept, 2 tasks\n"
-    code, out, _ = program("validate", "--predictions", "submissions/mine")
+    assert out == "submissions/kept/mine: a sound submission of mine 1 to kept, 2 tasks\n"
+    code, out, _ = program("validate", "--predictions", "submissions/kept/mine")
     assert code == 0
     assert "its rows were held against no queries" in out
 
@@ -189,7 +189,7 @@ def test_queries_without_a_row_are_misses_and_a_suite_without_any_is_not_asked(s
     code, _, err = program(*flags(files, stored))
     assert code == 0, err
     assert "3 have none and count as misses" in err
-    code, out, _ = program("validate", "--predictions", "submissions/mine", "--for", stored)
+    code, out, _ = program("validate", "--predictions", "submissions/kept/mine", "--for", stored)
     assert code == 0
     assert "1 task, 3 queries without a row count as misses" in out
 
@@ -482,6 +482,18 @@ def test_a_submission_for_another_board_is_left_out_and_said(copied, stored, pro
     lines = []
     assert submissions_for("kept", [tmp_path / "submissions"], tell=lines.append) == ()
     assert lines == ["left out: 1 submission for other boards (other)"]
+
+
+def test_a_matcher_may_answer_several_boards_each_in_a_folder_of_its_own(copied, tmp_path):
+    root = tmp_path / "submissions"
+    for board in ("kept", "other"):
+        shutil.copytree(copied, root / board / "mine")
+    shutil.rmtree(copied)
+    change_said(root / "other" / "mine", lambda said: said.update(board="other"))
+    assert submissions_for("kept", [root], tell=silent) == (root / "kept" / "mine",)
+    (root / "kept" / "notes").mkdir()
+    with pytest.raises(StoreError, match="notes is no submission"):
+        submissions_for("kept", [root], tell=silent)
 
 
 def test_a_folder_of_submissions_holds_nothing_else_but_its_readme(copied):

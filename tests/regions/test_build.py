@@ -224,7 +224,7 @@ def test_a_build_killed_between_its_two_renames_is_taken_up(there, tmp_path):
     (plan.folder.parent / ".town-suburb.partial").mkdir()
     built(tmp_path, small(cell_size_m=2.0))
     assert read_manifest(plan.folder).cell_size_m == 2.0
-    assert sorted(path.name for path in plan.folder.parent.iterdir()) == [".town-suburb.lock", "town-suburb"]
+    assert sorted(path.name for path in plan.folder.parent.iterdir()) == ["town-suburb"]
 
 
 def test_a_folder_that_cannot_be_written_is_told(tmp_path):

@@ -26,6 +26,7 @@ _REJECTION: Final = (  # metrics of the tables of rejectors
     *("aurc", "e_aurc", "auroc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
     *("right_at_absent_0.05", "absent_reached_at_0.05", "ece", "cost_20"),
 )
+_RISK: Final = {"coverage_at_risk_0.05": "answered", "risk_reached_at_0.05": "false of these"}
 SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a right one
 _MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))
 
@@ -38,6 +39,42 @@ def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
             part, file_stem("rejection", *map(str, key)), f"Rejection: {key[0]}, {prior_words(str(key[1]))}"
         )
         for key, part in found
+    )
+
+
+def risk_tables(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Return what ranked matchers answer where 5 % of the answers may be false, a table for each track and prior group.
+
+    A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
+    """
+    rows = _rejection_rows(board)
+    best = rows[(rows["metric"] == "aurc") & ~rows["matcher"].map(is_unranked).astype(bool) & rows["value"].notna()]
+    best = best.sort_values(["value", "matcher", "rejector"]).drop_duplicates(["track", "prior_group", "matcher"])
+    return tuple(
+        _risk_table(rows, part, str(track), str(prior_group))
+        for (track, prior_group), part in best.groupby(["track", "prior_group"], sort=True)
+    )
+
+
+def _risk_table(rows: pd.DataFrame, best: pd.DataFrame, track: str, prior_group: str) -> Table:
+    lines = []
+    for matcher, rejector in zip(best["matcher"].map(str), best["rejector"].map(str), strict=True):
+        mine = (rows["matcher"] == matcher) & (rows["rejector"] == rejector) & (rows["prior_group"] == prior_group)
+        found = rows[mine & (rows["track"] == track)]
+        by_name: dict[str, Record] = {
+            str(row["metric"]): {str(field): row[field] for field in row} for row in found.to_dict("records")
+        }
+        figures = (figure_cell(by_name.get(metric)) for metric in _RISK)
+        lines.append(Row(cells=(*text_cells(matcher, rejector), *figures, plain_cell(int(found["n"].iloc[0])))))
+    return Table(
+        name=file_stem("risk", track, prior_group),
+        title=f"Answers where 5 % of them may be false fixes: {track}, {prior_words(prior_group)}",
+        columns=(
+            *words("matcher", "rejector"),
+            *(column(metric, title=title) for metric, title in _RISK.items()),
+            column("n"),
+        ),
+        rows=tuple(lines),
     )
 
 

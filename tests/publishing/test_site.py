@@ -16,8 +16,8 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.overview import summary
-from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
-from sasgeo_bench.leaderboard.tables import file_stem, page_names, ties_of
+from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables
+from sasgeo_bench.leaderboard.tables import file_stem, page_names, text_of, ties_of
 from sasgeo_bench.publishing.site import contrasts_of
 from sasgeo_bench.publishing.site_maps import place_maps
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
@@ -253,6 +253,29 @@ def test_rejectors_of_controls_come_last_however_good_their_order_is():
         ("raster", "plain"),
         ("oracle_pose", "control"),
         ("random", "control"),
+    ]
+
+
+def test_of_each_ranked_matcher_the_rejector_with_the_best_order_says_what_is_answered_at_a_risk():
+    facts = {"suite": "all suites", "track": "localization", "prior_group": "r500-weak-s3", "stratum": "as drawn"}
+    facts |= {"n": 9, "answered": 9, "missing": 0, "blocks": 2, "places": 2, "unit": "1", "better": "lower"}
+    figures = {
+        ("oracle_pose", "own"): (0.0, 1.0, 0.0),
+        ("raster", "margin"): (0.3, 0.5, 0.06),
+        ("raster", "own"): (0.4, 0.7, 0.0),
+        ("graph", "own"): (0.2, 0.8, 0.04),
+    }
+    metrics = ("aurc", "coverage_at_risk_0.05", "risk_reached_at_0.05")
+    rows = [
+        Row(matcher=name[0], rejector=name[1], metric=metric, value=value, **facts)
+        for name, values in figures.items()
+        for metric, value in zip(metrics, values, strict=True)
+    ]
+    (table,) = risk_tables(to_frame(rows))
+    assert [[cell.text for cell in row.cells][:2] for row in table.rows] == [["graph", "own"], ["raster", "margin"]]
+    assert [[text_of(cell) for cell in row.cells][2:] for row in table.rows] == [
+        ["0.800", "0.040", "9"],
+        ["0.500", "0.060", "9"],
     ]
 
 

@@ -13,6 +13,7 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, r
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.experiments.head_start import unpack_head_start
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
@@ -21,6 +22,7 @@ from sasgeo_bench.leaderboard.board_tables import Book
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
+from sasgeo_bench.leaderboard.rejection_tables import risk_tables
 from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
@@ -216,8 +218,11 @@ class LeaderboardOptions(Options):
 
 def leaderboard_command(options: LeaderboardOptions) -> None:
     """Carry out an experiment: draw its queries, run its matchers, score them, write OUT/boards/<id>/."""
-    spec = read_pipeline_file(find_pipeline_file(options.pipeline))
+    file = find_pipeline_file(options.pipeline)
+    spec = read_pipeline_file(file)
     opened = None if options.opened is None else read_day(options.opened, flag="--opened")
+    if options.seed_file is None and not options.dry_run:
+        unpack_head_start(file, options.out, tell=tell)
     plan = plan_pipeline(
         spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
         out=options.out,
@@ -288,8 +293,8 @@ def check_controls(board: Board) -> None:
 
 
 def show_board(board: Board) -> None:
-    """Print what a board says in short, one table for each track and prior group."""
-    tables = (*summary(Book.of(board.table, {})), contrast_table(board.findings))
+    """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
+    tables = (*summary(Book.of(board.table, {})), contrast_table(board.findings), *risk_tables(board.table))
     for table in (one for one in tables if one.rows):
         say(table.title)
         shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)

@@ -3,12 +3,12 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, say
+from sasgeo_bench.cli.console import print_table, say, tell
 from sasgeo_bench.cli.options import RegionFolders
 from sasgeo_bench.matching.plugins import (
     MATCHERS,
@@ -25,6 +25,7 @@ from sasgeo_bench.matching.plugins import (
 )
 from sasgeo_bench.texts import plain
 
+_OF_DEMO: Final = "demo-"  # too many made-up towns to list
 Shown = Annotated[str | None, typer.Argument(help="show the card of one: a name of the list, or module:Class")]
 
 
@@ -33,14 +34,17 @@ def list_regions_command(regions: RegionFolders = None) -> None:
     from sasgeo_bench.regions.region_spec import list_region_files, read_region_file  # noqa: PLC0415
 
     table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
-    for name, path in sorted(list_region_files(folders=regions or ()).items()):
-        spec = read_region_file(path)
+    files = list_region_files(folders=regions or ())
+    of_demo = sorted(name for name in files if name.startswith(_OF_DEMO))
+    for name in sorted(files.keys() - set(of_demo)):
+        spec = read_region_file(files[name])
         grid = spec.grid()
         area_km2 = grid.rows * grid.cols * grid.cell_size_m**2 / 1e6
         dates = [extract.date.isoformat() for extract in spec.extract]
         shown = dates[0] if len(dates) == 1 else f"{dates[0]} .. {dates[-1]} ({len(dates)})"
         table.add_row(name, spec.title, f"{area_km2:.1f}", f"{grid.cell_size_m:g} m", shown, ", ".join(spec.scenes))
     print_table(table)
+    tell(f"and {len(of_demo)} small towns of `leaderboard demo`, {of_demo[0]} to {of_demo[-1]}")
 
 
 def list_suites_command() -> None:

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What lies packed beside a pipeline file is laid down once, whole, and replaces nothing."""
+
+import io
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.experiments.head_start import unpack_head_start
+
+PACKED = {
+    "regions/one/region.json": b"map",
+    "regions/one/layers.tif": b"layers",
+    "tasks/clean/one/task.json": b"task",
+    "truth/clean/one/truth.json": b"truth",
+    "runs/random/abc/run.json": b"run",
+    "runs/random/abc/clean/one/predictions.parquet": b"answers",
+}
+
+
+def packed(folder: Path, files: dict[str, bytes]) -> Path:
+    file = folder / "mine.toml"
+    file.write_text("", encoding="utf-8")
+    with tarfile.open(folder / "mine.tar.xz", "w:xz") as archive:
+        for name, content in files.items():
+            entry = tarfile.TarInfo(name)
+            entry.size = len(content)
+            archive.addfile(entry, io.BytesIO(content))
+    return file
+
+
+def found(out: Path) -> dict[str, bytes]:
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in out.rglob("*") if path.is_file()}
+
+
+def test_all_is_laid_down_whole_and_told_once(tmp_path):
+    lines: list[str] = []
+    for _ in range(2):
+        unpack_head_start(packed(tmp_path, PACKED), tmp_path / "out", tell=lines.append)
+    assert found(tmp_path / "out") == PACKED
+    (line,) = lines
+    assert line.startswith("4 maps, tasks, truths and runs come with the program (mine.tar.xz)")
+
+
+def test_what_was_there_stays_and_is_not_mixed_with_what_is_packed(tmp_path):
+    own = tmp_path / "out/runs/random/abc"
+    own.mkdir(parents=True)
+    (own / "run.json").write_bytes(b"own")
+    unpack_head_start(packed(tmp_path, PACKED), tmp_path / "out", tell=lambda _: None)
+    mine = {name: content for name, content in found(tmp_path / "out").items() if name.startswith("runs/")}
+    assert mine == {"runs/random/abc/run.json": b"own"}
+    assert len(found(tmp_path / "out")) == len(PACKED) - 1
+
+
+def test_a_pipeline_without_one_begins_with_nothing(tmp_path):
+    file = tmp_path / "mine.toml"
+    file.write_text("", encoding="utf-8")
+    unpack_head_start(file, tmp_path / "out", tell=pytest.fail)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("fault", ["cut", "no archive", "leads out"])
+def test_a_damaged_archive_costs_one_line_and_leaves_nothing(tmp_path, fault):
+    file = packed(tmp_path, {"../lost.txt": b"?"} if fault == "leads out" else PACKED)
+    archive = tmp_path / "mine.tar.xz"
+    if fault != "leads out":
+        archive.write_bytes(archive.read_bytes()[:150] if fault == "cut" else b"nothing of the kind")
+    with pytest.raises(StoreError, match=r"mine\.tar\.xz cannot be unpacked into .*: remove the archive") as caught:
+        unpack_head_start(file, tmp_path / "out", tell=lambda _: None)
+    assert "\n" not in str(caught.value)
+    assert found(tmp_path / "out") == {}
+    assert not (tmp_path / "lost.txt").exists()

@@ -35,6 +35,7 @@ from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
 CONTROL_REGIONS: Final = ("town-riverside", "town-suburb")
+CONTROL_CELL_M: Final = 1.0  # of any town that stands in for them
 CONTROL_SPLIT: Final = "crossfit"
 CONTROL_SITES: Final = 8
 CONTROL_MATCHERS: Final = (ORACLE, "prior_centre")  # on all queries of every board
@@ -381,7 +382,8 @@ def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request,
     regions = [name for name in CONTROL_REGIONS if _may_control(name, split)]
     if not regions:
         specs = {name: read_region_file(path) for name, path in list_region_files().items()}
-        towns = [name for name, spec in specs.items() if spec.pick(None).town is not None]
+        made_up = (name for name, spec in specs.items() if spec.pick(None).town is not None)
+        towns = [name for name in made_up if specs[name].cell_size_m == CONTROL_CELL_M]
         regions = [name for name in towns if _may_control(name, split)][:1]
     if split is not None and not regions:
         message = f"split {split.spec.id!r} trains on every embedded town or seals it, and controls need one: free one"

@@ -132,7 +132,7 @@ def test_lists_and_findings_go_to_stdout(program):
         (("build-region", "vadus"), "did you mean 'vaduz'"),
         (("build-region", "none.toml"), "no region file none.toml"),
         (("build-region", "vadus.toml"), "no region file vadus.toml, did you mean 'vaduz'?"),
-        (("inspect", "vadus.toml"), "no split file vadus.toml: there are crossfit, flights, holdout"),
+        (("inspect", "vadus.toml"), "no split file vadus.toml: there are crossfit, demo, flights, holdout"),
         (("make-queries", "--split", "mine"), "no split 'mine': there are crossfit,"),
         (("build-region", "town-grid", "--date", "2014-13-01"), "must be a date"),
         (("build-region", "town-grid", "--date", "2013-01-01"), "2014-01-01, 2019-01-01, 2025-01-01"),

@@ -227,6 +227,7 @@ def shipped(name):
 
 
 OF_IMAGERY = {"banepa", "zanzibar"}  # of buildings alone, in a split of their own
+OF_DEMO = {name for name in list_region_files() if name.startswith("demo-")}  # have a split of their own
 COUNTRIES = {"andorra", "liechtenstein"}  # for flights; their towns are regions, too
 
 
@@ -234,7 +235,7 @@ COUNTRIES = {"andorra", "liechtenstein"}  # for flights; their towns are regions
 def test_the_shipped_splits_by_country_hold_the_same_regions_five_kilometres_apart(name):
     split = shipped(name)
     towns = {"canillo", "fuglafjordur", "runavik", "soldeu", "sorvagur", "tvoroyri", "vestmanna"}
-    assert set(split.spec.region_ids) == set(list_region_files()) - towns - OF_IMAGERY - COUNTRIES
+    assert set(split.spec.region_ids) == set(list_region_files()) - towns - OF_IMAGERY - COUNTRIES - OF_DEMO
     assert nearest_pair(split).gap_m >= 5000.0
 
 
@@ -248,8 +249,16 @@ def test_the_split_of_flights_has_two_countries_in_place_of_their_towns():
 
 def test_the_split_by_towns_holds_every_shipped_region_and_their_views_never_meet():
     split = shipped("places")
-    assert set(split.spec.region_ids) == set(list_region_files()) - OF_IMAGERY - COUNTRIES
+    assert set(split.spec.region_ids) == set(list_region_files()) - OF_IMAGERY - COUNTRIES - OF_DEMO
     assert nearest_pair(split).gap_m >= 2 * split.spec.reach_m + 800.0
+
+
+def test_the_split_of_the_demo_holds_its_towns_and_each_half_as_many_kinds():
+    split = shipped("demo")
+    assert set(split.spec.region_ids) == OF_DEMO
+    assert len(split.blocks) == 36
+    assert sum(half == "a" for half in split.half_of.values()) == 18
+    assert nearest_pair(split).gap_m >= 5000.0
 
 
 def test_towns_stand_in_the_half_of_their_country_and_cluster_by_it():

@@ -85,7 +85,15 @@ def run_pipeline(
     contrasts = tuple(named_on_board(item, names) for item in contrasts)
     split = plan.split
     figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
-    pictures = partial(pictures_extra, tell=tell, root=plan.out, contrasts=contrasts, split=split, has_cases=has_cases)
+    pictures = partial(
+        pictures_extra,
+        tell=tell,
+        root=plan.out,
+        contrasts=contrasts,
+        split=split,
+        has_cases=has_cases,
+        jobs=plan.jobs,
+    )
     request = ScoreRequest(
         predictions=folders,
         tasks=[*asked, *controls],

@@ -29,7 +29,7 @@ from sasgeo_bench.leaderboard.flight_maps import MOST_TRACKERS, flight_map_pixel
 from sasgeo_bench.leaderboard.plot_tables import ranked_matchers, shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import Tell, spread
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import paint_overview
@@ -96,12 +96,14 @@ def pictures_extra(
     contrasts: Sequence[Contrast] = (),
     split: Split | None = None,
     has_cases: bool = True,
+    jobs: int = 1,
 ) -> Extra:
     """Draw pictures of a board, and list them in `pictures.json`; empty if there is none.
 
     `root` holds regions/, tasks/ and truth/; tasks that are missing there, or of other queries, have no picture. Report
     by `tell` which pictures cannot be drawn, and how many there are. `contrasts` are the registered ones, `split` has
-    the blocks of a map; `has_cases` adds failed queries, and `answers.parquet` with the place of every query.
+    the blocks of a map; `has_cases` adds failed queries, drawn by `jobs` processes, and `answers.parquet` with the
+    place of every query.
     """
     found = _Found(failures=board.failures)
     tasks = [about for about in board.tasks if about["suite"] != CONTROLS]
@@ -118,7 +120,7 @@ def pictures_extra(
         _add_strips(found, board, asked, root)
         _add_flights(found, board, asked, root)
         shown = failures[failures["matcher"].isin(shown_matchers(board.table, contrasts))]
-        _add_cases(found, board, shown, asked, root)
+        _add_cases(found, board, shown, asked, root, jobs=jobs)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
     listed = ", ".join(
@@ -278,7 +280,7 @@ def _flight_map(about: Mapping[str, Any], flight: str, views: Mapping[str, pd.Da
 
 
 def _add_cases(
-    found: _Found, board: Board, failures: pd.DataFrame, asked: Sequence[Mapping[str, Any]], root: Path
+    found: _Found, board: Board, failures: pd.DataFrame, asked: Sequence[Mapping[str, Any]], root: Path, *, jobs: int
 ) -> None:
     about = {(str(item["suite"]), str(item["region"])): item for item in asked}
     failures = failures[[key in about for key in zip(failures["suite"], failures["region"], strict=True)]]
@@ -287,16 +289,17 @@ def _add_cases(
     chosen = sample_cases(failures, each=_EACH, most=MOST_CASES)
     words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in {*chosen["matcher"]}}
     drawn = {(row["query_id"], row["matcher"]): row for row in chosen.to_dict("records")}
-    for case in _cases(drawn, board, words, root, found):
+    cases = list(_cases(drawn, board, words, root, found))
+    draws = [partial(_drawn, case, root, about[case.query.suite, case.query.region]) for case in cases]
+    for case, outcome in zip(cases, spread(_outcome, draws, jobs=jobs), strict=True):
         row = drawn[case.query.query_id, case.matcher]
         facts = facts_of(case)
         off = f", {facts['error_m']:.0f} m off" if "error_m" in facts else ""
         alt = f"{case.failure}: view, true place and answer of {case.matcher} on {row['suite']}, {row['region']}{off}"
-        task = about[row["suite"], row["region"]]
         found.add(
             "cases",
             f"{case.matcher}-{case.query.query_id}",
-            partial(_drawn, case, root, task),
+            partial(_picture, outcome),
             {**{str(name): value for name, value in row.items()}, "alt": alt, "said": facts},
         )
     order = {key: at for at, key in enumerate(drawn)}
@@ -313,6 +316,20 @@ def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
                 judged = None if rejector is None else board.judged[name, rejector]
                 frames.append(find_cases(single_views(board.scores[name]), name, judged))
     return pd.concat(frames, ignore_index=True)
+
+
+def _outcome(draw: Callable[[], bytes]) -> bytes | Exception:
+    """Return a picture, or why there is none: of several processes none ends the others by an error."""
+    try:
+        return draw()
+    except Exception as error:  # noqa: BLE001 - raised where the picture is added
+        return error
+
+
+def _picture(outcome: bytes | Exception) -> bytes:
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
 
 
 def _drawn(case: Case, root: Path, about: Mapping[str, Any]) -> bytes:

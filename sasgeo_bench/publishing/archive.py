@@ -220,6 +220,7 @@ def score_all(
             contrasts=request.contrasts,
             split=request.split,
             has_cases=has_cases,
+            jobs=request.jobs,
         )
         record = {} if kept is None else read_board(kept)[0]
         extras = (figures, pictures) if request.stored is None else ()  # which need what was fitted for every entry

@@ -107,6 +107,14 @@ def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
     assert lines[-1].startswith(f"pictures: 2 of regions, 2 of suites, {len(said['cases'])} of cases, ")
 
 
+def test_several_processes_draw_the_same_pictures(made, root):
+    folder, _, board = made
+    drawn = pictures_extra(board, tell=lambda _: None, root=root, jobs=2).pictures
+    there = {path.relative_to(folder / "pictures").as_posix() for path in (folder / "pictures").rglob("*.webp")}
+    assert there <= set(drawn)
+    assert all(drawn[name] == (folder / "pictures" / name).read_bytes() for name in there)
+
+
 def test_each_case_says_what_it_is_of_in_plain_numbers_and_words(made):
     folder, _, board = made
     cases = json.loads((folder / "pictures" / "pictures.json").read_text(encoding="utf-8"))["cases"]

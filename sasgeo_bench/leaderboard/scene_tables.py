@@ -22,9 +22,11 @@ _Found = Mapping[str, Mapping[str, Record]]  # kind of place -> matcher -> row
 def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
     """Yield success by kind of place, a table for each suite, track and prior group; `scenes` is of `scene_frame`.
 
-    The first two lines count places and queries. Kinds with too few places to rank anybody are marked.
+    Those of most places come first. The first two lines count places and queries. Kinds with too few places to rank
+    anybody are marked.
     """
-    for key, part in scenes.groupby(list(GROUP), sort=True):
+    groups = sorted(scenes.groupby(list(GROUP)), key=lambda group: (-int(group[1]["places"].max()), group[0]))
+    for key, part in groups:
         found: dict[str, dict[str, Record]] = {}
         for row in part.to_dict("records"):
             found.setdefault(str(row["stratum"]), {})[str(row["matcher"])] = {str(name): row[name] for name in row}

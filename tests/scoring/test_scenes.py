@@ -99,6 +99,15 @@ def test_kinds_of_few_places_are_marked_and_rank_nobody():
     assert table.title.startswith("With a map 2 to 10 years old (real-age): success_25m")
 
 
+def test_the_suite_of_most_places_comes_first():
+    rows = {"mine": pd.concat([asked(places=2, suite="aerial+forest"), asked(places=8)], ignore_index=True)}
+    tables = scene_tables(scene_frame(rows, draws=50), Book.of(leaderboard(rows, draws=50), {}))
+    assert [table.title.partition(": ")[0] for table in tables] == [
+        "With a map 2 to 10 years old (real-age)",
+        "With a picture and a map of the day (aerial+forest)",
+    ]
+
+
 def test_suites_as_used_are_suites_with_the_strength_that_is_named():
     for name, use in AS_USED.items():
         strengths = {item.strength for item in EVERY_SUITE[name].variants if item.role == "stress"}

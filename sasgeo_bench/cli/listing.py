@@ -31,11 +31,13 @@ Shown = Annotated[str | None, typer.Argument(help="show the card of one: a name 
 
 def list_regions_command(regions: RegionFolders = None) -> None:
     """List the regions that come with the package, and your own."""
+    from sasgeo_bench.config import shipped_dir  # noqa: PLC0415
     from sasgeo_bench.regions.region_spec import list_region_files, read_region_file  # noqa: PLC0415
 
     table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
     files = list_region_files(folders=regions or ())
-    of_demo = sorted(name for name in files if name.startswith(_OF_DEMO))
+    shipped = shipped_dir("regions")
+    of_demo = sorted(name for name, path in files.items() if name.startswith(_OF_DEMO) and path.parent == shipped)
     for name in sorted(files.keys() - set(of_demo)):
         spec = read_region_file(files[name])
         grid = spec.grid()

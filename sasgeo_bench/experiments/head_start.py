@@ -4,17 +4,17 @@
 import lzma
 import os
 import tarfile
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Final
 
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.files.folders import remove_tree
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.texts import one_line
 
 SUFFIX: Final = ".tar.xz"
+FOLDERS: Final = frozenset(("regions", "runs", "segmenters", "tasks", "truth"))  # below the root of what is built
 
 
 def unpack_head_start(pipeline_file: Path, out: Path, *, tell: Tell) -> None:
@@ -32,13 +32,15 @@ def unpack_head_start(pipeline_file: Path, out: Path, *, tell: Tell) -> None:
         return
     try:
         out.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=".head-start-", dir=out))
-        try:
+        with TemporaryDirectory(prefix=".head-start-", dir=out) as folder:
+            scratch = Path(folder)
             with tarfile.open(archive, "r:xz") as packed:
                 packed.extractall(scratch, filter="data")
+            strange = sorted(set(os.listdir(scratch)) - FOLDERS)  # noqa: PTH208 - names alone
+            if strange:
+                message = f"{archive} holds {strange[0]!r}: pack {', '.join(sorted(FOLDERS))} alone"
+                raise StoreError(message)
             laid = sum(_lay(unit, out / unit.relative_to(scratch)) for unit in _units(scratch))
-        finally:
-            remove_tree(scratch)
     except (OSError, EOFError, lzma.LZMAError, tarfile.TarError) as error:
         mend = "remove the archive, and all is drawn and asked here"
         message = f"{archive} cannot be unpacked into {out} ({one_line(str(error))}): {mend}"

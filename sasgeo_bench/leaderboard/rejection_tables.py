@@ -48,24 +48,20 @@ def risk_tables(board: pd.DataFrame) -> tuple[Table, ...]:
     A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
     """
     rows = _rejection_rows(board)
-    best = rows[(rows["metric"] == "aurc") & ~rows["matcher"].map(is_unranked).astype(bool) & rows["value"].notna()]
-    best = best.sort_values(["value", "matcher", "rejector"]).drop_duplicates(["track", "prior_group", "matcher"])
+    ranked = rows[~rows["matcher"].map(is_unranked).astype(bool)]
     return tuple(
-        _risk_table(rows, part, str(track), str(prior_group))
-        for (track, prior_group), part in best.groupby(["track", "prior_group"], sort=True)
+        _risk_table(part, str(track), str(prior_group))
+        for (track, prior_group), part in ranked.groupby(["track", "prior_group"], sort=True)
     )
 
 
-def _risk_table(rows: pd.DataFrame, best: pd.DataFrame, track: str, prior_group: str) -> Table:
-    lines = []
-    for matcher, rejector in zip(best["matcher"].map(str), best["rejector"].map(str), strict=True):
-        mine = (rows["matcher"] == matcher) & (rows["rejector"] == rejector) & (rows["prior_group"] == prior_group)
-        found = rows[mine & (rows["track"] == track)]
-        by_name: dict[str, Record] = {
-            str(row["metric"]): {str(field): row[field] for field in row} for row in found.to_dict("records")
-        }
-        figures = (figure_cell(by_name.get(metric)) for metric in _RISK)
-        lines.append(Row(cells=(*text_cells(matcher, rejector), *figures, plain_cell(int(found["n"].iloc[0])))))
+def _risk_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
+    found = {(str(key[0]), str(key[1])): _by_metric(mine) for key, mine in part.groupby(["matcher", "rejector"])}
+    order = sorted((_area(by_name), key) for key, by_name in found.items())
+    best: dict[str, tuple[str, str]] = {}
+    for area, key in order:
+        if area < math.inf:
+            best.setdefault(key[0], key)
     return Table(
         name=file_stem("risk", track, prior_group),
         title=f"Answers where 5 % of them may be false fixes: {track}, {prior_words(prior_group)}",
@@ -74,8 +70,28 @@ def _risk_table(rows: pd.DataFrame, best: pd.DataFrame, track: str, prior_group:
             *(column(metric, title=title) for metric, title in _RISK.items()),
             column("n"),
         ),
-        rows=tuple(lines),
+        rows=tuple(
+            Row(
+                cells=(
+                    *text_cells(*key),
+                    *(figure_cell(found[key].get(metric)) for metric in _RISK),
+                    plain_cell(int(found[key]["aurc"]["n"])),
+                )
+            )
+            for key in best.values()
+        ),
     )
+
+
+def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
+    """Return the rows of one matcher and rejector by their metric."""
+    return {str(row["metric"]): {str(field): row[field] for field in row} for row in part.to_dict("records")}
+
+
+def _area(by_name: Mapping[str, Record]) -> float:
+    """Return the area that orders rejectors, infinite where there is none."""
+    area = by_name["aurc"]["value"] if "aurc" in by_name else math.nan
+    return math.inf if math.isnan(area) else float(area)
 
 
 def rejection_of(board: pd.DataFrame, matcher: str) -> Table | None:
@@ -97,15 +113,13 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
     rows = []
     for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
         matcher, rejector, track, prior_group = map(str, key)
-        by_name: dict[str, Record] = {
-            str(row["metric"]): {str(field): row[field] for field in row} for row in mine.to_dict("records")
-        }
+        by_name = _by_metric(mine)
         queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
         figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
         cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
-        area, is_control = by_name.get("aurc"), is_unranked(matcher)
+        is_control = is_unranked(matcher)
         row = Row(cells=cells, tone="control" if is_control else "plain")
-        rows.append((is_control, math.inf if area is None else float(area["value"]), matcher, rejector, row))
+        rows.append((is_control, _area(by_name), matcher, rejector, row))
     rows.sort(key=lambda row: row[:4])
     return Table(
         name=name,

@@ -86,6 +86,14 @@ def test_a_region_is_built_inspected_and_verified(program, tmp_path):
     assert program("inspect", "own")[2] == f"warning: {out}"
 
 
+def test_the_towns_of_the_demo_are_a_line_and_your_own_are_listed_whatever_their_name(program, tmp_path):
+    small_town(tmp_path, **{'id = "town-suburb"': 'id = "demo-mine"'})
+    code, out, err = program("list-regions", "--region-files", tmp_path)
+    assert code == 0, err
+    assert [line.split()[0] for line in out.splitlines() if line.startswith("demo-")] == ["demo-mine"]
+    assert "and 36 small towns of `leaderboard demo`, demo-agricultural-1 to demo-suburb-5" in err
+
+
 def test_inspect_draws_a_map_that_was_built_on_the_way_to_queries(program, tmp_path):
     spec = read_region_file(Path(small_town(tmp_path)))
     build_region(plan_build(spec, out=tmp_path / "out"), tell=lambda _: None)

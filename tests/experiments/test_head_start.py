@@ -72,3 +72,10 @@ def test_a_damaged_archive_costs_one_line_and_leaves_nothing(tmp_path, fault):
     assert "\n" not in str(caught.value)
     assert found(tmp_path / "out") == {}
     assert not (tmp_path / "lost.txt").exists()
+
+
+@pytest.mark.parametrize("name", ["readme.txt", "boards/demo/board.json"])
+def test_what_is_no_map_task_or_run_is_refused_before_anything_is_laid_down(tmp_path, name):
+    with pytest.raises(StoreError, match=r"mine\.tar\.xz holds '(readme\.txt|boards)': pack regions, runs"):
+        unpack_head_start(packed(tmp_path, {**PACKED, name: b"?"}), tmp_path / "out", tell=lambda _: None)
+    assert found(tmp_path / "out") == {}

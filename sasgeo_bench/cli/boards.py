@@ -13,7 +13,7 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, r
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.experiments.head_start import unpack_head_start
+from sasgeo_bench.experiments.head_start import head_start_of, unpack_head_start
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
@@ -221,8 +221,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     file = find_pipeline_file(options.pipeline)
     spec = read_pipeline_file(file)
     opened = None if options.opened is None else read_day(options.opened, flag="--opened")
-    if options.seed_file is None and not options.dry_run:
-        unpack_head_start(file, options.out, tell=tell)
+    _begin(file, options)
     plan = plan_pipeline(
         spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
         out=options.out,
@@ -292,15 +291,29 @@ def check_controls(board: Board) -> None:
         raise typer.Exit(CONTESTANT_FAILED)
 
 
+def _begin(file: Path, options: LeaderboardOptions) -> None:
+    """Lay down what is packed beside a pipeline file, or say so; queries of a private seed are nobody else's."""
+    packed = None if options.seed_file else head_start_of(file)
+    if packed is None:
+        return
+    if options.dry_run:
+        tell(f"{packed.name} beside the file is unpacked first: what it holds counts below as not there yet")
+        return
+    unpack_head_start(file, options.out, tell=tell)
+
+
 def show_board(board: Board) -> None:
     """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
-    tables = (*summary(Book.of(board.table, {})), contrast_table(board.findings), *risk_tables(board.table))
+    risks = risk_tables(board.table)
+    tables = (*summary(Book.of(board.table, {})), contrast_table(board.findings), *risks)
     for table in (one for one in tables if one.rows):
         say(table.title)
         shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)
         for row in table.rows:
             shown.add_row(*map(text_of, row.cells))
         print_table(shown)
+    for line in dict.fromkeys(note for table in risks if table.rows for note in table.notes):
+        say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
     for line in warnings_of(board.table):

@@ -46,7 +46,7 @@ def list_regions_command(regions: RegionFolders = None) -> None:
         shown = dates[0] if len(dates) == 1 else f"{dates[0]} .. {dates[-1]} ({len(dates)})"
         table.add_row(name, spec.title, f"{area_km2:.1f}", f"{grid.cell_size_m:g} m", shown, ", ".join(spec.scenes))
     print_table(table)
-    tell(f"and {len(of_demo)} small towns of `leaderboard demo`, {of_demo[0]} to {of_demo[-1]}")
+    tell(f"and {len(of_demo)} small towns of `leaderboard demo`, {_OF_DEMO}...: regions/README.md")
 
 
 def list_suites_command() -> None:

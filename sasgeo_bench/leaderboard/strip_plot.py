@@ -88,7 +88,8 @@ class Strip:
         """Return how often the pose is found, and how the queries were chosen."""
         return (
             f"The pose is found (within 25 m and 5 deg) in {self.found} of {counted(self.total, 'query', 'queries')}; "
-            f"here are {len(self.query_ids)} of them, half of them failures where there are so many."
+            f"here are {len(self.query_ids)} of them, half of them failures where there are so many. Views without the "
+            "stress (control) are among them; tables count those under stress."
         )
 
 

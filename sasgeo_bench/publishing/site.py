@@ -17,7 +17,7 @@ from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sec
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE, column
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
-from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables
+from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables, risk_tables
 from sasgeo_bench.leaderboard.scene_tables import scene_tables
 from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
@@ -254,6 +254,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
         "rejection.html": {
+            "risks": tuple(table for table in risk_tables(source.board) if table.rows),
             "tables": rejection,
             "acceptance": acceptance,
             "protection": protection,

@@ -91,7 +91,7 @@ def test_the_towns_of_the_demo_are_a_line_and_your_own_are_listed_whatever_their
     code, out, err = program("list-regions", "--region-files", tmp_path)
     assert code == 0, err
     assert [line.split()[0] for line in out.splitlines() if line.startswith("demo-")] == ["demo-mine"]
-    assert "and 36 small towns of `leaderboard demo`, demo-agricultural-1 to demo-suburb-5" in err
+    assert "and 36 small towns of `leaderboard demo`, demo-..." in err
 
 
 def test_inspect_draws_a_map_that_was_built_on_the_way_to_queries(program, tmp_path):

@@ -29,7 +29,8 @@ _REJECTION: Final = (  # metrics of the tables of rejectors
 _RISK: Final = {"coverage_at_risk_0.05": "answered", "risk_reached_at_0.05": "false of these"}
 _RISK_NOTES: Final = (
     "A matcher stands here with the rejector that orders its answers best. Thresholds are of other places.",
-    "Where more than 0.050 of the answers are false, the risk was not kept. † marks Wilson's interval over sites.",
+    "Where more than 0.050 of the answers are false, the risk was not kept on these places.",
+    "† marks Wilson's interval over sites.",
 )
 SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a right one
 _MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))

@@ -153,7 +153,7 @@ def test_lines_of_rejectors_are_filtered_by_matcher_and_the_address_keeps_it(pag
         "(document.querySelector('select[name=matcher]'))"
     )
     assert page.value(names) == ["raster"] * 2
-    assert page.value("document.querySelector('output').textContent") == "1 of 2 lines shown"
+    assert page.value("document.querySelector('output').textContent") == "2 of 4 lines shown"
     page.open(page.value("location.href"))
     assert page.value(names) == ["raster"] * 2
 

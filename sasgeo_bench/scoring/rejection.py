@@ -6,8 +6,9 @@ A matcher's own confidence is treated as a rejector that needs no fit.
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 import pandas as pd
@@ -118,10 +119,14 @@ def judge(
     frames = []
     usable = scores[scores["status"] != NOT_APPLICABLE]
     for _, group in usable.groupby(["track", "prior_group"], sort=True):
+        fits: dict[bytes, _Fit] = {}  # places share their calibration places with others
         for turn in turns(group, split, is_taught=is_taught):
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
-                frames.append(_judged(test, calibration, predictions, make).assign(is_own_calibration=turn.is_own))
+                same = turn.calibration.tobytes()
+                if same not in fits:
+                    fits[same] = _Fit.of(calibration, predictions, make)
+                frames.append(_judged(test, fits[same], predictions).assign(is_own_calibration=turn.is_own))
     return _together(frames, [*scores.columns, "p_right", "remark", "is_calibrated", *_DECIDED, "is_own_calibration"])
 
 
@@ -187,13 +192,25 @@ def _together(frames: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.Data
     return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
 
 
-def _judged(
-    test: pd.DataFrame, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make
-) -> pd.DataFrame:
-    p_false, remark = _fit_and_apply(make, calibration, test, predictions)
-    asked = test.assign(p_right=1.0 - p_false, remark=remark, is_calibrated=make().card.is_calibrated)
-    known = calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
-    return asked.assign(**_decided(known, asked))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Fit:
+    """A rejector fitted on calibration places, and these with their own `p_right`, each from a fit on others."""
+
+    rejector: Rejector
+    known: pd.DataFrame
+
+    @classmethod
+    def of(cls, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make) -> Self:
+        rejector = _fitted(make, calibration, predictions)
+        return cls(
+            rejector=rejector, known=calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))
+        )
+
+
+def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]) -> pd.DataFrame:
+    p_false, remark = _apply(fit.rejector, test, predictions)
+    asked = test.assign(p_right=1.0 - p_false, remark=remark, is_calibrated=fit.rejector.card.is_calibrated)
+    return asked.assign(**_decided(fit.known, asked))
 
 
 # What is decided about rows from the calibration places: acceptance by each threshold, chances at each declared share.
@@ -234,35 +251,45 @@ def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, 
     unit = next((name for name in ("country", "place") if len(set(calibration[name])) > 1), "block")
     names = sorted(set(calibration[unit]))
     if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
-        return _fit_and_apply(make, calibration, calibration, predictions)[0]
+        return _apply(_fitted(make, calibration, predictions), calibration, predictions)[0]
     fold = calibration[unit].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
     found = np.full(len(calibration), np.nan)
     for part in sorted(set(fold)):
         rest, mine = calibration[fold != part], calibration[fold == part]
         if rest["is_answered"].any():
-            found[fold == part] = _fit_and_apply(make, rest, mine, predictions)[0]
+            found[fold == part] = _apply(_fitted(make, rest, predictions), mine, predictions)[0]
     return found
 
 
-def _fit_and_apply(
-    make: Make, known: pd.DataFrame, asked: pd.DataFrame, predictions: Mapping[str, Prediction]
-) -> tuple[Floats, str]:
-    """Fit on the answers of some rows; return P(false) of others, NaN without an answer, and the remark on the fit."""
+def _fitted(make: Make, known: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Rejector:
+    """Return a new rejector, fitted on the answers of some rows."""
     rejector = make()
     answered = known[known["is_answered"].to_numpy(bool)]
+    with _blamed(rejector):
+        rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
+    return rejector
+
+
+def _apply(rejector: Rejector, asked: pd.DataFrame, predictions: Mapping[str, Prediction]) -> tuple[Floats, str]:
+    """Return P(false) of some rows, NaN without an answer, and the rejector's remark on its fit."""
     found = np.full(len(asked), np.nan)
     is_answered = asked["is_answered"].to_numpy(bool)
     some = _answers(asked[is_answered], predictions)
-    try:
-        rejector.fit(_answers(answered, predictions), ~answered["is_right"].to_numpy(bool))
+    with _blamed(rejector):
         if some:
             count = len(some)  # whatever becomes of the list
             found[is_answered] = check_p_false(rejector.p_false(some), count)
-        remark = remark_of(rejector)
-    except (Exception, SystemExit) as error:  # a plugin must not end the program
+        return found, remark_of(rejector)
+
+
+@contextmanager
+def _blamed(rejector: Rejector) -> Iterator[None]:
+    """Turn an error of a rejector into one line that names it: a plugin must not end the program."""
+    try:
+        yield
+    except (Exception, SystemExit) as error:
         message = f"rejector {rejector.card.name!r} failed ({message_of(error)}): mend it, or leave it out"
         raise MatchError(message) from error
-    return found, remark
 
 
 def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Sequence[Prediction]:

@@ -143,12 +143,13 @@ def test_thresholds_of_a_split_are_chosen_on_other_places():
 
 
 def test_a_threshold_is_set_on_countries_that_its_fit_has_not_seen(monkeypatch):
-    def fitted(make, rest, mine, predictions):  # noqa: ARG001
+    def applied(rest, mine, predictions):  # noqa: ARG001
         seen.append((set(rest["country"]), set(mine["country"])))
         return np.full(len(mine), 0.5), ""
 
     seen = []
-    monkeypatch.setattr(rejection, "_fit_and_apply", fitted)
+    monkeypatch.setattr(rejection, "_fitted", lambda make, rest, predictions: rest)  # noqa: ARG005
+    monkeypatch.setattr(rejection, "_apply", applied)
     places = [f"place{at % 4}" for at in range(120)]
     table = scores(ERRORS).assign(place=places, country=[f"land{at % 2}" for at in range(120)])
     assert (rejection._held_back(None, table, {}) == 0.5).all()

@@ -16,7 +16,7 @@ from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.scoring.controls import Falsifier, Verdict, verdict_frame
+from sasgeo_bench.scoring.controls import ALPHA, Falsifier, Verdict, verdict_frame
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.strata import ALL
 from sasgeo_bench.scoring.verdicts import Finding
@@ -60,6 +60,21 @@ def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
     """
     if not verdicts:
         return ["Controls: none were drawn for this board, so nothing vouches for it (a pipeline draws them)."]
+    return [*_held_lines(verdicts), *_powerless_lines(verdicts)]
+
+
+def _powerless_lines(verdicts: Sequence[Verdict]) -> Iterator[str]:
+    """Yield how many controls could not have failed."""
+    idle = sum(not item.can_fail for item in verdicts)
+    if idle:
+        yield (
+            f"{counted(idle, 'control')} could not fail: {'its' if idle == 1 else 'their'} queries are so few that "
+            f"guessing could have been right on all of them at a chance of {ALPHA:g}."
+        )
+
+
+def _held_lines(verdicts: Sequence[Verdict]) -> list[str]:
+    """Return how many controls held, and those that did not."""
     failed = [item for item in verdicts if not item.holds]
     lines = [item.to_text() for item in failed]
     of_board = sum(item.is_of_board for item in failed)

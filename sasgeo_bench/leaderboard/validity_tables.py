@@ -24,7 +24,7 @@ from sasgeo_bench.leaderboard.tables import (
     text_cells,
 )
 from sasgeo_bench.scoring.contrasts import AREAS
-from sasgeo_bench.scoring.controls import Falsifier
+from sasgeo_bench.scoring.controls import Falsifier, Verdict, verdicts_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.verdicts import Finding
 
@@ -75,22 +75,32 @@ def control_table(controls: pd.DataFrame) -> Table | None:
     """Return every control of every matcher, from `controls.verdict_frame`; None where none was drawn."""
     if not len(controls):
         return None
+    verdicts = verdicts_of(controls)
     rows = tuple(
         Row(
             cells=(
-                *text_cells(row["control"], row["matcher"]),
-                plain_cell(int(row["n"])),
-                Cell(text=tally_text(float(row["found"])), key=float(row["found"])),
-                Cell(text=tally_text(float(row["expected"])), key=float(row["expected"])),
-                p_cell(float(row["p"])),
-                Cell(text="held" if row["holds"] else "FAILED"),
+                *text_cells(item.control, item.matcher),
+                plain_cell(item.n),
+                Cell(text=tally_text(item.found), key=item.found),
+                Cell(text=tally_text(item.expected), key=item.expected),
+                p_cell(item.p),
+                _limit_cell(item),
+                Cell(text="held" if item.holds else "FAILED"),
             )
         )
-        for row in controls.to_dict("records")
+        for item in verdicts
     )
     first = column("control query", is_number=False, title="control")
-    columns = (first, *words("matcher"), *map(column, ("n", "found", "expected", "p")), *words("outcome"))
+    columns = (first, *words("matcher"), *map(column, ("n", "found", "expected", "p", "fails at")), *words("outcome"))
     return Table(name="controls", title="Controls, one by one", columns=columns, rows=rows, notes=(_CONTROLS_NOTE,))
+
+
+def _limit_cell(verdict: Verdict) -> Cell:
+    """Return how many right answers fail a control against chance."""
+    if math.isnan(verdict.p):
+        return Cell(text="-")
+    limit = verdict.fails_at
+    return Cell(text="never") if limit is None else plain_cell(limit)
 
 
 def contrast_table(findings: Sequence[Finding]) -> Table:

@@ -2,9 +2,9 @@
 """Controls of a board, compared with what is known about them in advance; falsifiers of registered contrasts."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pandas as pd
@@ -57,6 +57,25 @@ class Verdict:
         [True, True, False]
         """
         return name_alone(self.matcher) in {ORACLE, REFERENCE, *UNRANKED}
+
+    @property
+    def fails_at(self) -> int | None:
+        """Return how many right answers fail the control; None where even all of them would not, for want of queries.
+
+        Of controls against chance; where the trials differ in their chance, no fewer than this fail it.
+
+        >>> coins = {"control": "identical twins tie", "matcher": "m", "found": 3.0, "p": 0.66, "holds": True}
+        >>> [Verdict(n=n, expected=n / 2, **coins).fails_at for n in (6, 14, 60)]
+        [None, 14, 45]
+        """
+        ways = _ways(np.full(self.n, self.expected / self.n))
+        rare = np.flatnonzero(np.cumsum(ways[::-1])[::-1] < ALPHA)
+        return int(rare[0]) if len(rare) else None
+
+    @property
+    def can_fail(self) -> bool:
+        """Return False for a test against chance of so few queries that no answers could fail it."""
+        return math.isnan(self.p) or self.fails_at is not None
 
     def to_text(self) -> str:
         """Return the result in one line.
@@ -121,6 +140,17 @@ def verdict_frame(verdicts: Sequence[Verdict]) -> pd.DataFrame:
     return pd.DataFrame([{name: getattr(item, name) for name in columns} for item in verdicts], columns=columns)
 
 
+def verdicts_of(table: pd.DataFrame) -> list[Verdict]:
+    """Return the verdicts of a table of `verdict_frame`."""
+    kinds: dict[str, Callable[[Any], Any]] = {
+        **dict.fromkeys(("control", "matcher"), str),
+        "n": int,
+        **dict.fromkeys(("found", "expected", "p"), float),
+        "holds": bool,
+    }
+    return [Verdict(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in table.to_dict("records")]
+
+
 def hits(scores: pd.DataFrame) -> Floats:
     """Return the primary metric of each row, shape (N,): 1 if right, the chance of a tie."""
     parts = [
@@ -145,10 +175,15 @@ def at_least(count: float, each: Floats) -> float:
     >>> at_least(2, np.array([0.5, 0.5]))
     0.25
     """
+    return float(min(1.0, _ways(each)[math.ceil(count - 1e-9) :].sum()))
+
+
+def _ways(each: Floats) -> Floats:
+    """Return the chance of every number of hits, shape (N + 1,), in N independent trials of chance `each`."""
     ways = np.ones(1)
     for chance in each:
         ways = np.convolve(ways, (1 - chance, chance))
-    return float(min(1.0, ways[math.ceil(count - 1e-9) :].sum()))
+    return ways
 
 
 def _by_chance(matcher: str, controls: pd.DataFrame) -> Iterator[Verdict]:

@@ -13,6 +13,9 @@ aged
     size of view.
 occluded
     The same with more of the view unknown (`unknown_share`, by at least 0.05).
+one of several
+    The answer is wrong and accepted, and nobody could do better: the searched map holds the place several times, so
+    that its ceiling is below 1. The controls and falsifiers of twins are such.
 aliased
     The answer is wrong and accepted, at a place that has a double: alias index at least 0.9, the highest bin of a
     board, or a suite that copies places.
@@ -38,13 +41,17 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.rejection import OWN
 
 BOTH: Final = "also without the stress"
-FAILURES: Final = ("aliased", "aged", "occluded", "absent accepted", "right but not accepted", BOTH, "other")
+SEVERAL: Final = "one of several"
+FAILURES: Final = (
+    *("aliased", "aged", "occluded", "absent accepted", "right but not accepted", SEVERAL, BOTH, "other"),
+)
 MEANINGS: Final = {  # of the classes, for whoever looks at them; above in full
     "aliased": "wrong and accepted, where the map has a place much alike",
     "aged": "right on the map of the day, wrong where more of the map has changed",
     "occluded": "right in the open, wrong where more of the view is hidden",
     "absent accepted": "an answer is accepted although the place is not on the map",
     "right but not accepted": "the answer is right, and the rejector refuses it",
+    SEVERAL: "wrong and accepted, but the map holds the place several times, and nothing tells which it is",
     BOTH: "as wrong without the stress, which is not to blame",
     "other": "no right answer, for no reason that is told here",
 }
@@ -101,6 +108,7 @@ def find_cases(scores: pd.DataFrame, matcher: str, judged: pd.DataFrame | None =
         ("right but not accepted", is_present & is_right & has_threshold & ~taken & is_asked),
         ("aged", is_paired & (changed >= control["changed_share"].to_numpy(float) + _CHANGED_MORE)),
         ("occluded", is_paired & (unknown >= control["unknown_share"].to_numpy(float) + _UNKNOWN_MORE)),
+        (SEVERAL, is_wrong & is_answered & taken & (scores["ceiling"] < 1.0).to_numpy(bool)),
         ("aliased", is_wrong & is_answered & taken & has_double),
         (BOTH, is_wrong & is_stress & control["is_wrong"].to_numpy(bool)),
         ("other", is_wrong),

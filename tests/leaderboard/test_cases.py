@@ -72,6 +72,12 @@ def test_a_wrong_answer_is_aliased_where_the_place_has_a_double_and_it_is_accept
     assert classes(asked(row(np.inf, alias_index=0.95))) == {"q0": "other"}
 
 
+def test_a_wrong_answer_where_the_map_holds_the_place_several_times_is_nobodys_fault():
+    table = asked(row(90.0, ceiling=0.5, suite="instance-twins", role="control"), row(np.inf, ceiling=0.5))
+    assert classes(table) == {"q0": "one of several", "q1": "also without the stress"}
+    assert classes(table, said(table, [False, True]))["q0"] == "other"  # it was not trusted
+
+
 def test_an_answer_of_an_absent_place_is_a_failure_unless_it_is_rejected():
     table = asked(*[row(90.0, is_present=False)] * 2, row(np.inf, is_present=False))
     assert classes(table) == {"q0": "absent accepted", "q1": "absent accepted"}

@@ -23,7 +23,8 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "detectable": "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf "
     "if none, - where nobody is ranked",
     "n": "Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones",
-    "mean": "Mean of the suites beside it, which weigh alike; of entries that were asked about all of them",
+    "mean": "Mean of the suites beside it in which somebody is ranked, which weigh alike; of entries that were asked "
+    "about all suites",
     "missing": "Queries without a row; they count as misses",
     "blocks": "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
     "places, then blocks in them",
@@ -31,6 +32,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "part": "Which of the suite's queries: a role, a kind of stress, one of its steps at one size of view, or a bin "
     "of what was measured at the truth",
     "kind": "Kind of stress, or of its absence",
+    "risk kept": "Whether at most 5 % of the answers are false: yes or no where the whole interval says so, else open",
     "rejector": "Estimates of each answer how likely it is false; own: the matcher's own confidence, fitted to nothing",
     "track": "localization: find the place on the map; retrieval: pick it among candidates; sequence: follow a flight",
     "contrast": "Pair of entries that was registered before anything was run",
@@ -53,19 +55,22 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "found": "How many were right, or were answered where none must be",
     "expected": "How many are right by guessing, or how many there must be",
     "p": "Chance of finding as many or more by guessing; a control fails below 0.0001",
+    "fails at": "How many right ones fail the control; never: even if all were right, guessing could have done it",
     "figure": "Success or recall under stress, or false fixes at absent places",
     "public": "The figure on the public seed of this board",
     "private": "The same on a private seed, whose queries nobody else can draw",
     "private less public": "Difference with its interval; all intervals of a matcher hold at once (95 %)",
     "shown": "Whether the private figure is shown to be worse",
     "class": "Semantic class of the map",
-    "place": "Where maps of several dates were compared",
+    "place": "Regions so near each other that they count as one: places are resampled, and kept apart by the split",
+    "compared at": "Where maps of several dates were compared",
+    "queries": "Track of the queries, and what was known of the pose before",
     "years": "From the first map to the last",
     "things": "Things of the class on the first map and on the last",
     "vanishes": "Share of what the map shows that is gone after a year, with its 95 % interval, over all dates",
     "appears": "Share of a newer map that one a year older lacks, with its 95 % interval; late mapping is in it",
     "re-drawn": "Of the older amount: kept, but moved by more than 1 m between the first map and the last",
-    "shift": "How far what was kept moved, median; of areas that of the centroid",
+    "moved": "How far what was kept moved, median; of areas that of the centroid",
     "no.": "As on the map above",
     "half or part": "What the split keeps apart: one half trains and calibrates for the other, or train, calibration "
     "and test",
@@ -102,6 +107,8 @@ NOTE: Final = (
 RANKS_NOTE: Final = (
     "The first figure of a suite counts the stressed queries, or all where nothing is stressed; matchers are ranked by "
     "it. A rank is an interval: matchers that share one cannot be distinguished. Nothing is ranked across prior groups."
+    " Ranks compare all matchers of one suite; what a registered contrast says is adjusted for all contrasts of the "
+    "board, so that it may leave open what ranks tell apart."
 )
 TERMS: Final = {  # what tables show that is no column
     DAGGER: "Wilson's interval: of a few sites, or where all answers are right, draws alone would be too narrow",

@@ -54,17 +54,18 @@ def _overview(book: Book, keys: Sequence[Key]) -> Table:
     found = {name: [by_suite[key][name] for key in shown] for name in names}
     order = _order(book, found)
     whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
-    has_mean = len(shown) > 1 and len(whole - book.controls) > 1
+    weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
+    has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
     rows = _heads(book, shown, absent, primary, has_mean=has_mean)
     for name in order:
         cells = [short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
         cells += [short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False) for key in absent]
         if has_mean:
-            cells.append(number_cell(_mean_value(found[name]) if name in whole else math.nan))
+            cells.append(number_cell(_mean_value([found[name][at] for at in weighed]) if name in whole else math.nan))
         tone = "head" if name in book.controls else "plain"
         rows.append(Row(cells=(book.short_name(name), *cells), tone=tone))
     columns = (
-        *(_suite_column(book, key, primary) for key in shown),
+        *(_suite_column(book, key, primary, has_absent=key in absent) for key in shown),
         *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
         *([column("mean")] if has_mean else []),
     )
@@ -86,12 +87,12 @@ def _order(book: Book, found: Mapping[str, Sequence[Record | None]]) -> list[str
     )
 
 
-def _suite_column(book: Book, key: Key, primary: str) -> Column:
-    """Return the column of a suite, which says what is done in it, and what its figure pools."""
+def _suite_column(book: Book, key: Key, primary: str, *, has_absent: bool) -> Column:
+    """Return the column of a suite, which says what is done in it, and what its figure pools: places on the map."""
     counted = book.counted.get(key)
     texts = (suite_words(key[0]), f"Counted, each query alike: {counted}" if counted else "")
     meaning = " ".join(filter(None, texts)).removesuffix(".")
-    plain = column(primary, title=key[0])
+    plain = column(primary, title=f"{key[0]}: on the map" if has_absent else key[0])
     return replace(plain, meaning=meaning or plain.meaning)
 
 

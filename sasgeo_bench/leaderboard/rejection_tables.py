@@ -2,12 +2,13 @@
 """Tables of matchers with a rejector: over all suites, and by the kind of absence."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import pandas as pd
 
 from sasgeo_bench.leaderboard.columns import column, prior_words, words
+from sasgeo_bench.leaderboard.overview import short_cell
 from sasgeo_bench.leaderboard.tables import (
     Cell,
     Record,
@@ -26,11 +27,17 @@ _REJECTION: Final = (  # metrics of the tables of rejectors
     *("aurc", "e_aurc", "auroc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
     *("right_at_absent_0.05", "absent_reached_at_0.05", "ece", "cost_20"),
 )
-_RISK: Final = {"coverage_at_risk_0.05": "answered", "risk_reached_at_0.05": "false of these"}
+SHOWN_RISK: Final = 0.05
+COVERED: Final = "coverage_at_risk_0.05"
+REACHED: Final = "risk_reached_at_0.05"
 _RISK_NOTES: Final = (
-    "A matcher stands here with the rejector that orders its answers best. Thresholds are of other places.",
-    "Where more than 0.050 of the answers are false, the risk was not kept on these places.",
-    "† marks Wilson's interval over sites.",
+    "A matcher stands here with the rejector that orders its answers best on these very places, which flatters it.",
+    "Thresholds are of other places.",
+    "Rows with different n are of different queries: do not compare them. † marks Wilson's interval over sites.",
+)
+_BY_SUITE_NOTES: Final = (
+    "One threshold for all suites: where a suite is hard, more of its answers are false.",
+    "Controls and falsifiers of twins and of alias count, of which nobody can tell the two places apart.",
 )
 SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a right one
 _MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))
@@ -52,40 +59,92 @@ def risk_tables(board: pd.DataFrame) -> tuple[Table, ...]:
 
     A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
     """
-    rows = _rejection_rows(board)
-    ranked = rows[~rows["matcher"].map(is_unranked).astype(bool)]
-    return tuple(
-        _risk_table(part, str(track), str(prior_group))
-        for (track, prior_group), part in ranked.groupby(["track", "prior_group"], sort=True)
-    )
+    found = (_risk_table(best, *named) for best, _, *named in _groups(board, "risk"))
+    return tuple(table for table in found if table.rows)
 
 
-def _risk_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
+def risk_tables_by_suite(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Return how many of the answers of `risk_tables` are false where more places are absent, and in each suite."""
+    found = (_risk_by_suite(best, part, *named) for best, part, *named in _groups(board, "risk-by-suite"))
+    return tuple(table for table in found if table.rows)
+
+
+Best = Mapping[tuple[str, str], Mapping[str, Record]]  # figures by matcher and rejector, then by metric
+
+
+def _groups(board: pd.DataFrame, stem: str) -> Iterator[tuple[Best, pd.DataFrame, str, str]]:
+    """Yield by track and prior group the best pairs, the rows of all, the name of a table, and what it is of."""
+    rows = board[(board["rejector"] != "") & ~board["matcher"].map(is_unranked).astype(bool)]
+    for (track, prior_group), part in rows.groupby(["track", "prior_group"], sort=True):
+        where = f"{track}, {prior_words(str(prior_group))}"
+        yield _best_pairs(_rejection_rows(part)), part, file_stem(stem, str(track), str(prior_group)), where
+
+
+def _best_pairs(part: pd.DataFrame) -> Best:
+    """Return the figures of each matcher with the rejector of the least area, in the order of that area."""
     found = {(str(key[0]), str(key[1])): _by_metric(mine) for key, mine in part.groupby(["matcher", "rejector"])}
     order = sorted((_area(by_name), key) for key, by_name in found.items())
     best: dict[str, tuple[str, str]] = {}
     for area, key in order:
         if area < math.inf:
             best.setdefault(key[0], key)
+    return {key: found[key] for key in best.values()}
+
+
+def _risk_table(best: Best, name: str, where: str) -> Table:
+    rows = [
+        Row(
+            cells=(
+                *text_cells(*key),
+                *(figure_cell(by_name.get(metric)) for metric in (COVERED, REACHED)),
+                Cell(text=_kept(by_name.get(REACHED))),
+                plain_cell(int(by_name["aurc"]["n"])),
+            )
+        )
+        for key, by_name in best.items()
+    ]
+    figures = (column(COVERED, title="answered"), column(REACHED, title="false of these"))
     return Table(
-        name=file_stem("risk", track, prior_group),
-        title=f"Answers where 5 % of them may be false fixes: {track}, {prior_words(prior_group)}",
-        columns=(
-            *words("matcher", "rejector"),
-            *(column(metric, title=title) for metric, title in _RISK.items()),
-            column("n"),
-        ),
+        name=name,
+        title=f"Answers where 5 % of them may be false fixes: {where}",
+        columns=(*words("matcher", "rejector"), *figures, *words("risk kept"), column("n")),
+        rows=tuple(rows),
+        notes=_RISK_NOTES,
+    )
+
+
+def _kept(row: Record | None) -> str:
+    """Return whether the interval of a reached risk shows that it was kept.
+
+    >>> [_kept({"lo": lo, "hi": hi}) for lo, hi in ((0.0, 0.04), (0.03, 0.07), (0.06, 0.2))], _kept(None)
+    (['yes', 'open', 'no'], '-')
+    """
+    if row is None or math.isnan(row["lo"]):
+        return "-"
+    if row["hi"] <= SHOWN_RISK:
+        return "yes"
+    return "no" if row["lo"] > SHOWN_RISK else "open"
+
+
+def _risk_by_suite(best: Best, part: pd.DataFrame, name: str, where: str) -> Table:
+    reached = part[part["metric"] == REACHED]
+    suites = sorted(set(reached["suite"]) - {ALL_SUITES})
+    shares = {mixture_name(share): f"{100 * (1 - share):.0f} % of places absent" for share in PRESENT_SHARES}
+    places = [(ALL_SUITES, mixture) for mixture in shares] + [(suite, AS_DRAWN) for suite in suites]
+    keys = zip(*(reached[field] for field in ("matcher", "rejector", "suite", "stratum")), strict=True)
+    by_key: dict[tuple[Any, ...], Any] = dict(zip(keys, reached.to_dict("records"), strict=True))
+    titles = [*(shares[mixture] for mixture in shares), *suites]
+    return Table(
+        name=name,
+        title=f"How many of these are false, by share of absent places and by suite: {where}",
+        columns=(*words("matcher", "rejector"), *(column(REACHED, title=title) for title in titles)),
         rows=tuple(
             Row(
-                cells=(
-                    *text_cells(*key),
-                    *(figure_cell(found[key].get(metric)) for metric in _RISK),
-                    plain_cell(int(found[key]["aurc"]["n"])),
-                )
+                cells=(*text_cells(*key), *(short_cell(by_key.get((*key, *place)), has_rank=False) for place in places))
             )
-            for key in best.values()
+            for key in best
         ),
-        notes=_RISK_NOTES,
+        notes=_BY_SUITE_NOTES,
     )
 
 
@@ -132,7 +191,7 @@ def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: 
         title=title,
         columns=(
             *words("matcher", "rejector"),
-            *((column("track", is_number=False, title="queries"),) if has_queries else ()),
+            *(words("queries") if has_queries else ()),
             *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
         ),
         rows=tuple(row for *_, row in rows),

@@ -82,4 +82,4 @@ def _notes(suite: str, strength: float | None) -> Iterator[str]:
     yield suite_words(suite)
     card = suite_card(suite)
     if card is not None and strength is not None:
-        yield f"Only views of strength {strength:g} ({card.strength_unit}), which is what a user meets."
+        yield f"Only views of strength {strength:g} ({card.strength_unit}), as they are expected in use."

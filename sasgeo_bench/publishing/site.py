@@ -4,20 +4,26 @@
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from typing import Any, Final
+from urllib.parse import urlencode
 
 import pandas as pd
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of
-from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE, column
+from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE, column, suite_card
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
-from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables, rejection_tables, risk_tables
+from sasgeo_bench.leaderboard.rejection_tables import (
+    acceptance_tables,
+    rejection_tables,
+    risk_tables,
+    risk_tables_by_suite,
+)
 from sasgeo_bench.leaderboard.scene_tables import scene_tables
 from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
 from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
@@ -35,9 +41,9 @@ from sasgeo_bench.publishing.site_pages import (
 )
 from sasgeo_bench.publishing.site_source import Case, SiteSource
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.controls import Verdict
+from sasgeo_bench.scoring.controls import Verdict, verdicts_of
 from sasgeo_bench.scoring.verdicts import LOWER
-from sasgeo_bench.tasks.query import SEQUENCE
+from sasgeo_bench.tasks.query import SEQUENCE, base_of
 from sasgeo_bench.texts import plain
 
 _OF_SHARES: Final = frozenset({"primary", "interaction", "shift"})  # metrics whose meaning is a name that all know
@@ -190,7 +196,8 @@ def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) 
 ASSETS: Final = ("site.css", "site.js")
 MAP_ASSETS: Final = ("leaflet.css", "leaflet.js")  # as they came, with their licence
 FAILURES: Final = (  # in the order they are shown; others follow
-    *("aliased", "aged", "occluded", "absent accepted", "right but not accepted", "also without the stress"),
+    *("aliased", "aged", "occluded", "absent accepted", "right but not accepted"),
+    *("one of several", "also without the stress"),
 )
 _NAMES: Final = {  # pages that every site has or may have, in the order of the navigation
     "index.html": "Board",
@@ -254,7 +261,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
         "rejection.html": {
-            "risks": tuple(table for table in risk_tables(source.board) if table.rows),
+            "risks": (*risk_tables(source.board), *risk_tables_by_suite(source.board)),
             "tables": rejection,
             "acceptance": acceptance,
             "protection": protection,
@@ -263,7 +270,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         },
         "figures.html": {"kinds": kinds},
         "map.html": {"places": list(maps), "outcomes": ANSWER_OUTCOMES, "classes": load_taxonomy().classes},
-        "failures.html": {"groups": groups_of(source.pictures.cases), "total": len(source.pictures.cases)},
+        "failures.html": _failures(source, {place.region for place in maps}),
         "regions.html": {"table": region_table(source)},
         "ageing.html": {"table": rate_table(source.rates), "kinds": kinds},
         "method.html": {
@@ -292,8 +299,9 @@ def _map_files(templates: Environment, scripts: Mapping[str, str]) -> dict[str, 
 
 def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
     """Return what the first page shows."""
-    controls = _verdicts(source)
+    controls = verdicts_of(source.controls)
     overview = tuple(table for table in summary(book) if _has_rivals(table))
+    contrasts = contrasts_of(source)
     prices = {table.name.replace("summary", "price", 1) for table in overview}
     return {
         "sections": sections,
@@ -301,7 +309,9 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "overview": overview,
         "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),
         "ranks_note": RANKS_NOTE,
-        "contrasts": contrasts_of(source),
+        "contrasts": contrasts,
+        "found": _found_text(contrasts),
+        "made_of": _made_of(book),
         "control_lines": control_lines(controls),
         "controls_state": _controls_state(controls),
         "has_controls": bool(controls),
@@ -312,6 +322,48 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }
+
+
+def _made_of(book: Book) -> str:
+    """Return what the views of a board are made of, as far as this version knows its suites."""
+    needs = {need for suite in book.suite_pages for need in getattr(suite_card(suite), "needs", ())}
+    if "imagery" in needs:
+        return "Views are real aerial pictures, or made from maps: each suite says which."
+    return (
+        "Views are made from OpenStreetMap, with errors as a detector of classes makes them; what pictures there are, "
+        "are rendered. None is a photograph."
+    )
+
+
+def _found_text(contrasts: Sequence[ContrastSummary]) -> str:
+    """Return in one line how many registered differences came out how, and which entries are shown to be better."""
+    counts = Counter(item.outcome for item in contrasts)
+    said = ", ".join(f"{count} {outcome}" for outcome, count in counts.items())
+    told = [f"{item.headline} ({item.name})" for item in contrasts if item.outcome in _TOLD]
+    better = f" Shown: {'; '.join(told)}." if told else " Nobody is shown to be better than another."
+    return f"Of {counted(len(contrasts), 'difference')} registered before anything was run: {said}.{better}"
+
+
+def _failures(source: SiteSource, mapped: Collection[str]) -> dict[str, Any]:
+    """Return what the page of failures shows; `mapped` are the places with a map of their queries."""
+    groups = groups_of(source.pictures.cases)
+    numbered = {number: case for group in groups for number, case in group.cases}
+    return {
+        "groups": groups,
+        "total": len(numbered),
+        "links": {number: _on_map(case) for number, case in numbered.items() if base_of(case.region) in mapped},
+        "filters": [
+            ("Matcher", "matcher", sorted({case.matcher for case in numbered.values()}), {}),
+            ("Suite", "suite", sorted({case.suite for case in numbered.values()}), {}),
+            ("Class", "class", [group.title for group in groups], {}),
+        ],
+    }
+
+
+def _on_map(case: Case) -> str:
+    """Return the address of a case on the map of its place."""
+    asked = {"place": base_of(case.region), "matcher": case.matcher, "suite": case.suite, "outcome": "failures"}
+    return f"map.html?{urlencode(asked | {'query': case.query_id})}"
 
 
 def _filters(tables: Sequence[Table], *terms: str) -> list[tuple[str, str, list[str], dict[str, str]]]:
@@ -345,17 +397,6 @@ def _shown(value: object) -> object:
 def _render(templates: Environment, template: str, page: str, values: Mapping[str, Any]) -> str:
     text = templates.get_template(template).render(**values, page=page)
     return _BLANK_LINES.sub("\n", _INDENTS.sub("", text)) + "\n"
-
-
-def _verdicts(source: SiteSource) -> list[Verdict]:
-    kinds: dict[str, Callable[[Any], Any]] = {
-        **dict.fromkeys(("control", "matcher"), str),
-        "n": int,
-        **dict.fromkeys(("found", "expected", "p"), float),
-        "holds": bool,
-    }
-    records = source.controls.to_dict("records")
-    return [Verdict(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in records]
 
 
 def _controls_state(verdicts: Sequence[Verdict]) -> str:

@@ -85,6 +85,7 @@ def _script(place: PlaceMap, item: RegionMap, answers: pd.DataFrame, cases: Mapp
     content: dict[str, Any] = {
         "picture": f"pictures/{item.file}",
         "size_m": [east_m - west_m, north_m - south_m],
+        "corner_m": [west_m, south_m],
         "blocks": [
             [plain(name), left - west_m, low - south_m, right - west_m, high - south_m]
             for name, (left, low, right, high) in item.blocks_m.items()

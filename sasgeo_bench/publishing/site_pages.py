@@ -373,16 +373,16 @@ def rate_table(book: RateBook) -> Table:
         for place in book.places
         if (found := place.classes.get(name)) is not None
     ]
-    names = ("things", "vanishes", "appears", "re-drawn", "shift")
-    shown = {"vanishes": "vanishes (%/year)", "appears": "appears (%/year)", "re-drawn": "re-drawn (%)"}
+    names = ("things", "vanishes", "appears", "re-drawn", "moved")
+    units = {"vanishes": "%/year", "appears": "%/year", "re-drawn": "%", "moved": "m"}
     return Table(
         name="rates",
         title="Yearly rates by class and place",
         columns=(
             column("class", is_number=False),
-            column("place", is_number=False),
+            column("compared at", is_number=False, title="place"),
             column("years"),
-            *(column(name, title=shown.get(name, "shift (m)" if name == "shift" else name)) for name in names),
+            *(column(name, title=f"{name} ({units[name]})" if name in units else name) for name in names),
         ),
         rows=tuple(rows),
         notes=("Of few things a rate says little. What appears is mostly mapping that catches up, not new building.",),

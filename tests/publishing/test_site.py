@@ -16,7 +16,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.overview import summary
-from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables
+from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables, risk_tables_by_suite
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, text_of, ties_of
 from sasgeo_bench.publishing.site import contrasts_of
 from sasgeo_bench.publishing.site_maps import place_maps
@@ -274,9 +274,26 @@ def test_of_each_ranked_matcher_the_rejector_with_the_best_order_says_what_is_an
     (table,) = risk_tables(to_frame(rows))
     assert [[cell.text for cell in row.cells][:2] for row in table.rows] == [["graph", "own"], ["raster", "margin"]]
     assert [[text_of(cell) for cell in row.cells][2:] for row in table.rows] == [
-        ["0.800", "0.040", "9"],
-        ["0.500", "0.060", "9"],
+        ["0.800", "0.040", "-", "9"],
+        ["0.500", "0.060", "-", "9"],
     ]
+
+
+def test_whether_the_risk_was_kept_is_said_by_its_interval_and_where_it_was_not_by_suite():
+    facts = {"matcher": "m", "rejector": "own", "track": "localization", "prior_group": "r500-weak-s3", "unit": "1"}
+    facts |= {"n": 9, "answered": 9, "missing": 0, "blocks": 2, "places": 2, "better": "lower"}
+    whole = {"suite": "all suites", "stratum": "as drawn"}
+    rows = [
+        Row(metric="aurc", value=0.1, **facts, **whole),
+        Row(metric="risk_reached_at_0.05", value=0.04, lo=0.02, hi=0.07, **facts, **whole),
+        Row(metric="risk_reached_at_0.05", value=0.2, suite="all suites", stratum="present 0.5", **facts),
+        Row(metric="risk_reached_at_0.05", value=0.3, suite="twins", stratum="as drawn", **facts),
+    ]
+    (table,) = risk_tables(to_frame(rows))
+    assert table.rows[0].cells[4].text == "open"
+    (table,) = risk_tables_by_suite(to_frame(rows))
+    said = {one.name: text_of(cell) for one, cell in zip(table.columns, table.rows[0].cells, strict=True)}
+    assert said | {"50 % of places absent": "0.200", "30 % of places absent": "-", "twins": "0.300"} == said
 
 
 def test_words_of_files_are_plain():
@@ -397,7 +414,7 @@ def test_answers_that_lie_nowhere_are_refused_by_row(column, value):
 def test_false_fixes_stand_beside_the_success_of_a_suite_with_absent_places():
     absent = many_rows(3).assign(metric="answered_absent", stratum="all", n=30, rank_best=pd.NA, rank_worst=pd.NA)
     (table,) = summary(book_of(source(pd.concat([many_rows(3), absent], ignore_index=True))))
-    assert [column.name for column in table.columns] == ["matcher", "real-age", "real-age: false fixes"]
+    assert [column.name for column in table.columns] == ["matcher", "real-age: on the map", "real-age: false fixes"]
     heads, first, *_ = table.rows
     assert [cell.text for cell in heads.cells] == ["queries", "80", "30"]
     assert (first.cells[2].details, first.cells[2].tone) == (("[0.90, 1.00]",), "plain")  # no rank, and nobody leads

@@ -147,15 +147,15 @@ def test_what_is_filtered_and_sorted_stands_in_the_address_and_is_shown_again_fr
 def test_lines_of_rejectors_are_filtered_by_matcher_and_the_address_keeps_it(page, site):
     page.open(address(site, "rejection.html"))
     names = "[...document.querySelectorAll('tbody tr:not([hidden]) th')].map((one) => one.textContent)"
-    assert page.value(names) == ["graph", "raster"] * 2  # what is answered at a risk, and all metrics
+    assert page.value(names) == ["graph", "raster"] * 3  # what is answered at a risk, by suite, and all metrics
     page.value(
         "((one) => { one.value = 'raster'; one.dispatchEvent(new Event('change', {bubbles: true})); })"
         "(document.querySelector('select[name=matcher]'))"
     )
-    assert page.value(names) == ["raster"] * 2
-    assert page.value("document.querySelector('output').textContent") == "2 of 4 lines shown"
+    assert page.value(names) == ["raster"] * 3
+    assert page.value("document.querySelector('output').textContent") == "3 of 6 lines shown"
     page.open(page.value("location.href"))
-    assert page.value(names) == ["raster"] * 2
+    assert page.value(names) == ["raster"] * 3
 
 
 def test_ties_are_told_beside_the_ranks_and_below_the_table(page, site):
@@ -247,6 +247,20 @@ def test_failures_turn_by_key_and_by_link(page, site):
     assert page.value(
         "[...document.querySelectorAll('main > section:not([hidden]) h2')].map((one) => one.textContent)"
     ) == ["aliased"]
+
+
+def test_failures_are_filtered_and_turn_among_those_left(page, site):
+    page.open(f"{address(site, 'failures.html')}?class=aliased")
+    shown = "[...document.querySelectorAll('article.case:not([hidden])')].map((one) => one.id)"
+    assert page.value("document.querySelector('output').textContent") == "2 of 3 cases shown"
+    page.press("ArrowRight")
+    until(page, f"{shown}[0] === 'case-2'")
+    page.press("ArrowRight")  # the third is of another class
+    assert page.value(shown) == ["case-2"]
+    assert page.value("document.querySelector('#case-2 a[rel=next]').hidden")
+    page.value("location.hash = 'case-3'")  # a link to what is filtered away shows it all the same
+    until(page, f"{shown}[0] === 'case-3'")
+    assert page.value("document.querySelector('output').textContent") == "3 of 3 cases shown"
 
 
 def test_without_scripts_everything_can_be_read_and_nothing_pretends_to_work(page, site):

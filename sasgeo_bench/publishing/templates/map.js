@@ -116,6 +116,8 @@ function crop(title, pose, view_m, colour) {
   return figure;
 }
 
+// Easting, northing and yaw in the grid of the map.
+const spot = (pose) => `E ${(place.corner_m[0] + pose[0]).toFixed(1)} m, N ${(place.corner_m[1] + pose[1]).toFixed(1)} m, yaw ${pose[2].toFixed(0)} deg`;
 const away = (one, other) => Math.hypot(one[0] - other[0], one[1] - other[1]);
 
 function rivals(number) {
@@ -143,6 +145,7 @@ function show(number) {
   const truth = query.slice(EAST);
   facts.append(row("Suite", `${query[SUITE]}, ${query[KIND]}`), row("Searched map", query[REGION] + (query[REGION] === field("place").value ? "" : `; the picture shows ${field("place").value}`)), row("Query", query[ID]));
   facts.append(row("Answer", !fix.length ? "none" : truth.length ? `${away(fix, truth).toFixed(1)} m from where the view was taken` : "given"));
+  for (const [name, pose] of [["True place", truth], ["Answered place", fix]]) if (pose.length) facts.append(row(name, spot(pose)));
   if (!query[PRESENT]) facts.append(row("Place", "not on the searched map: the right answer is none"));
   if (truth.length) {
     L.circleMarker(latlng(...truth), { radius: 9, weight: 3, color: TRUE, fill: false }).bindTooltip("true place").addTo(detail);

@@ -68,8 +68,10 @@ for (const kind of ["pointerover", "focusin"]) {
   document.addEventListener(kind, () => document.body.classList.remove("calm"));
 }
 
-// What is filtered: sections by what they say of themselves, else the lines of tables by their columns.
+// What is filtered: cases and sections by what they say of themselves, else the lines of tables by their columns.
 function filtered() {
+  const cases = Array.from(document.querySelectorAll("article.case"), (part) => ({ part, facts: new Map(Object.entries(part.dataset)) }));
+  if (cases.length) return { what: "cases", parts: cases };
   const groups = Array.from(document.querySelectorAll("section.group"), (part) => ({ part, facts: new Map(Object.entries(part.dataset)) }));
   if (groups.length) return { what: "tables", parts: groups };
   const lines = Array.from(document.querySelectorAll("table"), (table) => {
@@ -84,8 +86,13 @@ if (form) {
   const { what, parts } = filtered();
   const filter = () => {
     const wanted = Array.from(form.querySelectorAll("select"), (one) => [one.name, one.value]);
-    for (const { part, facts } of parts) part.hidden = !wanted.every(([name, value]) => !value || !facts.has(name) || facts.get(name) === value);
-    const shown = parts.filter(({ part }) => !part.hidden).length;
+    let shown = 0;
+    for (const { part, facts } of parts) {
+      const fits = wanted.every(([name, value]) => !value || !facts.has(name) || facts.get(name) === value);
+      if (what === "cases") part.classList.toggle("out", !fits); // of those left one alone is not hidden
+      else part.hidden = !fits;
+      shown += Number(fits);
+    }
     form.querySelector("output").textContent = `${shown} of ${parts.length} ${what} shown`;
   };
   for (const one of form.querySelectorAll("select")) {
@@ -99,10 +106,10 @@ if (form) {
     filter();
   });
   filter(); // a browser may keep what was chosen before
-  // A link to a table that is filtered away shows it all the same.
+  // A link to what is filtered away shows it all the same.
   const reveal = () => {
     const found = location.hash && document.getElementById(location.hash.slice(1));
-    const group = found && found.closest("section.group[hidden]");
+    const group = found && found.closest(".out, section.group[hidden]");
     if (group) {
       form.reset();
       for (const one of form.querySelectorAll("select")) remember(one.name, "", () => true);
@@ -115,18 +122,25 @@ if (form) {
 
 const cases = Array.from(document.querySelectorAll("article.case"));
 if (cases.length) {
-  const current = () => Math.max(0, cases.findIndex((one) => `#${one.id}` === location.hash));
+  const left = () => cases.filter((one) => !one.classList.contains("out"));
+  const current = () => Math.max(0, left().findIndex((one) => `#${one.id}` === location.hash));
   const show = (isAsked) => {
-    const at = current();
-    cases.forEach((one, number) => { one.hidden = number !== at; });
+    const [kept, at] = [left(), current()];
+    for (const one of cases) one.hidden = one !== kept[at];
     for (const section of document.querySelectorAll("main > section")) section.hidden = !section.querySelector("article:not([hidden])");
-    if (isAsked) cases[at].focus();
+    for (const link of kept[at]?.querySelectorAll(".turn a") ?? []) {
+      const next = kept[at + (link.rel === "next" ? 1 : -1)];
+      link.hidden = !next;
+      if (next) link.hash = next.id;
+    }
+    if (isAsked) kept[at]?.focus();
   };
   addEventListener("hashchange", () => show(true));
+  form?.addEventListener("change", () => show(false));
   document.addEventListener("keydown", (event) => {
     const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
     const isTaken = event.altKey || event.ctrlKey || event.metaKey || event.shiftKey || event.target.closest("input, select, textarea");
-    const next = step && !isTaken ? cases[current() + step] : undefined;
+    const next = step && !isTaken ? left()[current() + step] : undefined;
     if (next) {
       event.preventDefault();
       location.hash = next.id;

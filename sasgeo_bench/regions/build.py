@@ -33,7 +33,7 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.imagery import ORTHO, Imagery, OrthoRecord
 from sasgeo_bench.regions.imagery_files import find_imagery
-from sasgeo_bench.regions.layers import PaintWindow, burn, burn_layers, make_paint, read_overview, write_layers
+from sasgeo_bench.regions.layers import PaintWindow, burn, burn_mapped, make_paint, read_overview, write_layers
 from sasgeo_bench.regions.ortho import Picture, check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.region import (
     ATTRIBUTION,
@@ -399,7 +399,7 @@ def _painter(reading: Reading, grid: Grid, classes: tuple[str, ...], factor: int
     Overviews draw lines at least one of their cells wide.
     """
     least_width_m = 0.0 if factor == 1 else grid.cell_size_m * factor
-    return partial(burn_layers, make_paint(reading.features, classes, reading.coverage, least_width_m=least_width_m))
+    return partial(burn_mapped, make_paint(reading.features, classes, reading.coverage, least_width_m=least_width_m))
 
 
 def make_manifest(plan: BuildPlan, extract: ExtractRecord, reading: Reading, graph: MapGraph) -> Manifest:

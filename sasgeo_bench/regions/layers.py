@@ -91,14 +91,20 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
     """
     layers = np.zeros((len(paint.classes), grid.rows, grid.cols), dtype=np.uint8)
     mapped = burn(paint.coverage, grid)
-    is_whole = bool(mapped.all())
+    outside = None if mapped.all() else np.where(mapped, np.uint8(0), np.uint8(OUTSIDE))
     for band, areas, bounds in zip(layers, paint.areas, paint.bounds, strict=True):
         near = areas[_meets(bounds, grid)]
         if len(near):
             band[...] = burn(near, grid)
-        if not is_whole:
-            band[~mapped] = OUTSIDE
+        if outside is not None:
+            np.maximum(band, outside, out=band)
     return layers
+
+
+def burn_mapped(paint: Paint, grid: Grid) -> NDArray[np.uint8] | None:
+    """Burn a window as `burn_layers` does; None where nothing of it is mapped."""
+    is_mapped = _meets(shapely.bounds(paint.coverage), grid).any() and burn(paint.coverage, grid).any()
+    return burn_layers(paint, grid) if is_mapped else None
 
 
 def _meets(bounds: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:
@@ -162,7 +168,7 @@ WINDOW_CELLS: Final = 1024  # 13 classes of one window take 14 MB, whatever the 
 _CACHE_BYTES: Final = 24 * 2**20
 _BIGTIFF_CELLS: Final = 2**31  # compressed, such a file stays far below the 4 GiB that need BigTIFF
 
-PaintWindow = Callable[[Grid], NDArray[np.uint8]]
+PaintWindow = Callable[[Grid], NDArray[np.uint8] | None]  # None where nothing is mapped
 
 
 def overview_factors(grid: Grid) -> tuple[int, ...]:
@@ -175,32 +181,33 @@ def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callab
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
     `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (C, rows,
-    cols).
+    cols), or None where nothing is mapped.
 
     A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver writes
     everything twice to get there. Here the empty overviews are laid out first and then every level is burnt from the
-    vectors into its place, so memory and time are those of one pass.
+    vectors into its place, so memory and time are those of one pass. The raster is filled by the handle that made it:
+    one that is opened again packs at GDAL's default level, in three times the time.
     """
     factors = overview_factors(grid)
     options = {"GDAL_CACHEMAX": _CACHE_BYTES, "SPARSE_OK_OVERVIEW": "YES", "GDAL_TIFF_OVR_BLOCKSIZE": BLOCK_CELLS}
     packing = {"COMPRESS_OVERVIEW": "ZSTD", "ZSTD_LEVEL_OVERVIEW": 1}
     try:
-        with rasterio.Env(**options, **packing):
-            _lay_out(path, grid, classes, factors)
+        with rasterio.Env(**options, **packing), _laid_out(path, grid, classes) as target:
+            if factors:
+                target.build_overviews(list(factors), Resampling.nearest)
             for level in reversed(range(len(factors))):
-                with rasterio.open(path, "r+", overview_level=level) as target:
-                    _fill(target, grid.coarsen(factors[level]), paint(factors[level]))
-            with rasterio.open(path, "r+") as target:
-                _fill(target, grid, paint(1))
+                with rasterio.open(path, "r+", overview_level=level) as overview:
+                    _fill(overview, grid.coarsen(factors[level]), paint(factors[level]))
+            _fill(target, grid, paint(1))
     except (RasterioError, RasterioIOError, OSError) as error:
         message = f"{path} cannot be written ({error}): check the free space and the rights of its folder"
         raise StoreError(message) from error
 
 
-def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: tuple[int, ...]) -> None:
-    """Write the headers of the raster and of its overviews; no block is stored yet."""
+def _laid_out(path: Path, grid: Grid, classes: tuple[str, ...]) -> rasterio.io.DatasetWriter:
+    """Open a new raster with its names and licence; no block is stored yet."""
     is_big = len(classes) * grid.rows * grid.cols > 16 * _BIGTIFF_CELLS
-    with rasterio.open(
+    target = rasterio.open(
         path,
         "w",
         driver="GTiff",
@@ -219,20 +226,23 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: tuple[in
         zstd_level=1,
         sparse_ok=True,
         bigtiff="YES" if is_big else "NO",
-    ) as target:
-        target.descriptions = classes
-        target.update_tags(TIFFTAG_COPYRIGHT=ATTRIBUTION, attribution=ATTRIBUTION, licence=LICENCE)
-    if factors:
-        with rasterio.open(path, "r+") as target:
-            target.build_overviews(list(factors), Resampling.nearest)
+    )
+    target.descriptions = classes
+    target.update_tags(TIFFTAG_COPYRIGHT=ATTRIBUTION, attribution=ATTRIBUTION, licence=LICENCE)
+    return target
 
 
 def _fill(target: rasterio.io.DatasetWriter, grid: Grid, burn: PaintWindow) -> None:
-    """Burn a window while GDAL packs the previous one, which needs no interpreter; at most two are held."""
+    """Burn a window while GDAL packs the previous one, which needs no interpreter; at most two are held.
+
+    Windows beyond the mapped area are not stored: a block that is missing reads as OUTSIDE, the value of no data.
+    """
     with ThreadPoolExecutor(max_workers=1) as executor:
         packing: Future[None] | None = None
         for row, col, window in grid.windows(WINDOW_CELLS):
             layers = burn(window)
+            if layers is None:
+                continue
             if packing is not None:
                 packing.result()
             packing = executor.submit(target.write, layers, window=Window(col, row, window.cols, window.rows))

@@ -9,6 +9,7 @@ from pathlib import Path
 import pandas as pd
 
 from sasgeo_bench.errors import StoreError, counted
+from sasgeo_bench.files.folders import SITE
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest, make_extras, write_files
 from sasgeo_bench.leaderboard.board_files import check_board, read_board
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
@@ -80,6 +81,8 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     if gone:
         names = ", ".join(gone)
         tell(f"{request.board} had rows of {names}, which this board has not; their answers are where they were")
+    if (request.board / SITE).is_dir():
+        tell(f"{request.board / SITE} is of the older board and is removed with it: publish again")
     write_files(request, board, make_extras(request, board, tell), [rule.card for rule in rules.values()])
     return board
 

@@ -44,6 +44,12 @@ class Paint:
         """Return west, south, east, north of every polygon, shape (N, 4) for each class."""
         return tuple(shapely.bounds(areas).reshape(-1, 4) for areas in self.areas)
 
+    @cached_property
+    def ground(self) -> NDArray[np.object_]:
+        """Return the mapped area, prepared: whether it meets a window is asked thousands of times."""
+        shapely.prepare(self.coverage)
+        return self.coverage
+
 
 def make_paint(
     features: "gpd.GeoDataFrame", classes: tuple[str, ...], coverage: shapely.Geometry, *, least_width_m: float = 0.0
@@ -90,8 +96,9 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
            [  0,   0,   0, 255]], dtype=uint8)
     """
     layers = np.zeros((len(paint.classes), grid.rows, grid.cols), dtype=np.uint8)
-    mapped = burn(paint.coverage, grid)
-    outside = None if mapped.all() else np.where(mapped, np.uint8(0), np.uint8(OUTSIDE))
+    outside = None
+    if not shapely.covers(paint.ground, shapely.box(*grid.bounds_m)).any():
+        outside = np.where(burn(paint.coverage, grid), np.uint8(0), np.uint8(OUTSIDE))
     for band, areas, bounds in zip(layers, paint.areas, paint.bounds, strict=True):
         near = areas[_meets(bounds, grid)]
         if len(near):
@@ -103,8 +110,7 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
 
 def burn_mapped(paint: Paint, grid: Grid) -> NDArray[np.uint8] | None:
     """Burn a window as `burn_layers` does; None where nothing of it is mapped."""
-    is_mapped = _meets(shapely.bounds(paint.coverage), grid).any() and burn(paint.coverage, grid).any()
-    return burn_layers(paint, grid) if is_mapped else None
+    return burn_layers(paint, grid) if shapely.intersects(paint.ground, shapely.box(*grid.bounds_m)).any() else None
 
 
 def _meets(bounds: NDArray[np.float64], grid: Grid) -> NDArray[np.bool_]:

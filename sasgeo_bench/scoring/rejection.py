@@ -201,6 +201,7 @@ class _Fit:
 
     @classmethod
     def of(cls, calibration: pd.DataFrame, predictions: Mapping[str, Prediction], make: Make) -> Self:
+        """Fit on calibration places, and on parts of them."""
         rejector = _fitted(make, calibration, predictions)
         return cls(
             rejector=rejector, known=calibration.assign(p_right=1.0 - _held_back(make, calibration, predictions))

@@ -6,6 +6,7 @@ import json
 import math
 import re
 import shutil
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -40,6 +41,7 @@ from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from tests.plain_boards import plain_boards
 
 TOWNS = ("town-riverside", "town-suburb")
 
@@ -102,11 +104,12 @@ def split():
     return make_split(SplitFile.model_validate(said | {"place": places}), grids)
 
 
-def board_of(out, *predictions, **changes):
+def board_of(out, *predictions, has_texts=False, **changes):
     request = ScoreRequest(
         predictions=predictions or [out / "runs"], root=out, board=out / "boards" / "mine", draws=200
     )
-    return make_board(replace(request, **changes), tell=lambda _: None)
+    with nullcontext() if has_texts else plain_boards():
+        return make_board(replace(request, **changes), tell=lambda _: None)
 
 
 def primary(board, matcher):
@@ -183,7 +186,7 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
 def test_predictions_for_half_of_the_queries_are_misses_for_the_rest(out, tmp_path):
     count = submission(out, tmp_path / "half.parquet", keep=lambda at: at % 2 == 0)
     assert count % 2 == 0
-    board = board_of(out, tmp_path / "half.parquet")
+    board = board_of(out, tmp_path / "half.parquet", has_texts=True)
     assert len(board.scores["half"]) == count
     row = primary(board, "half")
     assert row["missing"] > 0
@@ -515,7 +518,8 @@ def copy_run(out, name, towns, *, asked=None):
 def told_by(out, *predictions, **changes):
     lines = []
     request = ScoreRequest(predictions=predictions, root=out, board=out / "boards" / "mine", draws=200)
-    return make_board(replace(request, **changes), tell=lines.append), lines
+    with plain_boards():
+        return make_board(replace(request, **changes), tell=lines.append), lines
 
 
 class Once(dict):
@@ -787,7 +791,7 @@ CONTRAST = Contrast(name="which", first="good", second="bad", suites=("clean",))
 )
 def test_answers_that_are_none_cost_their_author_alone(out, both, alone, column, value, why):
     rewrite(both[1], column, value)
-    board = board_of(out, *both, contrasts=[CONTRAST])
+    board = board_of(out, *both, has_texts=True, contrasts=[CONTRAST])
     assert [entry.name for entry in board.entries] == ["good"]
     pd.testing.assert_frame_equal(board.scores["good"], alone.scores["good"])
     pd.testing.assert_frame_equal(board.table, alone.table)

@@ -251,6 +251,7 @@ def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_
     assert {"present 0.9", "present 0.7", "present 0.5"} < set(pooled["stratum"])
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_no_figure_hangs_on_how_many_processes_judge(out, tmp_path, split):
     rejectors = ["sasgeo_bench.sasgeo.rejectors:SasgeoLogistic", "margin"]
     submission(out, tmp_path / "mine.parquet")

@@ -28,7 +28,7 @@ def records_of(frame: pd.DataFrame) -> list[Record]:
     [{'matcher': 'mine', 'value': 0.5}]
     """
     names = [str(name) for name in frame.columns]
-    columns = (frame.iloc[:, at].tolist() for at in range(len(names)))
+    columns = (column.tolist() for _, column in frame.items())
     return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
 
 

@@ -240,8 +240,9 @@ def properties_of(svg):
 
 @pytest.fixture(scope="module")
 def harmless(tmp_path_factory):
-    """Properties of a figure of plain text."""
-    return properties_of(drawn(tmp_path_factory.mktemp("harmless") / "figure.svg", "style of x").decode())
+    """Properties of figures of plain text, of one line and of two, which are set otherwise."""
+    path = tmp_path_factory.mktemp("harmless") / "figure.svg"
+    return {name for text in ("style of x", "style\nof x") for name in properties_of(drawn(path, text).decode())}
 
 
 @FEW

@@ -76,7 +76,7 @@ class Book:
         """Index a leaderboard with the content of its `board.json`, which may be empty, and its scored queries."""
         entries = {str(entry["name"]): entry for entry in about.get("entries", ())}
         for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
-            reason = None if pd.isna(row["set_apart"]) else row["set_apart"]
+            reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
             entries.setdefault(row["matcher"], {"how": row["how"], "set_apart": reason})
         scored = pd.DataFrame() if scores is None else scores
         plain = board[board["rejector"] == ""] if len(board) else board

@@ -84,19 +84,17 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
     with tempfile.TemporaryDirectory() as scratch:
         folders = [path for path in unpack_tasks(folder, Path(scratch)) if path.parent.name == suite]
         tasks = [read_scored_task(path, Path(scratch) / "truth") for path in folders]
-        asked = {head.query_id for task in tasks for head in task.heads}
+        truths = {truth.query_id: truth for task in tasks for truth in task.truths}
+        heads = sorted((head for task in tasks for head in task.heads), key=lambda head: head.query_id)
         for matcher in matchers:
-            mine = {item.query_id: item for item in read_stored_predictions(folder, matcher, queries=asked)}
-            for task in tasks:
-                heads = sorted(task.heads, key=lambda head: head.query_id)  # by flight, then by time
-                truths = {truth.query_id: truth for truth in task.truths}
-                views = view_frame(heads, [truths[head.query_id] for head in heads], mine)
-                for name, part in views.groupby("sequence_id"):
-                    columns = (part[key].to_numpy() for key in ("distance_m", "error_m", "is_accepted"))
-                    found, truth = kept(*columns), truths[part["query_id"].iloc[0]]
-                    row = {key: getattr(truth, key) for key in ("role", "kind", "strength")}
-                    row |= {"place": part["place"].iloc[0], "matcher": matcher, "flight": name}
-                    rows.append(row | {"found": found.is_found, "kept_m": found.kept_m, "lost": found.is_lost})
+            mine = {item.query_id: item for item in read_stored_predictions(folder, matcher, queries=truths)}
+            views = view_frame(heads, [truths[head.query_id] for head in heads], mine)
+            for name, part in views.groupby("sequence_id"):  # whose ids begin with it, and go on with the time
+                columns = (part[key].to_numpy() for key in ("distance_m", "error_m", "is_accepted"))
+                found, truth = kept(*columns), truths[part["query_id"].iloc[0]]
+                row = {key: getattr(truth, key) for key in ("role", "kind", "strength")}
+                row |= {"place": part["place"].iloc[0], "matcher": matcher, "flight": name}
+                rows.append(row | {"found": found.is_found, "kept_m": found.kept_m, "lost": found.is_lost})
     return pd.DataFrame(rows)
 
 

@@ -4,10 +4,11 @@
 import gc
 import math
 import os
+import pickle
 import shutil
 import socket
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import islice
@@ -215,6 +216,22 @@ def in_threads() -> Iterator[None]:
     """Matchers are served by threads: for tests that are not about processes."""
     with threaded():
         yield
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work for several jobs is done here, each item and result pickled: for tests that are about the same results.
+
+    Processes take seconds to start. tests/test_progress.py, test_outlets.py and test_task_batch.py start some.
+    """
+
+    def found(work: Callable[[Any], Any], items: Sequence[Any], jobs: int) -> Iterator[Any]:
+        return map(work, items) if jobs == 1 else (copied(copied(work)(copied(item))) for item in items)
+
+    def copied(value: Any) -> Any:
+        return pickle.loads(pickle.dumps(value))  # noqa: S301 - our own
+
+    monkeypatch.setattr(progress, "_found", found)
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from sasgeo_bench.running.prediction_rows import PART_SCHEMA
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, TRUTH_SCHEMA
+from tests.test_repository import markdown_links
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -103,6 +104,16 @@ def test_every_published_board_is_in_the_reference_fewest_queries_first_with_whe
     pictured = {"systems-pictures", "aerial", "aerial-soft"}
     assert min(downloads - pictured, key=queries.__getitem__) == "systems-objects"  # and with one
     assert "**Begin with `systems-objects`**" in page
+
+
+def test_every_link_between_documents_leads_somewhere(pages):
+    """To a file, or to a page of the site that is made from the code, so that no file holds it."""
+    broken = [
+        f"{path.relative_to(ROOT)} -> {target}"
+        for path, target in markdown_links()
+        if not (path.parent / target).exists() and os.path.relpath(path.parent / target, DOCS) not in pages
+    ]
+    assert broken == []
 
 
 def test_what_a_docstring_says_of_several_parameters_is_said_of_each():

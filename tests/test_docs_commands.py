@@ -213,7 +213,7 @@ def desk(towns: Path, lay_towns: Callable[..., Path], tmp_path_factory: pytest.T
     out = tmp_path_factory.mktemp("desk") / "out"
     lay_towns(Path(shutil.copytree(towns, out)), "town-suburb")
     wanted = Wanted(
-        suites=("clean",), regions=("town-riverside", "town-suburb"), split="crossfit", count=2, seed=0, out=out
+        suites=("clean",), regions=("town-riverside", "town-suburb"), split="crossfit", count=1, seed=0, out=out
     )
     for request in plan_requests(wanted, tell=lambda _: None):
         make_tasks(request, tell=lambda _: None)
@@ -282,6 +282,11 @@ def told(words: list[str], monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
     return int(leaving.value.code or 0), said.getvalue()
 
 
+def by_one_process(words: list[str]) -> list[str]:
+    """A command without its --jobs: processes take seconds to start, and tests/running starts some."""
+    return [word for before, word in zip(["", *words], words, strict=False) if "--jobs" not in (before, word)]
+
+
 @pytest.mark.usefixtures("without_drawings")
 @pytest.mark.parametrize("document", WALKS)
 def test_the_commands_of_a_document_do_what_they_say(
@@ -294,5 +299,5 @@ def test_the_commands_of_a_document_do_what_they_say(
     for line in commands(document):
         if RUN.get(line.text) is not None and RUN[line.text] == line:
             with nullcontext() if line.words[1] == "check-matcher" else threaded():
-                code, said = told(line.words, monkeypatch)
+                code, said = told(by_one_process(line.words), monkeypatch)
             assert code == 0, f"{document}:{line.number}: {line.text}\n{said}"

@@ -85,13 +85,13 @@ def test_a_function_takes_the_words_of_the_flags_of_its_command(command, functio
         assert f"\n{name} : " in getattr(sgb, function).__doc__
 
 
-@pytest.mark.usefixtures("in_threads", "few_figures", "plain_site")
+@pytest.mark.usefixtures("in_threads", "without_drawings", "plain_site")
 def test_a_town_is_driven_from_region_to_site_by_functions_alone(tmp_path, capfd):
     out, notes = tmp_path / "out", []
     (folder,) = sgb.build_region("town-grid", out=out)
     region = sgb.read_region(str(folder))  # folders may be texts, as everywhere
     assert region.layers.any()
-    tasks = sgb.make_tasks(suite="clean", regions="town-grid", n=2, out=str(out))
+    tasks = sgb.make_tasks(suite="clean", regions="town-grid", n=1, out=str(out))
     assert tasks == (out / "tasks/clean/town-grid",)
     assert sgb.read_task(str(tasks[0]))["suite"] == "clean"
     truths = list(sgb.read_truths(str(out / "truth/clean/town-grid")))

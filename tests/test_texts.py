@@ -230,23 +230,34 @@ def drawn(path, text):
     return path.read_bytes()
 
 
+STYLE = re.compile(r"\.s\d+\{([^}]*)\}")
+
+
+def properties_of(svg):
+    """Names of the properties that the styles of a figure set."""
+    return {one for rule in STYLE.findall(svg) for one in re.findall(r"([\w-]+):", rule)}
+
+
+@pytest.fixture(scope="module")
+def harmless(tmp_path_factory):
+    """Properties of figures of plain text, of one line and of two, which are set otherwise."""
+    path = tmp_path_factory.mktemp("harmless") / "figure.svg"
+    return {name for text in ("style of x", "style\nof x") for name in properties_of(drawn(path, text).decode())}
+
+
 @FEW
 @example(r"cost $\nosuchthing$")
 @example("\x00\x1b\ud800")
 @example(' style="} * {display:none} .x {" x="1.23456"')
 @given(TEXTS)
-def test_a_figure_is_drawn_and_shows_the_text(tmp_path_factory, text):
+def test_a_figure_is_drawn_and_shows_the_text(tmp_path_factory, harmless, text):
     path = tmp_path_factory.mktemp("figure") / "figure.svg"
     svg = drawn(path, text[:200]).decode()
     assert svg_fault(svg) is None
     said = {"".join(item.itertext()) for item in ET.fromstring(svg).iter("{http://www.w3.org/2000/svg}text")}  # noqa: S314
     for line in text[:200].split("\n"):
         assert plain(line) in said or not plain(line).strip()
-    harmless = drawn(path, "style of x").decode()
-    style = re.compile(r"\.s\d+\{([^}]*)\}")
-    assert {one for rule in style.findall(svg) for one in re.findall(r"([\w-]+):", rule)} <= {
-        one for rule in style.findall(harmless) for one in re.findall(r"([\w-]+):", rule)
-    } | {"transform", "text-anchor", "font", "fill"}
+    assert properties_of(svg) <= harmless | {"transform", "text-anchor", "font", "fill"}
 
 
 def test_the_metadata_of_a_picture_are_lines(tmp_path):

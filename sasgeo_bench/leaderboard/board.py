@@ -5,7 +5,7 @@ import platform
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Final
@@ -230,8 +230,9 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
     }
 
 
-def _libraries() -> dict[str, str]:
-    """Return the versions of Python and of installed libraries that affect results."""
+@cache
+def _libraries() -> Mapping[str, str]:
+    """Return the versions of Python and of installed libraries that affect results, looked up once."""
     found = {"python": platform.python_version()}
     for name in _LIBRARIES:
         with suppress(PackageNotFoundError):

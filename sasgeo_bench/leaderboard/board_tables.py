@@ -26,6 +26,7 @@ from sasgeo_bench.leaderboard.tables import (
     page_names,
     plain_cell,
     rank_cell,
+    records_of,
     ties_of,
 )
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
@@ -74,18 +75,18 @@ class Book:
     def of(cls, board: pd.DataFrame, about: Mapping[str, Any], scores: pd.DataFrame | None = None) -> Self:
         """Index a leaderboard with the content of its `board.json`, which may be empty, and its scored queries."""
         entries = {str(entry["name"]): entry for entry in about.get("entries", ())}
-        for row in board.drop_duplicates("matcher").to_dict("records") if "set_apart" in board else ():
-            reason = None if pd.isna(row["set_apart"]) else row["set_apart"]
+        for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
+            reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
             entries.setdefault(row["matcher"], {"how": row["how"], "set_apart": reason})
         scored = pd.DataFrame() if scores is None else scores
         plain = board[board["rejector"] == ""] if len(board) else board
         figures: dict[tuple[str, ...], Record] = {}
         matchers: dict[Key, dict[str, None]] = {}
         strata: dict[Key, dict[str, None]] = {}
-        for row in plain.to_dict("records"):
+        for row in records_of(plain):
             suite, track, prior = (str(row[name]) for name in GROUP)
             name, stratum = str(row["matcher"]), str(row["stratum"])
-            figures[suite, track, prior, name, stratum, str(row["metric"])] = {str(key): row[key] for key in row}
+            figures[suite, track, prior, name, stratum, str(row["metric"])] = row
             if suite != ALL_SUITES:
                 matchers.setdefault((suite, track, prior), {})[name] = None
                 strata.setdefault((suite, track, prior), {})[stratum] = None
@@ -381,7 +382,7 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
     named = ages or {}
     for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
         suite, track, prior_group, kind, unit = map(str, key)
-        records: list[Record] = [{str(field): row[field] for field in row} for row in part.to_dict("records")]
+        records = records_of(part)
         counts: dict[tuple[int, float], int] = {}
         for row in sorted(records, key=lambda row: (row["view_cells"], row["strength"])):
             step = (row["view_cells"], row["strength"])

@@ -17,6 +17,7 @@ from sasgeo_bench.leaderboard.tables import (
     figure_cell,
     file_stem,
     plain_cell,
+    records_of,
     text_cells,
 )
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES
@@ -150,7 +151,7 @@ def _risk_by_suite(best: Best, part: pd.DataFrame, name: str, where: str) -> Tab
 
 def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
     """Return the rows of one matcher and rejector by their metric."""
-    return {str(row["metric"]): {str(field): row[field] for field in row} for row in part.to_dict("records")}
+    return {str(row["metric"]): row for row in records_of(part)}
 
 
 def _area(by_name: Mapping[str, Record]) -> float:
@@ -216,7 +217,7 @@ def acceptance_tables(acceptance: pd.DataFrame) -> tuple[Table, ...]:
 def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
     rows = []
     for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
-        by_mixture = {str(row["mixture"]): row for row in mine.to_dict("records")}
+        by_mixture = {str(row["mixture"]): row for row in records_of(mine)}
         some = next(iter(by_mixture.values()))
         absent = plain_cell(int(some["absent"]))
         cells = [_cell(by_mixture.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")]

@@ -10,7 +10,17 @@ import pandas as pd
 from sasgeo_bench.leaderboard.board_tables import Book
 from sasgeo_bench.leaderboard.columns import FEW, column, prior_words, suite_card, suite_words, words
 from sasgeo_bench.leaderboard.overview import short_cell
-from sasgeo_bench.leaderboard.tables import Cell, Column, Key, Record, Row, Table, file_stem, plain_cell
+from sasgeo_bench.leaderboard.tables import (
+    Cell,
+    Column,
+    Key,
+    Record,
+    Row,
+    Table,
+    file_stem,
+    plain_cell,
+    records_of,
+)
 from sasgeo_bench.scoring.scenes import AS_USED, SCENES
 from sasgeo_bench.scoring.strata import ALL, GROUP
 from sasgeo_bench.scoring.verdicts import LEAST_PLACES
@@ -28,8 +38,8 @@ def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
     groups = sorted(scenes.groupby(list(GROUP)), key=lambda group: (-int(group[1]["places"].max()), group[0]))
     for key, part in groups:
         found: dict[str, dict[str, Record]] = {}
-        for row in part.to_dict("records"):
-            found.setdefault(str(row["stratum"]), {})[str(row["matcher"])] = {str(name): row[name] for name in row}
+        for row in records_of(part):
+            found.setdefault(str(row["stratum"]), {})[str(row["matcher"])] = row
         yield _table((str(key[0]), str(key[1]), str(key[2])), found, book)
 
 

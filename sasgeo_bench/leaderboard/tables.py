@@ -21,6 +21,17 @@ _PLAIN: Final = re.compile(r"[^a-z0-9]+")
 _MOST_LETTERS: Final = 60  # of a part of a file name
 
 
+def records_of(frame: pd.DataFrame) -> list[Record]:
+    """Return the rows of a table, each a mapping of names to values; a third of the work of `DataFrame.to_dict`.
+
+    >>> records_of(pd.DataFrame({"matcher": ["mine"], "value": [0.5]}))
+    [{'matcher': 'mine', 'value': 0.5}]
+    """
+    names = [str(name) for name in frame.columns]
+    columns = (column.tolist() for _, column in frame.items())
+    return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
+
+
 def figure_text(row: Record) -> str:
     """Return a figure with its interval, as in "0.63 [0.55, 0.70]"; a dagger where that is Wilson's."""
     mark = DAGGER if row["interval"] == "wilson" else ""

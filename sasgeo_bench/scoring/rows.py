@@ -171,7 +171,7 @@ def bare(value: float) -> BoardInterval:
 
 def to_frame(rows: list[Row]) -> pd.DataFrame:
     """Return rows as a table with the columns of `Row`."""
-    frame = pd.DataFrame([{name: getattr(row, name) for name in COLUMNS} for row in rows], columns=list(COLUMNS))
+    frame = pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
     return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # integers or missing
 
 

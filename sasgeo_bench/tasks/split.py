@@ -228,7 +228,15 @@ class Split:
 
     def places_in(self, region: str) -> tuple[str, ...]:
         """Return the places that hold blocks of a region."""
-        return tuple(place for place, blocks in self.blocks.items() if any(block.region == region for block in blocks))
+        return self._places_by_region.get(region, ())
+
+    @cached_property
+    def _places_by_region(self) -> Mapping[str, tuple[str, ...]]:
+        found: dict[str, dict[str, None]] = {}
+        for place, blocks in self.blocks.items():
+            for block in blocks:
+                found.setdefault(block.region, {})[place] = None
+        return {region: tuple(places) for region, places in found.items()}
 
     def blocks_in(self, region: str) -> tuple[Block, ...]:
         """Return the blocks of one region, by rows."""

@@ -99,7 +99,10 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
     check_roots(wanted.out)
     files = list_region_files(folders=wanted.region_folders)
     known = {name: read_region_file(path) for name, path in files.items()}
-    named = [read_region_file(find_region_file(name, folders=wanted.region_folders)) for name in wanted.regions]
+    named = [
+        known.get(name) or read_region_file(find_region_file(name, folders=wanted.region_folders))
+        for name in wanted.regions
+    ]
     known |= {spec.id: spec for spec in named}
     spec = read_split_file(find_split_file(wanted.split))
     split = make_split(spec, {name: item.grid() for name, item in known.items()})

@@ -113,16 +113,6 @@ def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["own.toml"]
 
 
-def test_several_regions_are_built_at_once(program, tmp_path):
-    (tmp_path / "mine").mkdir()
-    for name in (names := ("one", "two")):
-        small_town(tmp_path, **{'id = "town-suburb"': f'id = "{name}"'}).rename(tmp_path / "mine" / f"{name}.toml")
-    code, _, err = program("build-region", *names, "--regions", "mine", "--jobs", "2", "--out", "o")
-    assert code == 0, err
-    for name in names:
-        assert (tmp_path / "o/regions" / name / "region.json").is_file()
-
-
 def test_lists_and_findings_go_to_stdout(program):
     code, listed, err = program("list-regions")
     assert code == 0, err

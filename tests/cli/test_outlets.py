@@ -81,7 +81,7 @@ def test_every_command_has_both_flags_and_they_end_with_it(program, tmp_path):
     assert not {progress.QUIET, console.LOG} & set(os.environ)
 
 
-def test_processes_of_a_quiet_command_are_quiet_and_write_the_same_log(program, tmp_path):
+def test_two_processes_of_a_quiet_command_build_a_region_each_and_are_quiet_and_write_the_same_log(program, tmp_path):
     for name in ("town-suburb", "town-old-town"):
         text = (shipped_dir("regions") / f"{name}.toml").read_text(encoding="utf-8")
         small = re.sub(r"size_m = \[.*\]", "size_m = [300, 200]", text).replace(f'id = "{name}"', f'id = "my-{name}"')
@@ -91,6 +91,7 @@ def test_processes_of_a_quiet_command_are_quiet_and_write_the_same_log(program, 
     lines = logged(tmp_path / "all.log")
     for name in ("my-town-suburb", "my-town-old-town"):
         assert f"{name}: built out/regions/{name}" in lines
+        assert (tmp_path / "out" / "regions" / name / "region.json").is_file()
 
 
 @pytest.mark.parametrize("log", ["none/all.log", "."])

@@ -14,6 +14,7 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.leaderboard import board_pictures
 from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_pictures import (
     CASE_BYTES,
@@ -31,9 +32,12 @@ from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split
+from tests.plain_boards import plain_boards
 
 HASH = "0123456789ab"
+FEW = 6  # cases that are drawn
 ASKED = (("absent", "town-riverside"), ("alias", "town-grid+alias"))
+EVERY = (*ASKED, ("no-priors", "town-riverside"))
 
 
 def answer(query, truth, number):
@@ -86,8 +90,10 @@ def made(root, tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("made") / "board"
     request = ScoreRequest(predictions=[root / "runs"], root=root, board=folder, draws=100, extras=(pictures,))
-    make_board(request, tell=lambda _: None)
-    return folder, lines, kept[0]
+    with pytest.MonkeyPatch.context() as patch, plain_boards():
+        patch.setattr(board_pictures, "MOST_CASES", FEW)
+        make_board(request, tell=lambda _: None)
+        yield folder, lines, kept[0]
 
 
 def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
@@ -107,6 +113,7 @@ def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
     assert lines[-1].startswith(f"pictures: 2 of regions, 2 of suites, {len(said['cases'])} of cases, ")
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_several_processes_draw_the_same_pictures(made, root):
     folder, _, board = made
     drawn = pictures_extra(board, tell=lambda _: None, root=root, jobs=2).pictures
@@ -151,21 +158,24 @@ def test_every_answer_has_its_place_and_every_failure_its_class(made):
     assert all(classes[one["query_id"], one["matcher"]] == one["failure"] for one in cases)
 
 
-def test_a_map_says_where_it_lies_and_which_blocks_it_has(made, root):
+@pytest.fixture(scope="module")
+def caseless(made, root):
+    """What is drawn of the board without its cases, with the blocks of a split."""
     _, _, board = made
-    extra = pictures_extra(board, tell=lambda _: None, root=root, split=find_split("crossfit"), has_cases=False)
-    first = json.loads(extra.pictures["pictures.json"])["regions"][0]
+    return pictures_extra(board, tell=lambda _: None, root=root, split=find_split("crossfit"), has_cases=False)
+
+
+def test_a_map_says_where_it_lies_and_which_blocks_it_has(caseless, root):
+    first = json.loads(caseless.pictures["pictures.json"])["regions"][0]
     assert tuple(first["bounds_m"]) == read_manifest(root / "regions" / first["region"]).bounds_m
     edges = np.array([one["bounds_m"] for one in first["blocks"]])
     assert [*edges[:, :2].min(axis=0), *edges[:, 2:].max(axis=0)] == first["bounds_m"]
     assert first["blocks"][0]["name"] == f"{first['region']}/0-0"
 
 
-def test_without_cases_no_truth_is_shown(made, root):
-    _, _, board = made
-    extra = pictures_extra(board, tell=lambda _: None, root=root, has_cases=False)
-    assert not extra.tables
-    files = extra.pictures
+def test_without_cases_no_truth_is_shown(caseless):
+    assert not caseless.tables
+    files = caseless.pictures
     assert {name.partition("/")[0] for name in files} == {"pictures.json", "regions", "suites"}
     assert json.loads(files["pictures.json"])["cases"] == []
 
@@ -188,8 +198,14 @@ def case_at(root, suite, region, number=0, **changes):
     return Case(matcher="mine", query=query, truth=truth, **said), task_files.read_task(task)
 
 
-@pytest.mark.parametrize("prediction", [None, Prediction(query_id="x", status="timeout"), "answer"])
-@pytest.mark.parametrize("asked", [*ASKED, ("no-priors", "town-riverside")])
+@pytest.mark.parametrize(
+    ("asked", "prediction"),
+    [
+        *((asked, "answer") for asked in EVERY),
+        *((asked, None) for asked in EVERY),
+        (ASKED[0], Prediction(query_id="x", status="timeout")),
+    ],
+)
 def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, asked, prediction):
     changes = {} if prediction == "answer" else {"prediction": prediction}
     said = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}

@@ -89,7 +89,7 @@ def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path
     assert contents_of(again) == {name: data for name, data in there.items() if name.parts[0] != "pictures"}
 
 
-def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept, tmp_path):
+def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept, tmp_path, monkeypatch):
     _, plan, folder, _ = kept
     shutil.copytree(plan.out, tmp_path / "out", ignore=shutil.ignore_patterns("boards", "runs"))
     other = tmp_path / "out" / "tasks" / "clean" / "town-agricultural"
@@ -97,6 +97,7 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
     said["files"]["queries.parquet"]["sha256"] = "0" * 64
     (other / "task.json").write_text(json.dumps(said), encoding="utf-8")
     lines = []
+    monkeypatch.setattr(archive, "figures_extra", lambda *_, **__: Extra())
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path / "out")
     score_all(replace(usual, draws=100, rejectors=()), tell=lines.append)
     said = json.loads((tmp_path / "again" / "pictures" / "pictures.json").read_text(encoding="utf-8"))

@@ -9,11 +9,18 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
+from sasgeo_bench.scoring import compare
 from sasgeo_bench.scoring.contrasts import COLUMNS, Contrast, contrast_frame, hold_contrasts
 from sasgeo_bench.scoring.intervals import wilson
 from tests.scoring.test_tables import scores
 
 CONTRAST = Contrast(name="graph", first="with", second="without", suites=("occlusion",))
+
+
+@pytest.fixture(autouse=True)
+def _few_flips(monkeypatch):
+    """Signs are flipped 16,000 times at most: tests/scoring/test_compare.py flips them as often as a board does."""
+    monkeypatch.setattr(compare, "_FLIPS", 2**14)
 
 
 def errors(share, count=600, seed=1):

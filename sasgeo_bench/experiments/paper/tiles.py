@@ -2,6 +2,7 @@
 """The 30 procedural regions, side by side; their windows, global descriptors, and similar candidates."""
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Self
 
 import geopandas as gpd
@@ -59,8 +60,12 @@ def tile_boxes() -> NDArray[np.object_]:
     return np.asarray(shapely.box(*(centres - _HALF_M).T, *(centres + _HALF_M).T))
 
 
+@lru_cache(maxsize=8)  # readings of one seed share its tiles
 def make_tiles(seeds: Seeds) -> gpd.GeoDataFrame:
-    """Draw all tiles, each from its own random stream, as a feature table; no feature leaves its tile."""
+    """Draw all tiles, each from its own random stream, as a feature table; no feature leaves its tile.
+
+    Whoever asks again for the same tiles gets the same table: do not write to it.
+    """
     taxonomy = load_taxonomy()
     rows: list[tuple[str, float, shapely.Geometry]] = []
     for tile in range(TILES):

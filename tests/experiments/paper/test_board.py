@@ -2,11 +2,13 @@
 """The paper's experiment as one command: table, trials and figures with the board, drawn once, resampled by seed."""
 
 import json
+from dataclasses import replace
 
 import pandas as pd
 import pytest
 
 from sasgeo_bench.config import parse_toml
+from sasgeo_bench.experiments import pipeline
 from sasgeo_bench.experiments.paper.board import paper_extra
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
@@ -16,7 +18,7 @@ from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from tests.threaded import threaded
 
-pytestmark = pytest.mark.usefixtures("in_threads", "few_figures", "without_pictures")
+pytestmark = pytest.mark.usefixtures("in_threads")
 
 TEXT = """
 id = "few"
@@ -44,8 +46,8 @@ def planned(out, text=TEXT):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
-    """Two seeds, then a board of the first alone from the same trials and answers."""
+def made(tmp_path_factory, few_controls, without_drawings, lay_towns):  # noqa: ARG001
+    """Two seeds, then a board of the first alone from the same trials and answers, without its figures."""
     out = lay_towns(tmp_path_factory.mktemp("paperboard") / "out", "town-suburb")
     with threaded():
         plan = planned(out)
@@ -53,7 +55,11 @@ def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
         board = run_pipeline(plan, tell=lambda _: None)
         lines = []
         one = planned(out, TEXT.replace('id = "few"', 'id = "one"').replace("[42, 43]", "[42]"))
-        run_pipeline(one, tell=lines.append)
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                pipeline, "paper_extra", lambda *about, **more: replace(paper_extra(*about, **more), figures={})
+            )
+            run_pipeline(one, tell=lines.append)
     return plan, board, one, lines, before
 
 
@@ -91,8 +97,8 @@ def test_the_board_holds_table_trials_and_figures(made):
     assert "oracle_pose" in text
     assert list(summary["crop"].unique()) == ["unknown", "smaller"]
     assert "| not in the view, which is smaller | Global descriptor |" in text
-    drawn = {path.name for path in (folder / "figures").iterdir()}  # beside those that every board has
-    assert {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")} <= drawn
+    drawn = {path.name for path in (folder / "figures").iterdir()}
+    assert drawn == {f"{name}.{kind}" for name in FIGURES for kind in ("png", "svg")}
 
 
 def test_a_board_can_be_scored_again_where_it_lies(made):

@@ -96,7 +96,7 @@ def test_twice_as_many_poses_have_the_same_drift_at_the_same_distance(kind) -> N
         np.mean(end_errors(straight(step), profile(**KINDS[kind]), 150, seed=int(step)) ** 2, axis=0)
         for step in (5.0, 50.0)
     )
-    # Root mean squares of place and heading; 150 runs each know one to 6 %. White noise would part them by a factor of 3.
+    # Root mean squares of place and heading; 150 runs each know one to 6 %; white noise would treble one of them.
     assert np.sqrt(fine[:2].sum()) == pytest.approx(np.sqrt(coarse[:2].sum()), rel=0.25)
     assert np.sqrt(fine[2]) == pytest.approx(np.sqrt(coarse[2]), rel=0.25, abs=1e-9)
 

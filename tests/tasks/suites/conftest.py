@@ -245,10 +245,9 @@ def flown(scene, town, edited) -> Callable[[str], Flown]:
         airspace = Airspace(
             region=town(where), scene=over, suite=suite, split=split, seeds=seeds, group=suite.card.group
         )
+        lengths_m = flight_choice.LENGTHS_M if name == "flight-gap" else (1000.0,)  # gaps of every length need room
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(
-                flight_choice, "LENGTHS_M", (2000.0 if name == "flight-gap" else 1000.0,)
-            )  # as short as can be
+            patch.setattr(flight_choice, "LENGTHS_M", lengths_m)
             flights = airspace.choose(count=1, may_be_fewer=False)
         if suite.is_pictured:
             flights = {0: replace(flights[0], views=rows(flights[0].views, slice(0, PICTURES)))}

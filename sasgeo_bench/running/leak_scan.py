@@ -13,6 +13,7 @@ from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
@@ -82,7 +83,8 @@ class Walk:
         real = [os.path.realpath(path) for path in kept]
         hidden: dict[str, None] = {}
         for item in self.found:
-            if any(str(above) in hidden for above in Path(item.folder).parents):
+            outer = accumulate(item.folder.split("/")[:-1], "{}/{}".format)
+            if not hidden.keys().isdisjoint(outer):
                 continue
             is_split = item.is_code or any(f"{path}/".startswith(f"{item.folder}/") for path in real)
             hidden.update(dict.fromkeys(item.parts if is_split else (item.folder,)))

@@ -163,13 +163,12 @@ def mirror(
 def split_long(features: "gpd.GeoDataFrame", *, piece_m: float, least_area_m2: float) -> "gpd.GeoDataFrame":
     """Cut large buildings across their long side into a row of houses; their union stays exactly the same."""
     is_large = (features["class"] == "building").to_numpy() & (features.geometry.area.to_numpy() >= least_area_m2)
-    rows = [features[~is_large]]
-    for _, row in features[is_large].iterrows():
-        pieces = _row_of_houses(row.geometry, piece_m)
-        part = pd.DataFrame([row] * len(pieces)).set_geometry(pieces, crs=features.crs)  # type: ignore[operator]
-        rows.append(part)
-    table = gpd.GeoDataFrame(pd.concat(rows, ignore_index=True), geometry="geometry", crs=features.crs)
-    return table.astype(dict(_types(features)))
+    large = features[is_large]
+    rows = [_row_of_houses(shape, piece_m) for shape in large.geometry]
+    houses = large.iloc[np.repeat(np.arange(len(rows)), [len(row) for row in rows])]
+    shapes = gpd.GeoSeries([house for row in rows for house in row], index=houses.index, crs=features.crs)
+    table = pd.concat([features[~is_large], houses.set_geometry(shapes)], ignore_index=True)
+    return gpd.GeoDataFrame(table, geometry="geometry", crs=features.crs).astype(dict(_types(features)))
 
 
 def _row_of_houses(shape: shapely.Geometry, piece_m: float) -> list[shapely.Geometry]:

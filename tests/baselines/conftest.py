@@ -2,7 +2,7 @@
 """Helpers of a made-up map, and tasks of an embedded town."""
 
 import builtins
-import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,13 +23,16 @@ def made() -> SimpleNamespace:
 
 
 @pytest.fixture(scope="session")
-def town_tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Root with town-grid and the suite `clean` at one site."""
+def town_tasks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Root with a quarter of town-grid, which is enough for the search of a view, and the suite `clean` at one site."""
     out = tmp_path_factory.mktemp("baselines") / "out"
-    shutil.copytree(towns / "regions" / "town-grid", out / "regions" / "town-grid")
     wanted = Wanted(suites=("clean",), regions=("town-grid",), split="crossfit", count=1, seed=0, out=out)
     for request in plan_requests(wanted, tell=lambda _: None):
-        make_tasks(request, tell=lambda _: None)
+        whole = request.region
+        town = whole.extract[-1].town.model_copy(update={"size_m": 1280.0})
+        extract = whole.extract[-1].model_copy(update={"town": town})
+        quarter = whole.model_copy(update={"size_m": (1024.0, 1024.0), "extract": [extract]})
+        make_tasks(replace(request, region=quarter), tell=lambda _: None)
     return out
 
 

@@ -189,6 +189,6 @@ def test_each_prepares_a_map_without_imagery_and_withholds(name, window, drawn_f
     assert made.match(query_of(picture(window, TRUTH)), top_k=5) == sgb.WITHHELD
 
 
-def test_a_made_up_place_without_imagery_leaves_no_query(tmp_path: Path):
-    checks = sgb.check_matcher("ncc_gradient", place=sgb.tiny_place(tmp_path), is_shut_in=False)
+def test_a_made_up_place_without_imagery_leaves_no_query(tiny: sgb.TinyPlace):
+    checks = sgb.check_matcher("ncc_gradient", place=tiny, is_shut_in=False)
     assert not [check for check in checks if check.outcome == "fail"]

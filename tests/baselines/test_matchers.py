@@ -79,11 +79,12 @@ def queries(town_tasks):
 
 @pytest.fixture(scope="module")
 def two(queries):
-    """A view of each track, searched within 100 m of the middle of its prior and among five candidates."""
-    found, listed = (next(item for item in queries if item.track == track) for track in ("localization", "retrieval"))
+    """A small view of each track, searched within 40 m of the middle of its prior and among three candidates."""
+    small = [item for item in queries if item.evidence.shape[0] == 96]
+    found, listed = (next(item for item in small if item.track == track) for track in ("localization", "retrieval"))
     return [
-        replace(found, prior=replace(found.prior, radius_m=100.0)),
-        replace(listed, candidates=listed.candidates[:5]),
+        replace(found, prior=replace(found.prior, radius_m=40.0, yaw_sigma_deg=5.0)),
+        replace(listed, candidates=listed.candidates[:3]),
     ]
 
 
@@ -106,14 +107,25 @@ def test_every_matcher_is_registered() -> None:
     assert set(REGISTERED) == {"global_descriptor", "graph_only", *SYSTEMS, *DENSE, *CONTROLS}
 
 
+@pytest.fixture(scope="module")
+def without_error(queries, truths):
+    """A view that shows whole objects, searched within 100 m of the middle of its prior."""
+    found = next(item for item in queries if item.evidence.shape[0] == 192 and truths[item.query_id].role == "control")
+    return replace(found, prior=replace(found.prior, radius_m=100.0))
+
+
 @pytest.mark.parametrize("name", REGISTERED)
-def test_answers_are_valid_and_the_same_in_any_order(name, prepared, two) -> None:
+def test_answers_are_valid_and_the_same_in_any_order_and_no_more_than_asked_for(
+    name, prepared, two, without_error
+) -> None:
     first, second = prepared(name), deepcopy(prepared(name))
-    forward = {query.query_id: check_match(first.match(query, top_k=5), query, top_k=5) for query in two}
-    backward = {query.query_id: check_match(second.match(query, top_k=5), query, top_k=5) for query in reversed(two)}
+    asked = (without_error if name in OF_OBJECTS else two[0], two[1])
+    forward = {query.query_id: check_match(first.match(query, top_k=2), query, top_k=2) for query in asked}
+    backward = {query.query_id: check_match(second.match(query, top_k=2), query, top_k=2) for query in reversed(asked)}
     assert forward == backward
-    least = 0.5 if name in OF_OBJECTS else 1.0
-    assert sum(bool(match.poses) for match in forward.values()) >= least * len(forward)
+    found, ranked = forward.values()
+    assert found.poses
+    assert len(ranked.poses) == 2 or name in OF_OBJECTS
     assert all(match.confidence is None for match in forward.values() if match.poses)
 
 
@@ -121,11 +133,6 @@ def test_answers_are_valid_and_the_same_in_any_order(name, prepared, two) -> Non
 def test_a_matcher_says_that_it_must_be_prepared(name, queries) -> None:
     with pytest.raises(RuntimeError, match="prepare"):
         make(name).match(queries[0], top_k=1)
-
-
-@pytest.mark.parametrize("name", REGISTERED)
-def test_no_more_is_given_than_asked_for(name, prepared, two) -> None:
-    assert len(prepared(name).match(two[1], top_k=1).poses) == 1 or name in OF_OBJECTS
 
 
 LEARNERS = (
@@ -147,7 +154,7 @@ def test_no_candidates_have_no_answer_and_views_of_few_cells_are_borne(name, pre
     nobody = prepared(name).match(replace(asked, candidates=()), top_k=5)
     assert not check_match(nobody, replace(asked, candidates=()), top_k=5).poses
     for rows in (1, 6):
-        tiny = replace(asked, evidence=asked.evidence.replace(asked.evidence.cells[:, 96 : 96 + rows, 96:97].copy()))
+        tiny = replace(asked, evidence=asked.evidence.replace(asked.evidence.cells[:, 48 : 48 + rows, 48:49].copy()))
         check_match(prepared(name).match(tiny, top_k=5), tiny, top_k=5)
 
 
@@ -168,17 +175,19 @@ def test_a_map_of_three_rows_is_borne(name, made, two) -> None:
 
 @pytest.mark.parametrize("name", DENSE)
 def test_dense_matchers_find_what_has_no_errors(name, prepared, queries, truths) -> None:
-    matcher = prepared(name)
-    for query in queries:
-        truth = truths[query.query_id]
-        if truth.role != "control" or truth.pose is None:
-            continue
-        best = matcher.match(query, top_k=5).poses[0]
-        if query.track == "retrieval":
-            assert candidates_at(best, query.candidates)[0] == truth.candidate
-        elif query.evidence.shape[0] == 192:
-            away_m = np.hypot(best.easting_m - truth.pose.easting_m, best.northing_m - truth.pose.northing_m)
-            assert away_m <= 1.0
+    asked = {
+        query.track: (query, truths[query.query_id])
+        for query in queries
+        if truths[query.query_id].role == "control"
+        and query.evidence.shape[0] == (96 if query.track == "retrieval" else 192)
+    }
+    query, truth = asked["retrieval"]
+    best = prepared(name).match(query, top_k=5).poses[0]
+    assert candidates_at(best, query.candidates)[0] == truth.candidate
+    query, truth = asked["localization"]
+    best = prepared(name).match(query, top_k=5).poses[0]
+    away_m = np.hypot(best.easting_m - truth.pose.easting_m, best.northing_m - truth.pose.northing_m)
+    assert away_m <= 1.0
 
 
 @pytest.mark.parametrize("name", CONTROLS)

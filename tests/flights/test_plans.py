@@ -10,7 +10,7 @@ import geopandas as gpd
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import FlightError
@@ -38,7 +38,6 @@ def _turns_deg(path_m: np.ndarray) -> np.ndarray:
     return np.degrees(np.diff(course))
 
 
-@settings(max_examples=40)
 @given(
     town=st.sampled_from(TOWNS),
     kind=st.sampled_from(KINDS),

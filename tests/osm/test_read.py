@@ -313,6 +313,9 @@ REAL = {
 }
 
 
+SMALL = ("monaco-2015-04-27.osm.pbf", "oakland-2016-07-13.osm.bz2", "porto-2020-07-20.osm.pbf")
+
+
 def world_grid(path, epsg):
     """One grid of huge cells over a whole extract."""
     lonlat = [
@@ -323,7 +326,9 @@ def world_grid(path, epsg):
 
 
 @pytest.mark.real
-@pytest.mark.parametrize("name", sorted(REAL))
+@pytest.mark.parametrize(
+    "name", [*SMALL, *(pytest.param(name, marks=pytest.mark.slow) for name in sorted(set(REAL) - set(SMALL)))]
+)
 def test_counts_agree_with_a_second_reader(name, real_extracts):
     path = real_extracts / name
     counting = Counting()

@@ -19,6 +19,7 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import flight_id, view_id
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from tests.threaded import threaded
 
 distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
 
@@ -57,8 +58,9 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
 
 
 def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
-    alone = plan_run(request_of(task, tmp_path / "one"))
-    run(alone, tell=lambda _: None)
+    with threaded():
+        alone = plan_run(request_of(task, tmp_path / "one"))
+        run(alone, tell=lambda _: None)
     plan = plan_run(request_of(task, tmp_path / "two", name="Held", dask="local:2"))
     part = plan.parts[0]
     (place / "hold").write_text(" ".join(next(iter(runner._chunks(part.left, 2, str)))), encoding="utf-8")

@@ -68,17 +68,26 @@ def views_of(rows):
     return [int(item.diagnostics["views"]) for item in rows]
 
 
-@pytest.mark.parametrize("jobs", [1, 3])
-def test_views_of_a_flight_come_in_order_to_one_process(task, tmp_path, jobs):
-    flights = run_of(task, tmp_path, "Counting", jobs=jobs)
-    assert len(flights) == 3
-    assert sum(map(len, flights.values())) == len(task_files.read_ids(task))
-    for rows in flights.values():
+@pytest.fixture(scope="module")
+def counted(flown, tmp_path_factory):
+    """The rows of a tracker that counts what it is given, asked by two processes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(flown)
+        patch.syspath_prepend(str(flown))
+        task = flown / "out" / "tasks" / "flight-overconfident" / TOWN
+        return run_of(task, tmp_path_factory.mktemp("counted"), "Counting", jobs=2)
+
+
+def test_views_of_a_flight_come_in_order_to_one_process(task, counted):
+    assert len(counted) == 3
+    assert sum(map(len, counted.values())) == len(task_files.read_ids(task))
+    for rows in counted.values():
         assert views_of(rows) == list(range(1, len(rows) + 1))
         assert len({item.diagnostics["process"] for item in rows}) == 1
         assert {item.diagnostics["has_place"] for item in rows} == {1.0}
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_what_a_tracker_learnt_reaches_every_step(task, tasks, tmp_path):
     (train,) = (tasks / "tasks" / "alias").glob("town-grid*")
     flights = run_of(task, tmp_path, "Taught", train=(train,))
@@ -97,8 +106,8 @@ def test_a_tracker_that_learns_is_planned_to_learn(task, tasks, tmp_path, name):
     assert "to be trained on" in plan.to_text()
 
 
-def test_no_view_to_come_is_in_the_process_of_a_tracker(task, tmp_path):
-    rows = [item for rows in run_of(task, tmp_path, "Counting").values() for item in rows]
+def test_no_view_to_come_is_in_the_process_of_a_tracker(counted):
+    rows = [item for rows in counted.values() for item in rows]
     assert {item.diagnostics["held"] for item in rows} == {1.0}
 
 
@@ -113,8 +122,8 @@ def test_a_tracker_reads_neither_the_views_to_come_nor_the_truths(task):
     assert {(item.status, item.diagnostics.get("read")) for item in rows} <= {("ok", 0.0), ("refused", None)}
 
 
-def test_a_fix_is_stored_with_its_covariance_and_modes(task, tmp_path):
-    row = next(iter(run_of(task, tmp_path, "Counting").values()))[0]
+def test_a_fix_is_stored_with_its_covariance_and_modes(counted):
+    row = next(iter(counted.values()))[0]
     assert row.is_accepted is True
     assert row.covariance == (4.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 1.0)
     assert [score for _, score in row.candidates] == [1.0, 0.5]
@@ -130,7 +139,9 @@ def test_a_fix_is_stored_with_its_covariance_and_modes(task, tmp_path):
         ("text", "invalid", "step() returned str"),
     ],
 )
-def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_path, way, status, told):
+def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_path, request, way, status, told):
+    if way not in ("hangs", "dies"):  # what its process does not live through
+        request.getfixturevalue("in_threads")
     first = flight_id(min(task_files.read_ids(task)))
     (flown / "fails").write_text(f"{first} {way}", encoding="utf-8")
     flights = run_of(task, tmp_path, "Failing", limits=replace(PATIENT, match_s=5.0 if way == "hangs" else 600.0))
@@ -143,6 +154,7 @@ def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_pa
         assert views_of(rows) == list(range(1, len(rows) + 1))
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_flight_that_was_cut_off_is_asked_from_its_first_view(task, tmp_path):
     """Rows of a whole flight stay; the other begins anew, since a tracker needs what came before."""
     ids = sorted(task_files.read_ids(task))
@@ -162,6 +174,7 @@ def test_shards_hold_whole_flights_and_all_of_them(task, tmp_path):
     assert sorted([*parts[0], *parts[1]]) == sorted(task_files.read_ids(task))
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_odometry_alone_begins_at_the_prior_and_drifts_and_the_start_alone_stays(task, tmp_path):
     reckoned = run_of(task, tmp_path, "dead_reckoning")
     stayed = run_of(task, tmp_path, "prior_only")
@@ -176,6 +189,7 @@ def test_odometry_alone_begins_at_the_prior_and_drifts_and_the_start_alone_stays
         assert {item.is_accepted for item in rows} == {False}
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_merged_answers_of_a_tracker_keep_what_only_fixes_have(task, tmp_path):
     flights = run_of(task, tmp_path, "Counting", limit=4)
     into = tmp_path / "merged.parquet"
@@ -187,6 +201,7 @@ def test_merged_answers_of_a_tracker_keep_what_only_fixes_have(task, tmp_path):
         assert {(item.is_accepted, item.covariance[0]) for item in found.values()} == {(True, 4.0)}
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_a_matcher_of_single_views_follows_flights_and_its_run_says_how(task, tmp_path, monkeypatch):
     flights = run_of(task, tmp_path, "prior_centre", limit=4)
     rows = [item for rows in flights.values() for item in rows]
@@ -206,6 +221,7 @@ def test_a_matcher_of_single_views_follows_flights_and_its_run_says_how(task, tm
         prediction_files.key_of({"follower": 7})
 
 
+@pytest.mark.usefixtures("in_threads")
 def test_the_oracle_follows_flights_and_a_matcher_that_only_ranks_does_not(task, tmp_path):
     truths = {
         item.query_id: item.pose for item in task_files.read_truths(task.parents[2] / "truth" / task.parent.name / TOWN)

@@ -68,8 +68,9 @@ def test_views_without_a_map_of_their_day_are_dropped_and_none_left_is_said(tiny
 
 def near(tiny, count=3):
     """Views of known place whose prior is a disc about it, small beside the map."""
+    narrow = {"radius_m": 50.0, "yaw_sigma_deg": 5.0}
     return [
-        (replace(query, prior=replace(query.prior, radius_m=100.0, center_m=(pose.easting_m, pose.northing_m))), truth)
+        (replace(query, prior=replace(query.prior, center_m=(pose.easting_m, pose.northing_m), **narrow)), truth)
         for query, truth in zip(tiny.queries, tiny.truths, strict=True)
         if query.suite == "clean" and query.track == "localization" and query.evidence.shape[0] == 192
         for pose in [truth.pose]
@@ -94,7 +95,7 @@ def test_an_arm_that_learns_from_maps_of_the_day_keeps_the_rates_of_ageing_set_b
 
 
 def test_parts_of_a_large_map_teach_what_the_whole_map_does(tiny, monkeypatch):
-    training = Training(regions={tiny.queries[0].region: tiny.region}, pairs=near(tiny))
+    training = Training(regions={tiny.queries[0].region: tiny.region}, pairs=near(tiny, 2))
     whole = SasgeoNoGraph().learn(training)
     cut = partial(around_views, most_values=1)
     monkeypatch.setattr(learning, "around_views", cut)
@@ -110,7 +111,7 @@ def test_each_view_of_a_large_map_has_a_part_that_holds_its_prior(tiny):
         assert query.region == own
         assert part.grid.rows * part.grid.cols < grid.rows * grid.cols
         west_m, south_m, east_m, north_m = part.grid.bounds_m
-        reach_m = 100.0 + 96 * 2**0.5
+        reach_m = 50.0 + 96 * 2**0.5
         map_west_m, map_south_m, map_east_m, map_north_m = grid.bounds_m
         assert west_m <= max(truth.pose.easting_m - reach_m, map_west_m)
         assert east_m >= min(truth.pose.easting_m + reach_m, map_east_m)

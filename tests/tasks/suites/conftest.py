@@ -17,6 +17,7 @@ from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from sasgeo_bench.tasks import flight_choice
 from sasgeo_bench.tasks.flight_choice import Airspace, Flight, rows
 from sasgeo_bench.tasks.flight_sampling import FlightDrawer
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
@@ -244,7 +245,10 @@ def flown(scene, town, edited) -> Callable[[str], Flown]:
         airspace = Airspace(
             region=town(where), scene=over, suite=suite, split=split, seeds=seeds, group=suite.card.group
         )
-        flights = airspace.choose(count=1, may_be_fewer=False)
+        lengths_m = flight_choice.LENGTHS_M if name == "flight-gap" else (1000.0,)  # gaps of every length need room
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(flight_choice, "LENGTHS_M", lengths_m)
+            flights = airspace.choose(count=1, may_be_fewer=False)
         if suite.is_pictured:
             flights = {0: replace(flights[0], views=rows(flights[0].views, slice(0, PICTURES)))}
         if flights[0].plot is not None:

@@ -62,7 +62,8 @@ def stresses(made, role="stress"):
 @pytest.mark.parametrize("name", SUITES)
 def test_the_same_seed_gives_the_same_draft(carried, name):
     made = carried(name)
-    for variant in made.suite.variants:
+    smallest = {item.kind: item for item in sorted(made.suite.variants, key=lambda item: -item.view_cells)}
+    for variant in smallest.values():
         assert same_drafts(made.draw(made.sites[0], variant), made.drawn(made.sites[0], variant))
 
 

@@ -427,6 +427,11 @@ def test_rows_that_a_board_has_no_more_are_told(out, tmp_path):
     _, third = told_by(out, out / "runs", board=board)
     said = f"{board} had rows of mine, which this board has not; their answers are where they were"
     assert [said in lines for lines in (first, second, third)] == [False, True, False]
+    (board / "site").mkdir()
+    (board / "site" / "site.json").write_text('{"files": []}', encoding="utf-8")
+    _, fourth = told_by(out, out / "runs", board=board)
+    assert f"{board / 'site'} is of the older board and is removed with it: publish again" in fourth
+    assert not (board / "site").exists()
 
 
 def test_a_folder_with_other_things_is_not_replaced(out):

@@ -2,6 +2,7 @@
 """The layer file: what was burnt is what is read, in a cloud-optimized layout."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from sasgeo_bench.regions.layers import (
     OUTSIDE,
     Paint,
     burn_layers,
+    burn_mapped,
     overview_factors,
     read_layers,
     read_overview,
@@ -52,6 +54,33 @@ def written(tmp_path_factory):
 
 def test_what_is_read_is_what_was_burnt(written):
     assert (read_layers(written) == burn_layers(paint(), GRID)).all()
+
+
+def test_ground_that_is_not_mapped_is_not_stored_and_reads_as_unknown(tmp_path):
+    west, south, east, north = GRID.bounds_m
+    half = shapely.orient_polygons(np.array([shapely.box(west, south, east - 4000.0, north)], dtype=object))
+    drawn, stored = replace(paint(), coverage=half), []
+
+    def burnt(window):
+        found = burn_mapped(drawn, window)
+        stored.append(found is not None)
+        return found
+
+    write_layers(tmp_path / "sparse.tif", GRID, CLASSES, lambda _: burnt)
+    assert not all(stored)
+    assert (read_layers(tmp_path / "sparse.tif") == burn_layers(drawn, GRID)).all()
+
+
+def test_blocks_are_packed_at_the_level_that_was_asked_for(written, tmp_path):
+    """A raster that is opened again packs at GDAL's default level, which takes three times as long."""
+    path = tmp_path / "plain.tif"
+    with rasterio.open(written) as source, rasterio.open(path, "w", **source.profile | {"zstd_level": 1}) as target:
+        target.write(source.read())
+    sizes = []
+    for each in (written, path):
+        with rasterio.open(each) as source:
+            sizes.append([source.block_size(band, row, col) for band in (1, 2) for row in range(4) for col in range(8)])
+    assert sizes[0] == sizes[1]
 
 
 def test_a_window_is_read_alone(written):

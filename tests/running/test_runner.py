@@ -144,7 +144,7 @@ def command_of(program, task, out, *words):
 
 
 @pytest.mark.parametrize("kills", [1, pytest.param(20, marks=pytest.mark.slow)])
-def test_killed_at_random_moments_a_run_ends_with_the_same_rows(place, task, undisturbed, tmp_path, kills):
+def test_killed_once_or_at_random_moments_a_run_ends_with_the_same_rows(place, task, undisturbed, tmp_path, kills):
     folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
     killed = command_of(SIGNALLED.format(number=int(signal.SIGKILL)), task, tmp_path, "--jobs", "2")
     command = command_of(UNDISTURBED, task, tmp_path, "--jobs", "2")

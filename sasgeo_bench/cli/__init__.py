@@ -3,17 +3,18 @@
 
 import sys
 
-from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, is_interrupt
+from sasgeo_bench.cli.interrupts import exit_interrupted, interrupted_by_signals, is_interrupt
 
 
 def main() -> None:
     """Run the program; an interrupt while it is still being imported is one line as well."""
-    try:
-        from sasgeo_bench.cli import program  # noqa: PLC0415 - takes a third of a second, in which users press Ctrl-C
+    with interrupted_by_signals():
+        try:
+            from sasgeo_bench.cli import program  # noqa: PLC0415 - takes a third of a second, in which users press Ctrl-C
 
-        program.main()
-    except BaseException as error:
-        if not is_interrupt(error):
-            raise
-        sys.stderr.write("sasgeo-bench: interrupted before it began; run it again\n")
-        sys.exit(EXIT_INTERRUPTED)
+            program.main()
+        except BaseException as error:
+            if not is_interrupt(error):
+                raise
+            sys.stderr.write("sasgeo-bench: interrupted before it began; run it again\n")
+            sys.exit(exit_interrupted())

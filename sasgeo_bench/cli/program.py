@@ -16,7 +16,7 @@ import typer
 from typer.core import TyperGroup
 
 from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say, tell
-from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, is_interrupt
+from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, exit_interrupted, is_interrupt
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.progress import QUIET
@@ -238,6 +238,7 @@ def _status() -> int:
             note(traceback.format_exc())
             raise
         status = EXIT_INTERRUPTED
-    if status == EXIT_INTERRUPTED:  # typer turns Ctrl-C into this status without a word
+    if status == EXIT_INTERRUPTED:  # typer turns an interrupt into this status without a word
+        status = exit_interrupted()
         complain(f"sasgeo-bench: interrupted; {KEPT.get(' '.join(sys.argv[1:2]), _NOTHING)}")
     return status

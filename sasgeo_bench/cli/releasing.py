@@ -12,7 +12,8 @@ from sasgeo_bench.cli.options import ExtractFolders, Options, Out
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.experiments.board_queries import BoardRequest, draw_board
-from sasgeo_bench.publishing.release import ReleaseRequest, check_installed, make_release
+from sasgeo_bench.files.paths import given_path
+from sasgeo_bench.publishing.release import ReleaseRequest, check_place, make_release
 from sasgeo_bench.publishing.release_files import BoardTasks
 
 
@@ -49,6 +50,8 @@ def release_command(options: ReleaseOptions) -> None:
     """Write regions and queries, or those of a board, as a dataset that others load without this program."""
     day = read_date(options.date)
     _check_flags(options)
+    into = given_path(options.into or options.out / "release")
+    check_place(into, options.out, url=options.url)
     board = None if options.board is None else _queries_of(options, options.board)
     request = ReleaseRequest(
         regions=tuple(options.regions or ()) if board is None else board.regions,
@@ -56,7 +59,7 @@ def release_command(options: ReleaseOptions) -> None:
         split=options.split if board is None else board.split,
         with_truth=options.truth,
         out=options.out,
-        into=options.into or options.out / "release",
+        into=into,
         published=None if day is None else day.isoformat(),
         url=options.url,
         board=board,
@@ -68,8 +71,7 @@ def release_command(options: ReleaseOptions) -> None:
 
 
 def _check_flags(options: ReleaseOptions) -> None:
-    """Refuse flags that do not go together, and missing packages, before anything is drawn."""
-    check_installed()
+    """Refuse flags that do not go together, before anything is drawn."""
     if (options.board is None) != bool(options.regions) or (options.board and (options.truth or options.suites)):
         message = (
             "release takes either --regions, with --suites and --truth, or --board: a board names its queries, and its "

@@ -92,12 +92,14 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
     The file of the lock is removed while it is still held. Whoever waits for it then holds a file without a name, sees
     that, and tries again by the name (`filelock`, since 3.21).
     """
+    folder = absolute(folder)
     lock = FileLock(folder.parent / f".{folder.name}.lock")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         try:
             lock.acquire(timeout=0)
         except Timeout:
+            check_room(folder)  # where no file can be made, nobody holds it
             tell(f"{folder} is being written by another run, waiting for it")
             lock.acquire()
     except OSError as error:
@@ -138,6 +140,7 @@ def fresh_folder(target: Path) -> Iterator[Path]:
 
     Call it under `locked`: leftovers of a build that was killed are removed first.
     """
+    target = absolute(target)
     scratch = target.parent / f".{target.name}.partial"
     replaced = target.parent / f".{target.name}.replaced"
     if replaced.exists() and not target.exists():
@@ -212,9 +215,28 @@ def resolve_link(path: Path) -> Path:
         raise StoreError(message) from error
 
 
+def absolute(path: Path) -> Path:
+    """Return a path from the root, which has a name also where it was given as "." or ".."; links stay.
+
+    >>> absolute(Path("/data/maps/..")).name
+    'data'
+    """
+    return Path(os.path.abspath(path))  # noqa: PTH100 - Path.resolve follows links, Path.absolute keeps ".."
+
+
 def _walk(folder: Path, without: Collection[str]) -> Iterator[tuple[str, Path]]:
-    """Yield everything below a folder except folders, by relative path; links are not followed."""
-    for parent, folders, files in os.walk(folder):
+    """Yield everything below a folder except folders, by relative path; links are not followed.
+
+    Raise `StoreError` for a folder that cannot be looked into: nobody knows what it holds.
+    """
+
+    def refuse(error: OSError) -> None:
+        if isinstance(error, FileNotFoundError | NotADirectoryError):
+            return  # of what is not there, or no folder, the caller speaks
+        message = f"{error.filename} cannot be looked into ({error.strerror}): check your rights, or move it away"
+        raise StoreError(message) from error
+
+    for parent, folders, files in os.walk(folder, onerror=refuse):
         if Path(parent) == folder:
             folders[:] = [name for name in folders if name not in without]
         links = [name for name in folders if (Path(parent) / name).is_symlink()]
@@ -278,7 +300,8 @@ def check_known(
 def check_site(folder: Path) -> None:
     """Refuse to replace a site that holds somebody else's files; raise `StoreError` naming them."""
     try:
-        known = read_json(folder / SITE_MANIFEST, mend="publish again")["files"]
+        about = read_json(folder / SITE_MANIFEST, mend="publish again")
+        known = about["files"] if "OpenStreetMap" in about["attribution"] else []  # else it is another program's file
     except (StoreError, KeyError, TypeError):
         known = None
     if isinstance(known, list):
@@ -289,9 +312,13 @@ def check_site(folder: Path) -> None:
 
 def check_room(folder: Path) -> None:
     """Raise `StoreError` if a folder cannot be made or replaced: the work to fill it may take an hour."""
-    there = next(path for path in (folder.parent, *folder.absolute().parents) if path.exists())
+    folder = absolute(folder)
+    there = next(path for path in folder.parents if path.exists())
     if not there.is_dir():
         message = f"{folder} cannot be written, for {there} is a file: name another folder"
+        raise StoreError(message)
+    if folder.is_mount():
+        message = f"{folder} is a mount point, which cannot be replaced as a whole: name a folder in it"
         raise StoreError(message)
     try:
         with tempfile.TemporaryDirectory(prefix=".sasgeo-bench-", dir=there):

@@ -17,7 +17,7 @@ def given_path(value: object) -> Path:
         ...
     sasgeo_bench.errors.StoreError: 5 is no path: name a folder or a file, as a text or a Path
     """
-    if not isinstance(value, str | Path) or "\0" in str(value):
+    if not isinstance(value, str | Path) or "\0" in str(value) or value == "":
         message = f"{one_line(repr(value))} is no path: name a folder or a file, as a text or a Path"
         raise StoreError(message)
     return Path(value)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board's folder -> its site: the order of the steps."""
 
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
@@ -14,7 +15,7 @@ import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import SITE, resolve_link
+from sasgeo_bench.files.folders import SITE, absolute, resolve_link
 from sasgeo_bench.leaderboard.board_files import (
     ANSWERS,
     BOARD_FILES,
@@ -91,7 +92,7 @@ def publish(
         message = f"{board / SITE} is a link: name where it leads with --into"
         raise StoreError(message)
     target = board / SITE if into is None else resolve_link(into)
-    place, whole = target.parent.resolve() / target.name, board.resolve()
+    place, whole = Path(os.path.realpath(absolute(target).parent)) / absolute(target).name, board.resolve()
     if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
         message = f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
         raise StoreError(message)

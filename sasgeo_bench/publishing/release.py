@@ -2,6 +2,7 @@
 """Regions and tasks -> a dataset release that others load: what is refused, and the order of the steps."""
 
 import datetime as dt
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -98,9 +99,7 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     rasters are no valid COG, if a task is of another map or split, holds pictures or lacks its truths, or if the folder
     holds something else.
     """
-    check_installed()
-    _check_address(request.url)
-    _check_folder(request.into, request.out)
+    check_place(request.into, request.out, url=request.url)
     split = read_split_file(find_split_file(request.split))
     regions = tuple(dict.fromkeys(request.regions))
     if request.board is None:
@@ -136,9 +135,17 @@ def check_installed() -> None:
         raise ConfigError(message)
 
 
-def _check_folder(into: Path, out: Path) -> None:
-    others = (out / name for name in ("regions", "tasks", "truth", "runs", "boards"))
-    inside = next((folder for folder in others if into.resolve().is_relative_to(folder.resolve())), None)
+def check_place(into: Path, out: Path, *, url: str | None = None) -> None:
+    """Refuse, before anything is drawn, a folder that a release cannot replace, and an address that is none.
+
+    Raise `ConfigError` for a folder that others read, an address, or missing packages; `StoreError` for a folder that
+    holds something else, or cannot be written.
+    """
+    check_installed()
+    _check_address(url)
+    place = Path(os.path.realpath(into))  # `Path.resolve` raises where links form a circle
+    others = (out / name for name in ("regions", "tasks", "truth", "runs", "boards", "segmenters", "private"))
+    inside = next((folder for folder in others if place.is_relative_to(folder.resolve())), None)
     if inside is not None:
         message = f"{into} lies inside {inside}, which others read: name another folder with --into"
         raise ConfigError(message)

@@ -13,7 +13,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.folders import FileRecord, file_record, fresh_folder, locked
+from sasgeo_bench.files.folders import (
+    FileRecord,
+    check_known,
+    check_room,
+    file_record,
+    fresh_folder,
+    locked,
+    sha256_of,
+)
+from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_table, table_writer
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
@@ -228,27 +237,34 @@ def has_images(task_folder: Path) -> bool:
 
 
 def check_target(folder: Path) -> None:
-    """Raise `StoreError`, naming the file, if a folder holds a file that no release has written."""
+    """Raise `StoreError`, naming a file, if a folder holds what no release has written, or what was changed since."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
         message = f"{folder} is a file or a link: move it away, a release goes there"
         raise StoreError(message)
-    known = {SUMS, *_named_in_sums(folder)} if (folder / INDEX).is_file() else set()
-    other = next((path for path in sorted(folder.rglob("*")) if _is_strange(path, folder, known)), None)
-    if other is not None:
-        message = f"{other} is no part of a release and would be lost: move it away, or name another folder with --into"
+    check_room(folder)
+    sums = _sums_of(folder)
+    check_known(folder, {SUMS, *sums} if sums else (), "a release")
+    changed = next((name for name, each in sums.items() if not _is_same(folder / name, each)), None)
+    if changed is not None:
+        message = (
+            f"{folder / changed} was changed since it was released, which would be lost: move the folder away, or name "
+            "another one"
+        )
         raise StoreError(message)
 
 
-def _is_strange(path: Path, folder: Path, known: Collection[str]) -> bool:
-    return (path.is_file() or path.is_symlink()) and path.relative_to(folder).as_posix() not in known
+def _is_same(path: Path, sha256: str) -> bool:
+    return not path.is_file() or sha256_of(path) == sha256
 
 
-def _named_in_sums(folder: Path) -> list[str]:
+def _sums_of(folder: Path) -> dict[str, str]:
+    """Return the SHA-256 of the files of an older release of ours; nothing where there is none."""
     try:
+        made_by = read_json(folder / INDEX, mend="release again")["made_by"]
         lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError):
-        return []
-    return [line[66:] for line in lines]  # after 64 digits and two spaces
+    except (OSError, UnicodeDecodeError, StoreError, KeyError, TypeError):
+        return {}
+    return {line[66:]: line[:64] for line in lines} if str(made_by).startswith("sasgeo-bench") else {}
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 """Metadata of a release: `croissant.json` with the meaning of every column, and STAC in `stac/` for maps."""
 
 import datetime as dt
+import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -359,10 +360,15 @@ def write_stac(folder: Path, release: Release) -> None:
     )
     catalog.add_link(_licence_link())
     catalog.add_child(collection)
-    catalog.normalize_hrefs(str(folder / STAC))
+    catalog.normalize_hrefs(f"/{STAC}")  # no real path: in one, # and ? would be parts of an address
     for item in collection.get_items():
         item.make_asset_hrefs_relative()
-    catalog.save(catalog_type=pystac.CatalogType.SELF_CONTAINED)
+    catalog.catalog_type = pystac.CatalogType.SELF_CONTAINED
+    for each in (catalog, collection, *items):
+        path = folder / str(each.get_self_href()).removeprefix("/")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        content = json.dumps(each.to_dict(include_self_link=False), indent=2)
+        path.write_text(content, encoding="utf-8")
 
 
 def _collection(items: list["pystac.Item"], release: Release) -> "pystac.Collection":

@@ -81,9 +81,10 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     )
     asked = {name: one for task in tasks for name, one in task.asked.items()}
     folder = request.into or default_folder(submission.board, card.name)
-    if is_submission(folder):
-        tell(f"{folder}: the submission that was there is replaced")
+    is_replaced = is_submission(folder)
     write_submission(folder, submission, list(rows.values()), asked)
+    if is_replaced:
+        tell(f"{folder}: the submission that was there is replaced")
     for line in _remarks(submission):
         tell(line)
     return folder

@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.folders import file_record, fresh_folder, locked
+from sasgeo_bench.files.folders import check_known, file_record, fresh_folder, locked
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
@@ -47,9 +47,21 @@ def check_submission_folder(folder: Path, name: str) -> None:
     if folder.name != name:
         message = f"{folder} must be named as the card is, {name!r}: name another folder"
         raise StoreError(message)
-    if os.path.lexists(folder) and not is_submission(folder) and (not folder.is_dir() or any(folder.iterdir())):
+    is_free = not os.path.lexists(folder) or (folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()))
+    if is_free:
+        return
+    if folder.is_symlink() or not _is_ours(folder):
         message = f"{folder} holds something else than a submission, which would be lost: name another folder"
         raise StoreError(message)
+    check_known(folder, {SUBMISSION, predictions_name(name)}, "a submission")
+
+
+def _is_ours(folder: Path) -> bool:
+    """Return whether a folder holds a submission of this program, whole or not."""
+    try:
+        return str(read_json(folder / SUBMISSION, mend="submit again")["made_by"]).startswith("sasgeo-bench")
+    except (StoreError, KeyError, TypeError):
+        return False
 
 
 def write_submission(

@@ -2,6 +2,7 @@
 """The program as a user meets it: exit codes, one line for a mistake, results on stdout."""
 
 import os
+import signal
 import subprocess
 import sys
 from importlib import metadata
@@ -202,6 +203,8 @@ def tell(text):
     return write(text)
 
 signal.signal(signal.SIGINT, signal.default_int_handler)
+for name in ("SIGTERM", "SIGHUP"):
+    signal.signal(getattr(signal, name), signal.SIG_DFL)
 
 def strike(number, frame):
     # Not where Python drops exceptions: in a callback of a weak reference, or in a destructor.
@@ -210,7 +213,7 @@ def strike(number, frame):
             signal.setitimer(signal.ITIMER_PROF, 0.001)
             return
         frame = frame.f_back
-    signal.raise_signal(signal.SIGINT)
+    signal.raise_signal(NUMBER)
 
 signal.signal(signal.SIGPROF, strike)
 write, sys.stderr.write = sys.stderr.write, tell
@@ -218,11 +221,13 @@ cli.main()
 """
 
 
-def test_ctrl_c_leaves_nothing_half_written(tmp_path):
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_an_interrupt_leaves_nothing_half_written(tmp_path, number, status):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
-    command = [sys.executable, "-c", INTERRUPTED, "build-region", "town-suburb", "town-grid"]
+    program = INTERRUPTED.replace("NUMBER", str(int(number)))
+    command = [sys.executable, "-c", program, "build-region", "town-suburb", "town-grid"]
     ended = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
-    assert ended.returncode == 130, ended.stderr
+    assert ended.returncode == status, ended.stderr
     assert "interrupted" in ended.stderr
     assert "Traceback" not in ended.stderr
     left = [path for path in (tmp_path / "out/regions").iterdir() if not path.name.endswith(".lock")]

@@ -4,10 +4,12 @@
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from threading import Event
 
 import pytest
 
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import locked
 
 # Adds 1 to a number in a file, many times: of two at once, which both read the same number, one would be lost.
@@ -34,6 +36,11 @@ def test_nothing_is_left_of_a_lock_whatever_happened_under_it(tmp_path):
     with pytest.raises(KeyError), locked(tmp_path / "site", tell=silent):
         raise KeyError
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_lock_that_cannot_be_made_is_a_fault_and_nobody_waits_for_it():
+    with pytest.raises(StoreError, match="/proc/site cannot be written"), locked(Path("/proc/site"), tell=pytest.fail):
+        pass
 
 
 def test_who_waited_for_a_lock_excludes_who_comes_later(tmp_path):

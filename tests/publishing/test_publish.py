@@ -579,6 +579,11 @@ def test_files_of_ones_own_in_an_older_site_are_never_lost(few, mistake, tmp_pat
     with pytest.raises(StoreError, match=r"1 file \(figures/notes.txt\) that would be lost"):
         check_board(few, scorer_version=json.loads((few / "board.json").read_text(encoding="utf-8"))["scorer_version"])
     (few / "figures" / "notes.txt").unlink()
+    said = {"files": ["thesis.tex"]}  # a file of another program that has the name
+    (tmp_path / "thesis").mkdir()
+    (tmp_path / "thesis" / "thesis.tex").touch()
+    (tmp_path / "thesis" / "site.json").write_text(json.dumps(said), encoding="utf-8")
+    assert "1 file (thesis.tex) that would be lost" in mistake("publish", "--board", few, "--into", tmp_path / "thesis")
     with pytest.raises(StoreError, match=r"1 file \(CNAME\) that would be lost"):
         check_board(few, scorer_version=json.loads((few / "board.json").read_text(encoding="utf-8"))["scorer_version"])
 

@@ -31,7 +31,7 @@ from pystac.validation.stac_validator import JsonSchemaSTACValidator
 from rio_cogeo.cogeo import cog_validate
 
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.files.folders import file_record
+from sasgeo_bench.files.folders import file_record, sha256_of
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.publishing import release as release_module
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
@@ -505,7 +505,8 @@ def test_a_region_that_is_not_fit_is_refused(changes, told, own, mistake):
         (("--regions", RIVERSIDE, "--split", "holdout"), "was drawn by split 'crossfit', not by 'holdout'"),
         (("--regions", RIVERSIDE, "--split", "nowhere"), "there is no split 'nowhere'"),
         (("--regions", RIVERSIDE, "--into", "out/tasks/new"), "lies inside out/tasks, which others read"),
-        (("--regions", RIVERSIDE, "--into", "."), "is no part of a release and would be lost"),
+        (("--regions", RIVERSIDE, "--into", "out/segmenters/new"), "lies inside out/segmenters, which others read"),
+        (("--regions", RIVERSIDE, "--into", "."), "that would be lost and are not part of a release"),
         (("--regions", RIVERSIDE, "--date", "yesterday"), "--date must be a date as in 2021-10-28"),
     ],
 )
@@ -543,10 +544,50 @@ def test_an_older_release_is_replaced_and_a_strange_file_in_it_saved(own, progra
         " 1 map, 32 queries of 1 suite, " + out.split(", ")[-1].strip(),
     )
     (own / FOLDER / "stac" / "mine.txt").write_text("mine")
-    assert "mine.txt is no part of a release and would be lost" in mistake(*words)
+    assert "holds 1 file (stac/mine.txt) that would be lost and are not part of a release" in mistake(*words)
     (own / FOLDER / "stac" / "mine.txt").unlink()
+    os.mkfifo(own / FOLDER / "pipe")
+    assert "1 file (pipe) that would be lost" in mistake(*words)
+    (own / FOLDER / "pipe").unlink()
     assert program(*words, "--truth")[0] == 0
     assert (own / FOLDER / "truth").is_dir()
+    (own / FOLDER / "README.md").write_text("changed by hand", encoding="utf-8")
+    assert "README.md was changed since it was released, which would be lost" in mistake(*words)
+
+
+def test_a_folder_of_another_program_with_files_of_the_same_names_is_saved(own, mistake):
+    folder = own / "thesis"
+    folder.mkdir()
+    for name, text in (("thesis.tex", "years of work"), ("release.json", '{"version": "1.0"}')):
+        (folder / name).write_text(text, encoding="utf-8")
+    sums = [f"{sha256_of(folder / name)}  {name}\n" for name in ("thesis.tex", "release.json")]
+    (folder / "SHA256SUMS").write_text("".join(sums), encoding="utf-8")
+    told = mistake("release", "--regions", RIVERSIDE, "--out", own, "--into", folder)
+    assert "(SHA256SUMS, release.json, thesis.tex) that would be lost" in told
+    assert (folder / "thesis.tex").read_text(encoding="utf-8") == "years of work"
+
+
+@pytest.mark.parametrize("name", ["C#", "what?", "two\nlines", "a b"])
+def test_a_release_is_whole_whatever_its_folder_is_called(name, own, tmp_path):
+    (tmp_path / "C").mkdir()
+    (tmp_path / "C" / "catalog.json").write_text("mine", encoding="utf-8")
+    _release(own, tmp_path / name / "release", regions=(RIVERSIDE,), suites=("clean",))
+    assert {"catalog.json", "regions"} <= {path.name for path in (tmp_path / name / "release" / "stac").iterdir()}
+    assert (tmp_path / "C" / "catalog.json").read_text(encoding="utf-8") == "mine"
+    assert [path.name for path in (tmp_path / "C").iterdir()] == ["catalog.json"]
+
+
+def test_links_in_a_circle_and_folders_that_cannot_be_are_one_line(own, mistake, tmp_path):
+    (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "file").touch()
+    words = ("release", "--regions", RIVERSIDE, "--out", own, "--into")
+    assert "is a file or a link" in mistake(*words, tmp_path / "loop")
+    assert "loop/x cannot be looked into (Too many levels of symbolic links)" in mistake(
+        *words, tmp_path / "loop" / "x"
+    )
+    assert "file is a file: name another folder" in mistake(*words, tmp_path / "file" / "x")
+    assert "/proc/x cannot be written" in mistake(*words, "/proc/x")
+    assert "/proc is a mount point" in mistake(*words, "/proc")
 
 
 @pytest.mark.parametrize("fault", [OSError(errno.ENOSPC, "No space left on device"), KeyboardInterrupt()])

@@ -325,6 +325,20 @@ def test_a_folder_of_something_else_is_not_replaced_and_the_name_is_the_cards(st
     assert "must be named as the card is, 'mine'" in mistake(*words, tmp_path / "elsewhere" / "other")
 
 
+def test_a_submission_with_files_of_ones_own_is_not_replaced(stored, files, program, mistake, tmp_path):
+    words, mine = [*flags(files, stored), "--into"], tmp_path / "sent" / "mine"
+    assert program(*words, mine)[0] == 0
+    assert program(*words, mine)[0] == 0  # a submission alone is replaced
+    (mine / "method.py").write_text("years of work", encoding="utf-8")
+    assert "1 file (method.py) that would be lost and are not part of a submission" in mistake(*words, mine)
+    (mine / "method.py").unlink()
+    (mine / "submission.json").write_text('{"of": "another program"}', encoding="utf-8")
+    assert "holds something else than a submission" in mistake(*words, mine)
+    (tmp_path / "link").mkdir()
+    (tmp_path / "link" / "mine").symlink_to(mine)
+    assert "holds something else than a submission" in mistake(*words, tmp_path / "link" / "mine")
+
+
 def test_submit_says_what_it_lacks_and_prints_a_card_that_is_one(program, mistake):
     assert mistake("submit", "--card", "card.toml").startswith("sasgeo-bench: submit needs --predictions and --for")
     code, out, _ = program("submit", "--example-card")

@@ -46,6 +46,7 @@ from sasgeo_bench.texts import FOLDER, one_line
 
 HIDDEN_PARTS: Final = ("test", "crossfit")  # whose truths are left out unless asked for
 _EXTRA: Final = {"mlcroissant": "mlcroissant", "pystac": "pystac", "rio_cogeo": "rio-cogeo"}
+_ADDRESS: Final = re.compile(r"https?://[A-Za-z0-9._~:/?#\[\]@!$&()*+,;=%-]+")  # no quotes and brackets of markup
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,8 +271,11 @@ def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
 
 
 def _check_address(url: str | None) -> None:
-    if url is not None and not url.startswith(("https://", "http://")):
-        message = f"--url is {one_line(url)[:80]!r}: the address of a release begins with https:// or http://"
+    if url is not None and not _ADDRESS.fullmatch(url):
+        message = (
+            f"--url is {one_line(url)[:80]!r}: the address of a release begins with https:// or http://, and holds "
+            "letters, digits and the signs of addresses alone"
+        )
         raise ConfigError(message)
 
 

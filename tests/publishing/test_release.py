@@ -496,6 +496,11 @@ def test_a_region_that_is_not_fit_is_refused(changes, told, own, mistake):
             ("--regions", RIVERSIDE, "--url", "javascript:alert(1)"),
             "--url is 'javascript:alert(1)': the address of a release begins with https:// or http://",
         ),
+        (
+            ("--regions", RIVERSIDE, "--url", 'https://x.org/"><script>'),
+            "the address of a release begins with https://",
+        ),
+        (("--regions", RIVERSIDE, "--url", "https://x.org/\n- a"), "holds letters, digits and the signs of addresses"),
         (("--regions", "town-rivreside"), "there is no region 'town-rivreside', did you mean 'town-riverside'?"),
         (("--regions", "vaduz"), "holds no map of vaduz: sasgeo-bench build-region vaduz"),
         (("--regions", f"{RIVERSIDE}@2014-01-01"), "--regions takes ids as in 'vaduz'"),

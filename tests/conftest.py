@@ -45,6 +45,7 @@ settings.register_profile(
 settings.register_profile("quick", settings.get_profile("sasgeo"), max_examples=10)
 settings.register_profile("search", settings.get_profile("sasgeo"), derandomize=False, max_examples=200)
 settings.load_profile("sasgeo")
+gc.disable()  # until the tests are collected, of which nothing is garbage: a fifth of that time
 progress.EVERY_S = math.inf  # else lines of progress come between others wherever the machine is slow
 
 BUILDERS = ("test_build.py", "test_cli.py", "test_results.py", "test_town.py")  # build or start something in each test
@@ -55,6 +56,7 @@ def pytest_collection_finish() -> None:
     """Collect garbage seldom, and never what is there for good: thousands of tests, and the modules they import."""
     gc.collect()
     gc.freeze()
+    gc.enable()
     gc.set_threshold(10_000, 10, 50)  # tables and figures make many objects that die without it
 
 

@@ -263,12 +263,14 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
 def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:
     """Return the submissions for a board id, in `paths` or folders of them; report how many are for others.
 
-    Raise `StoreError` if something is no submission or differs from its record, and `ConfigError` if `board` is empty.
+    What cannot be read is among them: the board reports and loses it alone. Raise `StoreError` if a path is neither a
+    submission nor a folder of them, and `ConfigError` if `board` is empty.
     """
     if not board:
         message = "submissions are scored with the stored results of a board: name them with --predictions"
         raise ConfigError(message)
-    found = {folder.resolve(): folder for path in paths for folder in list_submissions(path)}
+    listed = (folder for path in paths for folder in list_submissions(path))
+    found = {folder.parent.resolve() / folder.name: folder for folder in listed}  # a link may lead to itself
     boards = {folder: _board_named(folder, board) for folder in found.values()}
     others = sorted({name for name in boards.values() if name != board})
     if others:
@@ -281,7 +283,7 @@ def _board_named(folder: Path, board: str) -> str:
     """Return the board that a submission names; an unreadable one fails on this board, which reports it."""
     try:
         return read_submission(folder).board
-    except (StoreError, ConfigError):
+    except (StoreError, ConfigError, OSError):
         return board
 
 
@@ -292,8 +294,8 @@ def with_submissions(
 
     `submissions` are submissions and folders of them; those for other boards are left out. `root` holds regions/,
     tasks/ and truth/ for pictures, `jobs` counts the processes that fit rejectors. Rows of submissions are marked `as
-    submitted`. Raise `StoreError` or `ConfigError` if results or submissions are damaged or do not fit; nothing is
-    written then.
+    submitted`. A submission that is damaged or does not fit is left out, among the `failures` of the board. Raise
+    `StoreError` or `ConfigError` if results are damaged or no folder holds submissions; nothing is written then.
     """
     return score_all(_request(stored, submissions, board, tell=tell, root=root, jobs=jobs), tell=tell)
 

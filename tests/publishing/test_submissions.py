@@ -505,17 +505,43 @@ def test_a_matcher_may_answer_several_boards_each_in_a_folder_of_its_own(copied,
     shutil.rmtree(copied)
     change_said(root / "other" / "mine", lambda said: said.update(board="other"))
     assert submissions_for("kept", [root], tell=silent) == (root / "kept" / "mine",)
-    (root / "kept" / "notes").mkdir()
-    with pytest.raises(StoreError, match="notes is no submission"):
-        submissions_for("kept", [root], tell=silent)
 
 
-def test_a_folder_of_submissions_holds_nothing_else_but_its_readme(copied):
+def loop(path):
+    path.symlink_to(path.name)
+
+
+@pytest.mark.parametrize(
+    "lay",
+    [
+        lambda at: at.write_text("notes", encoding="utf-8"),
+        lambda at: at.mkdir(),
+        lambda at: (at / "predictions").mkdir(parents=True),
+        lambda at: at.symlink_to("nowhere"),
+        loop,
+        os.mkfifo,  # whoever opens it waits for ever
+        lambda at: shutil.copytree(at.with_name("mine"), at / "deep" / "mine"),
+    ],
+)
+def test_a_stray_entry_beside_submissions_costs_nobody_else_the_board(copied, tmp_path, lay):
+    stray = copied.with_name("random")  # a name of a control, which must not go with it
+    lay(stray)
+    found = submissions_for("kept", [copied.parent], tell=silent)
+    assert found == (copied, stray)
+    lines = []
+    failures = Failures(tmp_path / "log", tell=lines.append)
+    assert [entry.name for entry in find_entries([], found, failures=failures)] == ["mine"]
+    why = f"{stray} is no submission, for it holds no submission.json: remove it, or make it by 'submit'"
+    assert failures.found == {str(stray): why}
+    assert lines == [f"{stray} failed: {why}"]
+
+
+def test_what_is_named_must_be_a_submission_or_a_folder_of_them(copied):
     (copied.parent / "README.md").write_text("how to", encoding="utf-8")
     assert submissions_for("kept", [copied.parent, copied], tell=silent) == (copied,)
-    (copied.parent / "notes").mkdir()
-    with pytest.raises(StoreError, match=r"notes is no submission, for it holds no submission\.json"):
-        submissions_for("kept", [copied.parent], tell=silent)
+    for path in (copied / "predictions", copied / "submission.json", copied.with_name("nowhere")):
+        with pytest.raises(StoreError, match=f"{path} is no folder of submissions: name one, or a submission itself"):
+            submissions_for("kept", [path], tell=silent)
     with pytest.raises(ConfigError, match="with the stored results of a board: name them with --predictions"):
         submissions_for("", [copied], tell=silent)
 
@@ -600,7 +626,32 @@ def test_one_command_scores_stored_results_and_submissions(copied, stored, progr
     assert read_board(tmp_path / "boards" / "both")[0]["entries"][0]["name"] == "mine"
 
 
-def test_two_contestants_of_one_name_are_refused(copied, stored, tmp_path, rows, mistake):
+def test_of_submissions_that_share_a_name_none_is_scored_and_the_others_are(copied, tmp_path):
+    twin = shutil.copytree(copied, copied.parent / "kept" / "mine")
+    other = shutil.copytree(copied, copied.with_name("other"))
+    change_said(other, lambda said: rename_said(other, said))
+    failures = Failures(tmp_path / "log", tell=silent)
+    found = submissions_for("kept", [copied.parent], tell=silent)
+    assert [entry.name for entry in find_entries([], found, failures=failures)] == ["other"]
+    assert failures.found == {
+        str(one): f"{one} and {another} have one name, 'mine': remove or rename the submission"
+        for one, another in ((copied, twin), (twin, copied))
+    }
+    with pytest.raises(ConfigError, match="have one name, 'mine'"):
+        find_entries([], found)
+
+
+def rename_said(folder, said):
+    name = folder.name
+    said["card"]["name"] = name
+    said["files"] = {f"predictions/{name}.parquet": said["files"].popitem()[1]}
+    (folder / "predictions" / "mine.parquet").rename(folder / "predictions" / f"{name}.parquet")
+
+
+def test_a_submission_that_has_the_name_of_another_entry_is_left_out(copied, stored, tmp_path, rows, program):
     path = write_rows(tmp_path / "mine.parquet", rows)
-    words = ("score", "--predictions", stored, "--predictions", path, "--submissions", copied)
-    assert "two entries are named 'mine'" in mistake(*words)
+    words = ("score", "--predictions", stored, "--predictions", path, "--submissions", copied, "--out", tmp_path)
+    code, _, err = program(*words)
+    assert code == CONTESTANT_FAILED
+    assert f"{copied} and another entry have one name, 'mine': remove or rename the submission" in err
+    assert [entry["name"] for entry in read_board(tmp_path / "boards" / "board")[0]["entries"]].count("mine") == 1

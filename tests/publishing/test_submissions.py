@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED
+from sasgeo_bench.cli.publishing import publish
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import file_record
@@ -595,25 +596,24 @@ def test_who_was_taught_by_a_test_place_is_set_apart(copied, stored, tmp_path, t
 
 
 @pytest.mark.usefixtures("plain_site")
-def test_one_command_publishes_stored_results_and_submissions(copied, stored, program, tmp_path):
-    words = (
-        "publish",
-        "--board",
-        stored,
-        "--submissions",
-        copied.parent,
-        "--into",
-        tmp_path / "site",
-        "--out",
-        tmp_path,
-    )
-    code, said, err = program(*words)
-    assert code == 0, err
-    assert said.split()[-1] == str(tmp_path / "site" / "index.html")
-    page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+def test_one_command_publishes_stored_results_and_submissions_and_says_what_it_left_out(
+    copied, stored, program, tmp_path
+):
+    stray = copied.with_name("notes.txt")
+    stray.write_text("notes", encoding="utf-8")
+    lost = f"failed, and so not on the board: {stray}: "
+    into, lines = tmp_path / "site", []
+    publish(board=stored, submissions=copied.parent, into=into, out=tmp_path, tell=lines.append)
+    assert sum(line.startswith(lost) for line in lines) == 1
+    words = ("--submissions", copied.parent, "--into", into, "--out", tmp_path)
+    code, said, err = program("publish", "--board", stored, *words)
+    assert code == CONTESTANT_FAILED
+    assert err.count(lost) == 1
+    assert said.split()[-1] == str(into / "index.html")
+    page = (into / "index.html").read_text(encoding="utf-8")
     assert "as submitted" in page
     assert "run here" in page
-    code, _, err = program("publish", "--board", tmp_path, "--submissions", copied.parent, "--out", tmp_path)
+    code, _, err = program("publish", "--board", tmp_path, *words)
     assert code == 2
     assert "holds no stored results" in err
 

@@ -14,17 +14,17 @@ from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_files import read_board
 from sasgeo_bench.leaderboard.stored_figures import read_stored_figures, why_anew
 from sasgeo_bench.matching.card_file import read_card_file
-from sasgeo_bench.matching.plugins import shipped_names
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskManifest
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_settings
+from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_among, stored_settings
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.contestants import AskedTask
+from sasgeo_bench.scoring.entries import check_name
 from sasgeo_bench.scoring.rejection import rules_of
-from sasgeo_bench.scoring.rows import is_unranked, name_alone
+from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.submission_files import is_submission, list_submissions, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
@@ -100,24 +100,19 @@ def check_card(card: Card, board: Path, *, source: str) -> Split | None:
 
     Raise `ConfigError` if its name is that of another row or of a matcher that ships, or training places are unknown.
     """
-    name = stored_settings([board]).split
-    split = None if name is None else find_split(name)
-    _check_name(card.name, board, source)
+    split = _split_of(stored_settings([board]).split)
+    check_name(card.name, _names_on(board), source=source)
     _check_places(card, board, split, source)
     return split
 
 
-def _check_name(name: str, board: Path, source: str) -> None:
-    taken = {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
-    kinds = {
-        "a control of every board": is_unranked(name),
-        f"a matcher on the board {board.name}": name in taken,
-        "a matcher that ships": name in shipped_names(),
-    }
-    whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
-    if whose is not None:
-        message = f"{source}: {name!r} is the name of {whose}: choose another name"
-        raise ConfigError(message)
+def _split_of(name: str | None) -> Split | None:
+    return None if name is None else find_split(name)
+
+
+def _names_on(board: Path) -> set[str]:
+    """Return the names of the matchers on a board, without their versions."""
+    return {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
 
 
 def _check_places(card: Card, board: Path, split: Split | None, source: str) -> None:
@@ -240,14 +235,17 @@ def _remarks(submission: Submission) -> Iterator[str]:
 def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tuple[Violation, ...]]:
     """Check a submission against itself and against tasks, task folders or stored results, if any.
 
-    Return its record and all faults, queries without a row among them. Raise `StoreError` if its files differ from its
-    record or something cannot be read, and `ConfigError` if the record is wrong in itself, or of another board.
+    Return its record and all faults, queries without a row among them. The split is that of the board, or the one that
+    the record names where no board is given. Raise `StoreError` if its files differ from its record or something cannot
+    be read, and `ConfigError` if the record is wrong in itself, or of another board, or its name is that of another
+    row.
     """
     submission = read_submission(folder)
-    split = None if submission.split is None else find_split(submission.split)
-    places = () if split is None else tuple(split.blocks)
+    stored = stored_among(tasks)
+    check_name(submission.card.name, () if stored is None else _names_on(stored), source=str(folder))
+    split = _split_of(submission.split if stored is None else stored_settings([stored]).split)
     if not tasks:
-        return submission, tuple(submission_faults(folder, submission, None, places=places))
+        return submission, tuple(submission_faults(folder, submission, None, split))
     board = board_of(tasks)
     if board and board != submission.board:
         message = (
@@ -256,8 +254,7 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
         )
         raise ConfigError(message)
     with laid_tasks(tasks) as folders:
-        faults = submission_faults(folder, submission, folders, places=places)
-        return submission, tuple(faults)
+        return submission, tuple(submission_faults(folder, submission, folders, split))
 
 
 def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
-from sasgeo_bench.matching.plugins import ORACLE
+from sasgeo_bench.matching.plugins import ORACLE, shipped_names
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
@@ -226,14 +226,30 @@ def _file_entry(path: Path) -> Entry:
     if not FILE_NAME.fullmatch(path.stem):
         message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
         raise ConfigError(message)
-    _check_free(path.stem, path)
+    if is_unranked(path.stem):
+        message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: choose another name"
+        raise ConfigError(message)
     return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
 
 
-def _check_free(name: str, path: Path) -> None:
-    """Refuse the name of a control: its row would not be ranked."""
-    if is_unranked(name):
-        message = f"{path.name!r}: {name!r} is the name of a control of every board: choose another name"
+def check_name(name: str, taken: Collection[str] = (), *, source: str) -> None:
+    """Refuse the name of a submission whose row would be taken for that of another; `source` is where the name stands.
+
+    `taken` are names of matchers on the board. Raise `ConfigError`.
+
+    >>> check_name("random", source="card.toml")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: card.toml: 'random' is the name of a control of every board: choose another name
+    """
+    kinds = {
+        "a control of every board": is_unranked(name),
+        "another entry of the board": name in taken,
+        "a matcher that ships": name in shipped_names(),
+    }
+    whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
+    if whose is not None:
+        message = f"{source}: {name!r} is the name of {whose}: choose another name"
         raise ConfigError(message)
 
 
@@ -246,16 +262,15 @@ def _submitted(folders: Sequence[Path], taken: Collection[str], failures: Failur
     for folder in folders:
         with _noted(failures, one_line(str(folder))):
             submission = read_submission(folder)
-            _check_free(submission.card.name, folder)
+            check_name(submission.card.name, taken, source=str(folder))
             read[folder] = submission
     found = []
     for folder, submission in read.items():
         name = submission.card.name
         twins = [str(other) for other, one in read.items() if one.card.name == name and other != folder]
         with _noted(failures, one_line(str(folder))):
-            if twins or name in taken:
-                others = ", ".join(twins) or "another entry"
-                message = f"{folder} and {others} have one name, {name!r}: remove or rename the submission"
+            if twins:
+                message = f"{folder} and {', '.join(twins)} have one name, {name!r}: remove or rename a submission"
                 raise ConfigError(message)
             found.append(_entry_of(folder, submission))
     return found

@@ -2,7 +2,7 @@
 """Validation of predictions against the tasks they answer: every violation with row, column, found and expected."""
 
 import difflib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -19,6 +19,7 @@ from sasgeo_bench.running.prediction_rows import differing_columns, prediction_o
 from sasgeo_bench.scoring.submission_files import SUBMISSION, predictions_name
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
+from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_rows import ASKED
 from sasgeo_bench.texts import MOST_CANDIDATES
 
@@ -91,15 +92,15 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
 
 def submission_faults(
-    folder: Path, submission: Submission, tasks: Sequence[Path] | None, *, places: Collection[str] = ()
+    folder: Path, submission: Submission, tasks: Sequence[Path] | None, split: Split | None
 ) -> Iterator[Violation]:
     """Yield the violations of a submission against the tasks of a board: card, rows, then missing rows.
 
-    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `places` are those of its
-    split; if empty, declared training places are not checked. Files and hashes are checked by `read_submission`. Raise
-    StoreError if a file cannot be read, or a task is of another version.
+    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `split` is that of the
+    board. Files and hashes are checked by `read_submission`. Raise StoreError if a file cannot be read, or a task is of
+    another version.
     """
-    yield from _card_faults(submission, places)
+    yield from _record_faults(submission, split)
     if tasks is None or submission.task_version not in TASK_VERSIONS:
         return
     named = {(item.suite, item.region) for item in submission.tasks}
@@ -126,13 +127,19 @@ def submission_faults(
     yield from _missing(file.name, queries, seen)
 
 
-def _card_faults(submission: Submission, places: Collection[str]) -> Iterator[Violation]:
+def _record_faults(submission: Submission, split: Split | None) -> Iterator[Violation]:
     """Yield the fields of a submission that fit no board, or not its split."""
     if submission.task_version not in TASK_VERSIONS:
         yield Violation(
             SUBMISSION, -1, "task_version", str(submission.task_version), f"{TASK_VERSION}: run and submit again"
         )
-    for place in submission.card.places if places else ():
+    expected = None if split is None else split.spec.id
+    if submission.split != expected:
+        yield Violation(
+            SUBMISSION, -1, "split", repr(submission.split), f"{expected!r}, the split of the board: submit again"
+        )
+    places = () if split is None else split.blocks
+    for place in submission.card.places:
         if place not in places:
             near = difflib.get_close_matches(place, places, n=1)
             hint = f", did you mean {near[0]!r}?" if near else ": other training data belongs into trained_elsewhere"

@@ -256,9 +256,9 @@ def test_a_card_that_does_not_say_what_it_must_is_refused(stored, files, mistake
 
 
 def test_a_name_that_is_on_the_board_is_refused(stored, files, mistake, monkeypatch):
-    monkeypatch.setattr("sasgeo_bench.publishing.submissions.is_unranked", lambda _: False)
+    monkeypatch.setattr("sasgeo_bench.scoring.entries.is_unranked", lambda _: False)
     write_card(files["card"], name="prior_centre")
-    assert "'prior_centre' is the name of a matcher on the board kept: choose another" in mistake(*flags(files, stored))
+    assert "'prior_centre' is the name of another entry of the board: choose another" in mistake(*flags(files, stored))
 
 
 @pytest.mark.parametrize(
@@ -445,6 +445,12 @@ def change_rows(folder, change):
     [
         (lambda at: change_said(at, lambda said: said.update(task_version=99)), "task_version: found 99, expected"),
         (lambda at: change_said(at, lambda said: said["card"].update(trained_on=["mars"])), "trained_on: found 'mars'"),
+        (
+            lambda at: change_said(at, lambda said: said.update(split=None)),
+            "split: found None, expected 'crossfit', the",
+        ),
+        (lambda at: change_said(at, lambda said: said.update(split="holdout")), "split: found 'holdout', expected 'cr"),
+        (lambda at: change_said(at, lambda said: said.update(split="nowhere")), "split: found 'nowhere', expected 'cr"),
         (
             lambda at: change_said(at, lambda said: said["tasks"][0].update(suite="alias")),
             "tasks: found alias/town-riverside, expected tasks that the board holds",
@@ -634,11 +640,26 @@ def test_of_submissions_that_share_a_name_none_is_scored_and_the_others_are(copi
     found = submissions_for("kept", [copied.parent], tell=silent)
     assert [entry.name for entry in find_entries([], found, failures=failures)] == ["other"]
     assert failures.found == {
-        str(one): f"{one} and {another} have one name, 'mine': remove or rename the submission"
+        str(one): f"{one} and {another} have one name, 'mine': remove or rename a submission"
         for one, another in ((copied, twin), (twin, copied))
     }
     with pytest.raises(ConfigError, match="have one name, 'mine'"):
         find_entries([], found)
+
+
+@pytest.mark.parametrize(
+    ("name", "whose"), [("random", "a control of every board"), ("sasgeo", "a matcher that ships")]
+)
+def test_a_name_that_is_not_free_is_refused_by_whoever_validates_and_whoever_scores(
+    copied, stored, tmp_path, mistake, name, whose
+):
+    folder = copied.rename(copied.with_name(name))
+    change_said(folder, lambda said: rename_said(folder, said))
+    fault = f"{folder}: {name!r} is the name of {whose}: choose another name"
+    assert fault in mistake("validate", "--predictions", folder, "--for", stored)
+    failures = Failures(tmp_path / "log", tell=silent)
+    assert find_entries([], [folder], failures=failures) == ()
+    assert failures.found == {str(folder): fault.removeprefix(f"{folder}: ")}
 
 
 def rename_said(folder, said):
@@ -653,5 +674,5 @@ def test_a_submission_that_has_the_name_of_another_entry_is_left_out(copied, sto
     words = ("score", "--predictions", stored, "--predictions", path, "--submissions", copied, "--out", tmp_path)
     code, _, err = program(*words)
     assert code == CONTESTANT_FAILED
-    assert f"{copied} and another entry have one name, 'mine': remove or rename the submission" in err
+    assert f"{copied}: 'mine' is the name of another entry of the board: choose another name" in err
     assert [entry["name"] for entry in read_board(tmp_path / "boards" / "board")[0]["entries"]].count("mine") == 1

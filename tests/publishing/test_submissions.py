@@ -440,6 +440,10 @@ def change_rows(folder, change):
     put_table(folder, pa.Table.from_pylist(rows, schema=table.schema))
 
 
+def state_task(**fields):
+    return lambda folder: change_said(folder, lambda said: said["tasks"][0].update(fields))
+
+
 @pytest.mark.parametrize(
     ("spoil", "fault"),
     [
@@ -454,6 +458,16 @@ def change_rows(folder, change):
         (
             lambda at: change_said(at, lambda said: said["tasks"][0].update(suite="alias")),
             "tasks: found alias/town-riverside, expected tasks that the board holds",
+        ),
+        (
+            state_task(queries_sha256="0" * 64),
+            f"tasks: found clean/town-riverside with queries_sha256 {'0' * 64}, expec",
+        ),
+        (state_task(queries=10**9), "tasks: found clean/town-riverside with queries 1000000000, expected"),
+        (state_task(answered=10**9), "tasks: found clean/town-riverside with answered 1000000000, expected"),
+        (
+            lambda at: change_said(at, lambda said: said["tasks"].append(said["tasks"][0])),
+            "tasks: found clean/town-riverside 2 times, expected each task once: submit again",
         ),
         (
             lambda at: change_rows(at, lambda rows: rows[0].update(asked_sha256="0" * 64)),

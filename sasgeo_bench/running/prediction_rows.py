@@ -2,7 +2,7 @@
 """Rows of `part-*.parquet`: their schema, conversion to and from predictions, and faults of untrusted rows."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -132,6 +132,9 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
 # --- untrusted rows ---------------------------------------------------------------------------------------------------
 
 Mask = NDArray[np.bool_]
+FAR: Final = 4  # times a bound, at least the bytes of a character; a file that goes beyond it is refused unread
+_TEXTS: Final = ("query_id", "status", "message", ASKED)
+_MOST_ITEMS: Final = {"candidates": MOST_CANDIDATES, "diagnostics": MOST_DIAGNOSTICS, "covariance": SIDE**2}
 _PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
 
 
@@ -143,6 +146,39 @@ class RowFault:
     column: str
     found: str
     expected: str
+
+
+def far_fault(batch: pa.RecordBatch) -> RowFault | None:
+    """Return the first list or text of some rows that is more than `FAR` times its bound, or None.
+
+    Texts must be dictionaries. Nothing becomes an object of Python; `row_faults` finds what is shorter.
+    """
+    columns = zip(batch.schema.names, batch.columns, strict=True)
+    return next((fault for name, column in columns for fault in _far_faults(name, column)), None)
+
+
+def _far_faults(name: str, column: pa.Array) -> Iterator[RowFault]:
+    kind = column.type
+    if name in _TEXTS and pa.types.is_dictionary(kind):
+        yield from _longest(name, _text_lengths(column), "bytes", MOST_MESSAGE)
+    if name in _MOST_ITEMS and (pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_map(kind)):
+        ends = column.offsets.to_numpy()
+        yield from _longest(name, np.diff(ends), "items", _MOST_ITEMS[name])
+        if pa.types.is_map(kind) and pa.types.is_dictionary(kind.key_type):
+            for fault in _longest(name, _text_lengths(column.keys), "bytes in a name", MOST_NAME):
+                yield replace(fault, row=int(np.searchsorted(ends, fault.row, side="right")) - 1)
+
+
+def _text_lengths(texts: pa.DictionaryArray) -> NDArray[np.int64]:
+    """Return the bytes of each text, 0 of a null."""
+    lengths = pc.binary_length(texts.dictionary).take(texts.indices)
+    return np.asarray(lengths.fill_null(0).cast(pa.int64()))
+
+
+def _longest(column: str, lengths: NDArray[np.int64], unit: str, most: int) -> Iterator[RowFault]:
+    if len(lengths) and lengths.max() > FAR * most:
+        row = int(np.argmax(lengths))
+        yield RowFault(row=row, column=column, found=f"{lengths[row]} {unit}", expected=f"at most {most}")
 
 
 def row_faults(table: pa.Table) -> Iterator[RowFault]:

@@ -18,6 +18,7 @@ from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Submission, SubmittedFile
+from sasgeo_bench.running.prediction_files import check_lengths
 from sasgeo_bench.running.prediction_rows import (
     FLOWN_SCHEMA,
     PREDICTION_SCHEMA,
@@ -26,14 +27,13 @@ from sasgeo_bench.running.prediction_rows import (
     schema_of,
 )
 from sasgeo_bench.tasks.task_rows import ASKED
-from sasgeo_bench.texts import MOST_MESSAGE, json_text
+from sasgeo_bench.texts import json_text
 
 SUBMISSION: Final = "submission.json"
 PREDICTIONS: Final = "predictions"
 README: Final = "README.md"  # may lie among submissions
 MOST_BYTES: Final = 20_000_000  # of the predictions
 _MOST_SUBMISSION_BYTES: Final = 5_000_000
-_TEXTS: Final = ("query_id", "status", "message", ASKED)
 _LEVEL: Final = 19
 
 
@@ -216,17 +216,10 @@ def _check_file(path: Path, expected: SubmittedFile) -> None:
 
 
 def _check_table(path: Path) -> None:
-    """Refuse a table of another shape, and one that decompresses to overlong texts."""
+    """Refuse a table of another shape, and one that unpacks to overlong lists or texts."""
     with open_table(path, mend="submit again") as source:
         _check_schema(path, source.schema_arrow)
-    with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:
-        texts = source.read(columns=list(_TEXTS))  # each distinct text once
-    for name in _TEXTS:
-        known = (text for chunk in texts[name].chunks for text in chunk.dictionary if text.is_valid)
-        longest = max((len(text.as_buffer()) for text in known), default=0)
-        if longest > 4 * MOST_MESSAGE:
-            message = f"{path}, {name}: found a text of {longest} bytes, expected {MOST_MESSAGE} characters at most"
-            raise StoreError(message)
+    check_lengths(path, mend="submit again")
 
 
 def _check_schema(path: Path, schema: pa.Schema) -> None:

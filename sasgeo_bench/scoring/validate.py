@@ -85,7 +85,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
             yield Violation(file.name, -1, column, found, f"a column of {expected}")
         unread += bool(differing)
         wrong = {} if differing else _faults_by_row(file.name, table)
-        for row, item in enumerate([] if differing else table.to_pylist()):
+        for row, item in enumerate([] if differing else prediction_files.items_of(table)):
             tie = prediction_files.tie_of(item)
             is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
             if item["query_id"] not in before and not is_aside:
@@ -114,7 +114,7 @@ def submission_faults(
     file = folder / predictions_name(submission.card.name)
     table = prediction_files.read_part(file)
     wrong = _faults_by_row(file.name, table)
-    for row, item in enumerate(table.to_pylist()):
+    for row, item in enumerate(prediction_files.items_of(table)):
         name = item["query_id"]
         yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
         if name in asked and item[ASKED] != asked[name]:

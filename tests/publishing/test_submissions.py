@@ -53,6 +53,7 @@ CARD = {
     "licence": "MIT",
     "trained_on": "none",
 }
+A_POSE = {"easting_m": 1.0, "northing_m": 1.0, "yaw_deg": 0.0, "scale": 1.0, "score": 0.0}
 SUITES = ("clean", "absent")
 ROOT = Path(__file__).parents[2]
 
@@ -385,6 +386,10 @@ def long_text(folder):
     put_table(folder, table.set_column(table.schema.get_field_index("message"), "message", texts), compression="zstd")
 
 
+def long_lists(folder):
+    change_rows(folder, lambda rows: [row.update(candidates=[A_POSE] * 30_000) for row in rows[:3]])
+
+
 def more_columns(folder):
     table = pq.read_table(folder / "predictions" / "mine.parquet")
     put_table(folder, table.append_column("note", pa.nulls(len(table), pa.string())))
@@ -404,7 +409,8 @@ def rename_folder(folder):
         (link_table, "mine.parquet is a link, or no plain file: a submission holds files alone"),
         (make_pipe, "submission.json is a link, or no plain file"),
         (many_rows, "holds 1000001 rows, 1000000 at most"),
-        (long_text, "message: found a text of 3000000 bytes"),
+        (long_text, "bytes of texts in message, "),
+        (long_lists, "row 0, is no prediction (candidates: found 30000 items, expected at most 1000): submit again"),
         (more_columns, "(note is not as it must be)"),
         (rename_folder, "holds the submission 'yours': name the folder so"),
         (lambda at: (at / "run.sh").write_text("true", encoding="utf-8"), "run.sh is no part of a submission"),

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Publish a board as a site: the function and its command."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from sasgeo_bench.cli.boards import check_controls
 from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.publishing import build
 from sasgeo_bench.publishing.archive import board_of
 from sasgeo_bench.publishing.site_files import Written
@@ -36,6 +38,8 @@ class PublishOptions(Options):
 def publish(options: PublishOptions) -> Written:
     """Make the static site of a board: plain files that open without a server.
 
+    Submissions that have a fault are left out, and `tell` gets a line about each.
+
     Returns
     -------
     Written
@@ -57,20 +61,45 @@ def publish(options: PublishOptions) -> Written:
     sasgeo_bench.errors.StoreError: out/boards/demo/figures is the board itself, or would be a strange folder in it: \
 name another one with --into
     """
-    board = options.board
-    if options.submissions:
-        board = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
-        with_submissions(
-            options.board, options.submissions, board, tell=options.tell, root=options.out, jobs=options.jobs
-        )
+    board = _scored(options)
+    for name, why in board.failures.found.items() if board else ():
+        options.tell(f"failed, and so not on the board: {name}: {why}")
+    return _site_of(options, board)
+
+
+def _scored(options: PublishOptions) -> Board | None:
+    """Score submissions with the stored results; return None if there are none to score."""
+    if not options.submissions:
+        return None
+    board = _board_folder(options)
+    return with_submissions(
+        options.board, options.submissions, board, tell=options.tell, root=options.out, jobs=options.jobs
+    )
+
+
+def _board_folder(options: PublishOptions) -> Path:
+    return options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
+
+
+def _site_of(options: PublishOptions, scored: Board | None) -> Written:
+    """Make the site of the board that was scored, or else of the one that is named."""
     return build.publish(
-        board, options.into, tell=options.tell, root=options.out, jobs=options.jobs, progress=options.progress
+        options.board if scored is None else _board_folder(options),
+        options.into,
+        tell=options.tell,
+        root=options.out,
+        jobs=options.jobs,
+        progress=options.progress,
     )
 
 
 def publish_command(options: PublishOptions) -> None:
     """Make the static site of a board: plain files that open without a server, to be put on any host."""
     with shown_progress() as progress:
-        written = publish(**vars(options) | {"say": say, "tell": tell, "progress": progress})
+        shown = replace(options, say=say, tell=tell, progress=progress)
+        board = _scored(shown)
+        written = _site_of(shown, board)
     tell(written.to_text())
     say(written.folder / "index.html")
+    if board is not None:
+        check_controls(board)

@@ -9,7 +9,7 @@ structure is checked.
 import json
 import os
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
@@ -27,6 +27,7 @@ VERIFIED: Final[Mapping[str, Any]] = {"page_checksum_verification": True}
 MOST_ROWS: Final = 1_000_000  # of a table that is converted to rows
 MOST_VALUES: Final = 100_000_000  # of all columns together, with the items of lists
 _MOST_UNPACKED: Final = 2_000_000_000  # bytes
+_LEAST_BYTES: Final = 1_000_000  # that a column of texts may have, with the headers of its pages
 _ATTRS: Final = b"PANDAS_ATTRS"  # where pandas itself looks for them
 _SEAL: Final = b"sasgeo_footer_crc32"
 _DIGITS: Final = 8  # of a CRC-32, hexadecimal
@@ -114,6 +115,41 @@ def read_schema(path: Path, *, mend: str) -> pa.Schema:
     """Read names, types and metadata of a table's columns; raise as `open_table` does."""
     with open_table(path, mend=mend, most_rows=MOST_VALUES, is_whole=False) as source:
         return source.schema_arrow
+
+
+def read_batches(
+    path: Path, *, mend: str, rows: int, columns: Collection[str], text_bytes: int
+) -> Iterator[pa.RecordBatch]:
+    """Yield some columns of a table, so many rows at once; texts as dictionaries, that hold each distinct one once.
+
+    Columns that the table lacks are passed over. Raise as `open_table` does, and if the texts of a column have more
+    than `text_bytes` bytes each on the average: that is seen before they are unpacked.
+    """
+    with open_table(path, mend=mend) as source:
+        leaves = map(source.schema.column, range(len(source.schema)))
+        texts = {one.path for one in leaves if one.physical_type == "BYTE_ARRAY" and _column_of(one.path) in columns}
+        fault = _texts_fault(source.metadata, texts, text_bytes)
+        found = [name for name in dict.fromkeys(source.schema_arrow.names) if name in columns]
+    if fault is not None:
+        message = f"{path} holds {fault}: {mend}"
+        raise StoreError(message)
+    with open_table(path, mend=mend, read_dictionary=sorted(texts)) as source:
+        for group in range(source.num_row_groups):  # Arrow cannot join the dictionaries of two inside a list
+            yield from source.iter_batches(rows, row_groups=[group], columns=found)
+
+
+def _column_of(leaf: str) -> str:
+    return leaf.partition(".")[0]
+
+
+def _texts_fault(about: pq.FileMetaData, texts: Collection[str], text_bytes: int) -> str | None:
+    """Describe a column of texts that are too long on the average, by the footer, or return None."""
+    for group in map(about.row_group, range(about.num_row_groups)):
+        for chunk in map(group.column, range(about.num_columns)):
+            size, most = chunk.total_uncompressed_size, text_bytes * chunk.num_values + _LEAST_BYTES
+            if chunk.path_in_schema in texts and size > most:
+                return f"{size} bytes of texts in {_column_of(chunk.path_in_schema)}, {most} at most"
+    return None
 
 
 def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True) -> str | None:

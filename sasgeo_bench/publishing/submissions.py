@@ -14,17 +14,17 @@ from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_files import read_board
 from sasgeo_bench.leaderboard.stored_figures import read_stored_figures, why_anew
 from sasgeo_bench.matching.card_file import read_card_file
-from sasgeo_bench.matching.plugins import shipped_names
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskManifest
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_settings
+from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_among, stored_settings
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.contestants import AskedTask
+from sasgeo_bench.scoring.entries import check_name
 from sasgeo_bench.scoring.rejection import rules_of
-from sasgeo_bench.scoring.rows import is_unranked, name_alone
+from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.submission_files import is_submission, list_submissions, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
@@ -100,24 +100,19 @@ def check_card(card: Card, board: Path, *, source: str) -> Split | None:
 
     Raise `ConfigError` if its name is that of another row or of a matcher that ships, or training places are unknown.
     """
-    name = stored_settings([board]).split
-    split = None if name is None else find_split(name)
-    _check_name(card.name, board, source)
+    split = _split_of(stored_settings([board]).split)
+    check_name(card.name, _names_on(board), source=source)
     _check_places(card, board, split, source)
     return split
 
 
-def _check_name(name: str, board: Path, source: str) -> None:
-    taken = {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
-    kinds = {
-        "a control of every board": is_unranked(name),
-        f"a matcher on the board {board.name}": name in taken,
-        "a matcher that ships": name in shipped_names(),
-    }
-    whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
-    if whose is not None:
-        message = f"{source}: {name!r} is the name of {whose}: choose another name"
-        raise ConfigError(message)
+def _split_of(name: str | None) -> Split | None:
+    return None if name is None else find_split(name)
+
+
+def _names_on(board: Path) -> set[str]:
+    """Return the names of the matchers on a board, without their versions."""
+    return {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
 
 
 def _check_places(card: Card, board: Path, split: Split | None, source: str) -> None:
@@ -240,14 +235,17 @@ def _remarks(submission: Submission) -> Iterator[str]:
 def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tuple[Violation, ...]]:
     """Check a submission against itself and against tasks, task folders or stored results, if any.
 
-    Return its record and all faults, queries without a row among them. Raise `StoreError` if its files differ from its
-    record or something cannot be read, and `ConfigError` if the record is wrong in itself, or of another board.
+    Return its record and all faults, queries without a row among them. The split is that of the board, or the one that
+    the record names where no board is given. Raise `StoreError` if its files differ from its record or something cannot
+    be read, and `ConfigError` if the record is wrong in itself, or of another board, or its name is that of another
+    row.
     """
     submission = read_submission(folder)
-    split = None if submission.split is None else find_split(submission.split)
-    places = () if split is None else tuple(split.blocks)
+    stored = stored_among(tasks)
+    check_name(submission.card.name, () if stored is None else _names_on(stored), source=str(folder))
+    split = _split_of(submission.split if stored is None else stored_settings([stored]).split)
     if not tasks:
-        return submission, tuple(submission_faults(folder, submission, None, places=places))
+        return submission, tuple(submission_faults(folder, submission, None, split))
     board = board_of(tasks)
     if board and board != submission.board:
         message = (
@@ -256,19 +254,20 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
         )
         raise ConfigError(message)
     with laid_tasks(tasks) as folders:
-        faults = submission_faults(folder, submission, folders, places=places)
-        return submission, tuple(faults)
+        return submission, tuple(submission_faults(folder, submission, folders, split))
 
 
 def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:
     """Return the submissions for a board id, in `paths` or folders of them; report how many are for others.
 
-    Raise `StoreError` if something is no submission or differs from its record, and `ConfigError` if `board` is empty.
+    What cannot be read is among them: the board reports and loses it alone. Raise `StoreError` if a path is neither a
+    submission nor a folder of them, and `ConfigError` if `board` is empty.
     """
     if not board:
         message = "submissions are scored with the stored results of a board: name them with --predictions"
         raise ConfigError(message)
-    found = {folder.resolve(): folder for path in paths for folder in list_submissions(path)}
+    listed = (folder for path in paths for folder in list_submissions(path))
+    found = {folder.parent.resolve() / folder.name: folder for folder in listed}  # a link may lead to itself
     boards = {folder: _board_named(folder, board) for folder in found.values()}
     others = sorted({name for name in boards.values() if name != board})
     if others:
@@ -281,7 +280,7 @@ def _board_named(folder: Path, board: str) -> str:
     """Return the board that a submission names; an unreadable one fails on this board, which reports it."""
     try:
         return read_submission(folder).board
-    except (StoreError, ConfigError):
+    except (StoreError, ConfigError, OSError):
         return board
 
 
@@ -292,8 +291,8 @@ def with_submissions(
 
     `submissions` are submissions and folders of them; those for other boards are left out. `root` holds regions/,
     tasks/ and truth/ for pictures, `jobs` counts the processes that fit rejectors. Rows of submissions are marked `as
-    submitted`. Raise `StoreError` or `ConfigError` if results or submissions are damaged or do not fit; nothing is
-    written then.
+    submitted`. A submission that is damaged or does not fit is left out, among the `failures` of the board. Raise
+    `StoreError` or `ConfigError` if results are damaged or no folder holds submissions; nothing is written then.
     """
     return score_all(_request(stored, submissions, board, tell=tell, root=root, jobs=jobs), tell=tell)
 

@@ -14,28 +14,31 @@ import pyarrow as pa
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.parquet import read_schema, read_table, write_table
+from sasgeo_bench.files.parquet import read_batches, read_schema, read_table, write_table
 from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import (
+    FAR,
     FLOWN_SCHEMA,
     PART_SCHEMA,
     PREDICTION_SCHEMA,
     differing_columns,
+    far_fault,
     prediction_row,
     predictions_of,
     row_faults,
     schema_of,
 )
 from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
-from sasgeo_bench.texts import json_text, one_line
+from sasgeo_bench.texts import MOST_MESSAGE, json_text, one_line
 
 RUN: Final = "run.json"
 ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is asked again
 _MEND: Final = "write it again, or remove it where it is a part of a run"
 _MEND_ROUND: Final = "remove it and enter with --again"
 _MEND_RUN: Final = "remove it and run again, its parts are kept"
+_ROWS_AT_ONCE: Final = 64
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
 
 
@@ -236,6 +239,7 @@ def _checked(part: Path) -> pa.Table:
 
 def read_part(path: Path) -> pa.Table:
     """Read a whole parquet file; raise `StoreError` if it is missing, damaged, too large, or no parquet file."""
+    check_lengths(path, mend=_MEND)
     table = read_table(path, mend=_MEND)
     try:
         table.validate(full=True)  # offsets, and texts that are no UTF-8, which Arrow reads unchecked
@@ -243,6 +247,30 @@ def read_part(path: Path) -> pa.Table:
         message = f"{path} cannot be read ({one_line(str(error))}): {_MEND}"
         raise StoreError(message) from error
     return table
+
+
+def check_lengths(path: Path, *, mend: str) -> None:
+    """Raise `StoreError` if a list or text of a file is far beyond its bound, before the file is read as a whole.
+
+    A small file may unpack to lists and texts that no memory holds.
+    """
+    before = 0
+    batches = read_batches(
+        path, mend=mend, rows=_ROWS_AT_ONCE, columns=PART_SCHEMA.names, text_bytes=FAR * MOST_MESSAGE
+    )
+    for batch in batches:
+        far = far_fault(batch)
+        if far is not None:
+            fault = f"{far.column}: found {far.found}, expected {far.expected}"
+            message = f"{path}, row {before + far.row}, is no prediction ({fault}): {mend}"
+            raise StoreError(message)
+        before += len(batch)
+
+
+def items_of(table: pa.Table) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a table, few of them at once as objects of Python, which are far larger."""
+    for batch in table.to_batches(max_chunksize=_ROWS_AT_ONCE):
+        yield from batch.to_pylist()
 
 
 def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | None = None) -> int:

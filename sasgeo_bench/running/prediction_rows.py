@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of `part-*.parquet`: their schema, conversion to and from predictions, and faults of untrusted rows."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -132,6 +132,9 @@ def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
 # --- untrusted rows ---------------------------------------------------------------------------------------------------
 
 Mask = NDArray[np.bool_]
+FAR: Final = 4  # times a bound, at least the bytes of a character; a file that goes beyond it is refused unread
+_TEXTS: Final = ("query_id", "status", "message", ASKED)
+_MOST_ITEMS: Final = {"candidates": MOST_CANDIDATES, "diagnostics": MOST_DIAGNOSTICS, "covariance": SIDE**2}
 _PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
 
 
@@ -145,6 +148,39 @@ class RowFault:
     expected: str
 
 
+def far_fault(batch: pa.RecordBatch) -> RowFault | None:
+    """Return the first list or text of some rows that is more than `FAR` times its bound, or None.
+
+    Texts must be dictionaries. Nothing becomes an object of Python; `row_faults` finds what is shorter.
+    """
+    columns = zip(batch.schema.names, batch.columns, strict=True)
+    return next((fault for name, column in columns for fault in _far_faults(name, column)), None)
+
+
+def _far_faults(name: str, column: pa.Array) -> Iterator[RowFault]:
+    kind = column.type
+    if name in _TEXTS and pa.types.is_dictionary(kind):
+        yield from _longest(name, _text_lengths(column), "bytes", MOST_MESSAGE)
+    if name in _MOST_ITEMS and (pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_map(kind)):
+        ends = column.offsets.to_numpy()
+        yield from _longest(name, np.diff(ends), "items", _MOST_ITEMS[name])
+        if pa.types.is_map(kind) and pa.types.is_dictionary(kind.key_type):
+            for fault in _longest(name, _text_lengths(column.keys), "bytes in a name", MOST_NAME):
+                yield replace(fault, row=int(np.searchsorted(ends, fault.row, side="right")) - 1)
+
+
+def _text_lengths(texts: pa.DictionaryArray) -> NDArray[np.int64]:
+    """Return the bytes of each text, 0 of a null."""
+    lengths = pc.binary_length(texts.dictionary).take(texts.indices)
+    return np.asarray(lengths.fill_null(0).cast(pa.int64()))
+
+
+def _longest(column: str, lengths: NDArray[np.int64], unit: str, most: int) -> Iterator[RowFault]:
+    if len(lengths) and lengths.max() > FAR * most:
+        row = int(np.argmax(lengths))
+        yield RowFault(row=row, column=column, found=f"{lengths[row]} {unit}", expected=f"at most {most}")
+
+
 def row_faults(table: pa.Table) -> Iterator[RowFault]:
     """Check every number, name and text of rows against the bounds of an answer (`texts.BOUNDS`).
 
@@ -156,17 +192,16 @@ def row_faults(table: pa.Table) -> Iterator[RowFault]:
     for name in (name for name in ("confidence", "latency_s", MATCHER_S) if name in table.column_names):
         values, is_null = _numbers(table[name]), np.asarray(table[name].is_null())
         is_wrong = ~is_null & ~_is_within(name, values)
-        shown = [f"{name} is {value:g}" for value in values] if is_wrong.any() else []
-        yield from _faults(name, is_wrong, shown, f"{bounds_text(name)} or null")
+        yield from _faults(name, is_wrong, f"{bounds_text(name)} or null", f"{name} is {{:g}}", values)
     if "covariance" in table.column_names:
         yield from _of_covariances(table["covariance"])
     yield from _of_candidates(table["candidates"])
     yield from _of_diagnostics(table["diagnostics"])
 
 
-def _faults(column: str, is_wrong: Mask, shown: Sequence[object], expected: str) -> Iterator[RowFault]:
-    for row in np.flatnonzero(is_wrong).tolist():
-        yield RowFault(row=row, column=column, found=str(shown[row])[: 2 * MOST_NAME], expected=expected)
+def _faults(column: str, is_wrong: Mask, expected: str, found: str, *values: NDArray[Any]) -> Iterator[RowFault]:
+    """Yield a fault for each wrong row; `found` is formatted with the values of that row."""
+    yield from _firsts(column, np.flatnonzero(is_wrong), expected, found, *(one[is_wrong] for one in values))
 
 
 def _numbers(column: pa.ChunkedArray | pa.Array) -> NDArray[np.float64]:
@@ -187,37 +222,35 @@ def _of_texts(table: pa.Table) -> Iterator[RowFault]:
         ("message", lambda text: is_line(text, MOST_MESSAGE), f"a line of at most {MOST_MESSAGE} printable characters"),
     ):
         texts, code = _texts(table[name])
-        is_odd = np.array([not is_sound(text) for text in texts] + [name != "message"])[code]  # the last is of nulls
-        shown = [repr([*texts, None][at]) for at in code] if is_odd.any() else []
-        yield from _faults(name, is_odd, shown, expected)
+        is_odd = np.array([name != "message" if text is None else not is_sound(text) for text in texts])[code]
+        yield from _faults(name, is_odd, expected, "{!r}", texts[code])
 
 
-def _texts(column: pa.ChunkedArray | pa.Array) -> tuple[list[str], NDArray[np.int64]]:
-    """Return each text once, and the index of the text of each row; -1 for null."""
+def _texts(column: pa.ChunkedArray | pa.Array) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    """Return each text once, None last, and the index of the text of each row; -1 for null."""
     whole = column.cast(pa.string())
     coded = (whole.combine_chunks() if isinstance(whole, pa.ChunkedArray) else whole).dictionary_encode()
-    return coded.dictionary.to_pylist(), coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+    texts = np.array([*coded.dictionary.to_pylist(), None], dtype=object)
+    return texts, coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
 
 
 def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
     """Check that every row has a list, not too long, of complete candidates."""
     whole = column.combine_chunks()
     is_null = np.asarray(whole.is_null())
-    yield from _faults("candidates", is_null, ["null"] * len(whole), "a list, empty where there is no pose")
+    yield from _faults("candidates", is_null, "a list, empty where there is no pose", "null")
     if is_null.all():
         return
     rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
     counts = np.bincount(rows, minlength=len(whole))
-    shown = [f"{number} poses" for number in counts.tolist()]
-    yield from _faults("candidates", counts > MOST_CANDIDATES, shown, f"at most {MOST_CANDIDATES}")
+    yield from _faults("candidates", counts > MOST_CANDIDATES, f"at most {MOST_CANDIDATES}", "{} poses", counts)
     is_null = np.asarray(items.is_null())
-    yield from _firsts("candidates", rows[is_null], ["a null"] * len(rows), "poses with scores")
+    yield from _firsts("candidates", rows[is_null], "poses with scores", "a null")
     rows, items = rows[~is_null], items.filter(pa.array(~is_null))
     for name in (*POSE_FIELDS, "score"):
         values = _numbers(items.field(name))
         is_wrong = ~_is_within(name, values)
-        shown = [f"{name} is {value:g}" for value in values[is_wrong]]
-        yield from _firsts("candidates", rows[is_wrong], shown, bounds_text(name))
+        yield from _firsts("candidates", rows[is_wrong], bounds_text(name), f"{name} is {{:g}}", values[is_wrong])
 
 
 def _of_covariances(column: pa.ChunkedArray) -> Iterator[RowFault]:
@@ -227,17 +260,16 @@ def _of_covariances(column: pa.ChunkedArray) -> Iterator[RowFault]:
     rows, values = pc.list_parent_indices(whole).to_numpy(), _numbers(pc.list_flatten(whole))
     counts = np.bincount(rows, minlength=len(whole))
     is_odd = is_given & (counts != SIDE**2)
-    shown = [f"{count} numbers" for count in counts.tolist()]
-    yield from _faults("covariance", is_odd, shown, f"{SIDE**2} numbers, or null")
+    yield from _faults("covariance", is_odd, f"{SIDE**2} numbers, or null", "{} numbers", counts)
     bad = rows[~(np.abs(values) <= MOST_VARIANCE)]
     is_far = is_given & ~is_odd & np.isin(np.arange(len(whole)), bad)
-    yield from _faults("covariance", is_far, ["a number beyond that"] * len(whole), f"numbers within {MOST_VARIANCE:g}")
+    yield from _faults("covariance", is_far, f"numbers within {MOST_VARIANCE:g}", "a number beyond that")
     whole_rows = np.flatnonzero(is_given & ~is_odd & ~is_far)
     table = values[np.isin(rows, whole_rows)].reshape(-1, SIDE, SIDE)
     is_none = np.zeros(len(whole), dtype=bool)
     is_none[whole_rows] = ~are_covariances(table)
     expected = "a symmetric and positive definite matrix, or null"
-    yield from _faults("covariance", is_none, ["a matrix that is none"] * len(whole), expected)
+    yield from _faults("covariance", is_none, expected, "a matrix that is none")
 
 
 def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
@@ -245,26 +277,25 @@ def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
     whole = column.cast(_PAIRS).combine_chunks()
     rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
     counts = np.bincount(rows, minlength=len(whole))
-    shown = [f"{number} numbers" for number in counts.tolist()]
-    yield from _faults("diagnostics", counts > MOST_DIAGNOSTICS, shown, f"at most {MOST_DIAGNOSTICS}")
+    yield from _faults("diagnostics", counts > MOST_DIAGNOSTICS, f"at most {MOST_DIAGNOSTICS}", "{} numbers", counts)
     names, code = _texts(items.field("key"))
-    is_odd = np.array([not name or not is_line(name, MOST_NAME) for name in names] + [True])[code]
-    shown = [f"the name {[*names, None][at]!r}" for at in code[is_odd]]
-    yield from _firsts("diagnostics", rows[is_odd], shown, f"names of 1..{MOST_NAME} printable characters")
-    place = rows * (len(names) + 1) + code
+    is_odd = np.array([not name or not is_line(name, MOST_NAME) for name in names])[code]
+    expected = f"names of 1..{MOST_NAME} printable characters"
+    yield from _firsts("diagnostics", rows[is_odd], expected, "the name {!r}", names[code[is_odd]])
+    place = rows * len(names) + code
     order = np.argsort(place, kind="stable")
     again = order[1:][np.diff(place[order]) == 0]
-    yield from _firsts(
-        "diagnostics", rows[again], [f"{[*names, None][at]!r} twice" for at in code[again]], "each name once"
-    )
+    yield from _firsts("diagnostics", rows[again], "each name once", "{!r} twice", names[code[again]])
     values = _numbers(items.field("value"))
     is_wrong = ~_is_within("diagnostics", values)
-    pairs = zip(code[is_wrong], values[is_wrong], strict=True)
-    shown = [f"diagnostics[{[*names, None][at]!r}] is {value:g}" for at, value in pairs]
-    yield from _firsts("diagnostics", rows[is_wrong], shown, bounds_text("diagnostics"))
+    found, expected = "diagnostics[{!r}] is {:g}", bounds_text("diagnostics")
+    yield from _firsts("diagnostics", rows[is_wrong], expected, found, names[code[is_wrong]], values[is_wrong])
 
 
-def _firsts(column: str, rows: NDArray[np.int64], shown: Sequence[str], expected: str) -> Iterator[RowFault]:
-    """Yield the first fault of each row among those of its items."""
+def _firsts(
+    column: str, rows: NDArray[np.int64], expected: str, found: str, *values: NDArray[Any]
+) -> Iterator[RowFault]:
+    """Yield the first fault of each row among those of its items; `found` is formatted with the values of that item."""
     for row, at in zip(*np.unique(rows, return_index=True), strict=True):
-        yield RowFault(row=int(row), column=column, found=shown[at][: 2 * MOST_NAME], expected=expected)
+        text = found.format(*(one[at] for one in values))[: 2 * MOST_NAME]
+        yield RowFault(row=int(row), column=column, found=text, expected=expected)

@@ -323,7 +323,7 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
         found = validate(path, folders)
     else:
         path = path.parents[1]
-        found = submission_faults(path, entry.submission, folders, places=() if split is None else tuple(split.blocks))
+        found = submission_faults(path, entry.submission, folders, split)
     faults = [fault for fault in found if not fault.is_missing_row]
     if faults:
         message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"

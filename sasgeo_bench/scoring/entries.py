@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
-from sasgeo_bench.matching.plugins import ORACLE
+from sasgeo_bench.matching.plugins import ORACLE, shipped_names
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
@@ -111,9 +111,10 @@ def find_entries(
     """Return the entries found in folders of runs, files of predictions and submissions, by name.
 
     Runs may lie at any depth. Two versions of one matcher are two entries, with the version in their names, and the
-    hash if versions agree. `failures` records runs and submissions that cannot be read; without it, the first one
-    raises. Raise StoreError if a path holds no predictions, a `run.json` does not identify its matcher, or a submission
-    is damaged. Raise ConfigError if two entries share a name, or a file or submission has that of a control.
+    hash if versions agree. `failures` records runs and submissions that cannot be read, and submissions whose name
+    another entry has; without it, the first one raises. Raise StoreError if a path holds no predictions, a `run.json`
+    does not identify its matcher, or a submission is damaged. Raise ConfigError if two files share a name, or one has
+    that of a run or a control.
     """
     runs: list[Path] = []
     files: list[Entry] = []
@@ -129,23 +130,14 @@ def find_entries(
             raise StoreError(message)
         runs += [run for run in found if _is_new(run, seen)]
     entries = [*_entries_of_runs(_by_run(runs, failures)), *files]
-    for folder in submissions:
-        with _noted(failures, folder.name):
-            entries.append(_submitted(folder))
-    names = {entry.runs[0]["matcher"]["name"] for entry in entries if entry.runs}
     listed = [entry.name for entry in entries]
-    # A submission may not have the name of a matcher shown as several versions: readers would confuse them.
-    twice = next(
-        (
-            one.name
-            for one in entries
-            if listed.count(one.name) > 1 or (one.submission is not None and one.name in names)
-        ),
-        None,
-    )
+    twice = next((name for name in listed if listed.count(name) > 1), None)
     if twice is not None:
-        message = f"two entries are named {twice!r}: rename the file or the submission of one"
+        message = f"two entries are named {twice!r}: rename the file of one"
         raise ConfigError(message)
+    # A submission may not have the name of a matcher shown as several versions: readers would confuse them.
+    taken = {*listed, *(entry.runs[0]["matcher"]["name"] for entry in entries if entry.runs)}
+    entries += _submitted(submissions, taken, failures)
     return tuple(sorted(entries, key=lambda entry: entry.name))
 
 
@@ -234,20 +226,57 @@ def _file_entry(path: Path) -> Entry:
     if not FILE_NAME.fullmatch(path.stem):
         message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
         raise ConfigError(message)
-    _check_free(path.stem, path)
+    if is_unranked(path.stem):
+        message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: choose another name"
+        raise ConfigError(message)
     return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
 
 
-def _check_free(name: str, path: Path) -> None:
-    """Refuse the name of a control: its row would not be ranked."""
-    if is_unranked(name):
-        message = f"{path.name!r}: {name!r} is the name of a control of every board: choose another name"
+def check_name(name: str, taken: Collection[str] = (), *, source: str) -> None:
+    """Refuse the name of a submission whose row would be taken for that of another; `source` is where the name stands.
+
+    `taken` are names of matchers on the board. Raise `ConfigError`.
+
+    >>> check_name("random", source="card.toml")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: card.toml: 'random' is the name of a control of every board: choose another name
+    """
+    kinds = {
+        "a control of every board": is_unranked(name),
+        "another entry of the board": name in taken,
+        "a matcher that ships": name in shipped_names(),
+    }
+    whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
+    if whose is not None:
+        message = f"{source}: {name!r} is the name of {whose}: choose another name"
         raise ConfigError(message)
 
 
-def _submitted(folder: Path) -> Entry:
-    submission = read_submission(folder)
-    _check_free(submission.card.name, folder)
+def _submitted(folders: Sequence[Path], taken: Collection[str], failures: Failures | None) -> list[Entry]:
+    """Return the submissions with a name of their own; `taken` are names of entries of other kinds.
+
+    A refused one is recorded by its path: under its name it would take an entry of that name with it.
+    """
+    read: dict[Path, Submission] = {}
+    for folder in folders:
+        with _noted(failures, one_line(str(folder))):
+            submission = read_submission(folder)
+            check_name(submission.card.name, taken, source=str(folder))
+            read[folder] = submission
+    found = []
+    for folder, submission in read.items():
+        name = submission.card.name
+        twins = [str(other) for other, one in read.items() if one.card.name == name and other != folder]
+        with _noted(failures, one_line(str(folder))):
+            if twins:
+                message = f"{folder} and {', '.join(twins)} have one name, {name!r}: remove or rename a submission"
+                raise ConfigError(message)
+            found.append(_entry_of(folder, submission))
+    return found
+
+
+def _entry_of(folder: Path, submission: Submission) -> Entry:
     return Entry(
         name=submission.card.name,
         version=submission.card.version,

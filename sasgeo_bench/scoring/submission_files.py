@@ -18,6 +18,7 @@ from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Submission, SubmittedFile
+from sasgeo_bench.running.prediction_files import check_lengths
 from sasgeo_bench.running.prediction_rows import (
     FLOWN_SCHEMA,
     PREDICTION_SCHEMA,
@@ -26,14 +27,13 @@ from sasgeo_bench.running.prediction_rows import (
     schema_of,
 )
 from sasgeo_bench.tasks.task_rows import ASKED
-from sasgeo_bench.texts import MOST_MESSAGE, json_text
+from sasgeo_bench.texts import json_text
 
 SUBMISSION: Final = "submission.json"
 PREDICTIONS: Final = "predictions"
 README: Final = "README.md"  # may lie among submissions
 MOST_BYTES: Final = 20_000_000  # of the predictions
 _MOST_SUBMISSION_BYTES: Final = 5_000_000
-_TEXTS: Final = ("query_id", "status", "message", ASKED)
 _LEVEL: Final = 19
 
 
@@ -115,32 +115,33 @@ def is_submission(folder: Path) -> bool:
 
 
 def list_submissions(folder: Path) -> tuple[Path, ...]:
-    """Return a submission itself, or all in a folder, without hidden files and the README.
+    """Return a submission itself, or all that lies in a folder of them, without hidden files and the README.
 
-    Those of a board may lie in a folder of their own, as in submissions/<board>/<name>. Raise StoreError if there is no
-    such folder, or something in it is no submission.
+    Those of a board may lie in a folder of their own, as in submissions/<board>/<name>. A stray entry beside them is
+    returned, too: `read_submission` refuses it. Raise StoreError if there is no such folder, or nothing in it is a
+    submission.
     """
     if is_submission(folder):
         return (folder,)
-    if not folder.is_dir():
+    inner = _visible(folder)
+    found = None if inner is None else tuple(path for one in inner for path in _of_board(one) or (one,))
+    if found is None or (found and not any(map(is_submission, found))):
         message = f"{folder} is no folder of submissions: name one, or a submission itself"
-        raise StoreError(message)
-    found = tuple(path for inner in _visible(folder) for path in _of_board(inner) or (inner,))
-    other = next((path for path in found if not is_submission(path)), None)
-    if other is not None:
-        message = f"{other} is no submission, for it holds no {SUBMISSION}: remove it, or make it by 'submit'"
         raise StoreError(message)
     return found
 
 
-def _visible(folder: Path) -> list[Path]:
-    return [path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.name != README]
+def _visible(folder: Path) -> list[Path] | None:
+    """Return what lies in a folder, without hidden files and the README; None if it is no folder that can be listed."""
+    try:
+        return [path for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.name != README]
+    except OSError:
+        return None
 
 
 def _of_board(folder: Path) -> list[Path]:
     """Return what lies in a folder of submissions; nothing of any other folder, of a link, or of a file."""
-    is_plain = folder.is_dir() and not folder.is_symlink() and not is_submission(folder)
-    inner = _visible(folder) if is_plain else []
+    inner = [] if folder.is_symlink() or is_submission(folder) else _visible(folder) or []
     return inner if any(map(is_submission, inner)) else []
 
 
@@ -150,6 +151,9 @@ def read_submission(folder: Path) -> Submission:
     Raise StoreError if a file is missing, unknown, a link, too large, differs from its hash, or holds no predictions.
     Raise ConfigError if a field of `submission.json` is wrong; all faults on one line.
     """
+    if not is_submission(folder):
+        message = f"{folder} is no submission, for it holds no {SUBMISSION}: remove it, or make it by 'submit'"
+        raise StoreError(message)
     _check_names(folder, {SUBMISSION, PREDICTIONS})
     submission = _read_document(folder / SUBMISSION)
     name = predictions_name(submission.card.name)
@@ -212,17 +216,10 @@ def _check_file(path: Path, expected: SubmittedFile) -> None:
 
 
 def _check_table(path: Path) -> None:
-    """Refuse a table of another shape, and one that decompresses to overlong texts."""
+    """Refuse a table of another shape, and one that unpacks to overlong lists or texts."""
     with open_table(path, mend="submit again") as source:
         _check_schema(path, source.schema_arrow)
-    with open_table(path, mend="submit again", read_dictionary=list(_TEXTS)) as source:
-        texts = source.read(columns=list(_TEXTS))  # each distinct text once
-    for name in _TEXTS:
-        known = (text for chunk in texts[name].chunks for text in chunk.dictionary if text.is_valid)
-        longest = max((len(text.as_buffer()) for text in known), default=0)
-        if longest > 4 * MOST_MESSAGE:
-            message = f"{path}, {name}: found a text of {longest} bytes, expected {MOST_MESSAGE} characters at most"
-            raise StoreError(message)
+    check_lengths(path, mend="submit again")
 
 
 def _check_schema(path: Path, schema: pa.Schema) -> None:

@@ -2,7 +2,8 @@
 """Validation of predictions against the tasks they answer: every violation with row, column, found and expected."""
 
 import difflib
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -12,16 +13,18 @@ import pyarrow as pa
 from sasgeo_bench.errors import MatchError, StoreError, counted
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match, check_match
-from sasgeo_bench.matching.submission import Submission
+from sasgeo_bench.matching.submission import Submission, TaskManifest
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import differing_columns, prediction_of, row_faults
 from sasgeo_bench.scoring.submission_files import SUBMISSION, predictions_name
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
+from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_rows import ASKED
 from sasgeo_bench.texts import MOST_CANDIDATES
 
+TaskName = tuple[str, str]  # suite and region
 Bounds = tuple[float, float, float, float]  # west, south, east, north, metres
 
 _ANSWERED: Final = "ok"
@@ -82,7 +85,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
             yield Violation(file.name, -1, column, found, f"a column of {expected}")
         unread += bool(differing)
         wrong = {} if differing else _faults_by_row(file.name, table)
-        for row, item in enumerate([] if differing else table.to_pylist()):
+        for row, item in enumerate([] if differing else prediction_files.items_of(table)):
             tie = prediction_files.tie_of(item)
             is_aside = path.is_dir() and bool(tie.asked) and not tie.answers(under[file.parent])
             if item["query_id"] not in before and not is_aside:
@@ -91,28 +94,27 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
 
 def submission_faults(
-    folder: Path, submission: Submission, tasks: Sequence[Path] | None, *, places: Collection[str] = ()
+    folder: Path, submission: Submission, tasks: Sequence[Path] | None, split: Split | None
 ) -> Iterator[Violation]:
     """Yield the violations of a submission against the tasks of a board: card, rows, then missing rows.
 
-    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `places` are those of its
-    split; if empty, declared training places are not checked. Files and hashes are checked by `read_submission`. Raise
-    StoreError if a file cannot be read, or a task is of another version.
+    Tasks that the submission does not name are skipped; without tasks, rows are not checked. `split` is that of the
+    board. Files and hashes are checked by `read_submission`. Raise StoreError if a file cannot be read, or a task is of
+    another version.
     """
-    yield from _card_faults(submission, places)
+    yield from _record_faults(submission, split)
     if tasks is None or submission.task_version not in TASK_VERSIONS:
         return
     named = {(item.suite, item.region) for item in submission.tasks}
-    mine = [task for task in tasks if _name_of(task) in named]
-    lost = sorted(named - {_name_of(task) for task in mine})
-    for suite, region in lost:
-        yield Violation(SUBMISSION, -1, "tasks", f"{suite}/{region}", "tasks that the board holds")
-    queries, asked = _asked_of(mine), _asked(mine)
+    mine = {name: task for task in tasks if (name := _name_of(task)) in named}
+    yield from _task_faults(submission, mine)
+    queries, by_task = _asked_of([*mine.values()]), {name: task_files.read_asked(task) for name, task in mine.items()}
+    asked = {query: digest for one in by_task.values() for query, digest in one.items()}
     seen: dict[str, str] = {}
     file = folder / predictions_name(submission.card.name)
     table = prediction_files.read_part(file)
     wrong = _faults_by_row(file.name, table)
-    for row, item in enumerate(table.to_pylist()):
+    for row, item in enumerate(prediction_files.items_of(table)):
         name = item["query_id"]
         yield from _row_faults(file.name, row, item, queries, seen, wrong.get(row, ()))
         if name in asked and item[ASKED] != asked[name]:
@@ -123,20 +125,61 @@ def submission_faults(
                 f"an answer to query {name} as it was drawn otherwise",
                 f"{asked[name]}: run and submit again",
             )
+    yield from _count_faults(submission, by_task, seen)
     yield from _missing(file.name, queries, seen)
 
 
-def _card_faults(submission: Submission, places: Collection[str]) -> Iterator[Violation]:
+def _record_faults(submission: Submission, split: Split | None) -> Iterator[Violation]:
     """Yield the fields of a submission that fit no board, or not its split."""
     if submission.task_version not in TASK_VERSIONS:
         yield Violation(
             SUBMISSION, -1, "task_version", str(submission.task_version), f"{TASK_VERSION}: run and submit again"
         )
-    for place in submission.card.places if places else ():
+    expected = None if split is None else split.spec.id
+    if submission.split != expected:
+        yield Violation(
+            SUBMISSION, -1, "split", repr(submission.split), f"{expected!r}, the split of the board: submit again"
+        )
+    places = () if split is None else split.blocks
+    for place in submission.card.places:
         if place not in places:
             near = difflib.get_close_matches(place, places, n=1)
             hint = f", did you mean {near[0]!r}?" if near else ": other training data belongs into trained_elsewhere"
             yield Violation(SUBMISSION, -1, "trained_on", repr(place), f"places of the split{hint}")
+
+
+def _task_faults(submission: Submission, tasks: Mapping[TaskName, Path]) -> Iterator[Violation]:
+    """Yield tasks of the record that the board lacks, that it lists twice, or of other queries."""
+    counts = Counter((item.suite, item.region) for item in submission.tasks)
+    for name in sorted(counts.keys() - tasks.keys()):
+        yield Violation(SUBMISSION, -1, "tasks", "/".join(name), "tasks that the board holds")
+    for item in submission.tasks:
+        name = (item.suite, item.region)
+        count = counts.pop(name, 1)
+        if count > 1:
+            yield _task_fault(item, f"{count} times", "each task once")
+        digest = task_files.read_task(tasks[name])["files"][task_files.QUERIES]["sha256"] if name in tasks else None
+        if digest not in (None, item.queries_sha256):
+            yield _task_fault(item, f"with queries_sha256 {item.queries_sha256}", f"{digest}, of the board's queries")
+
+
+def _count_faults(
+    submission: Submission, asked: Mapping[TaskName, Mapping[str, str]], seen: Mapping[str, str]
+) -> Iterator[Violation]:
+    """Yield tasks whose queries, or those with a row (`seen`), the record counts wrongly."""
+    for item in submission.tasks:
+        ids = asked.get((item.suite, item.region))
+        if ids is None:
+            continue
+        answered = len(ids.keys() & seen.keys())
+        if item.queries != len(ids):
+            yield _task_fault(item, f"with queries {item.queries}", f"{len(ids)}, as the board has")
+        if item.answered != answered:
+            yield _task_fault(item, f"with answered {item.answered}", f"{answered}, which have a row")
+
+
+def _task_fault(item: TaskManifest, found: str, expected: str) -> Violation:
+    return Violation(SUBMISSION, -1, "tasks", f"{item.suite}/{item.region} {found}", f"{expected}: submit again")
 
 
 def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iterator[Violation]:
@@ -166,7 +209,7 @@ def _asked(tasks: Sequence[Path]) -> dict[str, str]:
     return {name: digest for task in tasks for name, digest in task_files.read_asked(task).items()}
 
 
-def _name_of(task: Path) -> tuple[str, str]:
+def _name_of(task: Path) -> TaskName:
     about = task_files.read_task(task)
     return str(about["suite"]), str(about["region"])
 

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED
+from sasgeo_bench.cli.publishing import publish
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import file_record
@@ -52,6 +53,7 @@ CARD = {
     "licence": "MIT",
     "trained_on": "none",
 }
+A_POSE = {"easting_m": 1.0, "northing_m": 1.0, "yaw_deg": 0.0, "scale": 1.0, "score": 0.0}
 SUITES = ("clean", "absent")
 ROOT = Path(__file__).parents[2]
 
@@ -255,9 +257,9 @@ def test_a_card_that_does_not_say_what_it_must_is_refused(stored, files, mistake
 
 
 def test_a_name_that_is_on_the_board_is_refused(stored, files, mistake, monkeypatch):
-    monkeypatch.setattr("sasgeo_bench.publishing.submissions.is_unranked", lambda _: False)
+    monkeypatch.setattr("sasgeo_bench.scoring.entries.is_unranked", lambda _: False)
     write_card(files["card"], name="prior_centre")
-    assert "'prior_centre' is the name of a matcher on the board kept: choose another" in mistake(*flags(files, stored))
+    assert "'prior_centre' is the name of another entry of the board: choose another" in mistake(*flags(files, stored))
 
 
 @pytest.mark.parametrize(
@@ -384,6 +386,10 @@ def long_text(folder):
     put_table(folder, table.set_column(table.schema.get_field_index("message"), "message", texts), compression="zstd")
 
 
+def long_lists(folder):
+    change_rows(folder, lambda rows: [row.update(candidates=[A_POSE] * 30_000) for row in rows[:3]])
+
+
 def more_columns(folder):
     table = pq.read_table(folder / "predictions" / "mine.parquet")
     put_table(folder, table.append_column("note", pa.nulls(len(table), pa.string())))
@@ -403,7 +409,8 @@ def rename_folder(folder):
         (link_table, "mine.parquet is a link, or no plain file: a submission holds files alone"),
         (make_pipe, "submission.json is a link, or no plain file"),
         (many_rows, "holds 1000001 rows, 1000000 at most"),
-        (long_text, "message: found a text of 3000000 bytes"),
+        (long_text, "bytes of texts in message, "),
+        (long_lists, "row 0, is no prediction (candidates: found 30000 items, expected at most 1000): submit again"),
         (more_columns, "(note is not as it must be)"),
         (rename_folder, "holds the submission 'yours': name the folder so"),
         (lambda at: (at / "run.sh").write_text("true", encoding="utf-8"), "run.sh is no part of a submission"),
@@ -439,14 +446,34 @@ def change_rows(folder, change):
     put_table(folder, pa.Table.from_pylist(rows, schema=table.schema))
 
 
+def state_task(**fields):
+    return lambda folder: change_said(folder, lambda said: said["tasks"][0].update(fields))
+
+
 @pytest.mark.parametrize(
     ("spoil", "fault"),
     [
         (lambda at: change_said(at, lambda said: said.update(task_version=99)), "task_version: found 99, expected"),
         (lambda at: change_said(at, lambda said: said["card"].update(trained_on=["mars"])), "trained_on: found 'mars'"),
         (
+            lambda at: change_said(at, lambda said: said.update(split=None)),
+            "split: found None, expected 'crossfit', the",
+        ),
+        (lambda at: change_said(at, lambda said: said.update(split="holdout")), "split: found 'holdout', expected 'cr"),
+        (lambda at: change_said(at, lambda said: said.update(split="nowhere")), "split: found 'nowhere', expected 'cr"),
+        (
             lambda at: change_said(at, lambda said: said["tasks"][0].update(suite="alias")),
             "tasks: found alias/town-riverside, expected tasks that the board holds",
+        ),
+        (
+            state_task(queries_sha256="0" * 64),
+            f"tasks: found clean/town-riverside with queries_sha256 {'0' * 64}, expec",
+        ),
+        (state_task(queries=10**9), "tasks: found clean/town-riverside with queries 1000000000, expected"),
+        (state_task(answered=10**9), "tasks: found clean/town-riverside with answered 1000000000, expected"),
+        (
+            lambda at: change_said(at, lambda said: said["tasks"].append(said["tasks"][0])),
+            "tasks: found clean/town-riverside 2 times, expected each task once: submit again",
         ),
         (
             lambda at: change_rows(at, lambda rows: rows[0].update(asked_sha256="0" * 64)),
@@ -505,17 +532,43 @@ def test_a_matcher_may_answer_several_boards_each_in_a_folder_of_its_own(copied,
     shutil.rmtree(copied)
     change_said(root / "other" / "mine", lambda said: said.update(board="other"))
     assert submissions_for("kept", [root], tell=silent) == (root / "kept" / "mine",)
-    (root / "kept" / "notes").mkdir()
-    with pytest.raises(StoreError, match="notes is no submission"):
-        submissions_for("kept", [root], tell=silent)
 
 
-def test_a_folder_of_submissions_holds_nothing_else_but_its_readme(copied):
+def loop(path):
+    path.symlink_to(path.name)
+
+
+@pytest.mark.parametrize(
+    "lay",
+    [
+        lambda at: at.write_text("notes", encoding="utf-8"),
+        lambda at: at.mkdir(),
+        lambda at: (at / "predictions").mkdir(parents=True),
+        lambda at: at.symlink_to("nowhere"),
+        loop,
+        os.mkfifo,  # whoever opens it waits for ever
+        lambda at: shutil.copytree(at.with_name("mine"), at / "deep" / "mine"),
+    ],
+)
+def test_a_stray_entry_beside_submissions_costs_nobody_else_the_board(copied, tmp_path, lay):
+    stray = copied.with_name("random")  # a name of a control, which must not go with it
+    lay(stray)
+    found = submissions_for("kept", [copied.parent], tell=silent)
+    assert found == (copied, stray)
+    lines = []
+    failures = Failures(tmp_path / "log", tell=lines.append)
+    assert [entry.name for entry in find_entries([], found, failures=failures)] == ["mine"]
+    why = f"{stray} is no submission, for it holds no submission.json: remove it, or make it by 'submit'"
+    assert failures.found == {str(stray): why}
+    assert lines == [f"{stray} failed: {why}"]
+
+
+def test_what_is_named_must_be_a_submission_or_a_folder_of_them(copied):
     (copied.parent / "README.md").write_text("how to", encoding="utf-8")
     assert submissions_for("kept", [copied.parent, copied], tell=silent) == (copied,)
-    (copied.parent / "notes").mkdir()
-    with pytest.raises(StoreError, match=r"notes is no submission, for it holds no submission\.json"):
-        submissions_for("kept", [copied.parent], tell=silent)
+    for path in (copied / "predictions", copied / "submission.json", copied.with_name("nowhere")):
+        with pytest.raises(StoreError, match=f"{path} is no folder of submissions: name one, or a submission itself"):
+            submissions_for("kept", [path], tell=silent)
     with pytest.raises(ConfigError, match="with the stored results of a board: name them with --predictions"):
         submissions_for("", [copied], tell=silent)
 
@@ -569,25 +622,24 @@ def test_who_was_taught_by_a_test_place_is_set_apart(copied, stored, tmp_path, t
 
 
 @pytest.mark.usefixtures("plain_site")
-def test_one_command_publishes_stored_results_and_submissions(copied, stored, program, tmp_path):
-    words = (
-        "publish",
-        "--board",
-        stored,
-        "--submissions",
-        copied.parent,
-        "--into",
-        tmp_path / "site",
-        "--out",
-        tmp_path,
-    )
-    code, said, err = program(*words)
-    assert code == 0, err
-    assert said.split()[-1] == str(tmp_path / "site" / "index.html")
-    page = (tmp_path / "site" / "index.html").read_text(encoding="utf-8")
+def test_one_command_publishes_stored_results_and_submissions_and_says_what_it_left_out(
+    copied, stored, program, tmp_path
+):
+    stray = copied.with_name("notes.txt")
+    stray.write_text("notes", encoding="utf-8")
+    lost = f"failed, and so not on the board: {stray}: "
+    into, lines = tmp_path / "site", []
+    publish(board=stored, submissions=copied.parent, into=into, out=tmp_path, tell=lines.append)
+    assert sum(line.startswith(lost) for line in lines) == 1
+    words = ("--submissions", copied.parent, "--into", into, "--out", tmp_path)
+    code, said, err = program("publish", "--board", stored, *words)
+    assert code == CONTESTANT_FAILED
+    assert err.count(lost) == 1
+    assert said.split()[-1] == str(into / "index.html")
+    page = (into / "index.html").read_text(encoding="utf-8")
     assert "as submitted" in page
     assert "run here" in page
-    code, _, err = program("publish", "--board", tmp_path, "--submissions", copied.parent, "--out", tmp_path)
+    code, _, err = program("publish", "--board", tmp_path, *words)
     assert code == 2
     assert "holds no stored results" in err
 
@@ -600,7 +652,47 @@ def test_one_command_scores_stored_results_and_submissions(copied, stored, progr
     assert read_board(tmp_path / "boards" / "both")[0]["entries"][0]["name"] == "mine"
 
 
-def test_two_contestants_of_one_name_are_refused(copied, stored, tmp_path, rows, mistake):
+def test_of_submissions_that_share_a_name_none_is_scored_and_the_others_are(copied, tmp_path):
+    twin = shutil.copytree(copied, copied.parent / "kept" / "mine")
+    other = shutil.copytree(copied, copied.with_name("other"))
+    change_said(other, lambda said: rename_said(other, said))
+    failures = Failures(tmp_path / "log", tell=silent)
+    found = submissions_for("kept", [copied.parent], tell=silent)
+    assert [entry.name for entry in find_entries([], found, failures=failures)] == ["other"]
+    assert failures.found == {
+        str(one): f"{one} and {another} have one name, 'mine': remove or rename a submission"
+        for one, another in ((copied, twin), (twin, copied))
+    }
+    with pytest.raises(ConfigError, match="have one name, 'mine'"):
+        find_entries([], found)
+
+
+@pytest.mark.parametrize(
+    ("name", "whose"), [("random", "a control of every board"), ("sasgeo", "a matcher that ships")]
+)
+def test_a_name_that_is_not_free_is_refused_by_whoever_validates_and_whoever_scores(
+    copied, stored, tmp_path, mistake, name, whose
+):
+    folder = copied.rename(copied.with_name(name))
+    change_said(folder, lambda said: rename_said(folder, said))
+    fault = f"{folder}: {name!r} is the name of {whose}: choose another name"
+    assert fault in mistake("validate", "--predictions", folder, "--for", stored)
+    failures = Failures(tmp_path / "log", tell=silent)
+    assert find_entries([], [folder], failures=failures) == ()
+    assert failures.found == {str(folder): fault.removeprefix(f"{folder}: ")}
+
+
+def rename_said(folder, said):
+    name = folder.name
+    said["card"]["name"] = name
+    said["files"] = {f"predictions/{name}.parquet": said["files"].popitem()[1]}
+    (folder / "predictions" / "mine.parquet").rename(folder / "predictions" / f"{name}.parquet")
+
+
+def test_a_submission_that_has_the_name_of_another_entry_is_left_out(copied, stored, tmp_path, rows, program):
     path = write_rows(tmp_path / "mine.parquet", rows)
-    words = ("score", "--predictions", stored, "--predictions", path, "--submissions", copied)
-    assert "two entries are named 'mine'" in mistake(*words)
+    words = ("score", "--predictions", stored, "--predictions", path, "--submissions", copied, "--out", tmp_path)
+    code, _, err = program(*words)
+    assert code == CONTESTANT_FAILED
+    assert f"{copied}: 'mine' is the name of another entry of the board: choose another name" in err
+    assert [entry["name"] for entry in read_board(tmp_path / "boards" / "board")[0]["entries"]].count("mine") == 1

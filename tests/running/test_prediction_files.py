@@ -128,7 +128,7 @@ def test_where_a_clock_was_set_back_the_row_that_was_written_last_still_counts(t
         ("confidence", 1.5, "(confidence: found confidence is 1.5, expected 0..1 or null)"),
         ("latency_s", float("inf"), "(latency_s: found latency_s is inf, expected 0..604800 or null)"),
         ("latency_s", -1.0, "latency_s is -1"),
-        ("message", "x" * 1_000_000, "expected a line of at most 300 printable characters)"),
+        ("message", "x" * 1_000, "expected a line of at most 300 printable characters)"),
         ("message", "two\nlines", "(message: found 'two\\nlines', expected"),
         ("diagnostics", [("margin", 1.0), ("seen", 2.0), ("margin", 3.0)], "(diagnostics: found 'margin' twice"),
         ("diagnostics", [("margin", None)], "diagnostics['margin'] is nan"),
@@ -146,6 +146,32 @@ def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words
     assert "mine.parquet, row 1, is no prediction (" in told
     assert words in told
     assert told.endswith("'validate' says all that is wrong")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "words"),
+    [
+        ("candidates", 4_001, ", row 70, is no prediction (candidates: found 4001 items, expected at most 1000)"),
+        ("diagnostics", [(str(at), 0.0) for at in range(257)], "(diagnostics: found 257 items, expected at most 64)"),
+        (
+            "diagnostics",
+            [("a", 0.0), ("x" * 257, 0.0)],
+            ", row 70, is no prediction (diagnostics: found 257 bytes in a",
+        ),
+        ("covariance", [1.0] * 37, ", row 70, is no prediction (covariance: found 37 items, expected at most 9)"),
+        ("message", "x" * 1_201, ", row 70, is no prediction (message: found 1201 bytes, expected at most 300)"),
+        ("message", "x" * 1_200_000, "bytes of texts in message, 1025200 at most: write it again"),
+    ],
+)
+def test_lists_and_texts_far_beyond_their_bounds_are_refused_before_the_file_is_read(
+    tmp_path, rows, monkeypatch, name, value, words
+):
+    one = rows.to_pylist()[0] | {"covariance": None, "is_accepted": None}
+    value = one["candidates"][:1] * value if name == "candidates" else value
+    table = pa.Table.from_pylist([one] * 70 + [one | {name: value}], schema=prediction_rows.FLOWN_SCHEMA)
+    pq.write_table(table, tmp_path / "mine.parquet", row_group_size=50)
+    monkeypatch.setattr(prediction_files, "read_table", None)
+    assert words in refusal(everything, tmp_path / "mine.parquet")
 
 
 def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows, write):

@@ -57,7 +57,7 @@ def test_a_sound_file_has_no_violation(tmp_path, task, answers):
         ({"status": "crash"}, "candidates", "1 pose"),
         ({"latency_s": -1.0}, "latency_s", "latency_s is -1"),
         ({"latency_s": float("inf")}, "latency_s", "latency_s is inf"),
-        ({"message": "x" * 1_000_000}, "message", "'" + "x" * 127),
+        ({"message": "x" * 1_000}, "message", "'" + "x" * 127),
         ({"diagnostics": {"x" * 65: 1.0}}, "diagnostics", f"the name '{'x' * 65}'"),
         ({"query_id": "0" * 24}, "query_id", f"'{'0' * 24}'"),
         ({"diagnostics": {"margin": float("nan")}}, "diagnostics", "diagnostics['margin'] is nan"),

@@ -63,7 +63,7 @@ def test_a_submission_keeps_what_a_tracker_says_of_its_fixes(tmp_path) -> None:
         task_version=1,
         data_version=1,
         scorer_version=1,
-        made_by="a test",
+        made_by="sasgeo-bench test",
         tasks=[asked],
         files={},
         licence="ODbL-1.0",

@@ -17,6 +17,7 @@ def interrupted_by_signals() -> Iterator[None]:
     """Let the signals of a system that stops end the program as Ctrl-C does; one that is ignored (`nohup`) stays so."""
 
     def stop(number: int, _: FrameType | None) -> None:
+        """Do as Ctrl-C does, and remember who asked."""
         _received.append(number)
         raise KeyboardInterrupt
 

@@ -231,8 +231,9 @@ def _walk(folder: Path, without: Collection[str]) -> Iterator[tuple[str, Path]]:
     """
 
     def refuse(error: OSError) -> None:
+        """Name the folder; of what is not there, or no folder, the caller speaks."""
         if isinstance(error, FileNotFoundError | NotADirectoryError):
-            return  # of what is not there, or no folder, the caller speaks
+            return
         message = f"{error.filename} cannot be looked into ({error.strerror}): check your rights, or move it away"
         raise StoreError(message) from error
 

@@ -29,7 +29,7 @@ from sasgeo_bench.ageing.files import read_ageing
 from sasgeo_bench.ageing.measure import DTYPES
 from sasgeo_bench.config import parse_toml, shipped_dir
 from sasgeo_bench.errors import MOST_MESSAGE, SasgeoError
-from sasgeo_bench.files.folders import check_site
+from sasgeo_bench.files.folders import check_site, sha256_of
 from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
@@ -350,8 +350,8 @@ FORMATS = {
     "SHA256SUMS": Format(
         file="SHA256SUMS",
         make=lambda folder, _: [
-            (folder / "SHA256SUMS").write_text(f"{'0' * 64}  release.json\n"),
-            (folder / "release.json").write_text("{}"),
+            (folder / "release.json").write_text('{"made_by": "sasgeo-bench 0.1.0"}'),
+            (folder / "SHA256SUMS").write_text(f"{sha256_of(folder / 'release.json')}  release.json\n"),
         ],
         read=check_target,
     ),

@@ -149,7 +149,7 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
     aside: set[Tie] = set()
     under = {parent: asked_in(parent, asked) for parent in {part.parent for part in parts_of(folder)}}
     for part in reversed(parts_of(folder)):
-        table = _checked(part)
+        table = _checked(part, is_own=part != folder)
         ties, asked = _ties_of(table), under[part.parent]
         is_own = [tie.answers(asked, is_tied=is_tied) for tie in ties]
         aside |= {replace(tie, status="") for tie, own in zip(ties, is_own, strict=True) if not own}
@@ -211,21 +211,22 @@ def read_predictions(path: str | Path) -> Iterator[Prediction]:
     StoreError
         If there is none, or a file cannot be read.
     """
-    parts = parts_of(given_path(path))
+    path = given_path(path)
+    parts = parts_of(path)
     if not parts:
         message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
         raise StoreError(message)
     seen: set[str] = set()
     for part in reversed(parts):
-        for prediction in predictions_of(_checked(part)):
+        for prediction in predictions_of(_checked(part, is_own=part != path)):
             if prediction.query_id not in seen:
                 seen.add(prediction.query_id)
                 yield prediction
 
 
-def _checked(part: Path) -> pa.Table:
+def _checked(part: Path, *, is_own: bool) -> pa.Table:
     """Read a part; refuse other columns than those of predictions, and rows outside their bounds."""
-    table = read_part(part)
+    table = read_part(part, is_own=is_own)
     for name, found, expected in differing_columns(table):
         fault = f"{name}: found {found}, expected {expected}"[:200]
         message = f"{part} holds no predictions ({fault}): 'validate' lists all that is missing"
@@ -237,9 +238,14 @@ def _checked(part: Path) -> pa.Table:
     return table
 
 
-def read_part(path: Path) -> pa.Table:
-    """Read a whole parquet file; raise `StoreError` if it is missing, damaged, too large, or no parquet file."""
-    check_lengths(path, mend=_MEND)
+def read_part(path: Path, *, is_own: bool) -> pa.Table:
+    """Read a whole parquet file; raise `StoreError` if it is missing, damaged, too large, or no parquet file.
+
+    `is_own` is True of a part of a run, whose answers were held to their bounds before they were written: the lengths
+    of others are looked at first, which takes as long as reading them.
+    """
+    if not is_own:
+        check_lengths(path, mend=_MEND)
     table = read_table(path, mend=_MEND)
     try:
         table.validate(full=True)  # offsets, and texts that are no UTF-8, which Arrow reads unchecked
@@ -360,7 +366,7 @@ def read_ties(folder: Path, *, since_ns: int = 0) -> list[Tie]:
     for part in parts_of(folder):
         if _written_ns(part) < since_ns:
             continue
-        table = read_part(part)
+        table = read_part(part, is_own=True)
         if differing_columns(table):
             message = f"{part} holds no predictions: move it out of the run's folder"
             raise StoreError(message)

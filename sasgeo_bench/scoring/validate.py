@@ -79,7 +79,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     # In a run's folder a query that was asked again has two rows: the newer one counts.
     for file in reversed(files):
         before = frozenset(seen) if path.is_dir() else frozenset()
-        table = prediction_files.read_part(file)
+        table = prediction_files.read_part(file, is_own=path.is_dir())
         differing = differing_columns(table)
         for column, found, expected in differing:
             yield Violation(file.name, -1, column, found, f"a column of {expected}")
@@ -112,7 +112,7 @@ def submission_faults(
     asked = {query: digest for one in by_task.values() for query, digest in one.items()}
     seen: dict[str, str] = {}
     file = folder / predictions_name(submission.card.name)
-    table = prediction_files.read_part(file)
+    table = prediction_files.read_part(file, is_own=True)  # its lengths were looked at when its record was read
     wrong = _faults_by_row(file.name, table)
     for row, item in enumerate(prediction_files.items_of(table)):
         name = item["query_id"]

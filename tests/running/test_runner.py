@@ -119,7 +119,11 @@ def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
     reports = [run(plan, tell=lambda _: None) for plan in plans]
     assert [report.counts for report in reports] == [{"ok": 2}, {}, {"ok": 1}]
     assert (
-        sum(len(prediction_files.read_part(part)) for part in prediction_files.parts_of(plans[0].parts[0].folder)) == 3
+        sum(
+            len(prediction_files.read_part(part, is_own=True))
+            for part in prediction_files.parts_of(plans[0].parts[0].folder)
+        )
+        == 3
     )
 
 

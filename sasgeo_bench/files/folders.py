@@ -298,6 +298,18 @@ def check_known(
         raise StoreError(message)
 
 
+def is_ours(record: Path) -> bool:
+    """Return whether the JSON file that a folder is known by was written by this program: others use such names, too.
+
+    >>> is_ours(Path("nowhere/release.json"))
+    False
+    """
+    try:
+        return str(read_json(record, mend="")["made_by"]).startswith("sasgeo-bench")
+    except (StoreError, KeyError, TypeError):
+        return False
+
+
 def check_site(folder: Path) -> None:
     """Refuse to replace a site that holds somebody else's files; raise `StoreError` naming them."""
     try:

@@ -19,10 +19,10 @@ from sasgeo_bench.files.folders import (
     check_room,
     file_record,
     fresh_folder,
+    is_ours,
     locked,
     sha256_of,
 )
-from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_table, table_writer
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
@@ -260,11 +260,10 @@ def _is_same(path: Path, sha256: str) -> bool:
 def _sums_of(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of the files of an older release of ours; nothing where there is none."""
     try:
-        made_by = read_json(folder / INDEX, mend="release again")["made_by"]
-        lines = (folder / SUMS).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError, StoreError, KeyError, TypeError):
-        return {}
-    return {line[66:]: line[:64] for line in lines} if str(made_by).startswith("sasgeo-bench") else {}
+        lines = (folder / SUMS).read_text(encoding="utf-8").splitlines() if is_ours(folder / INDEX) else []
+    except (OSError, UnicodeDecodeError):
+        lines = []
+    return {line[66:]: line[:64] for line in lines}  # two spaces between
 
 
 @contextmanager

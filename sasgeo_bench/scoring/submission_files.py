@@ -13,7 +13,7 @@ import pyarrow as pa
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.files.folders import check_known, file_record, fresh_folder, locked
+from sasgeo_bench.files.folders import check_known, file_record, fresh_folder, is_ours, locked
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
@@ -50,18 +50,10 @@ def check_submission_folder(folder: Path, name: str) -> None:
     is_free = not os.path.lexists(folder) or (folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()))
     if is_free:
         return
-    if folder.is_symlink() or not _is_ours(folder):
+    if folder.is_symlink() or not is_ours(folder / SUBMISSION):
         message = f"{folder} holds something else than a submission, which would be lost: name another folder"
         raise StoreError(message)
     check_known(folder, {SUBMISSION, predictions_name(name)}, "a submission")
-
-
-def _is_ours(folder: Path) -> bool:
-    """Return whether a folder holds a submission of this program, whole or not."""
-    try:
-        return str(read_json(folder / SUBMISSION, mend="submit again")["made_by"]).startswith("sasgeo-bench")
-    except (StoreError, KeyError, TypeError):
-        return False
 
 
 def write_submission(

@@ -61,45 +61,36 @@ def publish(options: PublishOptions) -> Written:
     sasgeo_bench.errors.StoreError: out/boards/demo/figures is the board itself, or would be a strange folder in it: \
 name another one with --into
     """
-    board = _scored(options)
-    for name, why in board.failures.found.items() if board else ():
+    written, scored = _published(options)
+    for name, why in scored.failures.found.items() if scored else ():
         options.tell(f"failed, and so not on the board: {name}: {why}")
-    return _site_of(options, board)
+    return written
 
 
-def _scored(options: PublishOptions) -> Board | None:
-    """Score submissions with the stored results; return None if there are none to score."""
-    if not options.submissions:
-        return None
-    board = _board_folder(options)
-    return with_submissions(
-        options.board, options.submissions, board, tell=options.tell, root=options.out, jobs=options.jobs
-    )
-
-
-def _board_folder(options: PublishOptions) -> Path:
-    return options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
-
-
-def _site_of(options: PublishOptions, scored: Board | None) -> Written:
-    """Make the site of the board that was scored, or else of the one that is named."""
-    return build.publish(
-        options.board if scored is None else _board_folder(options),
+def _published(options: PublishOptions) -> tuple[Written, Board | None]:
+    """Score submissions, if any, with the stored results, and make the site; return it and the board of both."""
+    folder, scored = options.board, None
+    if options.submissions:
+        folder = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
+        scored = with_submissions(
+            options.board, options.submissions, folder, tell=options.tell, root=options.out, jobs=options.jobs
+        )
+    written = build.publish(
+        folder,
         options.into,
         tell=options.tell,
         root=options.out,
         jobs=options.jobs,
         progress=options.progress,
     )
+    return written, scored
 
 
 def publish_command(options: PublishOptions) -> None:
     """Make the static site of a board: plain files that open without a server, to be put on any host."""
     with shown_progress() as progress:
-        shown = replace(options, say=say, tell=tell, progress=progress)
-        board = _scored(shown)
-        written = _site_of(shown, board)
+        written, scored = _published(replace(options, say=say, tell=tell, progress=progress))
     tell(written.to_text())
     say(written.folder / "index.html")
-    if board is not None:
-        check_controls(board)
+    if scored is not None:
+        check_controls(scored)

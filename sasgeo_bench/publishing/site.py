@@ -326,8 +326,10 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
 
 def _made_of(book: Book) -> str:
     """Return what the views of a board are made of, as far as this version knows its suites."""
-    needs = {need for suite in book.suite_pages for need in getattr(suite_card(suite), "needs", ())}
-    if "imagery" in needs:
+    cards = [suite_card(suite) for suite in book.suite_pages]
+    if None in cards:
+        return ""
+    if any("imagery" in card.needs for card in cards if card is not None):
         return "Views are real aerial pictures, or made from maps: each suite says which."
     return (
         "Views are made from OpenStreetMap, with errors as a detector of classes makes them; what pictures there are, "

@@ -96,16 +96,17 @@ def draw(rows: dict[str, dict[str, float]], path: Path) -> None:
 
     plt.rcParams |= {"svg.hashsalt": "growth", "svg.fonttype": "none", "font.size": 8}
     figure, charts = plt.subplots(1, 2, figsize=(6.4, 2.6), layout="constrained")
-    at = [row["mapped_km2"] for row in rows.values()]
+    countries: dict[str, list[dict[str, float]]] = {}
+    for name, row in rows.items():
+        countries.setdefault(name.partition(",")[0], []).append(row)
     for chart, column, title in zip(
         charts, ("cpu_s", "peak_mb"), ("processor time (s)", "peak memory (MB)"), strict=True
     ):
-        chart.plot(at, [row[column] for row in rows.values()], "o", color="#0072b2")
-        for name, row in rows.items():
-            chart.annotate(
-                name, (row["mapped_km2"], row[column]), xytext=(3, 3), textcoords="offset points", fontsize=6
-            )
-        chart.set(xlabel="mapped area (km²), cells of 1 m", ylabel=title, ylim=(0, None), xlim=(0, None))
+        for marker, (name, some) in zip("sDo", countries.items(), strict=True):
+            chart.plot([row["mapped_km2"] for row in some], [row[column] for row in some], f"{marker}-", label=name)
+        highest = max(row[column] for row in rows.values())
+        chart.set(xlabel="mapped area (km²), cells of 1 m", ylabel=title, ylim=(0, 1.1 * highest), xlim=(0, None))
+    charts[0].legend()
     figure.savefig(path, metadata={"Date": None})
 
 

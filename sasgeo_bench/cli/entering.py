@@ -18,7 +18,7 @@ from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_li
 class EnterOptions(Options):
     """Flags of enter."""
 
-    board: Annotated[Path, typer.Argument(help="stored results of the board, as docs/results/systems")]
+    board: Annotated[Path, typer.Argument(help="stored results of the board, as docs/results/systems-objects")]
     matcher: Annotated[str, typer.Option(help="name of an installed matcher, or module:Class")]
     into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/BOARD/NAME")] = None
     pipeline: Annotated[

@@ -24,7 +24,8 @@ def new_matcher_command(
 ) -> None:
     """Write a plugin package that passes check-matcher at once, for you to put your method into."""
     lay_package(name, folder, plugin_files(name), check="check-matcher")
-    tell(f"later: sasgeo-bench enter docs/results/systems --matcher {name} (docs/howto/matcher.md walks the path)")
+    entry = f"sasgeo-bench enter docs/results/systems-objects --matcher {name}"
+    tell(f"later: {entry} (docs/howto/matcher.md walks the path)")
 
 
 def lay_package(name: str, folder: Path | None, files: Mapping[str, str], *, check: str) -> Path:

@@ -33,7 +33,8 @@ def submit_command(
     board: Annotated[
         Path | None,
         typer.Option(
-            "--for", help="stored results of the board, as docs/results/systems; leaderboard --results stores some"
+            "--for",
+            help="stored results of the board, as docs/results/systems-objects; leaderboard --results stores some",
         ),
     ] = None,
     into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/BOARD/NAME")] = None,

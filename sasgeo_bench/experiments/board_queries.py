@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The queries of a published board, drawn again by its pipeline and held against the hashes that it stores."""
 
+import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -39,6 +40,11 @@ class BoardRequest:
     jobs: int = 1
 
 
+def _boards_beside(stored: Path) -> list[str]:
+    """Return the names of the stored boards that lie where one was looked for."""
+    return [path.name for path in stored.parent.glob("*") if is_pack(path)] if stored.parent.is_dir() else []
+
+
 def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tell) -> PipelinePlan:
     """Plan to draw all queries of a published board and ask `matchers`; only files of settings are read.
 
@@ -53,7 +59,14 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
     """
     stored = request.stored
     if not is_pack(stored):
-        message = f"{stored} holds no stored results: name those of a board, as docs/results/systems"
+        near = difflib.get_close_matches(stored.name, _boards_beside(stored), n=1)
+        mend = (
+            f"did you mean {stored.parent / near[0]}?"
+            if near
+            else "name those of a board, as docs/results/systems-objects"
+        )
+        fault = "holds no stored results" if stored.is_dir() else "is no folder here"
+        message = f"{stored} {fault}: {mend}"
         raise StoreError(message)
     made_by = stored_settings([stored]).pipeline
     if not made_by.get("id"):

@@ -2,14 +2,14 @@
 """A matcher enters a published board: the board's queries are drawn, it is asked, and a submission is written."""
 
 import difflib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
 from typing import Final, NamedTuple
 
 from sasgeo_bench.config import LONGEST_LINE, check_document
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.experiments import entry_cost
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, plan_board, same_queries
 from sasgeo_bench.experiments.pipeline import ask, draw_all
@@ -29,7 +29,7 @@ from sasgeo_bench.publishing.submissions import (
     make_submission,
 )
 from sasgeo_bench.running.plan import RunPlan
-from sasgeo_bench.running.prediction_files import begin_round, end_round, open_round
+from sasgeo_bench.running.prediction_files import begin_round, end_round, open_round, read_predictions
 from sasgeo_bench.scoring.submission_files import check_submission_folder, is_submission, read_submission
 from sasgeo_bench.tasks.split import HALVES, Split
 from sasgeo_bench.texts import one_line
@@ -124,7 +124,9 @@ def enter(
     ConfigError
         If extracts are missing, or none of the board's queries can be drawn here; and as `check_entry` does, which
         comes first.
-    MatchError, StoreError
+    MatchError
+        If the matcher failed on every query; a submission that was there is as it was. And as `check_entry` does.
+    StoreError
         As `check_entry`, a run and a submission do.
     """
     folder, run = check_entry(entry, into=into)
@@ -139,6 +141,7 @@ def enter(
         tell(line)
     ask(entry.matcher, runs, tell=tell, progress=progress)
     end_round(run.run_folder)
+    _check_answered(planned, same, folder)
     card = _card_of(planned.card, runs, plan.split, source=entry.matcher)
     make_submission(
         SubmitRequest(predictions=planned.run_folder, card=card, board=entry.stored, into=folder), tell=tell
@@ -150,6 +153,17 @@ def enter(
     for line in failure_lines(board.predictions.get(card.name, {}).values()):
         tell(f"{card.name}: {line}")
     return folder, board
+
+
+def _check_answered(plan: RunPlan, asked: Collection[str], folder: Path) -> None:
+    """Refuse to make a submission of failures alone: it would take the place of an earlier one."""
+    answers = [item for item in read_predictions(plan.run_folder) if item.query_id in asked]
+    if answers and all(item.status not in SOUND for item in answers):
+        message = (
+            f"{plan.card.name} failed on all {counted(len(answers), 'query', 'queries')} "
+            f"({'; '.join(failure_lines(answers))}): mend it, raise its version and enter again; {folder} is as it was"
+        )
+        raise MatchError(message)
 
 
 def _changed(plan: RunPlan) -> Iterator[str]:

@@ -137,7 +137,7 @@ Say in the card (`src/{module}/card.toml`) where the method comes from, what of 
 tell for it to work; raise its version whenever answers change. Then enter a published board:
 
 ```bash
-sasgeo-bench enter docs/results/systems --matcher {name}
+sasgeo-bench enter docs/results/systems-objects --matcher {name}
 ```
 """
 

@@ -128,7 +128,7 @@ def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, m
     monkeypatch.setenv("PATH", str(pip.parent))
     code, told, err = program("new-matcher", "my-matcher")
     assert code == 0
-    assert "enter docs/results/systems --matcher my-matcher" in err
+    assert "enter docs/results/systems-objects --matcher my-matcher" in err
     assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check-matcher my-matcher\n"
     assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
     monkeypatch.setenv("PATH", "")  # a pip that would install for another Python is not named

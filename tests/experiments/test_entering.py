@@ -326,12 +326,23 @@ def test_a_round_that_was_cut_goes_on_where_it_was(request_, entered, tmp_path, 
     assert any(f": {whole - len(asked)} queries to ask, {len(asked)} answered before" in line for line in lines)
 
 
-def test_crashes_are_told_with_an_example_on_one_line(request_, tmp_path):
-    lines = []
+def test_who_fails_on_every_query_has_no_submission_and_an_example_of_it_on_one_line(request_, tmp_path):
     request = replace(request_, matcher=f"{__name__}:Lost")
-    enter(plan_entry(request, tell=silent), into=tmp_path / "lost", tell=lines.append)
-    (told,) = [line for line in lines if "ended as crash" in line]
-    assert re.fullmatch(r"\S+: \d+ ended as crash, the first with the message [\"'].*no road.*near \w+.*", told)
+    with pytest.raises(MatchError) as told:
+        enter(plan_entry(request, tell=silent), into=tmp_path / "lost", tell=silent)
+    said = (
+        r"lost failed on all (\d+) queries \(\1 ended as crash, the first with the message [\"'].*no road.*near \w+.*"
+    )
+    assert re.fullmatch(rf"{said}\): mend it, raise its version and enter again; \S+lost is as it was", str(told.value))
+    assert not (tmp_path / "lost").exists()
+
+
+def test_a_board_that_is_not_there_is_named_with_one_that_is(request_):
+    beside = request_.stored.parent
+    with pytest.raises(StoreError, match=f"is no folder here: did you mean {request_.stored}"):
+        plan_entry(replace(request_, stored=beside / f"{request_.stored.name}x"), tell=silent)
+    with pytest.raises(StoreError, match="holds no stored results: name those of a board"):
+        plan_entry(replace(request_, stored=beside), tell=silent)
 
 
 def test_extracts_that_are_missing_are_listed_at_once(request_, monkeypatch):

@@ -183,7 +183,8 @@ def test_every_command_of_the_program_has_flags_that_there_are() -> None:
         try:
             parsed(line.text)
         except UsageError as error:
-            pytest.fail(f"{line.document}:{line.number}: {line.text}: {error.format_message()}")
+            if "does not exist" not in error.format_message():  # a reader's own folder
+                pytest.fail(f"{line.document}:{line.number}: {line.text}: {error.format_message()}")
 
 
 def test_a_flag_that_is_made_up_is_found() -> None:

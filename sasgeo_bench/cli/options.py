@@ -34,12 +34,20 @@ OwnRegionFolders = Annotated[  # of commands whose --regions are ids
 ]
 ExtractFolders = Annotated[
     list[Path] | None,
-    typer.Option("--extracts", help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache"),
+    typer.Option(
+        "--extracts",
+        exists=True,
+        file_okay=False,
+        help="folder to search for extracts, before SASGEO_EXTRACTS and the user's cache",
+    ),
 ]
 ImageryFolders = Annotated[
     list[Path] | None,
     typer.Option(
-        "--imagery", help="folder to search for aerial pictures, before SASGEO_IMAGERY and 'imagery' beside extracts"
+        "--imagery",
+        exists=True,
+        file_okay=False,
+        help="folder to search for aerial pictures, before SASGEO_IMAGERY and 'imagery' beside extracts",
     ),
 ]
 

@@ -150,8 +150,6 @@ def enter(
     board = beside_stored(entry.stored, folder, both, tell=tell, root=plan.out, jobs=plan.jobs)
     if card.trained_elsewhere:
         tell(f"{card.name}: trained elsewhere than in the places of the split, not set apart: {card.trained_elsewhere}")
-    for line in failure_lines(board.predictions.get(card.name, {}).values()):
-        tell(f"{card.name}: {line}")
     return folder, board
 
 

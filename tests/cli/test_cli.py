@@ -179,9 +179,11 @@ def test_a_missing_extract_names_the_file_its_hash_and_where_to_put_it(mistake, 
     text = (shipped_dir("regions") / "monaco.toml").read_text()
     own = tmp_path / "own.toml"
     own.write_text("\n".join(line for line in text.splitlines() if not line.startswith("urls")))
-    told = mistake("build-region", own, "--extracts", "mine")
+    (tmp_path / "mine").mkdir()
+    told = mistake("build-region", own, "--extracts", tmp_path / "mine")
     for word in ("monaco-2025-02-15.osm.pbf", "72dc9a65600864fa", "mine", "--extracts"):
         assert word in told
+    assert "'nowhere' does not exist" in mistake("build-region", own, "--extracts", "nowhere")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")

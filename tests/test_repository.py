@@ -217,7 +217,7 @@ def test_make_alone_prints_every_target_with_its_line() -> None:
 
 def test_ci_runs_the_commands_of_the_readme() -> None:
     commands = re.findall(r"^(?:\s*)(make [a-z-]+)", read(".ci/run"), flags=re.MULTILINE)
-    assert commands == ["make check", "make test"]
+    assert commands == ["make check", "make test", "make test"]
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
     blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", read("README.md"), flags=re.DOTALL))
     for command in (*commands, "make demo"):

@@ -467,6 +467,7 @@ def printed(program):
     return run
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_figures", "plain_site")
 def test_a_hostile_board_is_scored_looked_at_published_and_released(root, printed, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT))

@@ -81,6 +81,7 @@ def test_every_command_has_both_flags_and_they_end_with_it(program, tmp_path):
     assert not {progress.QUIET, console.LOG} & set(os.environ)
 
 
+@pytest.mark.slow
 def test_two_processes_of_a_quiet_command_build_a_region_each_and_are_quiet_and_write_the_same_log(program, tmp_path):
     for name in ("town-suburb", "town-old-town"):
         text = (shipped_dir("regions") / f"{name}.toml").read_text(encoding="utf-8")

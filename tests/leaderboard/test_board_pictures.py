@@ -113,6 +113,7 @@ def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
     assert lines[-1].startswith(f"pictures: 2 of regions, 2 of suites, {len(said['cases'])} of cases, ")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_several_processes_draw_the_same_pictures(made, root):
     folder, _, board = made

@@ -88,6 +88,7 @@ def table_of_systems():
     return set(program["lines"](*program["read_board"](RESULTS / "systems")))
 
 
+@pytest.mark.slow
 def test_every_row_of_a_table_on_the_pages_stands_on_a_board(tables_of_pictures, table_of_losses, table_of_systems):
     boards = {line for path in RESULTS.glob("*/leaderboard.md") for line in path.read_text("utf-8").splitlines()}
     boards |= tables_of_pictures | table_of_losses | table_of_systems

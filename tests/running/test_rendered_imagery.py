@@ -52,6 +52,7 @@ def about(task, spec):
     return prediction_files.read_run(plan.parts[0].folder)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads")
 def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(draw):
     plain, seen = draw("clean"), draw("aerial", "P1 height")

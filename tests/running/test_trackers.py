@@ -75,7 +75,7 @@ def counted(flown, tmp_path_factory):
         patch.chdir(flown)
         patch.syspath_prepend(str(flown))
         task = flown / "out" / "tasks" / "flight-overconfident" / TOWN
-        return run_of(task, tmp_path_factory.mktemp("counted"), "Counting", jobs=2)
+        return run_of(task, tmp_path_factory.mktemp("counted"), "Holding", jobs=2)
 
 
 def test_views_of_a_flight_come_in_order_to_one_process(task, counted):

@@ -390,6 +390,7 @@ def test_two_runs_at_once_leave_one_whole_task(own_out, tasks):
     assert leftovers(own_out) == []
 
 
+@pytest.mark.slow
 def test_two_runs_of_different_counts_at_once_leave_the_map_of_the_last_and_its_task(own_out, tasks):
     told: dict[int, list[str]] = {2: [], 1: []}
     begun, waiting = threading.Event(), threading.Event()

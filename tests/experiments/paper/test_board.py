@@ -18,7 +18,7 @@ from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from tests.threaded import threaded
 
-pytestmark = pytest.mark.usefixtures("in_threads")
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("in_threads")]
 
 TEXT = """
 id = "few"

@@ -427,6 +427,7 @@ def test_a_rectangle_covers_no_more_than_its_share_and_lies_in_the_view_whole():
 # --- the same bytes -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_another_process_makes_the_same_bytes_and_fewer_trials_are_the_first_of_more(out, tmp_path):
     code = "import sys; from pathlib import Path; from sasgeo_bench.experiments.paper import make_paper_task as make\n"
     code += f"make(seed=42, out=Path(sys.argv[1]), trials={FEW}, tell=print)"

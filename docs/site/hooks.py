@@ -23,7 +23,7 @@ OUTSIDE: Final = {
     **{f"{name}/README.md": f"repository/{name}.md" for name in ("benchmarks", "pipelines", "regions", "splits")},
     "submissions/README.md": "repository/submissions.md",
 }
-_LINK: Final = re.compile(r"(?<!!)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
+_LINK: Final = re.compile(r"\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)#\s]+)(#[^)\s]*)?\)")
 _FOREIGN: Final = re.compile(
     r"<(?:script|img|iframe|link(?![^>]*rel=.?canonical))\b[^>]*(?:src|href)=.?(https?://[^\"'\s>]+)"
 )
@@ -52,7 +52,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to pages of the site; what is in the repository alone becomes text with its path."""
+    """Lead links to pages and pictures of the site; what is in the repository alone becomes text with its path."""
     del config
     sources = {page: path for path, page in OUTSIDE.items()}
     own = page.file.src_uri

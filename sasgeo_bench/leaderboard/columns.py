@@ -32,7 +32,7 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "part": "Which of the suite's queries: a role, a kind of stress, one of its steps at one size of view, or a bin "
     "of what was measured at the truth",
     "kind": "Kind of stress, or of its absence",
-    "risk kept": "Whether at most 5 % of the answers are false: yes or no where the whole interval says so, else open",
+    "risk kept": "Whether at most 5 % of all answers are false: yes or no where the whole interval says so, else open",
     "rejector": "Estimates of each answer how likely it is false; own: the matcher's own confidence, fitted to nothing",
     "track": "localization: find the place on the map; retrieval: pick it among candidates; sequence: follow a flight",
     "contrast": "Pair of entries that was registered before anything was run",

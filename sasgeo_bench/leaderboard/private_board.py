@@ -203,12 +203,17 @@ def seed_lines(about: Mapping[str, Any]) -> list[str]:
 
 
 def sealed_lines(about: Mapping[str, Any]) -> list[str]:
-    """Return by sealed place whether the board holds it, and when it was opened.
+    """Return whether the board holds the sealed places, and when they were opened: a line for those of one state.
 
-    >>> sealed_lines({"sealed": {"porto": {"drawn_by": None, "openings": []}}})
-    ['Sealed place porto: not opened, and so not on this board.']
+    >>> sealed_lines({"sealed": {name: {"drawn_by": None, "openings": []} for name in ("porto", "monaco")}})
+    ['Sealed places porto, monaco: not opened, and so not on this board.']
     """
-    return [f"Sealed place {place}: {_sealed_state(item)}." for place, item in (about.get("sealed") or {}).items()]
+    places: dict[str, list[str]] = {}
+    for place, item in (about.get("sealed") or {}).items():
+        places.setdefault(_sealed_state(item), []).append(place)
+    return [
+        f"Sealed place{'s' if len(names) > 1 else ''} {', '.join(names)}: {state}." for state, names in places.items()
+    ]
 
 
 def _sealed_state(item: Mapping[str, Any]) -> str:

@@ -69,7 +69,7 @@ def _powerless_lines(verdicts: Sequence[Verdict]) -> Iterator[str]:
     if idle:
         yield (
             f"{counted(idle, 'control')} could not fail: {'its' if idle == 1 else 'their'} queries are so few that "
-            f"guessing could have been right on all of them at a chance of {ALPHA:g}."
+            f"guesses are right on all of them with a probability above {ALPHA:g}."
         )
 
 

@@ -15,6 +15,7 @@ from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of
+from sasgeo_bench.leaderboard.cases import MEANINGS as FAILURE_MEANINGS
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE, column, suite_card
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
@@ -213,6 +214,8 @@ _NAMES: Final = {  # pages that every site has or may have, in the order of the 
     "method.html": "Method",
 }
 _BLANK_LINES: Final = re.compile(r"\n\s*\n+")
+_FIRM: Final = "\N{NO-BREAK SPACE}"  # within an interval no line ends
+_INTERVAL: Final = re.compile(r"\[(-?[\d.]+), (-?[\d.]+)\]")
 _INDENTS: Final = re.compile(r"^[ \t]+", re.MULTILINE)
 
 
@@ -353,6 +356,7 @@ def _failures(source: SiteSource, mapped: Collection[str]) -> dict[str, Any]:
     return {
         "groups": groups,
         "total": len(numbered),
+        "meanings_of": FAILURE_MEANINGS,
         "links": {number: _on_map(case) for number, case in numbered.items() if base_of(case.region) in mapped},
         "filters": [
             ("Matcher", "matcher", sorted({case.matcher for case in numbered.values()}), {}),
@@ -393,7 +397,9 @@ def _environment() -> Environment:
 
 def _shown(value: object) -> object:
     """Remove characters that a browser would not show or that reverse the direction of text."""
-    return plain(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
+    if not isinstance(value, str) or hasattr(value, "__html__"):
+        return value
+    return _INTERVAL.sub(rf"[\1,{_FIRM}\2]", plain(value))
 
 
 def _render(templates: Environment, template: str, page: str, values: Mapping[str, Any]) -> str:

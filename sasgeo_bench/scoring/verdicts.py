@@ -242,6 +242,8 @@ class Finding:
             return "not decided: a difference is shown by places, none by countries"
         if self.lo > 0 or self.hi < 0:
             return "not decided: no difference shown after Holm's adjustment"
+        if -self.least < self.lo and self.hi < self.least:
+            return "not decided: one that matters is ruled out by places, not by countries"
         return "not decided: no difference shown, and one that matters is not ruled out"
 
     def to_row(self) -> dict[str, object]:

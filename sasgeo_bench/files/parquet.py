@@ -9,7 +9,7 @@ structure is checked.
 import json
 import os
 import zlib
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
@@ -64,7 +64,11 @@ def write_frame(frame: "pd.DataFrame", path: Path, *, attrs: Mapping[str, Any], 
 
 def read_frame(path: Path, *, mend: str) -> "pd.DataFrame":
     """Read the output of `write_frame`, with its `attrs`; raise as `open_table` does."""
-    table = read_table(path, mend=mend, most_rows=MOST_VALUES)
+    return as_frame(read_table(path, mend=mend, most_rows=MOST_VALUES), path, mend=mend)
+
+
+def as_frame(table: pa.Table, path: Path, *, mend: str) -> "pd.DataFrame":
+    """Return a table that was read from the output of `write_frame` as a data frame; raise as `open_table` does."""
     try:
         frame: pd.DataFrame = table.to_pandas()
         frame.attrs = json.loads((table.schema.metadata or {}).get(_ATTRS, b"{}"))
@@ -109,6 +113,24 @@ def read_table(path: Path, *, mend: str, columns: Sequence[str] | None = None, m
     """Read a table, or some of its columns; raise as `open_table` does."""
     with open_table(path, mend=mend, most_rows=most_rows) as source:
         return source.read(columns=None if columns is None else list(columns))
+
+
+def read_kept(
+    path: Path,
+    *,
+    mend: str,
+    keep: Callable[[pa.Table], pa.BooleanArray],
+    may_hold: Callable[[pq.RowGroupMetaData], bool] = lambda _: True,
+) -> pa.Table:
+    """Read the rows that `keep` marks, one row group after the other; raise as `open_table` does.
+
+    Row groups of which `may_hold` says that they have none, by their statistics, are not read.
+    """
+    with open_table(path, mend=mend, most_rows=MOST_VALUES, is_whole=False) as source:
+        groups = [at for at in range(source.num_row_groups) if may_hold(source.metadata.row_group(at))]
+        parts = (source.read_row_group(at) for at in groups)
+        kept = [part.filter(keep(part)) for part in parts]
+        return pa.concat_tables(kept) if kept else source.schema_arrow.empty_table()
 
 
 def read_schema(path: Path, *, mend: str) -> pa.Schema:

@@ -4,7 +4,7 @@
 import datetime as dt
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Final, Generic, Self, TypeVar, cast
 
 import numpy as np
 import shapely
@@ -129,6 +129,10 @@ class Manifest(_Record):
             rows=self.rows,
             cols=self.cols,
         )
+
+    def of_part(self, grid: Grid) -> Self:
+        """Return what describes a part of the map with the grid of that part; all else is about the whole map."""
+        return self.model_copy(update={"bounds_m": grid.bounds_m, "rows": grid.rows, "cols": grid.cols})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,10 +261,9 @@ class Region:
                 part[band] = layer[top:end, left:last]
         found = []
         for part, (top, left, end, last) in zip(parts, spans, strict=True):
-            own = grid.window(top, left, end - top, last - left)
-            changed = {"bounds_m": own.bounds_m, "rows": own.rows, "cols": own.cols}
             part.flags.writeable = False
-            found.append(replace(self, manifest=self.manifest.model_copy(update=changed), layers=part, read_layer=None))
+            manifest = self.manifest.of_part(grid.window(top, left, end - top, last - left))
+            found.append(replace(self, manifest=manifest, layers=part, read_layer=None))
         return found
 
     def known(self) -> NDArray[np.bool_]:

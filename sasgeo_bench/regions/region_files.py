@@ -8,15 +8,28 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
 import shapely
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, GridError, StoreError
 from sasgeo_bench.files.folders import FileRecord, file_record, sha256_of
 from sasgeo_bench.files.json import read_json
-from sasgeo_bench.files.parquet import CHECKED, MOST_VALUES, read_frame, read_table, write_frame
+from sasgeo_bench.files.parquet import (
+    CHECKED,
+    MOST_VALUES,
+    as_frame,
+    read_frame,
+    read_kept,
+    read_schema,
+    read_table,
+    write_frame,
+)
 from sasgeo_bench.files.paths import given_path
+from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import check_features
 from sasgeo_bench.regions.imagery import ORTHO, Imagery
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, SCHEMA_VERSION, Manifest, MapGraph, Region
@@ -24,12 +37,12 @@ from sasgeo_bench.texts import json_text
 
 if TYPE_CHECKING:
     import geopandas as gpd
-    import numpy as np
     import pandas as pd
     from numpy.typing import NDArray
     from pyproj import CRS
 
 Table = TypeVar("Table", bound="pd.DataFrame")
+Bounds = tuple[float, float, float, float]  # west, south, east, north, metres
 
 MANIFEST: Final = "region.json"
 LAYERS: Final = "layers.tif"
@@ -37,14 +50,20 @@ FEATURES: Final = "features.parquet"
 NODES: Final = "nodes.parquet"
 EDGES: Final = "edges.parquet"
 PREVIEW: Final = "preview.png"
+GROUP_ROWS: Final = 2**15  # of features or nodes that are read at once: a town has fewer
 _ORIGIN: Final[Mapping[Any, Any]] = {"attribution": ATTRIBUTION, "licence": LICENCE}
 _MEND: Final = "build the region again"
 
 
 def write_tables(folder: Path, features: "gpd.GeoDataFrame", graph: MapGraph) -> None:
-    """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder."""
-    geographic = {**CHECKED, "schema_version": "1.1.0"}
-    _attributed(features).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
+    """Write features, nodes and edges as (Geo)Parquet 1.1 into a folder.
+
+    Features that fill several row groups are put in order along a Hilbert curve: a part of a map lies in few of them.
+    """
+    if len(features) > GROUP_ROWS:
+        features = features.iloc[np.argsort(features.hilbert_distance().to_numpy(), kind="stable")]
+    geographic = {**CHECKED, "schema_version": "1.1.0", "row_group_size": GROUP_ROWS}
+    _attributed(features.reset_index(drop=True)).to_parquet(folder / FEATURES, write_covering_bbox=True, **geographic)
     _attributed(graph.nodes).to_parquet(folder / NODES, **geographic)
     write_frame(graph.edges, folder / EDGES, attrs=_ORIGIN)
 
@@ -99,16 +118,35 @@ def read_manifest(folder: Path) -> Manifest:
 def read_region(
     path: str | Path,
     *,
+    bounds_m: Bounds | None = None,
     around: Callable[[], AbstractContextManager[object]] = nullcontext,
     around_layer: Callable[[], AbstractContextManager[object]] = nullcontext,
     with_layers: bool = True,
 ) -> Region:
-    """Read a region: its layers now, its features and graph when they are first used.
+    """Read a region, or a part of it: its layers now, its features and graph when they are first used.
 
-    All files are checked against their hashes now. Without `with_layers`, layers are read when they are first used,
-    too, and `Region.layer` reads one of them alone: a country's take a gigabyte. `around` gives a context that is
-    entered while something is read that the region keeps, `around_layer` one for a layer that it does not keep. Raise
-    `StoreError` if a file is missing, changed or unreadable.
+    Parameters
+    ----------
+    path : str or Path
+        Folder of the region.
+    bounds_m : tuple of float, optional
+        West, south, east, north of the part, metres in the region's CRS; by default all of the map. The part has every
+        cell that they touch, whole features that meet these cells, the nodes among them, numbered anew, and the edges
+        between those. No more is read, but to check the hashes: of a country a town takes the memory of a town. What
+        the manifest counts is of the whole map.
+    around, around_layer : callable
+        Give a context that is entered while something is read that the region keeps, and one for a layer that it does
+        not keep.
+    with_layers : bool
+        Without, layers are read when they are first used, too, and `Region.layer` reads one of them alone: a country's
+        take a gigabyte.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing, changed or unreadable: all are checked against their hashes now.
+    GridError
+        If the bounds are none, or lie beyond the map.
     """
     from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
 
@@ -116,37 +154,73 @@ def read_region(
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])
+    coverage, window, box = shapely.from_wkt(manifest.coverage.wkt), None, None
+    if bounds_m is not None:
+        window = _window(manifest.grid, bounds_m)
+        manifest = manifest.of_part(manifest.grid.window(*window))
+        box = manifest.bounds_m
+        coverage = shapely.intersection(coverage, shapely.box(*box))
 
     def layers() -> "NDArray[np.uint8]":
         """Read the layers when they are first used."""
         with around():
-            return read_layers(folder / LAYERS)
+            return read_layers(folder / LAYERS, window=window)
 
     def layer(index: int) -> "NDArray[np.uint8]":
         """Read one layer whenever it is used."""
         with around_layer():
-            found: NDArray[np.uint8] = read_layers(folder / LAYERS, bands=(index,))[0]
+            found: NDArray[np.uint8] = read_layers(folder / LAYERS, window=window, bands=(index,))[0]
             return found
 
     def features() -> "gpd.GeoDataFrame":
         """Read the features when they are first used."""
         with around():
-            return check_features(_read_geometry(folder / FEATURES))
+            return check_features(_read_geometry(folder / FEATURES, box))
 
     def graph() -> MapGraph:
         """Read the graph when it is first used."""
         with around():
-            return MapGraph(nodes=_read_geometry(folder / NODES), edges=read_frame(folder / EDGES, mend=_MEND))
+            nodes = _read_geometry(folder / NODES, box)
+            if box is None:
+                return MapGraph(nodes=nodes, edges=read_frame(folder / EDGES, mend=_MEND))
+            edges = _edges_between(nodes["id"].to_numpy(), folder / EDGES)
+            return MapGraph(nodes=nodes.assign(id=np.arange(len(nodes))), edges=edges)
 
     return Region(
         manifest=manifest,
-        layers=read_layers(folder / LAYERS) if with_layers else layers,
+        layers=read_layers(folder / LAYERS, window=window) if with_layers else layers,
         features=features,
         graph=graph,
-        coverage=shapely.from_wkt(manifest.coverage.wkt),
+        coverage=coverage,
         imagery=_imagery(folder, manifest),
         read_layer=layer,
     )
+
+
+def _window(grid: Grid, bounds_m: Bounds) -> tuple[int, int, int, int]:
+    """Return first row and column, rows and columns of the cells that bounds touch; cut at the edge of the map."""
+    part = Grid.from_bounds(*bounds_m, cell_size_m=grid.cell_size_m, epsg=grid.epsg)
+    top, left = (
+        round(shift_m / grid.cell_size_m) for shift_m in (grid.north_m - part.north_m, part.west_m - grid.west_m)
+    )
+    row, col = max(top, 0), max(left, 0)
+    rows, cols = min(top + part.rows, grid.rows) - row, min(left + part.cols, grid.cols) - col
+    if rows < 1 or cols < 1:
+        message = f"the bounds {tuple(bounds_m)} lie beyond the map: it has {grid.bounds_m} (west, south, east, north)"
+        raise GridError(message)
+    return row, col, rows, cols
+
+
+def _edges_between(ids: "NDArray[np.int64]", path: Path) -> "pd.DataFrame":
+    """Read the edges between some nodes, by their numbers in ascending order; they refer to their places among them."""
+    wanted = pa.array(ids)
+    table = read_kept(
+        path,
+        mend=_MEND,
+        keep=lambda part: pc.and_(pc.is_in(part["source"], wanted), pc.is_in(part["target"], wanted)),
+    )
+    edges = as_frame(table, path, mend=_MEND)
+    return edges.assign(**{end: np.searchsorted(ids, edges[end].to_numpy()) for end in ("source", "target")})
 
 
 def read_imagery(path: str | Path) -> Imagery | None:
@@ -203,27 +277,62 @@ def _check_file(path: Path, record: FileRecord) -> None:
         raise StoreError(message)
 
 
-def _read_geometry(path: Path) -> "gpd.GeoDataFrame":
-    """Read a table of geometry as `geopandas.read_parquet` does, which parses the same CRS anew for each table."""
+def _read_geometry(path: Path, box: Bounds | None = None) -> "gpd.GeoDataFrame":
+    """Read a table of geometry as `geopandas.read_parquet` does, which parses the same CRS anew for each table.
+
+    Of a `box` read what meets it alone: row groups, and rows, are chosen by the boxes of their shapes.
+    """
     import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
     from pyproj.exceptions import CRSError  # noqa: PLC0415
 
-    table = read_table(path, mend=_MEND, most_rows=MOST_VALUES)
     try:
+        table = read_table(path, mend=_MEND, most_rows=MOST_VALUES) if box is None else _read_near(path, box)
         about = json.loads(table.schema.metadata[b"geo"])
         name = about["primary_column"]
         column = about["columns"][name]
         bounds = {each[0] for each in column.get("covering", {}).get("bbox", {}).values()}  # derived from the geometry
         frame = table.drop_columns(sorted(bounds)).to_pandas()
         frame[name] = shapely.from_wkb(frame[name].to_numpy())
+        if box is not None:
+            frame = frame[shapely.intersects(frame[name].to_numpy(), shapely.box(*box))].reset_index(drop=True)
         frame.attrs = json.loads(table.schema.metadata.get(b"PANDAS_ATTRS", b"{}"))
         return gpd.GeoDataFrame(frame, geometry=name, crs=_crs(json.dumps(column["crs"])))
+    except StoreError:
+        raise
     except (
         *(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError),
         *(pa.ArrowException, CRSError, shapely.errors.ShapelyError),
     ) as error:
         message = f"{path} cannot be read ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
+
+
+def _read_near(path: Path, box: Bounds) -> pa.Table:
+    """Read the rows of a GeoParquet file whose bounding boxes meet a box; all rows of a file that has none."""
+    about = json.loads(read_schema(path, mend=_MEND).metadata[b"geo"])
+    covering = about["columns"][about["primary_column"]].get("covering", {}).get("bbox")
+    if covering is None:
+        return read_table(path, mend=_MEND, most_rows=MOST_VALUES)
+    west, south, east, north = box
+
+    def may_hold(group: pq.RowGroupMetaData) -> bool:
+        """Return whether the boxes of a row group may meet the box."""
+        chunks = map(group.column, range(group.num_columns))
+        least = {chunk.path_in_schema: chunk.statistics for chunk in chunks}
+        xmin, ymin, xmax, ymax = (least[".".join(covering[side])] for side in ("xmin", "ymin", "xmax", "ymax"))
+        if any(side is None or not side.has_min_max for side in (xmin, ymin, xmax, ymax)):
+            return True
+        return bool(xmin.min <= east and xmax.max >= west and ymin.min <= north and ymax.max >= south)
+
+    def keep(part: pa.Table) -> pa.BooleanArray:
+        """Mark the rows whose boxes meet the box."""
+        xmin, ymin, xmax, ymax = (
+            pc.struct_field(part[covering[side][0]], covering[side][1:]) for side in ("xmin", "ymin", "xmax", "ymax")
+        )
+        across = pc.and_(pc.less_equal(xmin, east), pc.greater_equal(xmax, west))
+        return pc.and_(across, pc.and_(pc.less_equal(ymin, north), pc.greater_equal(ymax, south)))
+
+    return read_kept(path, mend=_MEND, keep=keep, may_hold=may_hold)
 
 
 @cache

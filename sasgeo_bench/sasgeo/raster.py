@@ -1,9 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Raster score of the SASGeo paper, Eqs. 7 and 8: map and view prepared for the search, class by class."""
 
+import hashlib
+import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, Self
 
 import cv2
@@ -18,9 +22,11 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
+from sasgeo_bench.regions.region_files import FEATURES, LAYERS, read_manifest, read_region
 from sasgeo_bench.sasgeo.rates import FAR, RINGS_M, ring_of
 from sasgeo_bench.sasgeo.weights import STRATA, Gains, strata, weigh
 from sasgeo_bench.search.field import FULL, Field, Template, between, squares, warped
+from sasgeo_bench.search.stored import StoredField, store_levels
 from sasgeo_bench.tasks.vectors import as_features
 
 if TYPE_CHECKING:
@@ -36,6 +42,7 @@ LEVEL_M: Final = 24.0  # standard deviation of the ground that a class is compar
 REPEATED: Final = 3e3  # nats2 m2 of a class that say half of what as many independent cells would; from train places
 _STEPS: Final = 8  # coarse cells in it
 _LEAST: Final = 1e-6
+_FIELD_VERSION: Final = 1  # raised whenever the same map and settings give other levels
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
@@ -82,6 +89,46 @@ def read_field(
         into[:] = _degree(shares, weights, likeness[at], grid)
         into[~known] = 0
     return Field(grid=grid, layers=layers, known=np.where(known, np.uint8(FULL), np.uint8(0)))
+
+
+def store_field(
+    region: Path,
+    into: Path,
+    likeness: NDArray[np.float64],
+    *,
+    trust: NDArray[np.float64] | None = None,
+    cell_size_m: float = CELL_M,
+) -> StoredField:
+    """Store what `read_field` makes of a region, in levels on disk: window by window, so that it may be a country.
+
+    `region` is the folder of the region, `into` that of the levels; levels that are there of the same map, settings and
+    format are opened. The other arguments are those of `read_field`. Raise `StoreError` if the region is damaged or the
+    folder cannot be written.
+    """
+    manifest = read_manifest(region)
+    factor = max(1, round(cell_size_m / manifest.cell_size_m))
+    grid = manifest.grid.coarsen(factor)
+    reach_m = math.ceil(RINGS_M[-1] / grid.cell_size_m + 1) * grid.cell_size_m
+    settings = [likeness.tolist(), None if trust is None else trust.tolist(), factor, _FIELD_VERSION]
+    of_map = {name: record.sha256 for name, record in manifest.files.items() if name in (LAYERS, FEATURES)}
+    key = hashlib.sha256(json.dumps([of_map, settings], sort_keys=True).encode()).hexdigest()
+
+    def paint(window: Grid) -> Field | None:
+        """Read the map under a window and as far around as it matters, and cut what was made of it."""
+        west_m, south_m, east_m, north_m = window.bounds_m
+        around_m = (west_m - reach_m, south_m - reach_m, east_m + reach_m, north_m + reach_m)
+        part = read_region(region, bounds_m=around_m, with_layers=False)
+        if not part.coverage.area:
+            return None
+        field = read_field(part, likeness, trust=trust, cell_size_m=cell_size_m)
+        row, col = (
+            round(shift_m / grid.cell_size_m)
+            for shift_m in (field.grid.north_m - window.north_m, window.west_m - field.grid.west_m)
+        )
+        inner = np.s_[row : row + window.rows, col : col + window.cols]
+        return Field(grid=window, layers=field.layers[:, *inner], known=field.known[inner])
+
+    return store_levels(into, grid, len(manifest.classes), paint, key=key)
 
 
 def _degree(

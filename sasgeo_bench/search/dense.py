@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.search.correlation import Correlation
-from sasgeo_bench.search.field import FULL, Field, Level, Template, between, pooled, warped
+from sasgeo_bench.search.field import FULL, Level, Levels, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Disc, Mode, Null, Tile, Turns
 
 SPARE: Final = 4  # peaks of one heading for each requested mode, since neighbours are dropped
@@ -135,7 +135,7 @@ class LevelView:
     frame: Grid
 
     @classmethod
-    def of(cls, field: Field, template: Template, factor: int) -> Self:
+    def of(cls, field: Levels, template: Template, factor: int) -> Self:
         """Prepare a view for one level of a map."""
         level = field.level(factor)
         pool = max(1, round(level.grid.cell_size_m / template.cell_size_m))

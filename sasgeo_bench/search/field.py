@@ -4,7 +4,7 @@
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Final, Self, TypeVar
+from typing import Final, Protocol, Self, TypeVar
 
 import cv2
 import numpy as np
@@ -45,6 +45,19 @@ class Level:
             cut[:, top - row : bottom - row, left - col : right - col] = under[bands]
         cut /= FULL
         return cut
+
+
+class Levels(Protocol):
+    """What a search needs of a map: its own cells, and itself in larger ones."""
+
+    @property
+    def grid(self) -> Grid:
+        """Return the map's own cells."""
+        ...
+
+    def level(self, factor: int) -> Level:
+        """Return the map in cells of `factor` of its own a side."""
+        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -167,7 +180,12 @@ def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray
     """
     grown = np.asarray(cv2.dilate(band, kernel), dtype=np.uint8)
     share = float(band.sum(dtype=np.float64) / max(grown.sum(dtype=np.float64), 1.0))
-    return (grown, share) if share < _THIN else (band, 1.0)
+    return (grown, share) if is_thin(np.float64(share)) else (band, 1.0)
+
+
+def is_thin(share: NDArray[np.float64] | np.float64) -> NDArray[np.bool_]:
+    """Return whether a class that has such a share of its spread area is spread on a level."""
+    return np.asarray(share < _THIN)
 
 
 def round_kernel(radius: float) -> NDArray[np.uint8]:

@@ -13,7 +13,7 @@ import numpy as np
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.search.dense import Guess, LevelView, Stride, climbed, dense, polished
-from sasgeo_bench.search.field import Field, Template
+from sasgeo_bench.search.field import Levels, Template
 from sasgeo_bench.search.plan import (
     NO_PLACE,
     Disc,
@@ -35,7 +35,7 @@ _CORNER: Final = math.sqrt(0.5)  # cells from the middle of one to its corner
 
 
 def search(
-    field: Field,
+    field: Levels,
     template: Template,
     prior: Prior,
     plan: Plan | None = None,
@@ -68,7 +68,7 @@ def search(
 
 
 def rank(
-    field: Field, template: Template, prior: Prior, poses: Sequence[Pose], plan: Plan | None = None
+    field: Levels, template: Template, prior: Prior, poses: Sequence[Pose], plan: Plan | None = None
 ) -> tuple[list[Mode | None], Null]:
     """Return the best mode near each candidate, None where there is none, and statistics of coarse scores.
 
@@ -77,14 +77,14 @@ def rank(
     return Search(field=field, template=template, prior=prior, plan=plan or Plan()).candidates(poses)
 
 
-def exhaustive(field: Field, template: Template, *, yaw_step_deg: float, threads: int = 1) -> Mode:
+def exhaustive(field: Levels, template: Template, *, yaw_step_deg: float, threads: int = 1) -> Mode:
     """Return the best mode over all cells and headings on the map's own cells: a slow reference."""
     tiles = tiles_of(field.grid, field.grid, Disc(center_m=None, radius_m=0.0))
     found, _ = dense(field.level(1), template, tiles, all_around(yaw_step_deg), most=1, threads=threads)
     return max((mode for modes in found for mode in modes), key=lambda mode: mode.score)
 
 
-def score_at(field: Field, template: Template, pose: Pose) -> float:
+def score_at(field: Levels, template: Template, pose: Pose) -> float:
     """Return the score of one pose on the map's own cells, as `Template` defines it."""
     return LevelView.of(field, template, 1).score(pose)
 
@@ -93,7 +93,7 @@ def score_at(field: Field, template: Template, pose: Pose) -> float:
 class Search:
     """Search for one view on one map; its headings, and scales, lie at most `yaw_step_deg` apart."""
 
-    field: Field
+    field: Levels
     template: Template
     prior: Prior
     plan: Plan

@@ -10,9 +10,19 @@ from affine import Affine
 from rasterio.features import rasterize
 
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.raster import REPEATED, RasterView, burnt, doubted, likeness_by_hand, line_width_m, read_field
+from sasgeo_bench.sasgeo.raster import (
+    REPEATED,
+    RasterView,
+    burnt,
+    doubted,
+    likeness_by_hand,
+    line_width_m,
+    read_field,
+    store_field,
+)
 from sasgeo_bench.sasgeo.rates import hand_rates
-from sasgeo_bench.sasgeo.weights import even_gains, likelihood_gains
+from sasgeo_bench.sasgeo.weights import STRATA, even_gains, likelihood_gains
+from sasgeo_bench.search import stored
 from sasgeo_bench.search.field import FULL
 from sasgeo_bench.search.find import score_at, search
 from sasgeo_bench.tasks.vectors import vector_table
@@ -213,3 +223,18 @@ def test_a_view_beside_itself_weighs_as_much_as_alone(tiny, asked):
     alone = view.halved_with(other, np.arange(len(both)) == 0)
     assert (alone.weights[0] == view.weights[0] / 2).all()
     assert (alone.weights[1:] == view.weights[1:]).all()
+
+
+@pytest.mark.parametrize("is_stamped", [False, True])
+def test_a_map_on_disk_is_the_one_read_into_memory(tiny, tmp_path, monkeypatch, is_stamped):
+    monkeypatch.setattr(stored, "WINDOW_CELLS", 192)
+    near = likeness_by_hand(tiny.region.classes)
+    trust = np.linspace(0.2, 1.0, len(near) * STRATA).reshape(len(near), STRATA) if is_stamped else None
+    whole = read_field(tiny.region, near, trust=trust)
+    found = store_field(tiny.folder / "regions" / tiny.region.manifest.id, tmp_path / "map", near, trust=trust)
+    assert found.grid == whole.grid
+    assert found.grid.rows > 2 * 192
+    for factor in (1, 16):
+        np.testing.assert_array_equal(found.level(factor).cells, whole.level(factor).cells)
+    again = store_field(tiny.folder / "regions" / tiny.region.manifest.id, tmp_path / "map", near, trust=trust)
+    assert again == found

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The levels of a map on disk, made window by window and mapped into memory: a country is searched as a town is."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Final, Self
+
+import cv2
+import numpy as np
+from numpy.lib.format import open_memmap
+from numpy.typing import NDArray
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.json import read_json
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.search.field import Field, Level, is_thin, round_kernel
+
+FACTORS: Final = (1, 2, 4, 8, 16, 32)  # cells of 2 m: views of up to 2 km
+WINDOW_CELLS: Final = 2048  # of the map's own cells: 14 bands of one window take 60 MB
+_ABOUT: Final = "levels.json"
+_MEND: Final = "store the levels of the map again"
+
+Paint = Callable[[Grid], Field | None]  # of a window; None where nothing is mapped
+
+
+@dataclass(frozen=True, kw_only=True)
+class StoredField:
+    """A map whose levels lie in a folder: opened at once, and read where a search looks.
+
+    Searches take it in place of a `Field`, with the same result. `key` says of what map and by what settings it was
+    made; `thinner` has for each factor that is stored the `Level.thinner` of its bands.
+    """
+
+    folder: Path
+    grid: Grid
+    key: str
+    thinner: Mapping[int, tuple[float, ...]]
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Open the output of `store_levels`; raise `StoreError` if it is missing or damaged."""
+        about = read_json(folder / _ABOUT, mend=_MEND)
+        try:
+            thinner = {int(factor): tuple(map(float, shares)) for factor, shares in about["thinner"].items()}
+            found = cls(folder=folder, grid=Grid(**about["grid"]), key=str(about["key"]), thinner=thinner)
+            for factor in thinner:
+                found._cells(factor)
+        except (KeyError, TypeError, ValueError, AttributeError, EOFError, OSError) as error:
+            message = f"{folder} is damaged ({str(error)[:200]}): {_MEND}"
+            raise StoreError(message) from error
+        return found
+
+    def _cells(self, factor: int) -> NDArray[np.uint8]:
+        """Map the cells of a level into memory."""
+        cells = np.load(self.folder / _name(factor), mmap_mode="r", allow_pickle=False)
+        shape = (*self.grid.coarsen(factor).shape, len(self.thinner[factor]))
+        if cells.dtype != np.uint8 or cells.shape != shape:
+            message = f"{_name(factor)} has {cells.dtype} of shape {cells.shape}, expected uint8 of {shape}"
+            raise ValueError(message)
+        return np.asarray(cells)
+
+    def level(self, factor: int) -> Level:
+        """Return the map in cells of `factor` of its own a side; raise `StoreError` if that level is not stored."""
+        if factor not in self.thinner:
+            stored = ", ".join(map(str, self.thinner))
+            message = f"{self.folder} holds the levels {stored}, not {factor}: search for a smaller view"
+            raise StoreError(message)
+        shares = np.array(self.thinner[factor])
+        return Level(factor=factor, grid=self.grid.coarsen(factor), cells=self._cells(factor), thinner=shares)
+
+
+def store_levels(
+    folder: Path,
+    grid: Grid,
+    bands: int,
+    paint: Paint,
+    *,
+    key: str = "",
+    factors: tuple[int, ...] = FACTORS,
+    window_cells: int | None = None,
+) -> StoredField:
+    """Store the levels of a map, whole or not at all, in the memory of a few windows.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder to write; an earlier one of the same `key` is opened as it is.
+    grid : Grid
+        Cells of the map.
+    bands : int
+        Number of classes, K.
+    paint : callable
+        Takes a window of the grid and returns its `Field`, of the same grid; None where nothing is mapped. A disk that
+        can leave holes in files stores nothing of such windows.
+    key : str
+        Says of what the levels are made: hash of the map and settings.
+    factors : tuple of int
+        Sides of the cells of the levels, in cells of the map: 1 and powers of two.
+    window_cells : int, optional
+        Side of a window, a multiple of all factors; by default `WINDOW_CELLS`.
+
+    Returns
+    -------
+    StoredField
+        The levels, equal to those that a `Field` of all the map makes in memory.
+
+    Raises
+    ------
+    StoreError
+        If the folder cannot be written.
+
+    Examples
+    --------
+    >>> from tempfile import mkdtemp
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=64)
+    >>> town = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (1, 64, 64), p=[0.9, 0.1])
+    >>> whole = Field(grid=grid, layers=town, known=np.full((64, 64), 255, np.uint8))
+    >>> stored = store_levels(Path(mkdtemp()) / "town", grid, 1, lambda _: whole, factors=(1, 2, 4))
+    >>> all(np.array_equal(stored.level(at).cells, whole.level(at).cells) for at in (1, 2, 4))
+    True
+    """
+    window_cells = window_cells or WINDOW_CELLS
+    with locked(folder, tell=lambda _: None):
+        if (folder / _ABOUT).is_file() and (found := StoredField.open(folder)).key == key:
+            return found
+        try:
+            with fresh_folder(folder) as scratch:
+                base = _made(scratch, _name(1), grid.shape, bands + 1)
+                for row, col, window in grid.windows(window_cells):
+                    field = paint(window)
+                    if field is not None:
+                        base[row : row + window.rows, col : col + window.cols] = field.level(1).cells
+                shares = {1: np.ones(bands + 1)}
+                for factor in factors:
+                    if factor > 1:
+                        shares[factor] = _store_level(scratch, base, grid, factor, window_cells)
+                about = {
+                    "key": key,
+                    "grid": asdict(grid),
+                    "thinner": {factor: share.tolist() for factor, share in shares.items()},
+                }
+                (scratch / _ABOUT).write_text(json.dumps(about), encoding="utf-8")
+        except OSError as error:
+            message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+            raise StoreError(message) from error
+    return StoredField.open(folder)
+
+
+def _name(factor: int) -> str:
+    return f"level-{factor}.npy"
+
+
+def _made(folder: Path, name: str, shape: tuple[int, int], bands: int) -> NDArray[np.uint8]:
+    """Make a file of zeros and map it into memory."""
+    return open_memmap(folder / name, mode="w+", dtype=np.uint8, shape=(*shape, bands))
+
+
+def _store_level(
+    folder: Path, base: NDArray[np.uint8], grid: Grid, factor: int, window_cells: int
+) -> NDArray[np.float64]:
+    """Store a level, as `Field.level` makes it, and return its `thinner`.
+
+    Whether a class is thin is known when all of the map was looked at: until then there are two versions, the class as
+    it is and spread.
+    """
+    shape, bands = grid.coarsen(factor).shape, base.shape[-1]
+    plain, grown = (_made(folder, name, shape, bands) for name in (_name(factor), "grown.npy"))
+    before, after = np.zeros(bands), np.zeros(bands)
+    kernel = round_kernel(factor)
+    for row, col, window in grid.windows(window_cells):
+        top, left = max(row - factor, 0), max(col - factor, 0)
+        around = base[top : row + window.rows + factor, left : col + window.cols + factor]
+        if not around.any():
+            continue
+        inner = np.s_[row - top : row - top + window.rows, col - left : col - left + window.cols]
+        coarse = np.s_[
+            row // factor : -(-(row + window.rows) // factor), col // factor : -(-(col + window.cols) // factor)
+        ]
+        for band in range(bands):
+            layer = np.ascontiguousarray(around[..., band])
+            own = layer[inner]
+            plain[(*coarse, band)] = _averaged(own, factor)
+            if band < bands - 1:  # the last one says where the map is known
+                spread = np.asarray(cv2.dilate(layer, kernel), dtype=np.uint8)[inner]
+                grown[(*coarse, band)] = _averaged(spread, factor)
+                before[band] += own.sum(dtype=np.float64)
+                after[band] += spread.sum(dtype=np.float64)
+    shares = before / np.maximum(after, 1.0)
+    shares[-1] = 1.0
+    thin = is_thin(shares)
+    for rows in _stripes(shape[0]):
+        plain[rows][..., thin] = grown[rows][..., thin]
+    del grown
+    (folder / "grown.npy").unlink()
+    return np.where(thin, shares, 1.0)
+
+
+def _averaged(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
+    """Return means over squares of cells, zeros beyond the layer."""
+    rows, cols = (-(-side // factor) for side in layer.shape)
+    padded = np.pad(layer, ((0, -layer.shape[0] % factor), (0, -layer.shape[1] % factor)))
+    return np.asarray(cv2.resize(padded, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+def _stripes(rows: int) -> Iterator[slice]:
+    """Yield slices of some rows each."""
+    for top in range(0, rows, WINDOW_CELLS):
+        yield slice(top, top + WINDOW_CELLS)

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Levels on disk are those made in memory, whatever the windows; a search on either finds the same."""
+
+import json
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sasgeo_bench.errors import StoreError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import Prior
+from sasgeo_bench.search.field import FULL, Field, Template
+from sasgeo_bench.search.find import rank, search
+from sasgeo_bench.search.stored import StoredField, store_levels
+
+ROWS, COLS, WINDOW = 150, 203, 64
+GRID = Grid(epsg=32632, west_m=400.0, north_m=800.0, cell_size_m=2.0, rows=ROWS, cols=COLS)
+FACTORS = (1, 2, 4, 8)
+ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
+
+
+@pytest.fixture(scope="module")
+def whole():
+    """A thin class, a wide one, one that the map lacks; nothing is mapped in two windows."""
+    rng = np.random.default_rng(3)
+    layers = np.zeros((3, ROWS, COLS), np.uint8)
+    layers[0][rng.random((ROWS, COLS)) < 0.02] = FULL
+    layers[1, 40:140, 70:190] = rng.integers(100, FULL, (100, 120))
+    known = np.full((ROWS, COLS), FULL, np.uint8)
+    known[:WINDOW, : 2 * WINDOW] = 0
+    layers[:, known == 0] = 0
+    return Field(grid=GRID, layers=layers, known=known)
+
+
+def part_of(whole):
+    """What paints a window of a map; windows in which nothing is mapped are left out."""
+    asked = []
+
+    def paint(window):
+        asked.append(window)
+        row, col = round((GRID.north_m - window.north_m) / 2.0), round((window.west_m - GRID.west_m) / 2.0)
+        cut = np.s_[row : row + window.rows, col : col + window.cols]
+        known = whole.known[cut].copy()
+        return Field(grid=window, layers=whole.layers[:, *cut].copy(), known=known) if known.any() else None
+
+    return paint, asked
+
+
+def stored_in(folder, whole, **changes):
+    paint, asked = part_of(whole)
+    return store_levels(folder, GRID, 3, paint, **{"factors": FACTORS, "window_cells": WINDOW, **changes}), asked
+
+
+@pytest.fixture(scope="module")
+def stored(tmp_path_factory, whole):
+    return stored_in(tmp_path_factory.mktemp("levels") / "map", whole)[0]
+
+
+@pytest.mark.parametrize("factor", FACTORS)
+def test_a_level_on_disk_is_the_one_made_in_memory(stored, whole, factor):
+    found, expected = stored.level(factor), whole.level(factor)
+    np.testing.assert_array_equal(found.cells, expected.cells)
+    np.testing.assert_array_equal(found.thinner, expected.thinner)
+    assert (found.grid, found.factor) == (expected.grid, expected.factor)
+    assert isinstance(found.cells.base, np.memmap)
+
+
+def test_a_thin_class_is_spread_and_a_wide_one_is_not(stored):
+    assert stored.level(8).thinner[0] < 0.5
+    assert stored.level(8).thinner[[1, 3]].tolist() == [1.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def view(whole):
+    seen = whole.layers[:, 60:100, 80:120].astype(np.float32) / FULL
+    return Template(weights=2 * seen - 0.3, known=-0.3 * seen.sum(axis=0), cell_size_m=2.0)
+
+
+def test_a_search_on_stored_levels_finds_what_it_finds_in_memory(stored, whole, view):
+    found = search(stored, view, ANYWHERE)
+    assert found == search(whole, view, ANYWHERE)
+    assert len(found.modes) > 3
+    poses = [mode.pose for mode in found.modes[:3]]
+    assert rank(stored, view, ANYWHERE, poses) == rank(whole, view, ANYWHERE, poses)
+
+
+def test_levels_of_the_same_key_are_opened_and_others_are_made_anew(tmp_path, whole):
+    first, asked = stored_in(tmp_path / "map", whole, key="a")
+    again, none = stored_in(tmp_path / "map", whole, key="a")
+    assert (again, len(asked), none) == (first, 12, [])
+    other, anew = stored_in(tmp_path / "map", whole, key="b")
+    assert (other.key, anew) == ("b", asked)
+    assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".lock")] == ["map"]
+
+
+def test_a_level_that_is_not_stored_is_told(stored):
+    with pytest.raises(StoreError, match="holds the levels 1, 2, 4, 8, not 16: search for a smaller view"):
+        stored.level(16)
+
+
+def test_what_is_cut_off_leaves_the_levels_as_they_were(tmp_path, whole):
+    first, _ = stored_in(tmp_path / "map", whole, key="a")
+
+    def paint(_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        store_levels(tmp_path / "map", GRID, 3, paint, key="b")
+    assert StoredField.open(tmp_path / "map") == first
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("levels.json", "{", "levels.json"),
+        ("levels.json", "[]", "is damaged"),
+        ("levels.json", '{"grid": {}, "key": "", "thinner": {"1": []}}', "is damaged"),
+        ("level-4.npy", "", "is damaged"),
+        ("level-4.npy", None, "is damaged"),
+    ],
+)
+def test_damaged_levels_are_told_in_one_line(tmp_path, stored, name, content, words):
+    folder = shutil.copytree(stored.folder, tmp_path / "map")
+    (folder / name).unlink() if content is None else (folder / name).write_text(content, encoding="utf-8")
+    with pytest.raises(StoreError, match=words) as told:
+        StoredField.open(folder)
+    assert "store the levels of the map again" in str(told.value)
+
+
+def test_levels_of_another_shape_are_damaged(tmp_path, stored):
+    folder = shutil.copytree(stored.folder, tmp_path / "map")
+    about = json.loads((folder / "levels.json").read_text(encoding="utf-8"))
+    about["grid"]["rows"] += 1
+    (folder / "levels.json").write_text(json.dumps(about), encoding="utf-8")
+    with pytest.raises(StoreError, match=r"level-1.npy has uint8 of shape \(150, 203, 4\), expected uint8 of \(151, "):
+        StoredField.open(folder)
+    assert replace(stored, key="x") != stored

@@ -30,6 +30,7 @@ from sasgeo_bench.search.plan import (
     turns_of,
 )
 
+PATCH_KM2: Final = 17.0  # of places: a town, for which the beam was chosen
 _NOTHING: Final = 1e-9
 _CORNER: Final = math.sqrt(0.5)  # cells from the middle of one to its corner
 
@@ -101,9 +102,9 @@ class Search:
 
     def places(self, count: int, starts: Sequence[Pose]) -> Found:
         """Return the best modes within the prior."""
-        guesses, null = self._begun(self.tiles, most=self.plan.width(0))
+        guesses, null = self._begun(self.tiles, most=self.plan.width(0, self.patches))
         guesses = _ranked([*(replace(guess, owner=0) for guess in guesses), *self._proposed(starts)])
-        followed = self._followed(guesses, [self.disc])
+        followed = self._followed(guesses, [self.disc], patches=self.patches)
         near = self.within(1)  # dropped modes were limited by larger cells
         inside = (guess.mode for guess in followed if near.holds(np.array([place_m(guess.mode.pose)]))[0])
         return Found(modes=tuple(thinned(inside, self.plan.apart_m)[:count]), null=null)
@@ -154,6 +155,12 @@ class Search:
     def _coarse_m(self) -> float:
         return self._coarse_grid.cell_size_m
 
+    @property
+    def patches(self) -> int:
+        """Return how many times `PATCH_KM2` of places the prior allows, one at least: each adds a beam."""
+        allowed = sum(int(tile.allowed.sum()) for tile in self.tiles)
+        return max(1, round(allowed * (self._coarse_m / 1000) ** 2 / PATCH_KM2))
+
     @cached_property
     def turns(self) -> Turns:
         """Return headings and scales whose neighbours differ by at most a coarse cell at the side of the view."""
@@ -166,10 +173,11 @@ class Search:
         found, null = dense(level, self.template, tiles, self.turns, most=most, threads=self.plan.threads)
         return _ranked(Guess(mode=mode, owner=owner) for owner, modes in enumerate(found) for mode in modes), null
 
-    def _followed(self, guesses: list[Guess], discs: Sequence[Disc]) -> list[Guess]:
+    def _followed(self, guesses: list[Guess], discs: Sequence[Disc], *, patches: int = 1) -> list[Guess]:
         """Refine the best to the map's own cells and between them; best first, then dropped ones."""
         stride = Stride(yaw_deg=self.turns.yaw_step_deg, scale=self.turns.scale_step)
-        kept, behind = guesses[: self.plan.width(0)], [guesses[self.plan.width(0) - 1 :]]
+        width = self.plan.width(0, patches)
+        kept, behind = guesses[:width], [guesses[width - 1 :]]
         factor = self.factor
         with ThreadPoolExecutor(self.plan.threads) as pool:
             while factor > 1:
@@ -178,7 +186,7 @@ class Search:
                 near = [disc.wider(_CORNER * factor * self.field.grid.cell_size_m) for disc in discs]
                 moved = _ranked(pool.map(step, kept, [near[guess.owner] for guess in kept]))
                 merged = _merged(moved, factor * self.field.grid.cell_size_m, stride.yaw_deg)
-                width = self.plan.width(len(behind))
+                width = self.plan.width(len(behind), patches)
                 kept, behind = merged[:width], [*behind, merged[width - 1 :]]
             near = [disc.wider(_CORNER * self.field.grid.cell_size_m) for disc in discs]
             level_view = LevelView.of(self.field, self.template, 1)

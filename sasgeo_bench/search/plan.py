@@ -20,10 +20,10 @@ class Plan:
     """Settings of a search.
 
     `cells` is the least number of cells of the coarsest level along the longer side of the view; `beam` are the modes
-    kept at the coarsest level, then at each finer one, the last number for all further levels; `each` candidate starts
-    with so many modes. Headings and scales are searched within `spread` standard deviations, modes of a result are
-    `apart_m` from each other, and a view may lie within `around_m` of its candidate. The number of `threads` changes
-    the time alone.
+    kept at the coarsest level, then at each finer one, the last number for all further levels, for every 17 km2 of
+    places that the prior allows; `each` candidate starts with so many modes. Headings and scales are searched within
+    `spread` standard deviations, modes of a result are `apart_m` from each other, and a view may lie within `around_m`
+    of its candidate. The number of `threads` changes the time alone.
     """
 
     cells: int = 16
@@ -34,9 +34,9 @@ class Plan:
     around_m: float = 24.0
     threads: int = 1
 
-    def width(self, depth: int) -> int:
-        """Return how many modes are kept at a depth of the pyramid, 0 the coarsest."""
-        return self.beam[min(depth, len(self.beam) - 1)]
+    def width(self, depth: int, patches: int = 1) -> int:
+        """Return how many modes are kept at a depth of the pyramid, 0 the coarsest, of so many times 17 km2."""
+        return self.beam[min(depth, len(self.beam) - 1)] * patches
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -125,7 +125,8 @@ class BatchSearch:
                 message = f"templates[{at}] has {len(template.weights)} classes, the map {len(self.field.layers)}"
                 raise ShapeError(message)
             if len(template.active):
-                groups.setdefault((template.weights.shape, template.cell_size_m), []).append(at)
+                patches = self._search(template, priors[at]).patches
+                groups.setdefault((template.weights.shape, template.cell_size_m, patches), []).append(at)
         found = [_NONE] * len(templates)
         with torch.inference_mode():
             for group in groups.values():
@@ -137,7 +138,7 @@ class BatchSearch:
         return found
 
     def _together(self, templates: Sequence[Template], priors: Sequence[Prior], count: int) -> list[Found]:
-        """Search for views of one shape."""
+        """Search for views of one shape, in areas of about one size."""
         views, searches = Views.of(templates, self.device), [self._search(templates[0], prior) for prior in priors]
         guesses, nulls = self.begun(views, searches)
         found = self.followed(views, searches, guesses)[:count]
@@ -176,7 +177,9 @@ class BatchSearch:
             search = searches[group[0]]
             tiles = [tile for tile in search.tiles if tile.allowed.any()]
             if tiles:
-                found, some = self._coarse(views.some(group), search).found(tiles, most=self.plan.width(0))
+                found, some = self._coarse(views.some(group), search).found(
+                    tiles, most=self.plan.width(0, search.patches)
+                )
                 most = max(found.score.shape[1], guesses.score.shape[1])
                 guesses, found = guesses.filled(most), found.filled(most)
                 guesses.pose[group], guesses.score[group] = found.pose, found.score
@@ -187,13 +190,15 @@ class BatchSearch:
     def followed(self, views: Views, searches: Sequence[Search], guesses: Guesses) -> Guesses:
         """Refine modes to the map's own cells and between them; best first, then dropped ones."""
         plan, factor, cell_m = self.plan, searches[0].factor, self.field.grid.cell_size_m
+        patches = searches[0].patches
         stride = self._tensor([(each.turns.yaw_step_deg, each.turns.scale_step) for each in searches])
-        kept, behind = guesses[: plan.width(0)], [guesses[plan.width(0) - 1 :]]
+        width = plan.width(0, patches)
+        kept, behind = guesses[:width], [guesses[width - 1 :]]
         while factor > 1:
             factor, stride = factor // 2, stride / 2
             moved = climbed(self._level_views(views, factor), stride, kept, self._discs(searches, factor)).ranked()
             merged = moved.merged(factor * cell_m, stride[:, 0])
-            width = plan.width(len(behind))
+            width = plan.width(len(behind), patches)
             kept, behind = merged[:width], [*behind, merged[width - 1 :]]
         level_views, near = self._level_views(views, 1), self._discs(searches, 1)
         for move in (climbed, climbed, polished):

@@ -15,7 +15,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
 from sasgeo_bench.search.dense import _Peaks
 from sasgeo_bench.search.field import FULL, Field, Template
-from sasgeo_bench.search.find import exhaustive, rank, score_at, search
+from sasgeo_bench.search.find import Search, exhaustive, rank, score_at, search
 from sasgeo_bench.search.plan import Plan, all_around, posterior
 
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
@@ -245,6 +245,15 @@ def test_candidates_behind_the_beam_keep_their_order_below_the_others(place):
     assert all(narrow)
     assert narrow[0].pose == wide[0].pose
     assert len({mode.score for mode in narrow}) > 2
+
+
+def test_twice_the_ground_has_twice_the_beam_of_a_town():
+    layers = place_of(256)
+    field, template = as_field(a_grid(256, 25.0), layers), as_template(layers[:, 96:160, 96:160], 25.0)
+    discs = [replace(ANYWHERE, center_m=(4200.0, -1200.0), radius_m=radius_m) for radius_m in (10.0, 2700.0, 3300.0)]
+    searches = [Search(field=field, template=template, prior=prior, plan=Plan()) for prior in (*discs, ANYWHERE)]
+    assert [each.patches for each in searches] == [1, 1, 2, 2]
+    assert [Plan().width(depth, 3) for depth in range(6)] == [240, 72, 30, 18, 15, 15]
 
 
 def test_a_map_of_larger_cells_than_the_view():

@@ -30,7 +30,7 @@ from sasgeo_bench.leaderboard.case_plot import pixels_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.publishing.site import _environment
+from sasgeo_bench.publishing.site import environment
 from sasgeo_bench.publishing.site_files import svg_fault
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running import prediction_files
@@ -318,7 +318,7 @@ class Tags(HTMLParser):
 
 @given(TEXTS)
 def test_a_page_has_the_same_tags_whatever_its_texts_are(text):
-    template = _environment().from_string('<p title="{{ x }}">{{ x }}</p><img alt="{{ x }}">')
+    template = environment().from_string('<p title="{{ x }}">{{ x }}</p><img alt="{{ x }}">')
     found, harmless = (Tags(template.render(x=one)) for one in (text, "x"))
     assert found.tags == harmless.tags
     assert {"".join(found.words[1:-1]), found.words[0], found.words[-1]} == {plain(text)}

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sasgeo_bench.running import answers, plan, segmenter_testing, segmenting, testing, training
+from sasgeo_bench.running import answers, plan, profiling, segmenter_testing, segmenting, testing, training
 from sasgeo_bench.running.segmenter_process import SegmenterProcess
 from sasgeo_bench.running.serve import TOOLS, PluginServer, Server
 from sasgeo_bench.running.serve_segmenter import SegmenterServer
@@ -57,7 +57,7 @@ def threaded() -> Iterator[None]:
     for tool in TOOLS:  # the hash of a matcher's code covers those that are imported: all of them, from the beginning
         import_module(f"sasgeo_bench.{tool}")
     with pytest.MonkeyPatch.context() as patch:
-        for module in (answers, plan, training, testing):
+        for module in (answers, plan, profiling, training, testing):
             patch.setattr(module, "Worker", Threaded)
         for module in (segmenting, segmenter_testing):
             patch.setattr(module, "SegmenterProcess", ThreadedSegmenter)

@@ -63,6 +63,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Runs": {
         "run": "runs",
         "merge": "runs",
+        "profile": "profiling",
         "validate": "submissions",
         "submit": "submissions",
         "enter": "entering",

@@ -233,7 +233,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
 
     Pages refer to other hosts only by links, and each can be read without the script.
     """
-    templates = _environment()
+    templates = environment()
     book = Book.of(source.board, source.about, source.scores)
     maps = place_maps(source)
     scenes = tuple(scene_tables(source.scenes, book)) if len(source.scenes) else ()
@@ -385,7 +385,8 @@ def _has_rivals(table: Table) -> bool:
     return sum(row.tone != "control" for row in table.rows) > 1
 
 
-def _environment() -> Environment:
+def environment() -> Environment:
+    """Return what fills in the templates: everything is escaped, and what would not be seen is removed."""
     return Environment(
         loader=PackageLoader("sasgeo_bench.publishing"),
         autoescape=True,

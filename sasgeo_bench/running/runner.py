@@ -280,7 +280,7 @@ def _begin(plan: RunPlan, part: RunPart) -> Cost:
     return before
 
 
-def _map_bytes(part: RunPart) -> int:
+def map_bytes(part: RunPart) -> int:
     """Return the bytes of a map; rendered imagery counts for those that look at it."""
     manifest = region_files.read_manifest(part.region)
     is_idle = manifest.imagery is not None and manifest.imagery.is_rendered and part.imagery is None
@@ -311,7 +311,7 @@ def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
             "learned": None if plan.training_record is None else asdict(plan.training_record),
             **({} if part.imagery is None else {"rendered_imagery": part.imagery}),
             **({} if part.follower is None else {"follower": dict(part.follower)}),
-            "map_bytes": _map_bytes(part),
+            "map_bytes": map_bytes(part),
             **cost_fields,
             "licence": LICENCE,
             "attribution": ATTRIBUTION,

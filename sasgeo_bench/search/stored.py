@@ -181,6 +181,8 @@ def _store_level(
         ]
         for band in range(bands):
             layer = np.ascontiguousarray(around[..., band])
+            if not layer.any():
+                continue
             own = layer[inner]
             plain[(*coarse, band)] = _averaged(own, factor)
             if band < bands - 1:  # the last one says where the map is known

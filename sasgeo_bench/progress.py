@@ -1,20 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Spread long work over processes, and show its progress: as a line now and then, or as a terminal shows it."""
+"""Spread long work over processes or a cluster; show its progress: as a line now and then, or as a terminal does."""
 
+import logging
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
 from signal import SIG_DFL, SIGINT, signal
 from threading import Thread
-from typing import Final, Protocol, TypeVar
+from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar, cast
+
+from sasgeo_bench.errors import ConfigError, StoreError
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 EVERY_S = 10.0  # read when progress begins to be shown, so that a test can silence it on a slow machine
 QUIET: Final = "SASGEO_QUIET"  # variable that is set while nothing is to be shown but results and errors
 _MINUTE_S: Final = 60.0
 _HOUR_S: Final = 3600.0
+_CONNECT_S: Final = 10.0
 
 Tell = Callable[[str], None]
 
@@ -99,11 +108,50 @@ Item = TypeVar("Item")
 Found = TypeVar("Found")
 
 
+@contextmanager
+def connected(address: str) -> Iterator["Client"]:
+    """Yield a client of a dask scheduler at tcp://host:port, or of N processes on this machine for local:N.
+
+    Raise `ConfigError` if dask is not installed, the address is wrong, or no scheduler answers there.
+    """
+    try:
+        from distributed import Client, LocalCluster  # noqa: PLC0415 - an optional dependency
+    except ImportError as error:
+        message = "--dask needs the package distributed: pip install 'sasgeo-bench[dask]'"
+        raise ConfigError(message) from error
+    kind, _, count = address.partition(":")
+    if kind == "local":
+        if not (count.isascii() and count.isdecimal() and int(count) >= 1):
+            message = f"--dask must be local:N with N >= 1, or a scheduler's address, got {address!r}"
+            raise ConfigError(message)
+        with (
+            # One thread each: a chunk waits for one matcher's process. No dashboard: it would open a port.
+            LocalCluster(
+                n_workers=int(count),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                silence_logs=logging.CRITICAL,
+            ) as cluster,
+            Client(cluster) as client,
+        ):
+            yield client
+        return
+    try:
+        client = Client(address, timeout=_CONNECT_S)
+    except (OSError, TimeoutError, ValueError) as error:
+        message = f"no dask scheduler answers at {address!r} within {_CONNECT_S:g} s: check the address, or use local:N"
+        raise ConfigError(message) from error
+    with client:
+        yield client
+
+
 def spread(
     work: Callable[[Item], Found],
     items: Sequence[Item],
     *,
     jobs: int = 1,
+    dask: str | None = None,
     label: str = "",
     progress: Progress | None = None,
 ) -> Iterator[Found]:
@@ -111,10 +159,17 @@ def spread(
 
     `progress` counts the items that are done, under `label`. Another process must be able to import `work`, and to
     receive items and send results. The first error is raised here.
+
+    `dask` is the address of a scheduler, or local:N, whose workers reach the same folders: an item whose worker dies,
+    or cannot write or read, is given to another one. Raise `ConfigError` if it is not there, or named beside `jobs`;
+    `StoreError` if no worker can do an item.
     """
+    if dask is not None and jobs > 1:
+        message = f"--jobs {jobs} and --dask {dask} both share out the work: leave one of them out"
+        raise ConfigError(message)
     if progress is not None:
         progress.begin(label, len(items))
-    for found in _found(work, items, jobs):
+    for found in _found(work, items, jobs) if dask is None else _found_on_cluster(work, items, dask):
         if progress is not None:
             progress.advance(label, 1)
         yield found
@@ -126,6 +181,50 @@ def _found(work: Callable[[Item], Found], items: Sequence[Item], jobs: int) -> I
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
         yield from pool.map(work, items)
+
+
+class _Tried(NamedTuple, Generic[Found]):
+    """What came of an item: a result, or the error that a worker met who may lack what others have."""
+
+    result: Found | None
+    worker: str = ""
+    error: OSError | None = None
+
+
+def _found_on_cluster(work: Callable[[Item], Found], items: Sequence[Item], address: str) -> Iterator[Found]:
+    """Yield results in order; an item that fails for want of a file or of room is tried by each other worker once."""
+    from distributed import KilledWorker  # noqa: PLC0415 - an optional dependency, of which `connected` tells
+
+    try_ = partial(_try, work, os.getcwd())  # noqa: PTH109 - a text
+    with connected(address) as client:
+        futures = client.map(try_, items, pure=False)
+        for item, first in zip(items, futures, strict=True):
+            future, failed = first, set[str]()
+            while True:
+                try:
+                    tried: _Tried[Found] = future.result()
+                except KilledWorker as error:
+                    message = "dask workers died over and over on the same item: give them more memory, and go on"
+                    raise StoreError(message) from error
+                if tried.error is None:
+                    yield cast("Found", tried.result)
+                    break
+                failed.add(tried.worker)
+                others = sorted(set(client.scheduler_info(n_workers=-1)["workers"]) - failed)
+                if not others:
+                    raise tried.error
+                future = client.submit(try_, item, pure=False, workers=others)
+
+
+def _try(work: Callable[[Item], Found], folder: str, item: Item) -> _Tried[Found]:
+    """Do an item in the folder of the program that asked for it."""
+    from distributed import get_worker  # noqa: PLC0415
+
+    os.chdir(folder)
+    try:
+        return _Tried(work(item))
+    except OSError as error:  # a full disk, a folder that is not mounted: errors of ours about files are among them
+        return _Tried(None, str(get_worker().address), error)
 
 
 def _end_with_parent() -> None:

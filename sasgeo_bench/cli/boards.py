@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress, tell
-from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders, takes
+from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.head_start import head_start_of, unpack_head_start
@@ -105,6 +105,7 @@ class ScoreOptions(Options):
         typer.Option(min=100, help=f"of the bootstrap; default: {DRAWS}, or as many as of stored results"),
     ] = None
     jobs: Annotated[int, typer.Option(min=1, help="processes that fit rejectors")] = 1
+    dask: Dask = None
     results: Results = None
     cases: Cases = True
     out: Out = Path("out")
@@ -154,6 +155,7 @@ def score(options: ScoreOptions) -> Board:
         submissions=submitted,
         private=options.private,
         jobs=options.jobs,
+        dask=options.dask,
     )
     return score_all(
         request, tell=options.tell, progress=options.progress, has_cases=options.cases, results=options.results
@@ -201,7 +203,7 @@ class LeaderboardOptions(Options):
     extracts: ExtractFolders = None
     region_files: RegionFolders = None
     jobs: Annotated[int, typer.Option(min=1, help="processes of each matcher")] = 1
-    dask: Annotated[str | None, typer.Option(help="address of a dask scheduler, or local:N; instead of --jobs")] = None
+    dask: Dask = None
     seed_file: SeedFile = None
     sealed_seed_file: SealedSeedFile = None
     opened: Annotated[

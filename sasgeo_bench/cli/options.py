@@ -32,6 +32,9 @@ RegionFolders = Annotated[
 OwnRegionFolders = Annotated[  # of commands whose --regions are ids
     list[Path] | None, typer.Option("--region-files", help="folder with region files of your own; may be repeated")
 ]
+Dask = Annotated[
+    str | None, typer.Option(help="address of a dask scheduler, or local:N for N processes; instead of --jobs")
+]
 ExtractFolders = Annotated[
     list[Path] | None,
     typer.Option(

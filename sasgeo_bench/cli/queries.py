@@ -10,7 +10,7 @@ from typing import Annotated, get_args
 import typer
 
 from sasgeo_bench.cli.console import say, shown_progress, tell
-from sasgeo_bench.cli.options import ExtractFolders, Options, Out, OwnRegionFolders, takes
+from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, OwnRegionFolders, takes
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -60,6 +60,7 @@ class QueryOptions(Options):
     skip: Annotated[bool, typer.Option("--skip", help="pass over what a region cannot carry, and say so")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be drawn and written, and stop")] = False
     jobs: Annotated[int, typer.Option(min=1, help="tasks drawn at once")] = 1
+    dask: Dask = None
 
 
 @takes(QueryOptions)
@@ -105,9 +106,8 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
             options.say(_in_words(item))
         return tuple(map(_folder, requests))
     make = partial(_make, skip=options.skip, tell=options.tell)
-    made = spread(
-        make, requests, jobs=options.jobs, label="tasks drawn", progress=options.progress or Lines(options.tell)
-    )
+    progress = options.progress or Lines(options.tell)
+    made = spread(make, requests, jobs=options.jobs, dask=options.dask, label="tasks drawn", progress=progress)
     return tuple(folder for folders in made for folder in folders)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Build regions: the function and its command."""
 
+from collections import deque
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 
 from sasgeo_bench.cli.console import read_date, say, shown_progress, tell
-from sasgeo_bench.cli.options import ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
+from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.progress import Lines, spread
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
@@ -35,6 +36,7 @@ class BuildOptions(Options):
     out: Out = Path("out")
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what would be read and written, and stop")] = False
     jobs: Annotated[int, typer.Option(min=1, help="regions built at once")] = 1
+    dask: Dask = None
 
 
 @takes(BuildOptions)
@@ -72,8 +74,8 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
         options.say("\n".join(plan.to_text() for plan in plans))
     else:
         work, progress = partial(build.build_region, tell=options.tell), options.progress or Lines(options.tell)
-        for _ in spread(work, plans, jobs=options.jobs, label="regions built", progress=progress):
-            pass
+        built = spread(work, plans, jobs=options.jobs, dask=options.dask, label="regions built", progress=progress)
+        deque(built, maxlen=0)
     return tuple(plan.folder for plan in plans)
 
 

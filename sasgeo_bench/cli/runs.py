@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
-from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.cli.options import Dask, Options, Out, takes
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.matching.results import SOUND
 from sasgeo_bench.running import runner
@@ -32,9 +32,7 @@ class RunOptions(Options):
     tasks: Annotated[list[Path], typer.Option(help="task folder, OUT/tasks/SUITE/REGION; may be repeated")]
     top_k: Annotated[int, typer.Option(help="poses asked of each query")] = 25
     jobs: Annotated[int, typer.Option(help="processes at once")] = 1
-    dask: Annotated[
-        str | None, typer.Option(help="address of a dask scheduler, or local:N for N processes of this machine")
-    ] = None
+    dask: Dask = None
     shard: Annotated[str, typer.Option(help="i/n: answer the i-th of n parts of the queries")] = "1/1"
     limit: Annotated[int | None, typer.Option(help="queries of each task at most")] = None
     match_s: Annotated[float, typer.Option(help="seconds for one query")] = Limits().match_s

@@ -52,7 +52,8 @@ class ScoreRequest:
     `split` assigns blocks to places, and names those that calibrate; rejectors (names, or module:Class) need it.
     `contrasts` are the registered ones. `draws` counts those of the bootstrap; suites in `by_region` are resampled by
     region, not by block; in suites of `by_block` each block is a place. `without` are regions to leave out, with all of
-    their maps. `jobs` processes fit rejectors. `extras` make, from the finished board, files that are written with it.
+    their maps. `jobs` processes fit rejectors, or workers of the cluster at `dask`. `extras` make, from the finished
+    board, files that are written with it.
 
     `pipeline` is name and hash of the pipeline that requests the board, if one does. `private` is a board of a private
     seed of the same pipeline to compare rows with. `kept` is the `board.json` of stored results: it keeps the version
@@ -77,6 +78,7 @@ class ScoreRequest:
     without: Collection[str] = ()
     submissions: Sequence[Path] = ()
     jobs: int = 1
+    dask: str | None = None
     private: Path | None = None
     kept: Mapping[str, Any] = field(default_factory=dict)
     sealed: Mapping[str, Any] = field(default_factory=dict)

@@ -71,7 +71,13 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
     ]
     is_whole = request.stored is None
     rejection = evaluate_rejectors(
-        judgings, is_whole=is_whole, jobs=request.jobs, failures=failures, tell=tell, progress=progress
+        judgings,
+        is_whole=is_whole,
+        jobs=request.jobs,
+        dask=request.dask,
+        failures=failures,
+        tell=tell,
+        progress=progress,
     )
     rejection = rejection if request.stored is None else request.stored.joined(rejection)
     figures = pd.concat([part for part in (*ranks, *costs, *rejection.rows) if len(part)], ignore_index=True)

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Run a matcher over tasks, here or on a dask cluster: a row for every query, and resumable."""
 
-import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.follower import card_on_flights
-from sasgeo_bench.progress import Lines, Progress, Tell
+from sasgeo_bench.progress import Lines, Progress, Tell, connected
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -27,47 +26,8 @@ from sasgeo_bench.tasks import task_files
 if TYPE_CHECKING:
     from distributed import Client
 
-_CONNECT_S: Final = 10.0
 _CHUNKS_PER_THREAD: Final = 4  # so that the last ones end at about the same time
 _MOST_QUERIES: Final = 256  # of a chunk, which has `LEAST_ITEMS` at least
-
-
-@contextmanager
-def connected(address: str) -> Iterator["Client"]:
-    """Yield a client of a dask scheduler at tcp://host:port, or of N processes on this machine for local:N.
-
-    Raise `ConfigError` if dask is not installed, the address is wrong, or no scheduler answers there.
-    """
-    try:
-        from distributed import Client, LocalCluster  # noqa: PLC0415 - an optional dependency
-    except ImportError as error:
-        message = "--dask needs the package distributed: pip install 'sasgeo-bench[dask]'"
-        raise ConfigError(message) from error
-    kind, _, count = address.partition(":")
-    if kind == "local":
-        if not (count.isascii() and count.isdecimal() and int(count) >= 1):
-            message = f"--dask must be local:N with N >= 1, or a scheduler's address, got {address!r}"
-            raise ConfigError(message)
-        with (
-            # One thread each: a chunk waits for one matcher's process. No dashboard: it would open a port.
-            LocalCluster(
-                n_workers=int(count),
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address=None,
-                silence_logs=logging.CRITICAL,
-            ) as cluster,
-            Client(cluster) as client,
-        ):
-            yield client
-        return
-    try:
-        client = Client(address, timeout=_CONNECT_S)
-    except (OSError, TimeoutError, ValueError) as error:
-        message = f"no dask scheduler answers at {address!r} within {_CONNECT_S:g} s: check the address, or use local:N"
-        raise ConfigError(message) from error
-    with client:
-        yield client
 
 
 def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iterator[tuple[int, int, Cost]]:

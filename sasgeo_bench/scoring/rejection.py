@@ -330,6 +330,7 @@ def evaluate_rejectors(
     *,
     is_whole: bool = True,
     jobs: int,
+    dask: str | None = None,
     failures: Failures,
     tell: Tell,
     progress: Progress,
@@ -344,7 +345,7 @@ def evaluate_rejectors(
     accepted: list[pd.DataFrame] = []
     errors: dict[str, list[Exception]] = {}
     remarks: list[str] = []
-    found_by_task = spread(_evaluated, tasks, jobs=jobs, label=JUDGED, progress=progress)
+    found_by_task = spread(_evaluated, tasks, jobs=jobs, dask=dask, label=JUDGED, progress=progress)
     for task, results in zip(tasks, found_by_task, strict=True):
         for name, found in results.items():
             if isinstance(found, Exception):

@@ -9,6 +9,7 @@ from dataclasses import replace
 import psutil
 import pytest
 
+from sasgeo_bench import progress
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.running import prediction_files, runner
 from sasgeo_bench.running.answers import pool_costs
@@ -65,7 +66,7 @@ def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
     part = plan.parts[0]
     (place / "hold").write_text(" ".join(next(iter(runner._chunks(part.left, 2, str)))), encoding="utf-8")
     killed, asked, costs = [], [], []
-    with runner.connected("local:2") as client:
+    with progress.connected("local:2") as client:
         for number, _, cost in runner.answer_on(client, plan, [part]):
             assert number == 0
             costs.append(cost)
@@ -103,7 +104,7 @@ def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
     ],
 )
 def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeypatch, address, words):
-    monkeypatch.setattr(runner, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(progress, "_CONNECT_S", 0.5)
     plan = plan_run(request_of(task, tmp_path, dask=address))
     with pytest.raises(ConfigError, match=words):
         run(plan, tell=lambda _: None)
@@ -112,7 +113,7 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeyp
 
 def test_without_the_extra_the_way_to_it_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(ConfigError, match=r"pip install 'sasgeo-bench\[dask\]'"), runner.connected("local:2"):
+    with pytest.raises(ConfigError, match=r"pip install 'sasgeo-bench\[dask\]'"), progress.connected("local:2"):
         pass
 
 

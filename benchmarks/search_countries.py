@@ -9,8 +9,8 @@ hand; a view has 256 x 256 cells of 2 m with the errors of a detector, and lies 
 class. Each row is a process of its own: it opens the map ("ready": seconds and memory before the first search, imports
 included), and searches once for each view; medians. Memory is the resident size, mapped pages included (Linux).
 
-"by tiles" says in how many of the views a search of each 4 km of the map for itself, within a disc around its
-middle, finds the same best pose, and in how many one of a higher score.
+"by tiles" (--tiles N) says in how many of the first N views a search of each 4 km of the map for itself, within a disc
+around its middle, finds the same best pose, and in how many one of a higher score.
 
 The last table is of what a map takes on disk: levels (of mapped ground), layers of one byte a cell packed by zstd, and
 vectors; and the seconds of processor that it takes to make the cells of 1 km2 of each. All give the same cells.
@@ -33,7 +33,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
-from benchmarks.search import ANYWHERE, LEAST_DENSITY, LISTED, Look, peak_mb, read, seconds
+from benchmarks.search import ANYWHERE, LEAST_DENSITY, LISTED, THREADS, Look, peak_mb, read, seconds
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.build import build_region, plan_build
@@ -140,7 +140,7 @@ def measure(way: str, name: str, threads: int, given: argparse.Namespace) -> dic
     row = {"ready_s": ready_s, "ready_mb": ready_mb, "wall_s": wall_s, "cpu_s": cpu_s, "peak_mb": peak_mb()}
     same = higher = 0
     if threads == 1 and way == "stored":
-        for look, mode in zip(looks, modes, strict=True):
+        for look, mode in zip(looks[: given.tiles], modes, strict=False):
             best = max((best_of(found, look, disc, plan) for disc in tiles(found.grid)), key=lambda one: one.score)
             apart_m = math.dist(
                 (best.pose.easting_m, best.pose.northing_m), (mode.pose.easting_m, mode.pose.northing_m)
@@ -191,6 +191,7 @@ def in_a_process(way: str, name: str, threads: int, given: argparse.Namespace) -
     """Run `measure` in a process of its own."""
     folders = [word for folder in given.extracts for word in ("--extracts", str(folder))]
     command = [sys.executable, "-m", "benchmarks.search_countries", "--out", str(given.out), *folders]
+    command += ["--tiles", str(given.tiles)]
     done = subprocess.run(  # noqa: S603 - our own program
         [*command, "--measure", way, name, str(threads)], check=True, stdout=subprocess.PIPE, text=True
     )
@@ -204,6 +205,8 @@ def main() -> None:
     parser.add_argument("--extracts", type=Path, action="append", default=[])
     parser.add_argument("--regions", nargs="+", default=PLACES)
     parser.add_argument("--runs", type=int, default=7, help="views of each row")
+    parser.add_argument("--tiles", type=int, default=0, help="views to search for by tiles, too: minutes each")
+    parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, help="where the levels of the map lie")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     given = parser.parse_args()
     cv2.setNumThreads(1)
@@ -226,9 +229,9 @@ def main() -> None:
             weights=np.stack([look.weights for _, look in drawn]),
             known=np.stack([look.known for _, look in drawn]),
         )
-        for way, threads in (("stored", 1), ("stored", 2), ("memory", 2)):
+        for way, threads in ((way, threads) for way in given.ways for threads in THREADS):
             row = in_a_process(way, name, threads, given)
-            tiled = f"{row['same']} | {row['higher']}" if threads == 1 else " | "
+            tiled = f"{row['same']} | {row['higher']}" if threads == 1 and given.tiles and way == "stored" else " | "
             print(
                 f"| {name} | {km2:.0f} | {way} | {threads} | {row['ready_s']:.2f} | {row['ready_mb']:.0f} | "
                 f"{row['wall_s']:.2f} | {row['cpu_s']:.2f} | {row['peak_mb']:.0f} | {row['right']} of {given.runs} | "

@@ -275,7 +275,7 @@ THRESHOLDS: Final = tuple(
         ),
         _threshold(
             name=f"risk_reached_at_{risk:g}",
-            meaning=f"Share of false fixes among those accepted so, here. Above {risk:g} the promise did not hold",
+            meaning=f"Share of false fixes among those accepted so, here. Broken where the interval is above {risk:g}",
             limit=risk,
             what="risk",
         ),
@@ -289,7 +289,7 @@ THRESHOLDS: Final = tuple(
         ),
         _absent(
             name=f"absent_reached_at_{rate:g}",
-            meaning=f"Share of absent places accepted so, here. Above {rate:g} the promise did not hold",
+            meaning=f"Share of absent places accepted so, here. Broken where the interval is above {rate:g}",
             limit=rate,
             what="absent",
         ),

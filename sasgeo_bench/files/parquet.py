@@ -120,17 +120,24 @@ def read_kept(
     *,
     mend: str,
     keep: Callable[[pa.Table], pa.BooleanArray],
-    may_hold: Callable[[pq.RowGroupMetaData], bool] = lambda _: True,
+    may_hold: Callable[[Mapping[str, tuple[Any, Any]]], bool] = lambda _: True,
 ) -> pa.Table:
     """Read the rows that `keep` marks, one row group after the other; raise as `open_table` does.
 
-    Row groups of which `may_hold` says that they have none, by their statistics, are not read.
+    Row groups of which `may_hold` says that they have none are not read; it gets the least and the greatest value of
+    each column that the footer has them for, by its path.
     """
     with open_table(path, mend=mend, most_rows=MOST_VALUES, is_whole=False) as source:
-        groups = [at for at in range(source.num_row_groups) if may_hold(source.metadata.row_group(at))]
+        groups = [at for at in range(source.num_row_groups) if may_hold(_ranges(source.metadata.row_group(at)))]
         parts = (source.read_row_group(at) for at in groups)
         kept = [part.filter(keep(part)) for part in parts]
         return pa.concat_tables(kept) if kept else source.schema_arrow.empty_table()
+
+
+def _ranges(group: pq.RowGroupMetaData) -> dict[str, tuple[Any, Any]]:
+    """Return the least and the greatest value of each column of a row group that has them."""
+    chunks = [(chunk.path_in_schema, chunk.statistics) for chunk in map(group.column, range(group.num_columns))]
+    return {name: (known.min, known.max) for name, known in chunks if known is not None and known.has_min_max}
 
 
 def read_schema(path: Path, *, mend: str) -> pa.Schema:

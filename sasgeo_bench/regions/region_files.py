@@ -2,6 +2,7 @@
 """Read and write a region on disk: `region.json` and the files it names; written whole or not at all."""
 
 import json
+import math
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
@@ -11,7 +12,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 import shapely
 
 from sasgeo_bench.config import check_document
@@ -315,14 +315,13 @@ def _read_near(path: Path, box: Bounds) -> pa.Table:
         return read_table(path, mend=_MEND, most_rows=MOST_VALUES)
     west, south, east, north = box
 
-    def may_hold(group: pq.RowGroupMetaData) -> bool:
+    def may_hold(ranges: Mapping[str, tuple[Any, Any]]) -> bool:
         """Return whether the boxes of a row group may meet the box."""
-        chunks = map(group.column, range(group.num_columns))
-        least = {chunk.path_in_schema: chunk.statistics for chunk in chunks}
-        xmin, ymin, xmax, ymax = (least[".".join(covering[side])] for side in ("xmin", "ymin", "xmax", "ymax"))
-        if any(side is None or not side.has_min_max for side in (xmin, ymin, xmax, ymax)):
-            return True
-        return bool(xmin.min <= east and xmax.max >= west and ymin.min <= north and ymax.max >= south)
+        west_most, south_most, east_most, north_most = (
+            ranges.get(".".join(covering[side]), (-math.inf, math.inf)) for side in ("xmin", "ymin", "xmax", "ymax")
+        )
+        across = west_most[0] <= east and east_most[1] >= west
+        return bool(across and south_most[0] <= north and north_most[1] >= south)
 
     def keep(part: pa.Table) -> pa.BooleanArray:
         """Mark the rows whose boxes meet the box."""

@@ -53,7 +53,7 @@ def search(
     Examples
     --------
     >>> import numpy as np
-    >>> from sasgeo_bench.search.field import FULL
+    >>> from sasgeo_bench.search.field import FULL, Field
     >>> rng = np.random.default_rng(0)
     >>> town = np.where(rng.random((1, 64, 64)) < 0.1, FULL, 0).astype(np.uint8)
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=64)

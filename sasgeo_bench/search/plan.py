@@ -20,8 +20,8 @@ class Plan:
     """Settings of a search.
 
     `cells` is the least number of cells of the coarsest level along the longer side of the view; `beam` are the modes
-    kept at the coarsest level, then at each finer one, the last number for all further levels, for every 17 km2 of
-    places that the prior allows; `each` candidate starts with so many modes. Headings and scales are searched within
+    kept at the coarsest level, then at each finer one, the last number for all further levels: of 17 km2 of places, and
+    more of more (`Search.patches`); `each` candidate starts with so many modes. Headings and scales are searched within
     `spread` standard deviations, modes of a result are `apart_m` from each other, and a view may lie within `around_m`
     of its candidate. The number of `threads` changes the time alone.
     """
@@ -35,7 +35,7 @@ class Plan:
     threads: int = 1
 
     def width(self, depth: int, patches: int = 1) -> int:
-        """Return how many modes are kept at a depth of the pyramid, 0 the coarsest, of so many times 17 km2."""
+        """Return how many modes are kept at a depth of the pyramid, 0 the coarsest, with so many times the beam."""
         return self.beam[min(depth, len(self.beam) - 1)] * patches
 
 

@@ -12,6 +12,9 @@ included), and searches once for each view; medians. Memory is the resident size
 "by tiles" (--tiles N) says in how many of the first N views a search of each 4 km of the map for itself, within a disc
 around its middle, finds the same best pose, and in how many one of a higher score.
 
+--beams prints instead, for each view, the best score and how far it is from the true place, with so many times the beam
+of a town.
+
 The last table is of what a map takes on disk: levels (of mapped ground), layers of one byte a cell packed by zstd, and
 vectors; and the seconds of processor that it takes to make the cells of 1 km2 of each. All give the same cells.
 """
@@ -25,6 +28,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -43,7 +47,7 @@ from sasgeo_bench.regions.region_files import FEATURES, LAYERS, read_manifest, r
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sasgeo.raster import likeness_by_hand, read_field, store_field
 from sasgeo_bench.search.field import Levels, Template
-from sasgeo_bench.search.find import search
+from sasgeo_bench.search.find import Search, search
 from sasgeo_bench.search.plan import Mode, Plan
 from sasgeo_bench.search.stored import StoredField
 from sasgeo_bench.tasks.state import State
@@ -120,22 +124,55 @@ def best_of(found: Levels, look: Template, prior: Prior, plan: Plan) -> Mode:
     return modes[0] if modes else Mode(pose=Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0), score=-math.inf)
 
 
+@dataclass(frozen=True, kw_only=True)
+class OfBeam(Search):
+    """A search with so many times the beam of a town, whatever its area."""
+
+    times: int
+
+    @property
+    def patches(self) -> int:
+        """Return how many times the beam is kept."""
+        return self.times
+
+
+def beams(name: str, given: argparse.Namespace) -> None:
+    """Print the best of each view for several beams."""
+    found = StoredField.open(levels_of(name, given))
+    print(f"| {name}, view | {' | '.join(f'{times} beams: score | off, m | CPU s' for times in given.beams)} |")
+    print(f"|---:|{'---:|' * 3 * len(given.beams)}")
+    for at, (place, look) in enumerate(views_of(name, given)):
+        cells = []
+        for times in given.beams:
+            wide = OfBeam(field=found, template=look, prior=ANYWHERE, plan=Plan(threads=THREADS[-1]), times=times)
+            kept: list[Mode] = []
+            _, cpu_s = seconds(lambda wide=wide, kept=kept: kept.append(wide.places(LISTED, ()).modes[0]))
+            off_m = math.dist(place, (kept[0].pose.easting_m, kept[0].pose.northing_m))
+            cells.append(f"{kept[0].score:.2f} | {off_m:.0f} | {cpu_s:.1f}")
+        print(f"| {at} | {' | '.join(cells)} |", flush=True)
+
+
+def views_of(name: str, given: argparse.Namespace) -> list[tuple[tuple[float, float], Template]]:
+    """Read the views that were drawn on a region, and where each was taken."""
+    with np.load(levels_of(name, given).with_suffix(".views.npz")) as held:
+        rows = zip(held["poses"], held["weights"], held["known"], strict=True)
+        return [
+            ((float(place[0]), float(place[1])), Template(weights=weights, known=known, cell_size_m=CELL_M))
+            for place, weights, known in rows
+        ]
+
+
 def measure(way: str, name: str, threads: int, given: argparse.Namespace) -> dict[str, float]:
     """Return time and memory of this process, and how often it finds the place, or one that a tile finds."""
     start = time.perf_counter()
     found: Levels = map_of(way, name, given)
     ready_s, ready_mb = time.perf_counter() - start, peak_mb()
-    with np.load(levels_of(name, given).with_suffix(".views.npz")) as held:
-        poses = held["poses"]
-        looks = [
-            Template(weights=weights, known=known, cell_size_m=CELL_M)
-            for weights, known in zip(held["weights"], held["known"], strict=True)
-        ]
+    poses, looks = zip(*views_of(name, given), strict=True)
     plan = Plan(threads=threads)
     costs, right, modes = [], 0, []
     for at, look in zip(poses, looks, strict=True):
         costs.append(seconds(lambda look=look: modes.append(best_of(found, look, ANYWHERE, plan))))
-        right += math.dist(at[:2], (modes[-1].pose.easting_m, modes[-1].pose.northing_m)) <= 10.0  # noqa: PLR2004
+        right += math.dist(at, (modes[-1].pose.easting_m, modes[-1].pose.northing_m)) <= 10.0  # noqa: PLR2004
     wall_s, cpu_s = (statistics.median(column) for column in zip(*costs, strict=True))
     row = {"ready_s": ready_s, "ready_mb": ready_mb, "wall_s": wall_s, "cpu_s": cpu_s, "peak_mb": peak_mb()}
     same = higher = 0
@@ -207,6 +244,7 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=7, help="views of each row")
     parser.add_argument("--tiles", type=int, default=0, help="views to search for by tiles, too: minutes each")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, help="where the levels of the map lie")
+    parser.add_argument("--beams", nargs="+", type=int, default=(), help="times the beam of a town to compare")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     given = parser.parse_args()
     cv2.setNumThreads(1)
@@ -215,8 +253,9 @@ def main() -> None:
         print(json.dumps(measure(way, name, int(threads), given)))
         return
     sizes = []
-    print("| region | km2 | map | cores | ready, s | MB | fix, s | CPU s | peak MB | right | by tiles: same | higher |")
-    print(f"|---|---:|---|{'---:|' * 9}")
+    if not given.beams:
+        print("| region | km2 | map | cores | ready, s | MB | fix, s | CPU s | peak MB | right | by tiles | higher |")
+        print(f"|---|---:|---|{'---:|' * 9}")
     for name in given.regions:
         folder, levels = region_of(name, given), levels_of(name, given)
         manifest = read_manifest(folder)
@@ -229,6 +268,9 @@ def main() -> None:
             weights=np.stack([look.weights for _, look in drawn]),
             known=np.stack([look.known for _, look in drawn]),
         )
+        if given.beams:
+            beams(name, given)
+            continue
         for way, threads in ((way, threads) for way in given.ways for threads in THREADS):
             row = in_a_process(way, name, threads, given)
             tiled = f"{row['same']} | {row['higher']}" if threads == 1 and given.tiles and way == "stored" else " | "
@@ -240,6 +282,8 @@ def main() -> None:
             )
         files = (bytes_of(levels), *((folder / file).stat().st_size for file in (LAYERS, FEATURES)))
         sizes.append((name, km2, wall_s, cpu_s, files, made(folder, levels)))
+    if given.beams:
+        return
     print("\n| region | stored in s | CPU s | kB/km2: levels | layers | vectors | ms/km2: levels | layers | vectors |")
     print(f"|---|{'---:|' * 8}")
     for name, km2, wall_s, cpu_s, files, spent in sizes:

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import chdir, contextmanager
 from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
@@ -220,9 +220,9 @@ def _try(work: Callable[[Item], Found], folder: str, item: Item) -> _Tried[Found
     """Do an item in the folder of the program that asked for it."""
     from distributed import get_worker  # noqa: PLC0415
 
-    os.chdir(folder)
     try:
-        return _Tried(work(item))
+        with chdir(folder):  # a worker may serve others, too
+            return _Tried(work(item))
     except OSError as error:  # a full disk, a folder that is not mounted: errors of ours about files are among them
         return _Tried(None, str(get_worker().address), error)
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ShapeError, StoreError
 from sasgeo_bench.files.folders import fresh_folder, locked
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.geometry.grid import Grid
@@ -111,6 +111,8 @@ def store_levels(
     ------
     StoreError
         If the folder cannot be written.
+    ShapeError
+        If a window does not end where the cells of each level do.
 
     Examples
     --------
@@ -123,6 +125,10 @@ def store_levels(
     True
     """
     window_cells = window_cells or WINDOW_CELLS
+    uneven = [factor for factor in factors if window_cells % factor]
+    if uneven:
+        message = f"windows of {window_cells} cells cut cells of the levels {uneven}: name a multiple of all factors"
+        raise ShapeError(message)
     with locked(folder, tell=lambda _: None):
         if (folder / _ABOUT).is_file() and (found := StoredField.open(folder)).key == key:
             return found

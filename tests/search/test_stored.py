@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import ShapeError, StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.search.field import FULL, Field, Template
@@ -93,6 +93,12 @@ def test_levels_of_the_same_key_are_opened_and_others_are_made_anew(tmp_path, wh
     other, anew = stored_in(tmp_path / "map", whole, key="b")
     assert (other.key, anew) == ("b", asked)
     assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".lock")] == ["map"]
+
+
+def test_windows_that_cut_cells_of_a_level_are_refused(tmp_path, whole):
+    with pytest.raises(ShapeError, match=r"windows of 60 cells cut cells of the levels \[8\]: name a multiple"):
+        stored_in(tmp_path / "map", whole, window_cells=60)
+    assert not (tmp_path / "map").exists()
 
 
 def test_a_level_that_is_not_stored_is_told(stored):

@@ -9,8 +9,8 @@ import typer
 
 from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.options import Options, Out
-from sasgeo_bench.publishing.profile_page import PAGE, facts, write_profile
-from sasgeo_bench.running.profiling import ProfileRequest, profile
+from sasgeo_bench.publishing.profile_page import PAGE, check_profile, facts, write_profile
+from sasgeo_bench.running.profiling import ProfileRequest, plan_profile, profile
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,9 +46,11 @@ def profile_command(options: ProfileOptions) -> None:
         train=tuple(options.train or ()),
         is_shut_in=not options.trusted,
     )
+    plan = plan_profile(request)
+    folder = options.into or options.out / "profiles" / plan.card.name
+    check_profile(folder)  # before the minutes that it takes
     with shown_progress() as progress:
-        found = profile(request, tell=tell, progress=progress)
-    folder = options.into or options.out / "profiles" / found.matcher
+        found = profile(request, plan=plan, tell=tell, progress=progress)
     write_profile(found, folder, tell=tell)
     for name, value, meaning in facts(found):
         say(f"{name}: {value} ({meaning})")

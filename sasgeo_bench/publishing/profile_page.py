@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from sasgeo_bench.canvas import Page, page
 from sasgeo_bench.errors import StoreError, counted
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import check_known, check_room, fresh_folder, is_ours, locked
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.publishing.site import environment
 from sasgeo_bench.regions.build import package_version
@@ -58,22 +58,29 @@ def _megabytes(value: float) -> str:
     return f"{value / 1e6:,.1f} MB"
 
 
+def check_profile(folder: Path) -> None:
+    """Raise `StoreError` if a profile could not be written there, or would replace something else."""
+    if folder.exists() and not folder.is_dir():
+        message = f"{folder} is no folder: name another one"
+        raise StoreError(message)
+    check_known(folder, _FILES if is_ours(folder / RECORD) else (), "a profile")
+    check_room(folder)
+
+
 def write_profile(of: Profile, folder: Path, *, tell: Tell) -> None:
     """Write a profile, its page and its figure, whole or not at all; an earlier profile is replaced.
 
     Raise `StoreError` if the folder holds other files, or cannot be written.
     """
-    strangers = {path.name for path in folder.iterdir()} - _FILES if folder.is_dir() else set()
-    if strangers:
-        message = f"{folder} holds {min(strangers)}, which is of no profile: name another folder"
-        raise StoreError(message)
+    check_profile(folder)
+    made_by = f"sasgeo-bench {package_version()}"
     try:
         with locked(folder, tell=tell), fresh_folder(folder) as scratch:
-            record = json.dumps({"attribution": ATTRIBUTION, "made_by": package_version(), **of.to_dict()}, indent=1)
+            record = json.dumps({"attribution": ATTRIBUTION, "made_by": made_by, **of.to_dict()}, indent=1)
             (scratch / RECORD).write_text(record, encoding="utf-8")
             _draw(of, scratch / FIGURE)
             template = environment().get_template("profile.html")
-            text = template.render(of=of, rows=list(facts(of)), made_by=package_version())
+            text = template.render(of=of, rows=list(facts(of)), made_by=made_by)
             (scratch / PAGE).write_text(text, encoding="utf-8")
     except StoreError:
         raise

@@ -152,8 +152,10 @@ class Profile:
         return asdict(self)
 
 
-def profile(request: ProfileRequest, *, tell: Tell, progress: Progress | None = None) -> Profile:
-    """Measure a matcher; nothing is stored.
+def profile(
+    request: ProfileRequest, *, plan: RunPlan | None = None, tell: Tell, progress: Progress | None = None
+) -> Profile:
+    """Measure a matcher, as planned by `plan_profile`; nothing is stored.
 
     Raises
     ------
@@ -164,7 +166,7 @@ def profile(request: ProfileRequest, *, tell: Tell, progress: Progress | None = 
     StoreError
         If a task or its map is missing or damaged.
     """
-    plan = _planned(request)
+    plan = plan or plan_profile(request)
     region = plan.parts[0].region
     manifest = read_manifest(region)
     with _pinned(request.cores) as cores:
@@ -210,13 +212,16 @@ def profile(request: ProfileRequest, *, tell: Tell, progress: Progress | None = 
             )
 
 
-def _planned(request: ProfileRequest) -> RunPlan:
-    """Plan to ask everything, in a folder that nothing is written to."""
+def plan_profile(request: ProfileRequest) -> RunPlan:
+    """Plan to ask everything, in a folder that nothing is written to; raise as `profile` does."""
     if request.spec == ORACLE:
         message = f"{ORACLE} has no process that could be measured: name another matcher"
         raise ConfigError(message)
     if not 0 < request.sustain_s < math.inf:
         message = f"the time must be positive seconds, got {request.sustain_s!r}"
+        raise ConfigError(message)
+    if request.radius_m is not None and not request.radius_m > 0:
+        message = f"the radius must be positive metres, got {request.radius_m!r}"
         raise ConfigError(message)
     limits = Limits(memory_bytes=request.memory_bytes)
     plan = plan_run(

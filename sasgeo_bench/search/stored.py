@@ -4,6 +4,7 @@
 import json
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Final, Self
 
@@ -13,7 +14,7 @@ from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ShapeError, StoreError
-from sasgeo_bench.files.folders import fresh_folder, locked
+from sasgeo_bench.files.folders import check_known, fresh_folder, is_ours, locked
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.search.field import Field, Level, is_thin, round_kernel
@@ -110,7 +111,7 @@ def store_levels(
     Raises
     ------
     StoreError
-        If the folder cannot be written.
+        If the folder cannot be written, or holds other files.
     ShapeError
         If a window does not end where the cells of each level do.
 
@@ -132,6 +133,11 @@ def store_levels(
     with locked(folder, tell=lambda _: None):
         if (folder / _ABOUT).is_file() and (found := StoredField.open(folder)).key == key:
             return found
+        if folder.exists() and not folder.is_dir():
+            message = f"{folder} is no folder: name another one"
+            raise StoreError(message)
+        names = {_ABOUT, *map(_name, FACTORS), *map(_name, factors)} if is_ours(folder / _ABOUT) else set[str]()
+        check_known(folder, names, "the levels of a map")
         try:
             with fresh_folder(folder) as scratch:
                 base = _made(scratch, _name(1), grid.shape, bands + 1)
@@ -144,6 +150,7 @@ def store_levels(
                     if factor > 1:
                         shares[factor] = _store_level(scratch, base, grid, factor, window_cells)
                 about = {
+                    "made_by": f"sasgeo-bench {metadata.version('sasgeo-bench')}",
                     "key": key,
                     "grid": asdict(grid),
                     "thinner": {factor: share.tolist() for factor, share in shares.items()},

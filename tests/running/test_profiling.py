@@ -122,6 +122,8 @@ def test_what_cannot_be_asked_is_told_before(task, tasks):
         ({"cores": 0}, "core.*, not 0"),
         ({"cores": more}, f"core.*, not {more}"),
         ({"sustain_s": math.nan}, "the time must be positive seconds, got nan"),
+        ({"radius_m": -3.0}, "the radius must be positive metres, got -3.0"),
+        ({"radius_m": math.nan}, "the radius must be positive metres, got nan"),
         ({"radius_m": 0.5}, r"can be asked none of the \d+ queries: no prior within 0.5 m"),
         (
             {"tasks": (tasks / "tasks" / "clean" / "town-riverside", tasks / "tasks" / "alias" / "town-grid+alias")},
@@ -145,8 +147,13 @@ def test_a_page_is_written_whole_and_replaces_none_but_a_profile(slowing, tmp_pa
     assert "OpenStreetMap" in said["attribution"]
     write_profile(slowing, tmp_path / "mine", tell=lambda _: None)
     (tmp_path / "mine" / "notes.txt").touch()
-    with pytest.raises(StoreError, match=r"holds notes\.txt, which is of no profile: name another folder"):
-        write_profile(slowing, tmp_path / "mine", tell=lambda _: None)
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / RECORD).write_text('{"made_by": "another program"}', encoding="utf-8")
+    for name in ("mine", "file", "other"):
+        with pytest.raises(StoreError, match=r"notes\.txt|is no folder|profile\.json"):
+            write_profile(slowing, tmp_path / name, tell=lambda _: None)
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
     assert "mine" in (tmp_path / "mine" / PAGE).read_text(encoding="utf-8")
 
 

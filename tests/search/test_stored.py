@@ -95,6 +95,20 @@ def test_levels_of_the_same_key_are_opened_and_others_are_made_anew(tmp_path, wh
     assert [path.name for path in tmp_path.iterdir() if not path.name.endswith(".lock")] == ["map"]
 
 
+def test_levels_replace_no_files_of_others(tmp_path, whole):
+    stored_in(tmp_path / "map", whole, key="a")
+    (tmp_path / "map" / "notes.txt").touch()
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "levels.json").write_text('{"key": "b"}', encoding="utf-8")
+    (tmp_path / "file").touch()
+    for name, words in (("map", "notes.txt"), ("file", "is no folder")):
+        with pytest.raises(StoreError, match=words):
+            stored_in(tmp_path / name, whole, key="b")
+    with pytest.raises(StoreError, match="damaged"):
+        stored_in(tmp_path / "other", whole, key="b")
+    assert (tmp_path / "map" / "notes.txt").is_file()
+
+
 def test_windows_that_cut_cells_of_a_level_are_refused(tmp_path, whole):
     with pytest.raises(ShapeError, match=r"windows of 60 cells cut cells of the levels \[8\]: name a multiple"):
         stored_in(tmp_path / "map", whole, window_cells=60)

@@ -22,7 +22,7 @@ interval by places. A risk that none is accepted to tell is `-`.
 """
 
 import argparse
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -127,8 +127,8 @@ def accepted(
     return pd.concat(parts, ignore_index=True)
 
 
-def figures(rows: pd.DataFrame, absent: float) -> Iterator[BoardInterval]:
-    """Yield what is kept, the risk with all kinds of absence and with each, and what is kept of feature-poor views."""
+def figures(rows: pd.DataFrame, absent: float) -> list[BoardInterval]:
+    """Return what is kept, the risk with all kinds of absence and with each, and what is kept of feature-poor views."""
     taken, right, present = (rows[name].to_numpy(float) for name in ("accepted", "is_right", "is_present"))
     kind = rows["kind"].to_numpy()
     shares = [Share(counted=taken, mass=right)]

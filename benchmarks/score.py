@@ -1,20 +1,24 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seconds to score 10,000 predictions and put them on a board with all intervals: one matcher, and five.
+"""Time and memory of `score`, from reading the files to the written board, for boards of many sizes.
 
 Queries, truths and answers are made up: 12 regions of four blocks each, four suites of both tracks, a tenth of the
-places absent, 25 poses to an answer. "in memory" is scoring and figures alone; "from disk" is all that the command
-`score` does, from reading the files to the written board; "+ margin" is that with a rejector, and a contrast of both.
-Run it with `make bench`.
+places absent, 25 poses to an answer. A size is matchers x queries; each board is scored in a process of its own. The
+last column is that with the rejector `margin`, and a contrast of two matchers on each suite. Without arguments it
+scores 10,000 answers of one matcher and of five; a million take an hour to make up, most of it once:
+
+    python benchmarks/score.py --sizes 1x10000 10x1000 10x10000 10x100000 --runs 1 --keep out/made-up
 """
 
 import argparse
 import datetime as dt
-import gc
+import json
+import resource
 import statistics
+import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,13 +33,11 @@ from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.draws import DRAWS
-from sasgeo_bench.scoring.score import score_task
-from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import Head, Query, Truth
+from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import Split, SplitFile, make_split
 
-SIZES = ((1, 10_000), (5, 2_000))  # matchers, queries: 10,000 predictions each
+SIZES = ("1x10000", "5x2000")  # matchers x queries
 SUITES = ("clean", "occlusion", "real-age", "alias")
 PLACES, SIDE_M = 12, 2048.0
 POOL, TOP_K = 50, 25
@@ -145,95 +147,91 @@ def answers(task: Task, skill: float, rng: np.random.Generator) -> list[Predicti
     return found
 
 
-def made_up(matchers: int, queries: int) -> tuple[list[Task], dict[str, list[list[Prediction]]]]:
-    """Tasks, and for each matcher its answers to each of them."""
-    rng = np.random.default_rng(0)
+def tasks_of(queries: int, rng: np.random.Generator) -> Iterator[Task]:
+    """Yield tasks of all suites and places that hold some queries together."""
     cells = (rng.random((len(CLASSES), 192, 192)) < 0.1).astype(np.uint8)  # noqa: PLR2004 - a tenth is drawn
     evidence = Evidence(classes=CLASSES, cells=cells, cell_size_m=1.0)
     names = [(suite, f"place-{at}") for suite in SUITES for at in range(PLACES)]
     counts = np.diff(np.linspace(0, queries, len(names) + 1).astype(int)).tolist()
-    tasks = [made_up_task(*name, count, evidence, rng) for name, count in zip(names, counts, strict=True)]
+    yield from (made_up_task(*name, count, evidence, rng) for name, count in zip(names, counts, strict=True))
+
+
+def write(root: Path, matchers: int, queries: int) -> None:
+    """Write tasks, truths and runs where the command looks for them."""
+    rng = np.random.default_rng(0)
     skills = np.linspace(0.5, 0.7, matchers).tolist()
-    return tasks, {f"matcher-{at}": [answers(task, skill, rng) for task in tasks] for at, skill in enumerate(skills)}
-
-
-def head_of(query: Query) -> Head:
-    """What scoring needs of a query."""
-    names = ("query_id", "track", "suite", "suite_version", "part", "region", "prior_group", "candidates")
-    said = {name: getattr(query, name) for name in names}
-    return Head(**said, view_cells=query.evidence.shape[0], cell_size_m=query.evidence.cell_size_m)
-
-
-def in_memory(tasks: Sequence[Task], given: Mapping[str, Sequence[Sequence[Prediction]]], split: Split) -> float:
-    """Seconds of scoring and of the leaderboard."""
-    heads = [head_of(query) for task in tasks for query in task.queries]
-    truths = [truth for task in tasks for truth in task.truths]
-    found = {name: {item.query_id: item for part in parts for item in part} for name, parts in given.items()}
-    begun = time.perf_counter()
-    leaderboard({name: score_task(heads, truths, mine, place_of=split.place_of) for name, mine in found.items()})
-    return time.perf_counter() - begun
-
-
-def write(tasks: Sequence[Task], given: Mapping[str, Sequence[Sequence[Prediction]]], root: Path) -> None:
-    """Tasks, truths and runs where the command looks for them."""
-    for at, task in enumerate(tasks):
+    for task in tasks_of(queries, rng):
         folder, truth = (root / kind / task.suite / task.region for kind in ("tasks", "truth"))
         folder.mkdir(parents=True)
         truth.mkdir(parents=True)
         about = {"suite": task.suite, "title": task.suite, "region": task.region, "map_fingerprint": ""}
         task_files.write_task(folder, truth, zip(task.queries, task.truths, strict=True), about)
         sha256 = task_files.read_task(folder)["files"][task_files.QUERIES]["sha256"]
-        for name, parts in given.items():
+        for at, skill in enumerate(skills):
+            name = f"matcher-{at}"
             run = root / "runs" / name / task.suite / task.region
-            prediction_files.write_part(run, parts[at])
+            prediction_files.write_part(run, answers(task, skill, rng))
             card = {"name": name, "version": "1"}
             costs = {"prepare_s": 1.0, "peak_bytes": 10**9, "map_bytes": 10**7, "cpu_s": 60.0}
             said = {"suite": task.suite, "region": task.region, "queries_sha256": sha256, "hash": name}
             prediction_files.write_run(run, {"matcher": card, **said, **costs})
 
 
-def from_disk(root: Path, split: Split, *, rejectors: Sequence[str], names: Sequence[str]) -> float:
-    """Seconds of all that `score` does."""
-    pair = (names[0], names[-1])
+def score(root: Path, *, is_whole: bool) -> dict[str, float]:
+    """Score a made-up root as `score` does, in this process; return seconds by the clock and of processor, and MB."""
+    names = sorted(path.name for path in (root / "runs").iterdir())
+    contrasts = [Contrast(name=suite, first=names[0], second=names[-1], suites=(suite,)) for suite in SUITES]
     request = ScoreRequest(
         predictions=[root / "runs"],
         root=root,
         board=root / "boards" / "made-up",
-        split=split,
-        rejectors=rejectors,
-        contrasts=[Contrast(name=suite, first=pair[0], second=pair[1], suites=(suite,)) for suite in SUITES],
+        split=made_up_split(),
+        rejectors=("margin",) if is_whole else (),
+        contrasts=contrasts if is_whole and len(names) > 1 else (),
     )
     begun = time.perf_counter()
     make_board(request, tell=lambda _: None)
-    return time.perf_counter() - begun
+    usage = resource.getrusage(resource.RUSAGE_SELF)
+    used = usage.ru_utime + usage.ru_stime
+    return {"s": time.perf_counter() - begun, "cpu_s": used, "mb": usage.ru_maxrss * 1024 / 1e6}
+
+
+def measured(root: Path, *, is_whole: bool, runs: int) -> dict[str, float]:
+    """Return medians of `score` in processes of their own."""
+    command = [sys.executable, __file__, "--score", str(root), *(["--whole"] if is_whole else [])]
+    outputs = [subprocess.run(command, stdout=subprocess.PIPE, check=True).stdout for _ in range(runs)]  # noqa: S603 - this program
+    found = [json.loads(output) for output in outputs]
+    return {name: statistics.median(one[name] for one in found) for name in found[0]}
 
 
 def main() -> None:
     """Print a table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--sizes", nargs="+", default=SIZES, help="matchers x queries, as 10x1000")
     parser.add_argument("--runs", type=int, default=5)
-    runs = parser.parse_args().runs
-    split = made_up_split()
-    print(f"medians of {runs} runs in seconds; {DRAWS} draws, {len(SUITES)} suites, {PLACES} places of 4 blocks\n")
-    print(f"{'matchers':>8} {'queries':>8} {'in memory':>10} {'from disk':>10} {'+ margin':>9}")
-    for matchers, queries in SIZES:
-        tasks, given = made_up(matchers, queries)
-        with tempfile.TemporaryDirectory() as folder:
-            root = Path(folder)
-            write(tasks, given, root)
-            gc.collect()
-            gc.freeze()  # what was made up here is not for the scorer to look through
-            rows = [
-                (
-                    in_memory(tasks, given, split),
-                    from_disk(root, split, rejectors=(), names=list(given)),
-                    from_disk(root, split, rejectors=("margin",), names=list(given)),
-                )
-                for _ in range(runs)
-            ]
-        memory_s, disk_s, margin_s = (statistics.median(column) for column in zip(*rows, strict=True))
-        print(f"{matchers:8d} {queries:8d} {memory_s:10.2f} {disk_s:10.2f} {margin_s:9.2f}", flush=True)
+    parser.add_argument("--keep", type=Path, help="folder of made-up answers, which are made once")
+    parser.add_argument("--score", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--whole", action="store_true", help=argparse.SUPPRESS)
+    said = parser.parse_args()
+    if said.score:
+        print(json.dumps(score(said.score, is_whole=said.whole)))
+        return
+    print(f"medians of {said.runs} runs; {DRAWS} draws, {len(SUITES)} suites, {PLACES} places of 4 blocks\n")
+    print("| matchers | queries | s | CPU s | peak MB | s with margin and contrasts | CPU s | peak MB |")
+    print("|---:|---:|---:|---:|---:|---:|---:|---:|")
+    with tempfile.TemporaryDirectory() as scratch:
+        for size in said.sizes:
+            matchers, queries = map(int, size.split("x"))
+            root = (said.keep or Path(scratch)) / size
+            if not (root / "done").is_file():
+                write(root, matchers, queries)
+                (root / "done").touch()
+            cells = [f"{matchers}", f"{queries}"]
+            for is_whole in (False, True):
+                one = measured(root, is_whole=is_whole, runs=said.runs)
+                cells += [f"{one['s']:.1f}", f"{one['cpu_s']:.1f}", f"{one['mb']:.0f}"]
+            print(f"| {' | '.join(cells)} |", flush=True)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -19,7 +19,7 @@ from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
 from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost
 from sasgeo_bench.scoring.draws import seed_of_text
-from sasgeo_bench.scoring.intervals import BoardDraws, share_interval
+from sasgeo_bench.scoring.intervals import BoardDraws, intervals_of_columns
 from sasgeo_bench.scoring.metrics import primary_of, ranks_of
 from sasgeo_bench.scoring.pose import Ranks, hits, rank_pose
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
@@ -44,11 +44,7 @@ def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[dict[str, Any
     """Return means of columns of values in [0, 1] with intervals as of a board; the same queries share draws."""
     names = (np.unique(rows[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
     drawn = BoardDraws.of(*names, seed=seed_of_text(text), draws=SLOW_DRAWS)
-    means = drawn.means(table)
-    found = [
-        share_interval(float(value), (means[0][:, at], means[1][:, at]), drawn.trials)
-        for at, value in enumerate(table.mean(axis=0))
-    ]
+    found = intervals_of_columns(table.mean(axis=0), drawn.means(table), drawn.trials)
     counts = {"n": len(rows), "blocks": drawn.by_block.units_count}
     return [{**counts, "value": one.value, "lo": one.lo, "hi": one.hi} for one in found]
 

@@ -80,7 +80,7 @@ def _rows(pool: _Pool, text: str) -> Iterator[dict[str, Any]]:
         if _is_complete(plain, answers := answers_of(part, mixture))
         for cost_ratio in COST_RATIOS
     ]
-    intervals = share_intervals([share for *_, shares in cases for share in shares], site, drawn)
+    intervals = iter(share_intervals([share for *_, shares in cases for share in shares], site, drawn))
     counts = {"n": len(part), "absent": int((~part["is_present"].astype(bool)).sum()), "places": len(set(place))}
     for mixture, cost_ratio, _ in cases:
         found: dict[str, float] = {}

@@ -8,6 +8,7 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
 from scipy.stats import chi2, norm, permutation_test
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.multitest import multipletests
@@ -15,7 +16,7 @@ from statsmodels.stats.multitest import multipletests
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, block_codes, check_column
 from sasgeo_bench.scoring.decisions import Answers
-from sasgeo_bench.scoring.integrity_metric import drawn_areas
+from sasgeo_bench.scoring.integrity_metric import Curve
 from sasgeo_bench.scoring.intervals import LEVEL
 
 _FLIPS: Final = 2**18  # of signs, at most: exact up to 18 places
@@ -123,12 +124,6 @@ def sign_flip(sums: Floats) -> float:
     return min(float(found.pvalue), 1.0)
 
 
-def areas(answers: Answers, weights: Floats, name: str) -> Floats:
-    """Return one of `integrity_metric.DrawnAreas` for each row of weights, shape (D,)."""
-    found: Floats = getattr(drawn_areas(answers, weights), name)
-    return found
-
-
 def swap_places(first: Answers, second: Answers, place: Ints, name: str) -> float:
     """Return the p-value of swapping two sides at random places, for an area, which is no sum over places.
 
@@ -140,19 +135,24 @@ def swap_places(first: Answers, second: Answers, place: Ints, name: str) -> floa
     count = int(place.max(initial=-1)) + 1
     if count < 2:  # noqa: PLR2004 - one place cannot differ from itself
         return math.nan
-    both = _stacked(first, second)
-    swapped = np.random.default_rng(0).random((_SWAPS, count))[:, place] < 0.5  # noqa: PLR2004 - a fair coin
-    swapped = np.vstack((np.zeros(len(place), dtype=bool), swapped))
-    gaps = np.concatenate(
-        [
-            areas(both, np.hstack((~part, part)).astype(float), name)
-            - areas(both, np.hstack((part, ~part)).astype(float), name)
-            for part in np.array_split(swapped, 16)
-        ]
-    )
+    curve = Curve.of(_stacked(first, second), is_merged=True)
+    cells = (np.ones(2 * len(place)), (np.concatenate((place, count + place)), np.arange(2 * len(place))))
+    masses = (csr_array(cells, shape=(2 * count, 2 * len(place))) @ curve.sides).toarray()  # of each side at each place
+    swapped = np.random.default_rng(0).random((_SWAPS, count)) < 0.5  # noqa: PLR2004 - a fair coin
+    swapped = np.vstack((np.zeros(count, dtype=bool), swapped))
+    gaps = np.concatenate([_gaps(curve, masses, part, name) for part in np.array_split(swapped, 16)])
     if math.isnan(gaps[0]):  # as of AUROC without a false answer: no comparison holds, and p would be 0
         return math.nan
     return float((np.abs(gaps) >= abs(gaps[0]) - _NOTHING).mean())
+
+
+def _gaps(curve: Curve, masses: Floats, swapped: Bools, name: str) -> Floats:
+    """Return an area of the first side less that of the second, shape (D,), with the sides of some places swapped."""
+    ours, theirs = (
+        getattr(curve.areas(np.hstack(which).astype(float) @ masses), name)
+        for which in ((~swapped, swapped), (swapped, ~swapped))
+    )
+    return np.asarray(ours - theirs)
 
 
 def _stacked(first: Answers, second: Answers) -> Answers:

@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 import pandas as pd
+from scipy.sparse import hstack
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.compare import (
-    areas,
     holm,
     mcnemar_clustered,
     mcnemar_exact,
@@ -21,7 +21,7 @@ from sasgeo_bench.scoring.compare import (
     swap_places,
 )
 from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.integrity_metric import aurc, auroc, excess_aurc
+from sasgeo_bench.scoring.integrity_metric import Curve, aurc, auroc, excess_aurc
 from sasgeo_bench.scoring.intervals import (
     BoardDraws,
     Interval,
@@ -384,10 +384,18 @@ def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame)
     ours, theirs = (area(answers) for answers in both)
     drawn = _drawn(contrast, first, SLOW_DRAWS)
 
+    curves = [Curve.of(answers, is_merged=True) for answers in both]
+    table = hstack([curve.sides for curve in curves], format="csr")
+    columns = curves[0].sides.shape[1]
+
     def gaps_of(one: ClusterDraws) -> Floats:
         """Return the difference of the areas in every draw."""
-        parts = (areas(both[0], row, contrast.metric) - areas(both[1], row, contrast.metric) for row in one.weights())
-        return np.concatenate(list(parts))
+        gaps = []
+        for masses in one.sums(table):
+            sides = zip(curves, (masses[:, :columns], masses[:, columns:]), strict=True)
+            found = [getattr(curve.areas(mine), contrast.metric) for curve, mine in sides]
+            gaps.append(found[0] - found[1])
+        return np.concatenate(gaps)
 
     gaps = drawn.of_both(gaps_of)
     place = np.unique(first["place"], return_inverse=True)[1]

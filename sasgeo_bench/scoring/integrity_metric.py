@@ -6,14 +6,20 @@ At full coverage, queries without an answer come last and count as false, so tha
 
 import math
 from dataclasses import dataclass
+from typing import Final, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.sparse import csr_array
 from scipy.special import digamma
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.base import Floats, check_weights
+from sasgeo_bench.scoring.base import Bools, Floats, check_weights
 from sasgeo_bench.scoring.decisions import Answers
+
+_CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
+_FIRST: Final = 512  # groups of one answer each, where groups are merged: an area weighs its first answers most
+_OTHERS: Final = 1024
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,6 +106,78 @@ class DrawnAreas:
     auroc: Floats
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Curve:
+    """Answers in groups of equal confidence, to weigh them in many draws at once.
+
+    `sides`, shape (N, 3 G) for G groups, the most confident first, holds a 1 for each query: in the first G columns for
+    a right fix, in the next for a false one of a present place, in the last for one of an absent place. A query without
+    an answer counts as false and is of the last group. `is_given`, shape (G,), is False of that group.
+    """
+
+    sides: csr_array
+    is_given: Bools
+
+    @classmethod
+    def of(cls, answers: Answers, *, is_merged: bool) -> Self:
+        """Return the groups of some answers; with `is_merged`, of more than 1,536 answers neighbours tie.
+
+        The first 512 keep their order, the others lie in 1,024 groups of nearly as many answers. Areas of draws change
+        by less than 3e-5, a small part of their spread, and take no longer for a million answers.
+
+        >>> facts = {"is_answered": [1] * 4, "is_right": [1, 0, 0, 1], "is_present": [1] * 4}
+        >>> Curve.of(Answers(confidence=[0.9, 0.8, 0.7, 0.7], **facts), is_merged=True).sides.toarray().argmax(axis=1)
+        array([0, 4, 5, 2])
+        """
+        tie, last = answers.tie, len(answers.steps)  # the last group has no answer
+        if is_merged and last > _FIRST + _OTHERS:
+            sizes = np.bincount(tie, minlength=last + 1)
+            before = np.cumsum(sizes) - sizes
+            others = np.linspace(_FIRST, before[-1], _OTHERS, endpoint=False)
+            edges = np.concatenate((np.arange(_FIRST), others, before[-1:]))
+            tie, last = (np.searchsorted(edges, before, side="right") - 1)[tie], len(edges) - 1
+        groups, group = np.unique(tie, return_inverse=True)
+        side = np.where(answers.is_right, 0, np.where(answers.is_present, 1, 2))
+        cells = (np.ones(len(tie)), side * len(groups) + group, np.arange(len(tie) + 1))
+        return cls(sides=csr_array(cells, shape=(len(tie), 3 * len(groups))), is_given=groups < last)
+
+    def areas(self, masses: Floats, *, present: float = 1.0, absent: float = 1.0) -> DrawnAreas:
+        """Return all areas for the masses of D draws, shape (D, 3 G), with factors of present and absent places.
+
+        `weights @ sides` are the masses of weights of shape (D, N).
+        """
+        if not len(self.is_given):
+            none = np.full(len(masses), np.nan)
+            return DrawnAreas(aurc=none, e_aurc=none, augrc=none, auroc=none)
+        parts = np.array_split(masses, 1 + masses.size // _CACHED)
+        found = [self._areas(part, present, absent) for part in parts]
+        return DrawnAreas(**{name: np.concatenate([part[name] for part in found]) for name in found[0]})
+
+    def _areas(self, masses: Floats, present: float, absent: float) -> dict[str, Floats]:
+        right, missed, unseen = np.hsplit(masses, 3)
+        right = right * present
+        false = missed * present + unseen * absent
+        group = right + false
+        accepted, after = np.cumsum(group, axis=1), np.cumsum(false, axis=1)
+        total, wrong = accepted[:, -1], after[:, -1]
+        harmonic = np.diff(digamma(accepted + 1.0), axis=1, prepend=digamma(1.0))
+        slope = np.divide(false, group, out=np.zeros_like(group), where=group > 0)
+        area = (false + (after - false - (accepted - group) * slope) * harmonic).sum(axis=1)
+        least = wrong - (total - wrong) * (digamma(total + 1.0) - digamma(total - wrong + 1.0))
+        undetected = (group * (after - false / 2)).sum(axis=1)
+        some = np.where(total > 0, total, np.nan)
+        aurc_ = np.clip(area / some, 0.0, 1.0)
+        lost = false * self.is_given  # the last group may hold queries without an answer
+        above = np.cumsum(right, axis=1) - right / 2
+        pairs = right.sum(axis=1) * lost.sum(axis=1)
+        return {
+            "aurc": aurc_,
+            "e_aurc": np.maximum(aurc_ - least / some, 0.0),
+            "augrc": undetected / some**2,
+            "auroc": (lost * above).sum(axis=1) / np.where(pairs > 0, pairs, np.nan),
+        }
+
+
 def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
     """Return all areas for each row of weights, shape (D, N); several times faster than one by one.
 
@@ -108,35 +186,8 @@ def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
     >>> found.aurc.tolist(), found.augrc.tolist(), found.auroc.tolist()
     ([0.25, 0.0], [0.125, 0.0], [1.0, nan])
     """
-    order = np.argsort(answers.tie, kind="stable")
-    if not len(order):
-        none = np.full(len(weights), np.nan)
-        return DrawnAreas(aurc=none, e_aurc=none, augrc=none, auroc=none)
-    first = np.flatnonzero(np.diff(answers.tie[order], prepend=-1))
-    sorted_mass = weights[:, order]
-    group, false = sorted_mass, sorted_mass * ~answers.is_right[order]
-    if len(first) < len(order):
-        group, false = (np.add.reduceat(each, first, axis=1) for each in (group, false))
-    accepted = np.cumsum(group, axis=1)
-    total, after = accepted[:, -1], np.cumsum(false, axis=1)
-    wrong = after[:, -1]
-    harmonic = np.diff(digamma(accepted + 1.0), axis=1, prepend=digamma(1.0))
-    slope = np.divide(false, group, out=np.zeros_like(group), where=group > 0)
-    area = (false + (after - false - (accepted - group) * slope) * harmonic).sum(axis=1)
-    least = wrong - (total - wrong) * (digamma(total + 1.0) - digamma(total - wrong + 1.0))
-    undetected = (group * (after - false / 2)).sum(axis=1)
-    some = np.where(total > 0, total, np.nan)
-    aurc_ = np.clip(area / some, 0.0, 1.0)
-    is_given = answers.tie[order][first] < len(answers.steps)  # the last group may hold queries without an answer
-    right, lost = (group - false) * is_given, false * is_given
-    above = np.cumsum(right, axis=1) - right / 2
-    pairs = right.sum(axis=1) * lost.sum(axis=1)
-    return DrawnAreas(
-        aurc=aurc_,
-        e_aurc=np.maximum(aurc_ - least / some, 0.0),
-        augrc=np.asarray(undetected / some**2),
-        auroc=np.asarray((lost * above).sum(axis=1) / np.where(pairs > 0, pairs, np.nan)),
-    )
+    curve = Curve.of(answers, is_merged=False)
+    return curve.areas(weights @ curve.sides)
 
 
 def auroc(answers: Answers, weights: ArrayLike | None = None) -> float:

@@ -13,14 +13,19 @@ import pandas as pd
 from sasgeo_bench.scoring.base import Floats, Ints, weighted_mean
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_weights
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.integrity_metric import drawn_areas
-from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, effective_count, share_interval
+from sasgeo_bench.scoring.integrity_metric import Curve
+from sasgeo_bench.scoring.intervals import (
+    BoardDraws,
+    BoardInterval,
+    effective_count,
+    intervals_of_columns,
+    share_interval,
+)
 from sasgeo_bench.scoring.metric import RejectionMetric, ThresholdMetric
 from sasgeo_bench.scoring.metrics import REJECTION, THRESHOLDS
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads
 
 AS_DRAWN: Final = "as drawn"
-_CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
 SLOW_DRAWS: Final = 1000  # for metrics that are no means: each draw sorts again
 
 
@@ -92,10 +97,14 @@ def _drawn_areas(
     found: dict[tuple[str, str], list[Floats]] = {}
     if drawn.units_count < 2:  # noqa: PLR2004 - one place cannot differ from itself
         return {}
-    parts = (part for some in drawn.weights() for part in np.array_split(some, 1 + some.size // _CACHED))
-    for weights in parts:
-        for stratum, mass in mixtures.items():
-            for name, area in asdict(drawn_areas(answers, weights * mass)).items():
+    curve, present = Curve.of(answers, is_merged=True), answers.is_present
+    factors = {
+        stratum: {"present": mass[present].max(initial=0.0), "absent": mass[~present].max(initial=0.0)}
+        for stratum, mass in mixtures.items()
+    }
+    for masses in drawn.sums(curve.sides):
+        for stratum, both in factors.items():
+            for name, area in asdict(curve.areas(masses, **both)).items():
                 found.setdefault((stratum, name), []).append(area)
     return {key: np.concatenate(listed) for key, listed in found.items()}
 
@@ -142,22 +151,20 @@ def _shares(part: pd.DataFrame, mass: Floats) -> Iterator[tuple[ThresholdMetric,
             yield metric, Share(counted=counted, mass=counts)
 
 
-def share_intervals(shares: Sequence[Share], sites: Ints, drawn: BoardDraws) -> Iterator[BoardInterval]:
-    """Yield each share with its intervals; `sites` are those of the queries, shape (N,)."""
-    draws = zip(*(_drawn_shares(shares, one) for one in drawn.both), strict=True)
-    for share, both in zip(shares, draws, strict=True):
-        value = weighted_mean(share.counted, share.mass)
-        yield share_interval(value, both, effective_count(sites, share.mass))
+def share_intervals(shares: Sequence[Share], sites: Ints, drawn: BoardDraws) -> list[BoardInterval]:
+    """Return each share with its intervals; `sites` are those of the queries, shape (N,)."""
+    by_place, by_block = (_drawn_shares(shares, one) for one in drawn.both)
+    values = [weighted_mean(share.counted, share.mass) for share in shares]
+    return intervals_of_columns(values, (by_place, by_block), [effective_count(sites, share.mass) for share in shares])
 
 
-def _drawn_shares(shares: Sequence[Share], drawn: ClusterDraws) -> Iterator[Floats]:
-    """Yield each share in every draw, with one pass over the draws; NaN where a draw has no weight.
+def _drawn_shares(shares: Sequence[Share], drawn: ClusterDraws) -> Floats:
+    """Return all shares in every draw, shape (D, shares); NaN where a draw has no weight.
 
-    For fewer than two clusters the draws are empty.
+    For fewer than two clusters there are no draws.
     """
     if not shares or drawn.units_count < 2:  # noqa: PLR2004 - one place cannot differ from itself
-        yield from (np.empty(0) for _ in shares)
-        return
+        return np.empty((0, len(shares)))
     columns = [share.counted * share.mass for share in shares] + [share.mass for share in shares]
     top, bottom = np.hsplit(np.vstack(list(drawn.sums(np.column_stack(columns)))), 2)
-    yield from np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0).T
+    return np.asarray(np.divide(top, bottom, out=np.full(top.shape, np.nan), where=bottom > 0))

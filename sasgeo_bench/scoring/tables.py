@@ -17,7 +17,7 @@ from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
 from sasgeo_bench.scoring.compare import RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
-from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, amount_interval, share_interval
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, amount_interval, intervals_of_columns
 from sasgeo_bench.scoring.metric import MeanMetric, QuantileMetric
 from sasgeo_bench.scoring.metrics import COSTS, means_of, primary_of, quantiles_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, is_unranked, to_frame
@@ -204,10 +204,10 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
     means = _Means(table=table, drawn=drawn.means(table), trials=drawn.trials, clusters=drawn.by_block.units_count)
     for number, metric in enumerate(metrics):
         yield from _ranked(cell, keys, metric, means.some(slice(number * count, (number + 1) * count)))
-    for at, item in enumerate(below, start=len(metrics) * count):
+    shares = means.some(slice(len(metrics) * count, None)).intervals([item.quantile.share for item in below])
+    for item, found in zip(below, shares, strict=True):
         errors = group.errors[item.quantile.column][chosen, item.matcher]
-        found = means.interval(at, item.quantile.share).mapped(partial(_inverse, errors), item.value)
-        yield keys[item.matcher].row(item.quantile, found)
+        yield keys[item.matcher].row(item.quantile, found.mapped(partial(_inverse, errors), item.value))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,12 +224,12 @@ class _Means:
         by_place, by_block = (means[:, columns] for means in self.drawn)
         return replace(self, table=self.table[:, columns], drawn=(by_place, by_block))
 
-    def interval(self, column: int, value: float, *, is_share: bool = True) -> BoardInterval:
-        """Return the intervals of one column's mean; values of a share lie in [0, 1]."""
-        by_place, by_block = (means[:, column] for means in self.drawn)
-        if not is_share:
-            return amount_interval(value, (by_place, by_block), self.clusters)
-        return share_interval(value, (by_place, by_block), self.trials)
+    def intervals(self, values: Sequence[float], *, is_share: bool = True) -> list[BoardInterval]:
+        """Return the intervals of the means of all columns; values of a share lie in [0, 1]."""
+        if is_share:
+            return intervals_of_columns(values, self.drawn, self.trials)
+        both = zip(*(means.T for means in self.drawn), strict=True)
+        return [amount_interval(value, one, self.clusters) for value, one in zip(values, both, strict=True)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -269,9 +269,9 @@ def _ranked(cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, means: _Mea
     """Yield the rows of one metric, with ranks for the primary one."""
     names, places, table = cell.group.names, cell.group.places[cell.chosen], means.table
     is_share = metric.bounds == (0.0, 1.0)
-    found = [means.interval(at, float(table[:, at].mean()), is_share=is_share) for at in range(len(names))]
+    values = [float(table[:, at].mean()) for at in range(len(names))]
+    found = means.intervals(values, is_share=is_share)
     is_decidable = metric.is_primary and keys[0].places >= LEAST_PLACES
-    values = [interval.value for interval in found]
     ranks = _ranks(cell.group, values, means.drawn[0], metric) if is_decidable else {}
     for at, name in enumerate(names):
         rank = ranks.get(name)

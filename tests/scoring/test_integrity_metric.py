@@ -15,6 +15,7 @@ from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import check_weights, weighted_mean
 from sasgeo_bench.scoring.decisions import Answers, accept, presence_weights
 from sasgeo_bench.scoring.integrity_metric import (
+    Curve,
     augrc,
     aurc,
     choose_threshold,
@@ -90,6 +91,25 @@ def test_areas_of_many_draws_are_those_of_each(rows, seed) -> None:
     found = drawn_areas(answers, weights)
     np.testing.assert_allclose(found.aurc, [aurc(answers, row) for row in weights], atol=1e-12)
     np.testing.assert_allclose(found.augrc, [augrc(answers, row) for row in weights], atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [1_500, 20_000])
+def test_areas_of_merged_answers_are_nearly_those_of_each(count) -> None:
+    rng = np.random.default_rng(count)
+    confidence = rng.random(count)
+    is_present, is_answered = rng.random(count) < 0.8, rng.random(count) < 0.9
+    is_right = is_present & is_answered & (rng.random(count) < confidence)
+    answers = Answers(confidence=confidence, is_answered=is_answered, is_right=is_right, is_present=is_present)
+    weights = rng.integers(0, 3, (4, count)).astype(float)
+    exact, curve = drawn_areas(answers, weights), Curve.of(answers, is_merged=True)
+    assert curve.sides.shape[1] <= 3 * 1_537
+    found = curve.areas(weights @ curve.sides)
+    for name in ("aurc", "e_aurc", "augrc", "auroc"):
+        np.testing.assert_allclose(getattr(found, name), getattr(exact, name), atol=3e-5 if count > 1_536 else 1e-12)
+    halved = curve.areas(weights @ curve.sides, absent=0.5)
+    alike = drawn_areas(answers, weights * np.where(is_present, 1.0, 0.5))
+    np.testing.assert_allclose(halved.aurc, alike.aurc, atol=3e-5)
+    np.testing.assert_allclose(halved.auroc, alike.auroc, atol=3e-5)
 
 
 def test_areas_worked_by_hand() -> None:

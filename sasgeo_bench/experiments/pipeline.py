@@ -35,7 +35,7 @@ from sasgeo_bench.publishing.archive_folder import check_results
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
-from sasgeo_bench.scoring.contestants import read_scored_task, rows_of_task, rows_to_rank
+from sasgeo_bench.scoring.contestants import design_rows, read_scored_task, rows_to_rank
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
@@ -131,7 +131,7 @@ def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: S
     if not contrasts:
         return
     read = [read_scored_task(folder, plan.out / "truth") for folder in tasks]
-    frames = [rows_of_task(task, {}, plan.split)[0] for task in read]
+    frames = [design_rows(task, plan.split) for task in read]
     design = rows_to_rank({plan.spec.id: pd.concat(frames, ignore_index=True)}, plan.split)[plan.spec.id]
     pilots = {item.name: Pilot(**item.pilot.model_dump()) for item in plan.spec.contrast if item.pilot is not None}
     check_contrasts(contrasts, pilots, design, tell=tell)

@@ -20,10 +20,10 @@ from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables
 from sasgeo_bench.leaderboard.stored_figures import StoredFigures
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
-from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import LOG, Failures
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame
 from sasgeo_bench.scoring.controls import Falsifier, Verdict, failed_controls, falsifier_frame, verdict_frame
@@ -102,7 +102,7 @@ class Board:
 
     entries: tuple[Entry, ...]
     scores: dict[str, pd.DataFrame]
-    predictions: dict[str, dict[str, Prediction]]
+    predictions: Mapping[str, StoredAnswers]
     table: pd.DataFrame
     with_calibration: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()

@@ -164,8 +164,9 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
 
 def _of_flights(tasks: Sequence[ScoredTask]) -> dict[str, Mapping[str, float]]:
     """Return what was measured at the first view of each flight by the flight's id."""
-    firsts = {head.query_id: head.sequence_id for task in tasks for head in task.heads if head.frame == 0}
-    truths = (truth for task in tasks if task.is_of_flights for truth in task.truths)
+    flown = [task for task in tasks if task.is_of_flights]
+    firsts = {head.query_id: head.sequence_id for task in flown for head in task.heads if head.frame == 0}
+    truths = (truth for task in flown for truth in task.truths)
     return {str(firsts[truth.query_id]): truth.measured for truth in truths if truth.query_id in firsts}
 
 
@@ -248,7 +249,7 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
     for name in scores:
         with board.failures.of(f"protection levels of {name}"):
             rows = single_views(board.with_calibration[name])
-            levels.append(protection_frame(name, rows, board.predictions[name], request.split))
+            levels.append(protection_frame(name, rows, board.predictions[name].lean(), request.split))
     some = [frame for frame in levels if len(frame)]
     return replace(
         board,

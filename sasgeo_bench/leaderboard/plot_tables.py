@@ -7,7 +7,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.scoring.base import Floats, Ints
+from sasgeo_bench.scoring.base import Floats, Ints, codes_of
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.decisions import Answers, equal_mass_bins, stanford
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
@@ -176,7 +176,7 @@ def _parts(
 
 def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[dict[str, float]]:
     is_false = ~answered["is_right"].to_numpy(bool)
-    sites = np.unique(answered["pair_id"], return_inverse=True)[1]
+    sites = codes_of(answered["pair_id"])
     at = equal_mass_bins(1.0 - p_false)
     for number in np.unique(at):
         mine = at == number

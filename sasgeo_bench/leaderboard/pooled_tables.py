@@ -15,7 +15,7 @@ import pandas as pd
 
 from sasgeo_bench.leaderboard.plot_tables import calibrated_parts
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
 from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost
 from sasgeo_bench.scoring.draws import seed_of_text
@@ -42,7 +42,7 @@ _FIGURE: Final = ("n", "blocks", "value", "lo", "hi")
 
 def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[dict[str, Any]]:
     """Return means of columns of values in [0, 1] with intervals as of a board; the same queries share draws."""
-    names = (np.unique(rows[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
+    names = (codes_of(rows[name]) for name in ("place", "block", "pair_id"))
     drawn = BoardDraws.of(*names, seed=seed_of_text(text), draws=SLOW_DRAWS)
     found = intervals_of_columns(table.mean(axis=0), drawn.means(table), drawn.trials)
     counts = {"n": len(rows), "blocks": drawn.by_block.units_count}

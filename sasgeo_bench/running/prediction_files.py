@@ -4,8 +4,9 @@
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -132,10 +133,15 @@ class Tie:
 
 @dataclass(frozen=True, slots=True)
 class Answers:
-    """Answers of a run to some queries, by id, and the number of rows that answer others."""
+    """Answers of a run to some queries, a row for each, and the number of rows that answer others."""
 
-    found: dict[str, Prediction]
+    table: pa.Table
     aside: int
+
+    @property
+    def found(self) -> dict[str, Prediction]:
+        """Return the answers by query id."""
+        return {item.query_id: item for item in predictions_of(self.table)}
 
 
 def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Answers:
@@ -145,7 +151,8 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
     says (`key_of`). `is_tied` states whether rows without a hash are known to answer these queries. A run that was
     killed before its first row has no answers. Raise `StoreError` if a part cannot be read.
     """
-    found: dict[str, Prediction] = {}
+    tables: list[pa.Table] = []
+    seen: set[str] = set()
     aside: set[Tie] = set()
     under = {parent: asked_in(parent, asked) for parent in {part.parent for part in parts_of(folder)}}
     for part in reversed(parts_of(folder)):
@@ -153,11 +160,28 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
         ties, asked = _ties_of(table), under[part.parent]
         is_own = [tie.answers(asked, is_tied=is_tied) for tie in ties]
         aside |= {replace(tie, status="") for tie, own in zip(ties, is_own, strict=True) if not own}
-        if not all(is_own):
-            table = table.filter(pa.array(is_own, pa.bool_()))
-        for prediction in predictions_of(table):
-            found.setdefault(prediction.query_id, prediction)
-    return Answers(found, len(aside))
+        tables.append(
+            _newest(table, [tie.query_id if own else None for tie, own in zip(ties, is_own, strict=True)], seen)
+        )
+    return Answers(_joined(tables), len(aside))
+
+
+def _newest(table: pa.Table, ids: Sequence[str | None], seen: set[str]) -> pa.Table:
+    """Return the last row of each id that is not `seen`, and note these as seen; rows without an id are left out."""
+    rows = []
+    for at in range(len(ids) - 1, -1, -1):
+        name = ids[at]
+        if name is not None and name not in seen:
+            seen.add(name)
+            rows.append(at)
+    return table if len(rows) == len(table) else table.take(pa.array(rows, pa.int64()))
+
+
+def _joined(tables: Sequence[pa.Table]) -> pa.Table:
+    """Return the rows of several tables, of which some may lack columns; an empty one where there are none."""
+    plain = PART_SCHEMA.remove_metadata().empty_table()
+    some = [table.replace_schema_metadata() for table in tables if len(table)]
+    return pa.concat_tables(some, promote_options="permissive") if some else plain
 
 
 def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
@@ -211,17 +235,71 @@ def read_predictions(path: str | Path) -> Iterator[Prediction]:
     StoreError
         If there is none, or a file cannot be read.
     """
-    path = given_path(path)
+    for table in _tables_of(given_path(path)):
+        yield from predictions_of(table)
+
+
+def read_rows(path: Path) -> pa.Table:
+    """Read the rows of a run's folder or a file, one for each query. Raise as `read_predictions` does."""
+    return _joined(list(_tables_of(path)))
+
+
+def _tables_of(path: Path) -> Iterator[pa.Table]:
     parts = parts_of(path)
     if not parts:
         message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
         raise StoreError(message)
     seen: set[str] = set()
     for part in reversed(parts):
-        for prediction in predictions_of(_checked(part, is_own=part != path)):
-            if prediction.query_id not in seen:
-                seen.add(prediction.query_id)
-                yield prediction
+        table = _checked(part, is_own=part != path)
+        yield _newest(table, table["query_id"].to_pylist(), seen)
+
+
+class StoredAnswers(Mapping[str, Prediction]):
+    """Answers to the queries of some tasks, read from their files when they are asked for, a task at a time.
+
+    `read` returns the rows of each task, by its folder; `task_of` is the folder of each query. Who asks in the order of
+    the tasks reads each of them once.
+    """
+
+    def __init__(self, read: Mapping[Path, Callable[[], pa.Table]], task_of: Mapping[str, Path]) -> None:
+        self._read, self._task_of = dict(read), task_of
+        self._last: tuple[Path | None, dict[str, Prediction]] = (None, {})
+
+    def rows(self, task: Path) -> pa.Table:
+        """Return the rows of one task. Raise `StoreError` if they cannot be read."""
+        return self._read[task]()
+
+    def __getitem__(self, query_id: str) -> Prediction:
+        """Return one answer; raise KeyError without one."""
+        task = self._task_of[query_id]
+        if task not in self._read:
+            raise KeyError(query_id)
+        return self._of(task)[query_id]
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the ids of all queries that are answered."""
+        for task in self._read:
+            yield from self._of(task)
+
+    def __len__(self) -> int:
+        """Return the number of answers."""
+        return sum(len(self._of(task)) for task in self._read)
+
+    def _of(self, task: Path) -> dict[str, Prediction]:
+        if self._last[0] != task:
+            self._last = (task, {item.query_id: item for item in predictions_of(self.rows(task))})
+        return self._last[1]
+
+    def lean(self) -> "StoredAnswers":
+        """Return the same answers without their candidates, which take far longer to read than all the rest."""
+        return StoredAnswers({task: partial(_without_poses, read) for task, read in self._read.items()}, self._task_of)
+
+
+def _without_poses(read: Callable[[], pa.Table]) -> pa.Table:
+    table = read()
+    nothing = pa.array([[]] * len(table), PREDICTION_SCHEMA.field("candidates").type)
+    return table.set_column(table.column_names.index("candidates"), "candidates", nothing)
 
 
 def _checked(part: Path, *, is_own: bool) -> pa.Table:

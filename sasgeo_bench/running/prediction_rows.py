@@ -3,7 +3,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import numpy as np
 import pyarrow as pa
@@ -24,6 +24,9 @@ from sasgeo_bench.texts import (
     bounds_text,
     is_line,
 )
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
 SCHEMA_VERSION: Final = 1
 _CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
@@ -91,6 +94,56 @@ def predictions_of(table: pa.Table) -> list[Prediction]:
         _with_candidates(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
         for at in reversed(range(len(rows)))
     ]
+
+
+def table_of(predictions: Iterable[Prediction]) -> pa.Table:
+    """Return predictions as a table with the columns of a run's own parts, but for the hash of the question."""
+    schema = PART_SCHEMA.remove(PART_SCHEMA.get_field_index(ASKED))
+    return pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=schema)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerColumns:
+    """R rows of predictions as columns, without an object for each, and their C candidates one after the other.
+
+    `confidence` and `latency_s` have shape (R,), NaN for null. `poses`, shape (C, 4), are easting, northing, yaw and
+    scale; `scores` and `row`, shape (C,), the score and the row of each candidate; `first`, shape (R,), the first
+    candidate of each row, -1 without one.
+    """
+
+    query_id: list[str]
+    status: list[str]
+    confidence: Floats
+    latency_s: Floats
+    poses: Floats
+    scores: Floats
+    row: Ints
+    first: Ints
+
+    @classmethod
+    def of(cls, table: pa.Table) -> Self:
+        """Return the columns of a table without `row_faults`.
+
+        >>> pose = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0)
+        >>> answers = [Prediction(query_id="a"), Prediction(query_id="b", candidates=((pose, 9.0),))]
+        >>> found = AnswerColumns.of(table_of(answers))
+        >>> found.poses.tolist(), found.row.tolist(), found.first.tolist()
+        ([[1.0, 2.0, 3.0, 1.0]], [1], [-1, 0])
+        """
+        lists = table["candidates"].combine_chunks()
+        row, items = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
+        counts = np.bincount(row, minlength=len(table))
+        poses = [_numbers(items.field(name)) for name in POSE_FIELDS]
+        return cls(
+            query_id=table["query_id"].to_pylist(),
+            status=table["status"].to_pylist(),
+            confidence=_numbers(table["confidence"]),
+            latency_s=_numbers(table["latency_s"]),
+            poses=np.column_stack(poses),
+            scores=_numbers(items.field("score")),
+            row=np.asarray(row, dtype=np.int64),
+            first=np.where(counts > 0, np.cumsum(counts) - counts, -1),
+        )
 
 
 def _with_candidates(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float], ...]) -> Prediction:

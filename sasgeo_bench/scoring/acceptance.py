@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.controls import EVERY
 from sasgeo_bench.scoring.decisions import COST_RATIOS, Answers, accept_by_cost
 from sasgeo_bench.scoring.draws import seed_of_text
@@ -71,7 +71,7 @@ def _pools(part: pd.DataFrame) -> Iterator[_Pool]:
 
 def _rows(pool: _Pool, text: str) -> Iterator[dict[str, Any]]:
     part = pool.rows
-    place, block, site = (np.unique(part[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
+    place, block, site = (codes_of(part[name]) for name in ("place", "block", "pair_id"))
     drawn = BoardDraws.of(place, block, site, seed=seed_of_text(text), draws=SLOW_DRAWS)
     plain = answers_of(part)
     cases = [

@@ -4,6 +4,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 from numpy.typing import ArrayLike, NDArray
 
 from sasgeo_bench.errors import MetricError
@@ -62,10 +63,20 @@ def block_codes(blocks: Sequence[str] | Ints, count: int) -> tuple[Ints, Ints]:
     if len(blocks) != count:
         message = f"{len(blocks)} blocks for {count} queries, expected one each"
         raise MetricError(message)
-    names = np.asarray(blocks)
-    names = names if names.dtype.kind == "i" else names.astype(str)
-    _, code, sizes = np.unique(names, return_inverse=True, return_counts=True)
-    return np.asarray(sizes, dtype=np.int64), np.asarray(code, dtype=np.int64)
+    code = codes_of(blocks)
+    return np.bincount(code), code
+
+
+def codes_of(names: ArrayLike) -> Ints:
+    """Return for each of N names its place in their order, each counted once, shape (N,).
+
+    >>> codes_of(["b", "a", "b"]).tolist(), codes_of(np.array([7, 3, 7])).tolist()
+    ([1, 0, 1], [1, 0, 1])
+    """
+    values = np.asarray(names)
+    if values.dtype.kind != "i":
+        values = values.astype(object)
+    return np.asarray(pd.factorize(values, sort=True)[0], dtype=np.int64)
 
 
 def weighted_mean(values: ArrayLike, weights: ArrayLike | None = None) -> float:

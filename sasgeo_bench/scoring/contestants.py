@@ -3,27 +3,31 @@
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
 import pandas as pd
+import pyarrow as pa
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.running.prediction_files import StoredAnswers
+from sasgeo_bench.running.prediction_rows import predictions_of, table_of
 from sasgeo_bench.scoring.controls import hold_controls
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.scoring.rows import AS_SUBMITTED
-from sasgeo_bench.scoring.score import score_task, settle_not_applicable
+from sasgeo_bench.scoring.score import Questions, settle_not_applicable, some_rows, with_answers
 from sasgeo_bench.scoring.validate import submission_faults, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, Head, Truth
 from sasgeo_bench.tasks.split import Split
 
 M2_PER_KM2: Final = 1e6
+_MOST_KEPT_BYTES: Final = 128 * 1024**2  # of answers: some 120,000 of 25 poses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,12 +49,12 @@ class AskedTask:
 
 @dataclass(frozen=True, kw_only=True)
 class ScoredTask:
-    """A task with truths, read once for all entries."""
+    """A task with truths, read once for all entries; `parts` are those of the split that its queries belong to."""
 
     folder: Path
     about: dict[str, Any]
-    heads: tuple[Head, ...]
     truths: tuple[Truth, ...]
+    parts: frozenset[str]
     view_bytes: dict[str, int]
     area_km2: float | None
 
@@ -58,6 +62,11 @@ class ScoredTask:
     def is_of_flights(self) -> bool:
         """Return whether its queries are views of flights."""
         return "sequence" in self.about["counts"]
+
+    @property
+    def heads(self) -> tuple[Head, ...]:
+        """Read the queries, whose candidates are too many to keep those of all tasks in memory."""
+        return tuple(task_files.read_heads(self.folder))
 
 
 def read_scored_task(folder: Path, root: Path) -> ScoredTask:
@@ -68,12 +77,11 @@ def read_scored_task(folder: Path, root: Path) -> ScoredTask:
     about = task_files.read_task(folder)
     truth = root / str(about["suite"]) / str(about["region"])
     task_files.check_truths(folder, truth)
-    heads, truths = tuple(task_files.read_heads(folder)), tuple(task_files.read_truths(truth))
     return ScoredTask(
         folder=folder,
         about=about,
-        heads=heads,
-        truths=truths,
+        truths=tuple(task_files.read_truths(truth)),
+        parts=frozenset(task_files.read_parts(folder)),
         view_bytes=task_files.read_view_bytes(folder),
         area_km2=_area_km2(folder.resolve().parents[2] / "regions" / about["region"]),
     )
@@ -103,7 +111,7 @@ class EntryAnswers:
     """
 
     entry: Entry
-    predictions: dict[str, Prediction]
+    predictions: StoredAnswers
     held: frozenset[Path]
     asked: frozenset[Path]
 
@@ -124,21 +132,24 @@ def read_entry_answers(
     whose answers cannot be read. Raise StoreError if a run that the user named answers none of the queries. Raise
     ConfigError if no entry answers any task.
     """
-    files: dict[str, dict[str, Prediction]] = {}
+    files: dict[str, pa.Table] = {}
     for entry in entries:
         with failures.of(entry.name):
             if not entry.runs:
-                read = prediction_files.read_predictions(entry.sources[0])  # without runs there is one file
-                files[entry.name] = {item.query_id: item for item in read}
+                files[entry.name] = prediction_files.read_rows(entry.sources[0])  # without runs there is one file
     found = folders or _answered_folders(entries, files.values(), root)
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
+    task_of = {name: task.folder for task in tasks for name in task.asked}
+    room = _Room(_MOST_KEPT_BYTES)
     answers: list[EntryAnswers] = []
     stale: list[Path] = []
     for entry in (entry for entry in entries if entry.name not in failures.found):
         with failures.of(entry.name):
-            rows = files.get(entry.name)
-            item, others = _read_runs(entry, tasks) if rows is None else (_answers_of_file(entry, tasks, rows), [])
-            stale += others
+            if entry.name in files:
+                item = _answers_of_file(entry, tasks, files[entry.name], task_of)
+            else:
+                item, others = _read_runs(entry, tasks, task_of, room)
+                stale += others
             answers += [item] if item.asked else []
     if not answers and failures.first is not None:
         raise failures.first
@@ -160,33 +171,61 @@ def read_entry_answers(
     return answers
 
 
-def _answered_folders(
-    entries: Sequence[Entry], files: Collection[Mapping[str, Prediction]], root: Path
-) -> Iterator[Path]:
+def _answered_folders(entries: Sequence[Entry], files: Collection[pa.Table], root: Path) -> Iterator[Path]:
     """Yield the task folders that runs were made on, then those for which files hold an answer."""
     for suite, region in sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs}):
         if (root / "tasks" / suite / region / task_files.TASK).is_file():
             yield root / "tasks" / suite / region
-    held = {name for rows in files for name in rows}
+    held = {name for rows in files for name in rows["query_id"].to_pylist()}
     for path in sorted((root / "tasks").glob(f"*/*/{task_files.TASK}")) if held else ():
         if not held.isdisjoint(task_files.read_ids(path.parent)):
             yield path.parent
 
 
-def _answers_of_file(entry: Entry, tasks: Sequence[AskedTask], rows: dict[str, Prediction]) -> EntryAnswers:
+def _answers_of_file(
+    entry: Entry, tasks: Sequence[AskedTask], rows: pa.Table, task_of: Mapping[str, Path]
+) -> EntryAnswers:
     """Return a file or a submission with its answers; a submission is asked the tasks it names."""
     asked = tasks
     if entry.submission is not None:
         named = {(item.suite, item.region) for item in entry.submission.tasks}
         asked = [task for task in tasks if (task.about["suite"], task.about["region"]) in named]
-    held = frozenset(task.folder for task in tasks if not rows.keys().isdisjoint(task.asked))
-    return EntryAnswers(entry=entry, predictions=rows, held=held, asked=frozenset(task.folder for task in asked))
+    places: dict[Path | None, list[int]] = {}
+    for at, name in enumerate(rows["query_id"].to_pylist()):
+        places.setdefault(task_of.get(name), []).append(at)
+    read = {task.folder: partial(rows.take, places.get(task.folder, [])) for task in tasks}
+    held = frozenset(task.folder for task in tasks if task.folder in places)
+    answers = StoredAnswers(read, task_of)
+    return EntryAnswers(entry=entry, predictions=answers, held=held, asked=frozenset(task.folder for task in asked))
 
 
-def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[EntryAnswers, list[Path]]:
-    """Return an entry with the answers of its runs, and the folders of runs that answer none of the tasks."""
+class _Room:
+    """Memory for rows of answers: what does not fit is read again where it is used."""
+
+    def __init__(self, most_bytes: int) -> None:
+        self._left = most_bytes
+
+    def keep(self, rows: pa.Table, read: Callable[[], pa.Table]) -> Callable[[], pa.Table]:
+        """Return what returns these rows: from memory, or as `read` does."""
+        if rows.nbytes > self._left:
+            return read
+        self._left -= rows.nbytes
+        return partial(_same, rows)
+
+
+def _same(rows: pa.Table) -> pa.Table:
+    return rows
+
+
+def _read_runs(
+    entry: Entry, tasks: Sequence[AskedTask], task_of: Mapping[str, Path], room: _Room
+) -> tuple[EntryAnswers, list[Path]]:
+    """Return an entry with the answers of its runs, and the folders of runs that answer none of the tasks.
+
+    Every answer is checked here; those that find no room are read again where they are used.
+    """
     by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
-    rows: dict[str, Prediction] = {}
+    read: dict[Path, Callable[[], pa.Table]] = {}
     runs: list[tuple[Path, Mapping[str, Any]]] = []
     asked: set[Path] = set()
     stale: list[Path] = []
@@ -197,21 +236,26 @@ def _read_runs(entry: Entry, tasks: Sequence[AskedTask]) -> tuple[EntryAnswers, 
             continue
         is_same = about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
         found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
-        if not (found.found or is_same):
+        if not (len(found.table) or is_same):
             stale.append(source)
             continue
-        rows |= found.found
+        read[task.folder] = room.keep(found.table, partial(_rows_of_run, source, task.asked, is_tied=is_same))
         asked.add(task.folder)
         runs.append((source, _share_of(about, found)))
     mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
-    return EntryAnswers(entry=mine, predictions=rows, held=frozenset(asked), asked=frozenset(asked)), stale
+    answers = StoredAnswers(read, task_of)
+    return EntryAnswers(entry=mine, predictions=answers, held=frozenset(asked), asked=frozenset(asked)), stale
+
+
+def _rows_of_run(source: Path, asked: Mapping[str, str], *, is_tied: bool) -> pa.Table:
+    return prediction_files.read_answers(source, asked, is_tied=is_tied).table
 
 
 def _share_of(about: Mapping[str, Any], answers: prediction_files.Answers) -> Mapping[str, Any]:
     """Return the run record with CPU time scaled to the fraction of answers that count."""
     if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
         return about
-    return {**about, "cpu_s": about["cpu_s"] * len(answers.found) / (len(answers.found) + answers.aside)}
+    return {**about, "cpu_s": about["cpu_s"] * len(answers.table) / (len(answers.table) + answers.aside)}
 
 
 def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[ScoredTask]:
@@ -252,17 +296,31 @@ def score_entries(
     ConfigError, if no entry is left.
     """
     folders = [task.folder for task in tasks]
-    scores: dict[str, pd.DataFrame] = {}
-    views: dict[str, pd.DataFrame] = {}
+    parts: dict[str, list[_Part]] = {}
     for item in answers:
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
                 check_submitted(item.entry, folders, split)
-            scored, seen = _scored(item, tasks, split, by_region, by_block)
-            hold_controls({item.entry.name: scored})  # so that an error names the entry
-            scores[item.entry.name] = scored
-            if seen is not None:
-                views[item.entry.name] = seen
+            parts[item.entry.name] = []
+    for task in tasks:  # the candidates of a task are in memory at once
+        score = _scorer(task, split, by_region, by_block)
+        for item in answers:
+            name = item.entry.name
+            if name in parts and task.folder in item.asked:
+                with failures.of(name):
+                    parts[name].append(_scored(item, task, score))
+                    continue
+                del parts[name]
+    scores: dict[str, pd.DataFrame] = {}
+    views: dict[str, pd.DataFrame] = {}
+    shared: dict[tuple[int, ...], pd.DataFrame] = {}
+    for name, listed in parts.items():
+        with failures.of(name):
+            scored = settle_not_applicable(_joined(listed, shared))
+            hold_controls({name: scored})  # so that an error names the entry
+            scores[name] = scored
+            seen = [part.views for part in listed if part.views is not None]
+            views |= {name: pd.concat(seen, ignore_index=True)} if seen else {}
     if not scores and failures.first is not None:
         raise failures.first
     left = tuple(item for item in answers if item.entry.name in scores)
@@ -276,7 +334,7 @@ def scored_rows(contest: Contest, split: Split | None, *, tell: Callable[[str], 
     about the other suites of an entry. Raise ConfigError if no entry is left.
     """
     unused = {"train"} if split is not None and split.spec.kind == "holdout" else set()
-    tasks = [task for task in contest.tasks if not {head.part for head in task.heads} <= unused]
+    tasks = [task for task in contest.tasks if not task.parts <= unused]
     found = {}
     for item in contest.answers:
         asked = {task.about["suite"] for task in tasks if task.folder in item.asked}
@@ -286,7 +344,7 @@ def scored_rows(contest: Contest, split: Split | None, *, tell: Callable[[str], 
             tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
         scores = contest.scores[item.entry.name]
         is_used = scores["suite"].isin(asked - lacking) & ~scores["part"].isin(unused)
-        rows = scores[is_used].reset_index(drop=True)
+        rows = some_rows(scores, is_used.to_numpy(bool))
         if len(rows):
             found[item.entry.name] = rows
     if not found:
@@ -305,7 +363,9 @@ def rows_to_rank(scored: Mapping[str, pd.DataFrame], split: Split | None) -> dic
     """
     if split is None or split.spec.kind != "holdout":
         return dict(scored)
-    counted_rows = {name: rows[rows["part"] != "calibration"].reset_index(drop=True) for name, rows in scored.items()}
+    counted_rows = {
+        name: some_rows(rows, (rows["part"] != "calibration").to_numpy(bool)) for name, rows in scored.items()
+    }
     found = {name: rows for name, rows in counted_rows.items() if len(rows)}
     if not found:
         message = f"there is nothing to rank: no query is of a test place of the hold-out {split.spec.id!r}"
@@ -330,38 +390,64 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
         raise ConfigError(message)
 
 
-def rows_of_task(
-    task: ScoredTask, predictions: Mapping[str, Prediction], split: Split | None
-) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """Return a scored row per query or flight of one task, and the rows of views of flights; None if there are none.
+def design_rows(task: ScoredTask, split: Split | None) -> pd.DataFrame:
+    """Return a row for each query or flight of one task, scored without an answer; raise as `score_task` does."""
+    return _scorer(task, split)(table_of([])).whole
 
-    Raise MetricError as `score_task` does.
+
+def _scored(item: EntryAnswers, task: ScoredTask, score: Callable[[pa.Table], "_Part"]) -> "_Part":
+    return score(item.predictions.rows(task.folder))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Part:
+    """Scored rows of one entry at one task: columns of its queries, which entries share, and of its answers.
+
+    Of flights `questions` is None and `answers` holds all columns; `views` are the rows of their views.
     """
+
+    questions: pd.DataFrame | None
+    answers: pd.DataFrame
+    views: pd.DataFrame | None = None
+
+    @property
+    def whole(self) -> pd.DataFrame:
+        """Return rows with all columns."""
+        return self.answers if self.questions is None else with_answers(self.questions, self.answers)
+
+
+def _joined(parts: Sequence[_Part], shared: dict[tuple[int, ...], pd.DataFrame]) -> pd.DataFrame:
+    """Return the rows of all parts; `shared` keeps the columns of queries for entries that were asked the same."""
+    questions = [part.questions for part in parts if part.questions is not None]
+    if len(questions) < len(parts):
+        return pd.concat([part.whole for part in parts], ignore_index=True)
+    key = tuple(map(id, questions))
+    if key not in shared:
+        shared[key] = pd.concat(questions, ignore_index=True)
+    return with_answers(shared[key], pd.concat([part.answers for part in parts], ignore_index=True))
+
+
+def _scorer(
+    task: ScoredTask, split: Split | None, by_region: Collection[str] = (), by_block: Collection[str] = ()
+) -> Callable[[pa.Table], _Part]:
+    """Return what scores the rows of one entry's answers to a task, whose queries are read once for all entries."""
     of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
-    if not task.is_of_flights:
-        return score_task(task.heads, task.truths, predictions, **of_split), None
-    found = score_flights(task.heads, task.truths, predictions, **of_split)
-    return found.flights, found.views
+    questions = Questions.of(task.heads, task.truths, **of_split)
 
-
-def _scored(
-    answers: EntryAnswers,
-    tasks: Sequence[ScoredTask],
-    split: Split | None,
-    by_region: Collection[str],
-    by_block: Collection[str],
-) -> tuple[pd.DataFrame, pd.DataFrame | None]:
-    """Return one row per query or flight of all tasks that an entry was asked, and the rows of views of flights."""
-    frames, views = [], []
-    for task in tasks:
-        if task.folder not in answers.asked:
-            continue
-        names = [head.query_id for head in task.heads]
-        mine = {name: answers.predictions[name] for name in names if name in answers.predictions}
-        frame, seen = rows_of_task(task, mine, split)
-        views += [] if seen is None else [seen]
+    def resampled(frame: pd.DataFrame) -> pd.DataFrame:
+        """Return rows with the blocks and places that they are drawn by."""
         suite = task.about["suite"]
         frame = frame.assign(block=frame["region"]) if suite in by_region else frame
-        frames.append(frame.assign(place=frame["block"], country=frame["block"]) if suite in by_block else frame)
-    scored = settle_not_applicable(pd.concat(frames, ignore_index=True))
-    return scored, pd.concat(views, ignore_index=True) if views else None
+        return frame.assign(place=frame["block"], country=frame["block"]) if suite in by_block else frame
+
+    asked = resampled(questions.frame)
+
+    def score(rows: pa.Table) -> _Part:
+        """Score the answers of one entry."""
+        if not task.is_of_flights:
+            return _Part(questions=asked, answers=questions.answered(rows))
+        answers = {item.query_id: item for item in predictions_of(rows)}
+        found = score_flights(questions.heads, questions.truths, answers, **of_split)
+        return _Part(questions=None, answers=resampled(found.flights), views=found.views)
+
+    return score

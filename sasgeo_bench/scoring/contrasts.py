@@ -11,7 +11,7 @@ import pandas as pd
 from scipy.sparse import hstack
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.compare import (
     holm,
     mcnemar_clustered,
@@ -357,7 +357,7 @@ def _value_finding(contrast: Contrast, rows: pd.DataFrame, sides: _Sides, draws:
     drawn = _drawn(contrast, rows, draws)
     won = (float(np.maximum(gaps, 0.0).mean()), float(np.maximum(-gaps, 0.0).mean()))
     means = drawn.means(gaps[:, None])
-    place = np.unique(rows["place"], return_inverse=True)[1]
+    place = codes_of(rows["place"])
     found = replace(
         _nothing(contrast),
         n=len(gaps),
@@ -398,7 +398,7 @@ def _area_finding(contrast: Contrast, first: pd.DataFrame, second: pd.DataFrame)
         return np.concatenate(gaps)
 
     gaps = drawn.of_both(gaps_of)
-    place = np.unique(first["place"], return_inverse=True)[1]
+    place = codes_of(first["place"])
     is_relative = contrast.metric in RELATIVE
     best = {"aurc": aurc(both[0]) - excess_aurc(both[0]), "e_aurc": 0.0, "auroc": 1.0}[contrast.metric]
     found = replace(

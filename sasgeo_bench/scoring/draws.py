@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
@@ -171,8 +172,10 @@ def _numbered(block: Ints, sites: Sequence[str] | Ints | None) -> tuple[Ints, In
         return np.arange(len(block)), np.arange(len(block))
     _, code = block_codes(sites, len(block))
     within = block * (1 + int(code.max(initial=0))) + code  # a site in two blocks counts as two
-    _, first, inverse = np.unique(within, return_index=True, return_inverse=True)
-    return np.argsort(np.argsort(first))[inverse], np.sort(first)
+    site, names = pd.factorize(within)  # in the order of their appearance
+    first = np.empty(len(names), dtype=np.int64)
+    first[site[::-1]] = np.arange(len(site))[::-1]
+    return np.asarray(site, dtype=np.int64), first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -63,12 +63,7 @@ def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequ
     A pose of the answer is the candidate at its position. Raise MetricError if no candidate is right: recall is a share
     of the queries whose place is present.
     """
-    if not 0 <= truth.candidate < len(candidates):
-        message = (
-            f"query {truth.query_id} has no right candidate ({truth.candidate} of {len(candidates)}): "
-            "leave absent places out of recall, the integrity track counts them"
-        )
-        raise MetricError(message)
+    check_candidate(truth, len(candidates))
     if prediction is None or prediction.status != "ok":
         return MISS
     given: set[int] = set()
@@ -79,6 +74,16 @@ def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequ
         given.add(at)
         right.append(at == truth.candidate)
     return rank_of([score for _, score in prediction.candidates], right)
+
+
+def check_candidate(truth: Truth, count: int) -> None:
+    """Raise MetricError if none of so many candidates is right."""
+    if not 0 <= truth.candidate < count:
+        message = (
+            f"query {truth.query_id} has no right candidate ({truth.candidate} of {count}): "
+            "leave absent places out of recall, the integrity track counts them"
+        )
+        raise MetricError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -189,10 +194,18 @@ def pose_errors(answers: Sequence[Pose | None], truths: Sequence[Pose]) -> PoseE
     if len(answers) != len(truths):
         message = f"{len(answers)} answers for {len(truths)} truths: give None where there is no answer"
         raise MetricError(message)
-    nothing = (math.inf,) * 4
-    given = np.array([nothing if pose is None else _numbers(pose) for pose in answers]).reshape(-1, 4)
-    true = np.array([_numbers(pose) for pose in truths]).reshape(-1, 4)
-    is_given = np.array([pose is not None for pose in answers], dtype=bool)
+    return errors_of_columns(columns_of(answers), columns_of(truths))
+
+
+def columns_of(poses: Sequence[Pose | None]) -> Floats:
+    """Return easting, northing, yaw and scale of N poses, shape (N, 4); NaN for None."""
+    nothing = (math.nan,) * 4
+    return np.array([nothing if pose is None else _numbers(pose) for pose in poses]).reshape(-1, 4)
+
+
+def errors_of_columns(given: Floats, true: Floats) -> PoseErrors:
+    """Return `pose_errors` of fixes and truths as columns, shape (N, 4) each (`columns_of`)."""
+    is_given = ~np.isnan(given[:, 0])
     gap = np.where(is_given[:, None], given, true) - true
     ratio = np.where(is_given, given[:, 3], true[:, 3]) / true[:, 3]
     return PoseErrors(

@@ -2,7 +2,7 @@
 """Rows of protection levels: Stanford diagrams counted for each method, risk and alert limit."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -14,7 +14,7 @@ from statsmodels.stats.proportion import proportion_confint
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.conformal import METHODS, RISKS, SCALE, level_name
-from sasgeo_bench.scoring.base import Bools, Floats, check_column, weighted_mean
+from sasgeo_bench.scoring.base import Bools, Floats, check_column, codes_of, weighted_mean
 from sasgeo_bench.scoring.decisions import stanford
 from sasgeo_bench.scoring.intervals import LEVEL, Interval, effective_count, wilson_share
 from sasgeo_bench.scoring.rejection import turns
@@ -210,22 +210,26 @@ def _levels_of_group(
             sites=sites[counts],
         )
 
+    found = _told(group, predictions, [SCALE, *(level_name(method, risk) for risk in RISKS for method in METHODS)])
+    scale_m = found[SCALE]
     for risk in RISKS:
-        levels = {method: _diagnostic(group, predictions, level_name(method, risk)) for method in METHODS}
-        for method, level_m in levels.items():
+        for method in METHODS:
+            level_m = found[level_name(method, risk)]
             if np.isfinite(level_m).any():
                 yield of(method, risk, level_m, is_tested)
-        scale_m = _diagnostic(group, predictions, SCALE)
         if split is not None and np.isfinite(scale_m).any():
             yield of(CONFORMAL, risk, *_conformal(group, split, scale_m, error_m, risk))
 
 
-def _diagnostic(group: pd.DataFrame, predictions: Mapping[str, Prediction], name: str) -> Floats:
-    """Return the level or scale in each answer's diagnostics; infinite if missing or not positive."""
+def _told(group: pd.DataFrame, predictions: Mapping[str, Prediction], names: Sequence[str]) -> dict[str, Floats]:
+    """Return levels or scales in each answer's diagnostics, by name; infinite if missing or not positive."""
     answered = zip(group["query_id"], group["is_answered"], strict=True)
-    levels = [predictions[query].diagnostics.get(name, np.inf) if some else np.inf for query, some in answered]
-    values = np.array(levels, dtype=np.float64)
-    return np.asarray(np.where(values > 0, values, np.inf))
+    levels = [
+        [told.get(name, np.inf) for name in names]
+        for told in (predictions[query].diagnostics if some else {} for query, some in answered)
+    ]
+    values = np.array(levels, dtype=np.float64).reshape(-1, len(names))
+    return dict(zip(names, np.where(values > 0, values, np.inf).T, strict=True))
 
 
 def _conformal(
@@ -245,7 +249,7 @@ def _counted(levels: ProtectionLevels) -> Iterator[dict[str, Any]]:
     """Yield a row for each alert limit; none without queries."""
     if not len(levels.level_m):
         return
-    sites = effective_count(np.unique(levels.sites, return_inverse=True)[1])
+    sites = effective_count(codes_of(levels.sites))
     for limit_m in ALERT_LIMITS_M:
         counts = stanford_counts(levels.level_m, levels.error_m, limit_m, trials=sites)
         row: dict[str, Any] = {"method": levels.method, "risk": levels.risk, "alert_limit_m": limit_m}

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import pandas as pd
@@ -28,7 +28,7 @@ from sasgeo_bench.scoring.metrics import THRESHOLDS
 from sasgeo_bench.scoring.prior_shift import at_share
 from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows, shifted_column
 from sasgeo_bench.scoring.rows import to_frame
-from sasgeo_bench.scoring.score import NOT_APPLICABLE
+from sasgeo_bench.scoring.score import NOT_APPLICABLE, some_rows
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.texts import message_of
 
@@ -101,7 +101,7 @@ def turns(scores: pd.DataFrame, split: Split, *, is_taught: bool = False) -> Ite
         test = place == fold.held_out
         if not test.any():
             continue
-        own = np.array([fold.part_of.get(name) == "calibration" for name in place], dtype=bool)
+        own = np.isin(place, [name for name, kind in fold.part_of.items() if kind == "calibration"])
         is_own = is_taught or bool(own.any())
         yield Turn(test=test, calibration=own if is_own else ~(test | is_sealed), is_own=is_own)
 
@@ -116,9 +116,16 @@ def judge(
     (False if `p_right` is only an order), `accepted_<risk>` for each of `RISKS`, `is_own_calibration`, and `remark`,
     the rejector's remark on its fit.
     """
-    frames = []
-    usable = scores[scores["status"] != NOT_APPLICABLE]
-    for _, group in usable.groupby(["track", "prior_group"], sort=True):
+    usable = some_rows(scores, (scores["status"] != NOT_APPLICABLE).to_numpy(bool))
+    needed = usable[[*_NEEDED]]
+    columns: dict[str, Any] = {
+        **{name: np.full(len(usable), np.nan) for name in ("p_right", *_DECIDED)},
+        "remark": np.full(len(usable), "", dtype=object),
+        **{name: np.zeros(len(usable), dtype=bool) for name in ("is_calibrated", "is_own_calibration")},
+    }
+    is_judged = np.zeros(len(usable), dtype=bool)
+    for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
+        group = needed.iloc[rows]
         fits: dict[bytes, _Fit] = {}  # places share their calibration places with others
         for turn in turns(group, split, is_taught=is_taught):
             test, calibration = group[turn.test], group[turn.calibration]
@@ -126,8 +133,11 @@ def judge(
                 same = turn.calibration.tobytes()
                 if same not in fits:
                     fits[same] = _Fit.of(calibration, predictions, make)
-                frames.append(_judged(test, fits[same], predictions).assign(is_own_calibration=turn.is_own))
-    return _together(frames, [*scores.columns, "p_right", "remark", "is_calibrated", *_DECIDED, "is_own_calibration"])
+                is_judged[rows[turn.test]] = True
+                found = {**_judged(test, fits[same], predictions), "is_own_calibration": turn.is_own}
+                for name, values in found.items():
+                    columns[name][rows[turn.test]] = values
+    return some_rows(usable.assign(**columns), is_judged)
 
 
 def remarks_of(judged: pd.DataFrame) -> list[str]:
@@ -166,26 +176,22 @@ def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taugh
     and prior groups with some confidence count; an answer without one is trusted least. Of a hold-out split only the
     test part counts. Without a split there are no thresholds.
     """
-    usable = scores[scores["status"] != NOT_APPLICABLE]
-    frames = []
-    for _, group in usable.groupby(["track", "prior_group"], sort=True):
-        p_right = np.where(group["is_answered"].to_numpy(bool), group["confidence"].to_numpy(float), np.nan)
-        if not np.isnan(p_right).all():
-            frames.append(_own_of_group(group.assign(p_right=p_right), split, is_taught=is_taught))
-    return _together(frames, [*scores.columns, "p_right", *_DECIDED])
-
-
-def _own_of_group(group: pd.DataFrame, split: Split | None, *, is_taught: bool) -> pd.DataFrame:
-    """Return the tested rows of one track and prior group, with the fixes that thresholds of other places accept."""
-    accepted = {name: np.full(len(group), np.nan) for name in _DECIDED}
-    for turn in () if split is None else turns(group, split, is_taught=is_taught):
-        known = group[turn.calibration]
-        if known["is_answered"].any():
-            for name, taken in _decided(known, group[turn.test]).items():
-                accepted[name][turn.test] = taken
-    group = group.assign(**accepted)
-    is_holdout = split is not None and split.spec.kind == "holdout"
-    return group[(group["part"] == "test").to_numpy(bool)] if is_holdout else group
+    usable = some_rows(scores, (scores["status"] != NOT_APPLICABLE).to_numpy(bool))
+    p_right = np.where(usable["is_answered"].to_numpy(bool), usable["confidence"].to_numpy(float), np.nan)
+    needed = usable[[*_NEEDED]].assign(p_right=p_right)
+    accepted = {name: np.full(len(usable), np.nan) for name in _DECIDED}
+    is_given = np.zeros(len(usable), dtype=bool)
+    for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
+        is_given[rows] = not np.isnan(p_right[rows]).all()
+        group = needed.iloc[rows]
+        for turn in turns(group, split, is_taught=is_taught) if split is not None and is_given[rows].any() else ():
+            known = group[turn.calibration]
+            if known["is_answered"].any():
+                for name, taken in _decided(known, group[turn.test]).items():
+                    accepted[name][rows[turn.test]] = taken
+    if split is not None and split.spec.kind == "holdout":
+        is_given &= (usable["part"] == "test").to_numpy(bool)
+    return some_rows(usable.assign(p_right=p_right, **accepted), is_given)
 
 
 def _together(frames: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
@@ -208,12 +214,15 @@ class _Fit:
         )
 
 
-def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]) -> pd.DataFrame:
+def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]) -> dict[str, Any]:
+    """Return the columns that `judge` adds for some rows."""
     p_false, remark = _apply(fit.rejector, test, predictions)
-    asked = test.assign(p_right=1.0 - p_false, remark=remark, is_calibrated=fit.rejector.card.is_calibrated)
-    return asked.assign(**_decided(fit.known, asked))
+    p_right = 1.0 - p_false
+    said = {"p_right": p_right, "remark": remark, "is_calibrated": fit.rejector.card.is_calibrated}
+    return {**said, **_decided(fit.known, test.assign(p_right=p_right))}
 
 
+_NEEDED: Final = ("query_id", "place", "part", "country", "block", "is_answered", "is_right", "is_present")
 # What is decided about rows from the calibration places: acceptance by each threshold, chances at each declared share.
 _DECIDED: Final = (*dict.fromkeys(metric.accepted for metric in THRESHOLDS), *map(shifted_column, PRESENT_SHARES))
 
@@ -377,13 +386,15 @@ def evaluate_rejectors(
 def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
     """Return by rejector rows of `judge`, of the board and of acceptance, or the error; own confidence comes first."""
     results: dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception] = {}
+    answers: dict[str, Prediction] = {}  # of this entry alone, while it is judged
     for name in (OWN, *task.rules):
         try:
             if name == OWN:  # it counts as a probability
                 frame, is_calibrated = own_confidence(task.scores, task.split, is_taught=task.is_taught), True
             else:
                 rule = task.rules[name]
-                frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
+                answers = answers or dict(task.predictions)
+                frame = judge(task.scores, answers, rule.make, rule.split, is_taught=task.is_taught)
                 is_calibrated = rule.card.is_calibrated
             figures = to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
             taken = acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])

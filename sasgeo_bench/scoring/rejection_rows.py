@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.scoring.base import Floats, Ints, weighted_mean
+from sasgeo_bench.scoring.base import Floats, Ints, codes_of, weighted_mean
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_weights
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.integrity_metric import Curve
@@ -66,7 +66,7 @@ def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -
     some = answers_of(part)
     # The seed depends on the queries alone, so that all rejectors share draws.
     seed = seed_of_text(f"{key.suite}/{key.track}/{key.prior_group}")
-    names = (np.unique(part[name], return_inverse=True)[1] for name in ("place", "block", "pair_id"))
+    names = (codes_of(part[name]) for name in ("place", "block", "pair_id"))
     place, block, site = names
     drawn = BoardDraws.of(place, block, site, seed=seed, draws=SLOW_DRAWS)
     is_pooled = key.suite == ALL_SUITES

@@ -1,27 +1,27 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scored rows: one for every query of a task, answered or not."""
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Final
+from typing import Final, Self
 
+import numpy as np
 import pandas as pd
+import pyarrow as pa
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.pose import MISS, Rank, first_pose, pose_errors, rank_candidate, rank_of
+from sasgeo_bench.running.prediction_rows import AnswerColumns, predictions_of, table_of
+from sasgeo_bench.scoring.base import Bools, Floats, Ints
+from sasgeo_bench.scoring.pose import check_candidate, columns_of, errors_of_columns, rank_candidate
 from sasgeo_bench.tasks.query import CEILING, COPIES, SEQUENCE, Head, Truth, base_of
 
 SCORER_VERSION: Final = 6  # raise it if the same predictions get other scores; a board has one version
 FIX_M: Final = 25.0  # mission tolerance e_max of Eq. 12: a fix beyond it is false, on both tracks
 MISSING: Final = "missing"  # status of a query without a row
 NOT_APPLICABLE: Final = "not applicable"
-
-Errors = tuple[float, float, float]
-_NO_ERROR: Final[Errors] = (math.nan, math.nan, math.nan)
+RETRIEVAL: Final = "retrieval"  # the track
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,75 +121,172 @@ def score_task(
     places of the split, `country_of` places to countries. Raise MetricError if a query has no truth or a prediction
     belongs to no query.
     """
-    asked = list(heads)
-    by_id = truths_of(asked, truths, predictions)
-    answers = [predictions.get(head.query_id) for head in asked]
-    errors = _errors([by_id[head.query_id] for head in asked], answers)
-    places = [(place_of or {}).get(by_id[head.query_id].block, base_of(head.region)) for head in asked]
-    rows = [
-        _score(head, by_id[head.query_id], prediction, error, (place, (country_of or {}).get(place, place)))
-        for head, prediction, error, place in zip(asked, answers, errors, places, strict=True)
-    ]
-    return pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
+    questions = Questions.of(heads, truths, place_of=place_of, country_of=country_of)
+    return with_answers(questions.frame, questions.answered(table_of(predictions.values())))
+
+
+def with_answers(questions: pd.DataFrame, answers: pd.DataFrame) -> pd.DataFrame:
+    """Return scored rows with the columns of `Score` from those of queries and of answers, without a copy of either."""
+    return pd.DataFrame({name: (answers if name in answers else questions)[name] for name in COLUMNS}, copy=False)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Questions:
+    """N queries of a task with their truths, as columns to score the answers of many entries against.
+
+    `frame` has the columns of `Score` that no answer changes. `poses`, shape (N, 4), are the true poses
+    (`pose.columns_of`), NaN where none counts; `right_m`, shape (N, 2), where the right candidate lies, NaN where there
+    is none; `twins` are the queries of whose candidates several lie there.
+    """
+
+    heads: tuple[Head, ...]
+    truths: tuple[Truth, ...]
+    frame: pd.DataFrame
+    poses: Floats
+    right_m: Floats
+    twins: frozenset[int]
+
+    @classmethod
+    def of(
+        cls,
+        heads: Iterable[Head],
+        truths: Iterable[Truth],
+        *,
+        place_of: Mapping[str, str] | None = None,
+        country_of: Mapping[str, str] | None = None,
+    ) -> Self:
+        """Return the queries of a task; arguments and errors are as of `score_task`."""
+        asked = tuple(heads)
+        by_id = truths_of(asked, truths, ())
+        known = tuple(by_id[head.query_id] for head in asked)
+        places = [
+            (place_of or {}).get(truth.block, base_of(head.region)) for head, truth in zip(asked, known, strict=True)
+        ]
+        columns = {
+            **{name: [getattr(head, name) for head in asked] for name in _HEAD_COLUMNS},
+            **{name: [getattr(truth, name) for truth in known] for name in _TRUTH_COLUMNS},
+            "place": places,
+            "country": [(country_of or {}).get(place, place) for place in places],
+            "pool": [len(head.candidates) for head in asked],
+            "ceiling": [ceiling_of(truth) for truth in known],
+        }
+        right_m, twins = np.full((len(asked), 2), np.nan), set()
+        for at, (head, truth) in enumerate(zip(asked, known, strict=True)):
+            if head.track == RETRIEVAL and truth.is_present:
+                spots_m = np.array([(pose.easting_m, pose.northing_m) for pose in head.candidates])
+                check_candidate(truth, len(spots_m))
+                right_m[at] = spots_m[truth.candidate]
+                if np.count_nonzero(_distances_m(spots_m, right_m[at]) <= 2 * SAME_PLACE_M) > 1:
+                    twins.add(at)
+        return cls(
+            heads=asked,
+            truths=known,
+            frame=pd.DataFrame(columns),
+            poses=columns_of([truth.pose if truth.is_present else None for truth in known]),
+            right_m=right_m,
+            twins=frozenset(twins),
+        )
+
+    def answered(self, table: pa.Table) -> pd.DataFrame:
+        """Return the other columns of `Score`, a row for each query in order, from rows of answers, at most one each.
+
+        Raise MetricError if a row belongs to no query.
+        """
+        answers, places = AnswerColumns.of(table), {head.query_id: at for at, head in enumerate(self.heads)}
+        _check_known(answers.query_id, places)
+        row_of = np.full(len(self.heads), -1)
+        row_of[[places[name] for name in answers.query_id]] = np.arange(len(table))
+        is_ok = np.array([status == "ok" for status in answers.status], dtype=bool)
+        # A row more for queries without one, which the index -1 finds.
+        first = np.append(np.where(is_ok, answers.first, -1), -1)[row_of]
+        fixes = np.vstack((answers.poses, np.full(4, np.nan)))[first]
+        errors = self._errors(fixes)
+        above, tied, right = self._ranks(table, answers, row_of, is_ok)
+        is_miss = (self.frame["track"] == RETRIEVAL).to_numpy(bool)  # a given heading and a random offset: no errors
+        found = {
+            "status": [[*answers.status, MISSING][row] for row in row_of],
+            "is_answered": first >= 0,
+            "above": above,
+            "tied": tied,
+            "right": right,
+            **{name: np.where(is_miss, np.nan, column) for name, column in errors.items()},
+            "is_right": errors["position_error_m"] <= FIX_M,
+            "confidence": np.append(answers.confidence, np.nan)[row_of],
+            "latency_s": np.append(answers.latency_s, np.nan)[row_of],
+        }
+        return pd.DataFrame(found)
+
+    def _errors(self, fixes: Floats) -> dict[str, Floats]:
+        """Return metres, degrees and logarithm of the scale of each fix, shape (N,); NaN without a true pose."""
+        found = errors_of_columns(fixes, np.nan_to_num(self.poses, nan=1.0))
+        is_known = ~np.isnan(self.poses[:, 0])
+        columns = {
+            "position_error_m": found.position_m,
+            "yaw_error_deg": found.yaw_deg,
+            "log_scale_error": found.log_scale,
+        }
+        return {name: np.where(is_known, column, np.nan) for name, column in columns.items()}
+
+    def _ranks(self, table: pa.Table, answers: AnswerColumns, row_of: Ints, is_ok: Bools) -> Ints:
+        """Return above, tied and right of the ranks of the right candidates, shape (3, N); see `pose.Rank`.
+
+        A pose of the answer is the candidate at its position. Where another candidate shares the position of the right
+        one, each pose is compared with all of them.
+        """
+        query = np.full(len(table), -1)
+        query[row_of[row_of >= 0]] = np.flatnonzero(row_of >= 0)
+        spots_m = self.right_m[query[answers.row]]
+        is_right = is_ok[answers.row] & (_distances_m(answers.poses[:, :2], spots_m) <= SAME_PLACE_M)
+        best = np.full(len(table), np.inf)
+        has_right = np.zeros(len(table), dtype=bool)
+        has_right[answers.row[is_right]] = True
+        best[has_right] = -np.inf
+        np.maximum.at(best, answers.row[is_right], answers.scores[is_right])
+        is_tied = answers.scores == best[answers.row]
+        counts = [
+            np.bincount(answers.row, weights=mask, minlength=len(table)).astype(np.int64)
+            for mask in (answers.scores > best[answers.row], is_tied, is_tied & is_right)
+        ]
+        ranks = np.column_stack((np.array(counts).reshape(3, -1), np.zeros(3, dtype=np.int64)))[:, row_of]
+        for at in self.twins:
+            one = None if row_of[at] < 0 else predictions_of(table.slice(row_of[at], 1))[0]
+            rank = rank_candidate(one, self.truths[at], self.heads[at].candidates)
+            ranks[:, at] = rank.above, rank.tied, rank.right
+        return np.asarray(ranks)
+
+
+def _distances_m(spots_m: Floats, other_m: Floats) -> Floats:
+    """Return the distance of each of some positions, shape (K, 2), from another one."""
+    gaps_m = spots_m - other_m
+    return np.asarray(np.hypot(gaps_m[:, 0], gaps_m[:, 1]))
 
 
 def single_views(scores: pd.DataFrame) -> pd.DataFrame:
     """Return the scored rows that are of views alone, and not of flights."""
-    return scores[(scores["track"] != SEQUENCE).to_numpy(bool)].reset_index(drop=True)
+    return some_rows(scores, (scores["track"] != SEQUENCE).to_numpy(bool))
 
 
-def truths_of(
-    asked: Sequence[Head], truths: Iterable[Truth], predictions: Mapping[str, Prediction]
-) -> dict[str, Truth]:
-    """Return the truths by query id; raise MetricError if one is missing, or a prediction belongs to no query."""
+def some_rows(scores: pd.DataFrame, chosen: Bools) -> pd.DataFrame:
+    """Return the chosen rows, numbered anew; the table itself, and no copy, where these are all."""
+    return scores if chosen.all() else scores[chosen].reset_index(drop=True)
+
+
+def truths_of(asked: Sequence[Head], truths: Iterable[Truth], answered: Iterable[str]) -> dict[str, Truth]:
+    """Return the truths by query id; raise MetricError if one is missing, or an answer belongs to no query."""
     by_id = {truth.query_id: truth for truth in truths}
     lost = next((head.query_id for head in asked if head.query_id not in by_id), None)
     if lost is not None:
         message = f"query {lost} has no truth: these are the truths of other queries, make the queries again"
         raise MetricError(message)
-    foreign = next(iter(set(predictions) - {head.query_id for head in asked}), None)
-    if foreign is not None:
-        message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
-        raise MetricError(message)
+    _check_known(answered, {head.query_id for head in asked})
     return by_id
 
 
-def _errors(truths: Sequence[Truth], answers: Sequence[Prediction | None]) -> list[Errors]:
-    """Return metres, degrees and logarithm of the scale of each first pose; NaN without a true pose."""
-    found = [_NO_ERROR] * len(truths)
-    asked = [(at, truth.pose) for at, truth in enumerate(truths) if truth.is_present and truth.pose is not None]
-    errors = pose_errors([first_pose(answers[at]) for at, _ in asked], [pose for _, pose in asked])
-    columns = (errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist())
-    for (at, _), *error in zip(asked, *columns, strict=True):
-        found[at] = (error[0], error[1], error[2])
-    return found
-
-
-def _score(head: Head, truth: Truth, prediction: Prediction | None, errors: Errors, where: tuple[str, str]) -> Score:
-    rank = MISS
-    is_right = errors[0] <= FIX_M  # retrieval candidates have a given heading and a random offset, so no errors below
-    if head.track == "retrieval":
-        errors = _NO_ERROR
-        rank = _rank(prediction, truth, head.candidates) if truth.is_present else MISS
-    return Score(
-        **{name: getattr(head, name) for name in _HEAD_COLUMNS},
-        **{name: getattr(truth, name) for name in _TRUTH_COLUMNS},
-        place=where[0],
-        country=where[1],
-        pool=len(head.candidates),
-        status=MISSING if prediction is None else prediction.status,
-        ceiling=ceiling_of(truth),
-        is_answered=first_pose(prediction) is not None,
-        above=rank.above,
-        tied=rank.tied,
-        right=rank.right,
-        position_error_m=errors[0],
-        yaw_error_deg=errors[1],
-        log_scale_error=errors[2],
-        is_right=is_right,
-        confidence=math.nan if prediction is None or prediction.confidence is None else prediction.confidence,
-        latency_s=math.nan if prediction is None or prediction.latency_s is None else prediction.latency_s,
-    )
+def _check_known(answered: Iterable[str], asked: Collection[str]) -> None:
+    foreign = next((name for name in answered if name not in asked), None)
+    if foreign is not None:
+        message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
+        raise MetricError(message)
 
 
 def ceiling_of(truth: Truth) -> float:
@@ -202,22 +299,6 @@ def ceiling_of(truth: Truth) -> float:
         return 0.0
     copies = truth.measured.get(COPIES, 0.0)
     return truth.measured.get(CEILING, 1.0 / (1.0 + copies))
-
-
-def _rank(prediction: Prediction | None, truth: Truth, candidates: Sequence[Pose]) -> Rank:
-    """Return the rank of the right candidate; compare all candidates only if another one shares its position."""
-    right = candidates[truth.candidate]
-    twins = sum(_is_at(other, right, within_m=2 * SAME_PLACE_M) for other in candidates)
-    if twins > 1:
-        return rank_candidate(prediction, truth, candidates)
-    if prediction is None or prediction.status != "ok":
-        return MISS
-    scores = [score for _, score in prediction.candidates]
-    return rank_of(scores, [_is_at(pose, right) for pose, _ in prediction.candidates])
-
-
-def _is_at(pose: Pose, place: Pose, *, within_m: float = SAME_PLACE_M) -> bool:
-    return math.hypot(pose.easting_m - place.easting_m, pose.northing_m - place.northing_m) <= within_m
 
 
 def settle_not_applicable(scores: pd.DataFrame) -> pd.DataFrame:

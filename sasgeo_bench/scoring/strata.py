@@ -127,7 +127,13 @@ GROUP: Final = ("suite", "track", "prior_group")
 
 def queries_of(scores: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Return the query columns of scored rows, each query once."""
-    return pd.concat(list(scores.values()), ignore_index=True).drop_duplicates("query_id", ignore_index=True)
+    parts: list[pd.DataFrame] = []
+    seen: set[str] = set()
+    for frame in scores.values():
+        fresh = frame[~frame["query_id"].isin(seen)].drop_duplicates("query_id")
+        seen.update(fresh["query_id"])
+        parts += [fresh] if len(fresh) else []
+    return pd.concat(parts or list(scores.values())[:1], ignore_index=True)
 
 
 def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:

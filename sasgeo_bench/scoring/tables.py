@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.progress import Progress
-from sasgeo_bench.scoring.base import Bools, Floats, Ints, weighted_quantile
+from sasgeo_bench.scoring.base import Bools, Floats, Ints, codes_of, weighted_quantile
 from sasgeo_bench.scoring.compare import RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
@@ -44,22 +44,24 @@ def leaderboard(
     and are no rivals; controls never are. `done` is called after each suite, track and prior group. `parts` yields the
     strata of the queries of one of these. Raise MetricError if two matchers were scored on different queries.
     """
-    frames = {name: frame.sort_values("query_id", ignore_index=True) for name, frame in scored.items()}
-    if not frames:
+    if not scored:
         return to_frame([])
-    first = next(iter(frames))
-    queries = frames[first]
-    for name, frame in frames.items():
-        if not frame["query_id"].equals(queries["query_id"]):
+    first = next(iter(scored))
+    orders = {name: np.argsort(frame["query_id"].to_numpy(object), kind="stable") for name, frame in scored.items()}
+    queries = scored[first][["query_id", *GROUP]].iloc[orders[first]]
+    for name, frame in scored.items():
+        if not np.array_equal(frame["query_id"].to_numpy(object)[orders[name]], queries["query_id"].to_numpy(object)):
             message = f"{name} was scored on other queries than {first}: score them together"
             raise MetricError(message)
-    keys = [GroupKey(*key) for key in zip(*(queries[name] for name in GROUP), strict=True)]
-    groups = []
-    for key in sorted(set(keys)):
-        index = [at for at, other in enumerate(keys) if other == key]
-        groups.append((key, {name: frame.iloc[index] for name, frame in frames.items()}))
     unranked = frozenset({*excluded, *filter(is_unranked, scored)})
-    return to_frame(in_threads(lambda item: _rows_of_group(*item, draws, unranked, parts), groups, done))
+    places: Mapping[Any, Any] = queries.groupby(list(GROUP), sort=True).indices
+
+    def rows_of(key: tuple[str, str, str]) -> Iterator[Row]:
+        """Yield the rows of one group, whose queries alone are sorted and copied."""
+        frames = {name: frame.iloc[orders[name][places[key]]] for name, frame in scored.items()}
+        return _rows_of_group(GroupKey(*key), frames, draws, unranked, parts)
+
+    return to_frame(in_threads(rows_of, sorted(places), done))
 
 
 def leaderboards(
@@ -84,7 +86,10 @@ def asked_alike(scored: Mapping[str, pd.DataFrame]) -> Iterator[dict[str, pd.Dat
     for suite in sorted({suite for suites in suites_of.values() for suite in suites}):
         asked_by.setdefault(tuple(name for name in scored if suite in suites_of[name]), []).append(suite)
     for names, suites in asked_by.items():
-        yield {name: scored[name][scored[name]["suite"].isin(suites)] for name in names}
+        yield {
+            name: scored[name] if suites_of[name] == set(suites) else scored[name][scored[name]["suite"].isin(suites)]
+            for name in names
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,7 +117,7 @@ class _Group:
         """Return the columns of some matchers' rows; `unranked` matchers are no rivals."""
         first = next(iter(frames.values()))
         columns = dict.fromkeys(quantile.column for quantile in quantiles_of(key.track))
-        codes = [np.unique(first[name], return_inverse=True)[1] for name in ("block", "place", "pair_id")]
+        codes = [codes_of(first[name]) for name in ("block", "place", "pair_id")]
 
         def stacked(column: Callable[[pd.DataFrame], ArrayLike]) -> Any:  # noqa: ANN401 - of bools or floats
             """Return a column of each matcher, side by side."""

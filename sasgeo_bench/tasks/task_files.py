@@ -363,6 +363,13 @@ def read_ids(folder: Path) -> list[str]:
     return [str(name) for batch in batches for name in batch["query_id"].to_pylist()]
 
 
+def read_parts(folder: Path) -> set[str]:
+    """Read which parts of a split the queries of a task belong to."""
+    return {
+        str(part) for batch in read_batches(folder / QUERIES, ["part"]) for part in pc.unique(batch["part"]).to_pylist()
+    }
+
+
 def read_view_bytes(folder: Path) -> dict[str, int]:
     """Return the bytes of each query's view as it travels: packed cells, confidences and vectors, without compression.
 

@@ -815,6 +815,16 @@ def test_answers_that_are_none_cost_their_author_alone(out, both, alone, column,
     assert "- Failed, and not on this board: bad: " in text
 
 
+def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out, both, split, monkeypatch):
+    asked = {"split": split, "rejectors": (f"{__name__}:Doubt",)}
+    whole = board_of(out, out / "runs", *both, **asked)
+    monkeypatch.setattr(contestants, "_MOST_KEPT_BYTES", 0)
+    board = board_of(out, out / "runs", *both, **asked)
+    pd.testing.assert_frame_equal(board.table, whole.table)
+    pd.testing.assert_frame_equal(board.judged["good", "doubt"], whole.judged["good", "doubt"])
+    assert dict(board.predictions["oracle_pose"]) == dict(whole.predictions["oracle_pose"])
+
+
 def fails_with(monkeypatch, name, is_bad):
     """A mistake of ours that only what one contestant says brings about."""
     room = {"_scored": contestants, "hold_controls": contestants, "leaderboard": tables}.get(name, boards)

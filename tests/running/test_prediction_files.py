@@ -13,6 +13,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files, prediction_rows
+from sasgeo_bench.tasks.task_rows import POSE_FIELDS
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
 FULL = Prediction(
@@ -228,3 +229,47 @@ def test_a_full_disk_leaves_the_run_json_that_was_there(tmp_path, monkeypatch):
     assert "No space left on device" in refusal(prediction_files.write_run, tmp_path, {"hash": "bb"})
     assert prediction_files.read_run(tmp_path) == {"hash": "aa"}
     assert [path.name for path in tmp_path.iterdir()] == [prediction_files.RUN]
+
+
+# Rows in tables
+
+
+def test_the_last_row_of_a_query_counts_in_a_table_too_whatever_like_types_its_parts_have(tmp_path, rows):
+    folder = tmp_path / "run"
+    folder.mkdir()
+    texts = with_column(rows, "status", rows["status"].cast(pa.large_string()))
+    poses = [[item | {"rank": 1.0} for item in listed] for listed in rows["candidates"].to_pylist()]
+    more = pa.struct([pa.field(name, pa.float32()) for name in ("rank", "score", *POSE_FIELDS[::-1])])
+    ranked = with_column(rows, "candidates", pa.array(poses, pa.large_list(more)))
+    single = with_column(rows, "confidence", rows["confidence"].cast(pa.float32()))
+    timed = rows.append_column("matcher_s", pa.array([0.1, None]))
+    for at, table in enumerate((rows, texts, ranked, single, timed)):
+        pq.write_table(table, folder / f"part-{at:020d}-1.parquet")
+    found = prediction_files.read_answers(folder, {"a": "", "b": ""})
+    assert found.found == {item.query_id: item for item in everything(folder)}
+    assert sorted(prediction_files.read_rows(folder)["query_id"].to_pylist()) == ["a", "b"]
+    assert prediction_files.read_answers(folder, {"a": ""}).table["query_id"].to_pylist() == ["a"]
+
+
+def test_stored_answers_are_those_of_their_tasks_a_task_at_a_time(rows):
+    tasks = {Path("first"): rows.slice(0, 1), Path("second"): rows.slice(1, 1), Path("other"): rows.slice(0, 0)}
+    read = []
+
+    def reading(task):
+        def rows_of():
+            read.append(task)
+            return tasks[task]
+
+        return rows_of
+
+    first, second = rows["query_id"].to_pylist()
+    task_of = {first: Path("first"), second: Path("second"), "asked": Path("second"), "elsewhere": Path("far")}
+    answers = prediction_files.StoredAnswers({task: reading(task) for task in tasks}, task_of)
+    assert dict(answers) == {item.query_id: item for item in (FULL, FAILED)}
+    assert len(answers) == 2
+    read.clear()
+    assert [answers.get(name) for name in (first, first, second, "asked", "elsewhere", "nobody")].count(None) == 3
+    assert read == [Path("first"), Path("second")]
+    lean = answers.lean()
+    assert {name: replace(item, candidates=()) for name, item in answers.items()} == dict(lean)
+    assert not any(item.candidates for item in lean.values())

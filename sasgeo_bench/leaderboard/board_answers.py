@@ -1,19 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where the answers of a board lie: place and fix of every query, and the class of each failure."""
 
-import math
-from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
 
+import numpy as np
 import pandas as pd
 
-from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import ANSWER_COLUMNS
-from sasgeo_bench.scoring.pose import first_pose
+from sasgeo_bench.running.prediction_files import StoredAnswers
+from sasgeo_bench.scoring.base import Floats
+from sasgeo_bench.scoring.pose import columns_of
 from sasgeo_bench.scoring.score import single_views
-
-_TOLD: Final = ("suite", "region", "kind", "role", "is_present", "status")
 
 
 def answers_frame(board: Board, failures: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
@@ -23,28 +21,42 @@ def answers_frame(board: Board, failures: pd.DataFrame, names: Sequence[str]) ->
     are left out: nothing is asked of them than another answer. `view_m` is the side of a view. True is where it was
     taken, also of absent places; poses that do not exist are NaN.
     """
-    classes = {(row.query_id, row.matcher): row.failure for row in failures.itertuples()}
-    records = [
-        {**row, "failure": classes.get((row["query_id"], row["matcher"]), "")}
-        for name in names
-        if name in board.scores
-        for row in _answers_of(board, name)
-    ]
-    return pd.DataFrame(records, columns=list(ANSWER_COLUMNS))
+    frames = [_answers_of(board, name, failures) for name in names if name in board.scores]
+    some = [frame for frame in frames if len(frame)]
+    return pd.concat(some, ignore_index=True) if some else pd.DataFrame(columns=list(ANSWER_COLUMNS))
 
 
-def _answers_of(board: Board, name: str) -> Iterator[dict[str, Any]]:
-    scores = single_views(board.scores[name]).copy()
-    scores["view_m"] = scores["view_cells"] * scores["cell_size_m"]
-    for row in scores.loc[scores["role"] != "falsifier", ["query_id", *_TOLD, "view_m"]].to_dict("records"):
-        query_id = row["query_id"]
-        true, fix = board.truths[query_id].pose, first_pose(board.predictions[name].get(query_id))
-        told = {str(key): value for key, value in row.items()}
-        yield {**told, "matcher": name, **_numbers("true", true), **_numbers("fix", fix)}
+def _answers_of(board: Board, name: str, failures: pd.DataFrame) -> pd.DataFrame:
+    scores = single_views(board.scores[name])
+    rows = scores[(scores["role"] != "falsifier").to_numpy(bool)]
+    ids = rows["query_id"].tolist()
+    mine = failures[(failures["matcher"] == name).to_numpy(bool)]
+    classes = dict(zip(mine["query_id"], mine["failure"], strict=True))
+    true = columns_of([board.truths[query_id].pose for query_id in ids])
+    columns = {
+        "query_id": ids,
+        "matcher": name,
+        **{column: rows[column].to_numpy() for column in ("suite", "region", "kind", "role", "is_present", "status")},
+        "failure": [classes.get(query_id, "") for query_id in ids],
+        "view_m": (rows["view_cells"] * rows["cell_size_m"]).to_numpy(),
+        **_numbers("true", true),
+        **_numbers("fix", _fixes(board.predictions[name], ids)),
+    }
+    return pd.DataFrame(columns)[list(ANSWER_COLUMNS)]
 
 
-def _numbers(what: str, pose: Pose | None) -> dict[str, float]:
-    """Return a pose to a decimetre and a tenth of a degree: enough to draw, and small on disk."""
-    values = (math.nan,) * 3 if pose is None else (pose.easting_m, pose.northing_m, pose.yaw_deg)
+def _fixes(answers: StoredAnswers, ids: Sequence[str]) -> Floats:
+    """Return the fixes of some queries as columns, shape (N, 4); NaN without one."""
+    place = {query_id: at for at, query_id in enumerate(ids)}
+    found = np.full((len(ids), 4), np.nan)
+    for columns in answers.columns(ids):
+        at = np.array([place.get(query_id, -1) for query_id in columns.query_id], dtype=np.int64)
+        is_fix = (at >= 0) & (columns.fix >= 0)
+        found[at[is_fix]] = columns.poses[columns.fix[is_fix]]
+    return found
+
+
+def _numbers(what: str, poses: Floats) -> dict[str, Floats]:
+    """Return poses to a decimetre and a tenth of a degree: enough to draw, and small on disk."""
     names = ("easting_m", "northing_m", "yaw_deg")
-    return {f"{what}_{name}": round(value, 1) for name, value in zip(names, values, strict=True)}
+    return {f"{what}_{name}": column.round(1) for name, column in zip(names, poses.T[:3], strict=True)}

@@ -7,24 +7,23 @@ asked.
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from typing import Any, Final
 
 import numpy as np
 import pandas as pd
 
 from sasgeo_bench.leaderboard.plot_tables import calibrated_parts
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
 from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost
 from sasgeo_bench.scoring.draws import seed_of_text
 from sasgeo_bench.scoring.intervals import BoardDraws, intervals_of_columns
 from sasgeo_bench.scoring.metrics import primary_of, ranks_of
-from sasgeo_bench.scoring.pose import Ranks, hits, rank_pose
+from sasgeo_bench.scoring.pose import Ranks, columns_of, hits, ranks_of_lists
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
-from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE
+from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE, distances_m
 from sasgeo_bench.scoring.strata import ALL, GROUP, STRESS, is_counted
 from sasgeo_bench.tasks.query import Truth
 
@@ -125,7 +124,7 @@ def _pools(contrasts: Sequence[Contrast], scores: Scores) -> Iterator[Contrast]:
 
 def recall_frame(
     scores: Scores,
-    predictions: Mapping[str, Mapping[str, Prediction]],
+    predictions: Mapping[str, StoredAnswers],
     truths: Mapping[str, Truth],
     shown: Sequence[str],
 ) -> pd.DataFrame:
@@ -137,32 +136,39 @@ def recall_frame(
     """
     rows: list[dict[str, Any]] = []
     for group, frames in _suites(scores, shown):
-        longest = max(
-            len(answer.candidates)
-            for name, frame in frames.items()
-            for answer in chain([Prediction(query_id="")], _answers(predictions[name], frame))
-        )
+        lists = {name: _lists(frame, predictions[name], truths) for name, frame in frames.items()}
+        longest = max(count for count, _ in lists.values())
         steps = [k for k in RANKS if k <= longest]
         if len(steps) < 2:  # noqa: PLR2004 - a point is no curve
             continue
         text = "/".join((*group.values(), "recall"))
         for name, frame in frames.items():
-            ranks = ranks_of(frame) if group["track"] == "retrieval" else _near(frame, predictions[name], truths)
+            ranks = ranks_of(frame) if group["track"] == "retrieval" else lists[name][1]
             table = np.column_stack([hits(ranks, k) for k in steps])
             found = _figures(frame, table, text)
             rows += [{**group, "matcher": name, "k": k, **one} for k, one in zip(steps, found, strict=True)]
     return pd.DataFrame(rows, columns=[*GROUP, "stratum", "matcher", "k", *_FIGURE])
 
 
-def _answers(predictions: Mapping[str, Prediction], frame: pd.DataFrame) -> Iterator[Prediction]:
-    return (predictions[name] for name in frame["query_id"] if name in predictions)
+def _lists(frame: pd.DataFrame, answers: StoredAnswers, truths: Mapping[str, Truth]) -> tuple[int, Ranks]:
+    """Return the length of the longest list of poses, and the rank of the best pose near each truth.
 
-
-def _near(frame: pd.DataFrame, predictions: Mapping[str, Prediction], truths: Mapping[str, Truth]) -> Ranks:
-    """Return the rank of the best pose near the truth. Headings do not count: stored results may lack them."""
-    return Ranks.of(
-        [rank_pose(predictions.get(name), truths[name], within_m=FIX_M, within_deg=180.0) for name in frame["query_id"]]
-    )
+    Headings do not count: stored results may lack them.
+    """
+    place = {name: at for at, name in enumerate(frame["query_id"])}
+    longest, found = 0, np.zeros((3, len(frame)), dtype=np.int64)
+    for columns in answers.columns(place):
+        at = np.array([place.get(name, -1) for name in columns.query_id], dtype=np.int64)
+        mine = at[columns.row] >= 0
+        if not mine.any():
+            continue
+        poses = [truths[name].pose if name in place else None for name in columns.query_id]
+        near = distances_m(columns.poses[:, :2], columns_of(poses)[columns.row, :2]) <= FIX_M
+        is_right = mine & columns.is_ok[columns.row] & near
+        ranks = ranks_of_lists(columns.row, columns.scores, is_right, len(at))
+        found[:, at[at >= 0]] = np.array([ranks.above, ranks.tied, ranks.right])[:, at >= 0]
+        longest = max(longest, int(np.bincount(columns.row[mine], minlength=1).max()))
+    return longest, Ranks(above=found[0], tied=found[1], right=found[2])
 
 
 def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:

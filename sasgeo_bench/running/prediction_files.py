@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
 import pyarrow as pa
 
@@ -24,12 +24,14 @@ from sasgeo_bench.running.prediction_rows import (
     FLOWN_SCHEMA,
     PART_SCHEMA,
     PREDICTION_SCHEMA,
+    AnswerColumns,
     differing_columns,
     far_fault,
     prediction_row,
     predictions_of,
     row_faults,
     schema_of,
+    table_of,
 )
 from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
 from sasgeo_bench.texts import MOST_MESSAGE, json_text, one_line
@@ -265,6 +267,19 @@ class StoredAnswers(Mapping[str, Prediction]):
     def __init__(self, read: Mapping[Path, Callable[[], pa.Table]], task_of: Mapping[str, Path]) -> None:
         self._read, self._task_of = dict(read), task_of
         self._last: tuple[Path | None, dict[str, Prediction]] = (None, {})
+
+    @classmethod
+    def of(cls, answers: Iterable[Prediction]) -> Self:
+        """Return answers that are in memory, as those of one task."""
+        listed = list(answers)
+        return cls({Path(): partial(table_of, listed)}, dict.fromkeys((item.query_id for item in listed), Path()))
+
+    def columns(self, query_ids: Iterable[str]) -> Iterator[AnswerColumns]:
+        """Yield the answers to all queries of the tasks that some queries belong to, a task at a time."""
+        asked = {self._task_of[name] for name in query_ids if name in self._task_of}
+        for task, read in self._read.items():
+            if task in asked:
+                yield AnswerColumns.of(read())
 
     def rows(self, task: Path) -> pa.Table:
         """Return the rows of one task. Raise `StoreError` if they cannot be read."""

@@ -120,6 +120,16 @@ class AnswerColumns:
     row: Ints
     first: Ints
 
+    @property
+    def is_ok(self) -> NDArray[np.bool_]:
+        """Return which rows have the status "ok", shape (R,)."""
+        return np.array([status == "ok" for status in self.status], dtype=bool)
+
+    @property
+    def fix(self) -> Ints:
+        """Return the candidate that is the fix of each row, its first, shape (R,); -1 where the status is not ok."""
+        return np.where(self.is_ok, self.first, -1)
+
     @classmethod
     def of(cls, table: pa.Table) -> Self:
         """Return the columns of a table without `row_faults`.

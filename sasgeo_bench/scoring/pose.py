@@ -101,6 +101,26 @@ class Ranks:
         return cls(above=table[:, 0], tied=table[:, 1], right=table[:, 2])
 
 
+def ranks_of_lists(row: Ints, scores: Floats, is_right: Bools, count: int) -> Ranks:
+    """Return `rank_of` of so many answers, whose candidates stand one after the other, shape (C,).
+
+    `row` is the answer of each candidate, in ascending order.
+
+    >>> row, scores = np.array([0, 0, 0, 0, 2]), np.array([9.0, 7.0, 7.0, 1.0, 5.0])
+    >>> found = ranks_of_lists(row, scores, np.array([False, False, True, True, False]), 3)
+    >>> found.above.tolist(), found.tied.tolist(), found.right.tolist()
+    ([1, 0, 0], [2, 0, 0], [1, 0, 0])
+    """
+    best = np.full(count, np.inf)
+    best[row[is_right]] = -np.inf
+    np.maximum.at(best, row[is_right], scores[is_right])
+    is_tied = scores == best[row]
+    above, tied, right = (
+        np.bincount(row[mask], minlength=count) for mask in (scores > best[row], is_tied, is_tied & is_right)
+    )
+    return Ranks(above=above, tied=tied, right=right)
+
+
 def hits(ranks: Ranks, k: int) -> Floats:
     """Return the chance that a right pose is among the first k, shape (N,), if tied poses are in random order.
 
@@ -181,30 +201,26 @@ def first_pose(prediction: Prediction | None) -> Pose | None:
     return prediction.candidates[0][0]
 
 
-def pose_errors(answers: Sequence[Pose | None], truths: Sequence[Pose]) -> PoseErrors:
-    """Return the errors of N fixes against N truths; infinite for None, never clipped.
-
-    Raise MetricError if there are not as many answers as truths.
-
-    >>> truth = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=350.0)
-    >>> errors = pose_errors([Pose(easting_m=3.0, northing_m=4.0, yaw_deg=10.0), None], [truth, truth])
-    >>> errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist()
-    ([5.0, inf], [20.0, inf], [0.0, inf])
-    """
-    if len(answers) != len(truths):
-        message = f"{len(answers)} answers for {len(truths)} truths: give None where there is no answer"
-        raise MetricError(message)
-    return errors_of_columns(columns_of(answers), columns_of(truths))
-
-
 def columns_of(poses: Sequence[Pose | None]) -> Floats:
     """Return easting, northing, yaw and scale of N poses, shape (N, 4); NaN for None."""
     nothing = (math.nan,) * 4
     return np.array([nothing if pose is None else _numbers(pose) for pose in poses]).reshape(-1, 4)
 
 
-def errors_of_columns(given: Floats, true: Floats) -> PoseErrors:
-    """Return `pose_errors` of fixes and truths as columns, shape (N, 4) each (`columns_of`)."""
+def pose_errors(given: Floats, true: Floats) -> PoseErrors:
+    """Return the errors of N fixes against N truths, shape (N, 4) each (`columns_of`); infinite for NaN, never clipped.
+
+    Raise MetricError if there are not as many answers as truths.
+
+    >>> truth = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=350.0)
+    >>> fixes = columns_of([Pose(easting_m=3.0, northing_m=4.0, yaw_deg=10.0), None])
+    >>> errors = pose_errors(fixes, columns_of([truth, truth]))
+    >>> errors.position_m.tolist(), errors.yaw_deg.tolist(), errors.log_scale.tolist()
+    ([5.0, inf], [20.0, inf], [0.0, inf])
+    """
+    if len(given) != len(true):
+        message = f"{len(given)} answers for {len(true)} truths: give NaN where there is no answer"
+        raise MetricError(message)
     is_given = ~np.isnan(given[:, 0])
     gap = np.where(is_given[:, None], given, true) - true
     ratio = np.where(is_given, given[:, 3], true[:, 3]) / true[:, 3]
@@ -234,24 +250,6 @@ def successes(errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_D
         message = f"tolerances must be finite and not negative, got {within_m!r} m and {within_deg!r} deg"
         raise MetricError(message)
     return (errors.position_m <= within_m) & (errors.yaw_deg <= within_deg)
-
-
-def rank_pose(prediction: Prediction | None, truth: Truth, *, within_m: float, within_deg: float = SUCCESS_DEG) -> Rank:
-    """Return the rank of the best pose within tolerance in an answer to a localization query; `MISS` without one.
-
-    Raise MetricError if the place is absent: recall is a share of the queries whose place is present.
-    """
-    if not truth.is_present or truth.pose is None:
-        message = (
-            f"query {truth.query_id} has no right pose: "
-            "leave absent places out of recall, the integrity track counts them"
-        )
-        raise MetricError(message)
-    if first_pose(prediction) is None or prediction is None:
-        return MISS
-    poses = [pose for pose, _ in prediction.candidates]
-    errors = pose_errors(poses, [truth.pose] * len(poses))
-    return rank_of([score for _, score in prediction.candidates], successes(errors, within_m, within_deg))
 
 
 def area_values(errors: PoseErrors) -> Floats:

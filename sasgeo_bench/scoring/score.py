@@ -14,7 +14,7 @@ from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import AnswerColumns, predictions_of, table_of
 from sasgeo_bench.scoring.base import Bools, Floats, Ints
-from sasgeo_bench.scoring.pose import check_candidate, columns_of, errors_of_columns, rank_candidate
+from sasgeo_bench.scoring.pose import check_candidate, columns_of, pose_errors, rank_candidate, ranks_of_lists
 from sasgeo_bench.tasks.query import CEILING, COPIES, SEQUENCE, Head, Truth, base_of
 
 SCORER_VERSION: Final = 6  # raise it if the same predictions get other scores; a board has one version
@@ -176,7 +176,7 @@ class Questions:
                 spots_m = np.array([(pose.easting_m, pose.northing_m) for pose in head.candidates])
                 check_candidate(truth, len(spots_m))
                 right_m[at] = spots_m[truth.candidate]
-                if np.count_nonzero(_distances_m(spots_m, right_m[at]) <= 2 * SAME_PLACE_M) > 1:
+                if np.count_nonzero(distances_m(spots_m, right_m[at]) <= 2 * SAME_PLACE_M) > 1:
                     twins.add(at)
         return cls(
             heads=asked,
@@ -196,12 +196,11 @@ class Questions:
         _check_known(answers.query_id, places)
         row_of = np.full(len(self.heads), -1)
         row_of[[places[name] for name in answers.query_id]] = np.arange(len(table))
-        is_ok = np.array([status == "ok" for status in answers.status], dtype=bool)
-        # A row more for queries without one, which the index -1 finds.
-        first = np.append(np.where(is_ok, answers.first, -1), -1)[row_of]
+        # A row more for queries without an answer, which the index -1 finds.
+        first = np.append(answers.fix, -1)[row_of]
         fixes = np.vstack((answers.poses, np.full(4, np.nan)))[first]
         errors = self._errors(fixes)
-        above, tied, right = self._ranks(table, answers, row_of, is_ok)
+        above, tied, right = self._ranks(table, answers, row_of)
         is_miss = (self.frame["track"] == RETRIEVAL).to_numpy(bool)  # a given heading and a random offset: no errors
         found = {
             "status": [[*answers.status, MISSING][row] for row in row_of],
@@ -218,7 +217,7 @@ class Questions:
 
     def _errors(self, fixes: Floats) -> dict[str, Floats]:
         """Return metres, degrees and logarithm of the scale of each fix, shape (N,); NaN without a true pose."""
-        found = errors_of_columns(fixes, np.nan_to_num(self.poses, nan=1.0))
+        found = pose_errors(fixes, np.nan_to_num(self.poses, nan=1.0))
         is_known = ~np.isnan(self.poses[:, 0])
         columns = {
             "position_error_m": found.position_m,
@@ -227,7 +226,7 @@ class Questions:
         }
         return {name: np.where(is_known, column, np.nan) for name, column in columns.items()}
 
-    def _ranks(self, table: pa.Table, answers: AnswerColumns, row_of: Ints, is_ok: Bools) -> Ints:
+    def _ranks(self, table: pa.Table, answers: AnswerColumns, row_of: Ints) -> Ints:
         """Return above, tied and right of the ranks of the right candidates, shape (3, N); see `pose.Rank`.
 
         A pose of the answer is the candidate at its position. Where another candidate shares the position of the right
@@ -236,18 +235,9 @@ class Questions:
         query = np.full(len(table), -1)
         query[row_of[row_of >= 0]] = np.flatnonzero(row_of >= 0)
         spots_m = self.right_m[query[answers.row]]
-        is_right = is_ok[answers.row] & (_distances_m(answers.poses[:, :2], spots_m) <= SAME_PLACE_M)
-        best = np.full(len(table), np.inf)
-        has_right = np.zeros(len(table), dtype=bool)
-        has_right[answers.row[is_right]] = True
-        best[has_right] = -np.inf
-        np.maximum.at(best, answers.row[is_right], answers.scores[is_right])
-        is_tied = answers.scores == best[answers.row]
-        counts = [
-            np.bincount(answers.row, weights=mask, minlength=len(table)).astype(np.int64)
-            for mask in (answers.scores > best[answers.row], is_tied, is_tied & is_right)
-        ]
-        ranks = np.column_stack((np.array(counts).reshape(3, -1), np.zeros(3, dtype=np.int64)))[:, row_of]
+        is_right = answers.is_ok[answers.row] & (distances_m(answers.poses[:, :2], spots_m) <= SAME_PLACE_M)
+        found = ranks_of_lists(answers.row, answers.scores, is_right, len(table))
+        ranks = np.array([np.append(column, 0)[row_of] for column in (found.above, found.tied, found.right)])
         for at in self.twins:
             one = None if row_of[at] < 0 else predictions_of(table.slice(row_of[at], 1))[0]
             rank = rank_candidate(one, self.truths[at], self.heads[at].candidates)
@@ -255,8 +245,8 @@ class Questions:
         return np.asarray(ranks)
 
 
-def _distances_m(spots_m: Floats, other_m: Floats) -> Floats:
-    """Return the distance of each of some positions, shape (K, 2), from another one."""
+def distances_m(spots_m: Floats, other_m: Floats) -> Floats:
+    """Return the distances of K positions from others, or from one, shape (K, 2) or (2,)."""
     gaps_m = spots_m - other_m
     return np.asarray(np.hypot(gaps_m[:, 0], gaps_m[:, 1]))
 

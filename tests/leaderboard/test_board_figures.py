@@ -25,6 +25,7 @@ from sasgeo_bench.leaderboard.plot_tables import (
 )
 from sasgeo_bench.leaderboard.plots import draw_steps
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.sasgeo.conformal import level_name
 from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
 from sasgeo_bench.scoring.decisions import calibration_error
@@ -60,6 +61,9 @@ def asked(seed):
     return table.assign(is_answered=True, position_error_m=table["position_error_m"].where(is_present, np.nan))
 
 
+NOTHING = StoredAnswers.of([])
+
+
 @pytest.fixture(scope="module")
 def board():
     tables = {"raster": asked(1), "graph": asked(2), "oracle_pose": asked(3)}
@@ -79,9 +83,9 @@ def board():
         entries=(),
         scores=tables,
         predictions={
-            name: {
-                one: Prediction(query_id=one, diagnostics=levels if name == "graph" else {}) for one in rows_of(frame)
-            }
+            name: StoredAnswers.of(
+                Prediction(query_id=one, diagnostics=levels if name == "graph" else {}) for one in rows_of(frame)
+            )
             for name, frame in tables.items()
         },
         table=pd.concat([table, *rows], ignore_index=True),
@@ -138,7 +142,9 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
 
 def test_a_board_without_data_has_no_figures_and_says_so(board):
     told = []
-    bare = replace(board, judged={}, measured={}, findings=(), predictions={name: {} for name in board.scores})
+    bare = replace(
+        board, judged={}, measured={}, findings=(), predictions=dict.fromkeys(board.scores, StoredAnswers.of([]))
+    )
     assert set(figures_extra(unanswered(bare), tell=told.append).figures) == {
         "strength-real-age-localization-r500-weak-s3.svg",
         "stress-localization-r500-weak-s3.svg",
@@ -183,7 +189,7 @@ def test_prior_groups_are_never_in_one_figure(board):
     }
     both = {name: pd.concat([board.scores[name], frame], ignore_index=True) for name, frame in other.items()}
     table = leaderboard(both, draws=100)
-    apart = replace(board, scores=both, table=table, judged={}, predictions={name: {} for name in both}, findings=())
+    apart = replace(board, scores=both, table=table, judged={}, predictions=dict.fromkeys(both, NOTHING), findings=())
     both_named = [name for name in figures_extra(unanswered(apart), tell=lambda _: None).figures if "stress" in name]
     assert both_named == ["stress-localization-r500-weak-s3.svg", "stress-localization-rnone-weak-s3.svg"]
     steps = steps_frame(table, queries_of(both), ["graph"])

@@ -18,6 +18,7 @@ from sasgeo_bench.leaderboard.pooled_tables import (
     recall_frame,
 )
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.rejection import own_confidence
@@ -53,15 +54,15 @@ def listed():
     tables = {"one": first, "two": second}
     answers = {}
     for name, frame in tables.items():
-        answers[name] = {
-            query: Prediction(
+        answers[name] = StoredAnswers.of(
+            Prediction(
                 query_id=query,
                 candidates=((place(error), 9.0), (place(500), 5.0), (place(10 if at % 2 else 600), 1.0))
                 if np.isfinite(error)
                 else (),
             )
             for at, (query, error) in enumerate(zip(frame["query_id"], frame["position_error_m"], strict=True))
-        }
+        )
     return tables, answers, {query: truth_of(query) for query in first["query_id"]}
 
 
@@ -92,7 +93,7 @@ def test_recall_of_retrieval_is_that_of_the_board(listed):
 def test_answers_of_one_pose_have_no_curve_of_recall(listed):
     tables, answers, truths = listed
     first = {
-        name: {query: Prediction(query_id=query, candidates=one.candidates[:1]) for query, one in mine.items()}
+        name: StoredAnswers.of(Prediction(query_id=query, candidates=one.candidates[:1]) for query, one in mine.items())
         for name, mine in answers.items()
     }
     assert recall_frame(tables, first, truths, ["one", "two"]).empty

@@ -17,11 +17,12 @@ from sasgeo_bench.scoring.base import weighted_mean, weighted_quantile
 from sasgeo_bench.scoring.pose import (
     MISS,
     PoseErrors,
-    Rank,
     area_values,
+    columns_of,
     first_pose,
     pose_errors,
-    rank_pose,
+    rank_of,
+    ranks_of_lists,
     successes,
 )
 
@@ -50,7 +51,7 @@ def only_position(position_m) -> PoseErrors:
 
 @given(one=POSES, other=POSES)
 def test_errors_are_those_of_the_relative_pose_and_do_not_care_which_is_true(one, other) -> None:
-    errors, swapped = pose_errors([one], [other]), pose_errors([other], [one])
+    errors, swapped = (pose_errors(columns_of([a]), columns_of([b])) for a, b in ((one, other), (other, one)))
     offset_m = inverse(other).to_map(np.array([(one.easting_m, one.northing_m)]))
     assert errors.position_m[0] == pytest.approx(np.linalg.norm(offset_m) * other.scale, rel=1e-6, abs=1e-6)
     assert errors.yaw_deg[0] == pytest.approx(abs(wrap_deg(one.yaw_deg - other.yaw_deg)), abs=1e-6)
@@ -63,7 +64,7 @@ def test_errors_are_those_of_the_relative_pose_and_do_not_care_which_is_true(one
 def test_errors_worked_by_hand() -> None:
     truth = Pose(easting_m=100.0, northing_m=200.0, yaw_deg=355.0, scale=1.0)
     given_poses = [Pose(easting_m=103.0, northing_m=204.0, yaw_deg=5.0, scale=1.1), truth, None]
-    errors = pose_errors(given_poses, [truth] * 3)
+    errors = pose_errors(columns_of(given_poses), columns_of([truth] * 3))
     assert errors.position_m.tolist() == [5.0, 0.0, math.inf]
     assert errors.yaw_deg.tolist() == [10.0, 0.0, math.inf]
     np.testing.assert_allclose(errors.log_scale, [math.log(1.1), 0.0, math.inf])
@@ -116,7 +117,7 @@ def test_success_is_monotone_in_the_tolerance(errors_m) -> None:
 
 
 def test_no_queries_have_no_success() -> None:
-    nothing = pose_errors([], [])
+    nothing = pose_errors(columns_of([]), columns_of([]))
     assert math.isnan(success_rate(nothing, 5.0))
     assert math.isnan(success_auc(nothing))
     assert math.isnan(weighted_quantile(nothing.position_m, 0.5))
@@ -128,7 +129,7 @@ def test_what_cannot_be_is_refused() -> None:
         with pytest.raises(MetricError, match="tolerances"):
             successes(errors, within_m)
     with pytest.raises(MetricError, match="0 answers for 1 truths"):
-        pose_errors([], [Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)])
+        pose_errors(columns_of([]), columns_of([Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)]))
     with pytest.raises(MetricError, match="not negative"):
         only_position([-1.0])
     with pytest.raises(MetricError, match="NaN"):
@@ -153,14 +154,13 @@ def test_the_first_pose_is_the_fix_and_silence_is_none() -> None:
     assert first_pose(Prediction(query_id="q", candidates=((at(0.0), 1.0),), status="crash")) is None
 
 
-def test_the_best_pose_within_tolerance_has_the_rank(truth_of) -> None:
-    prediction = answer((at(40.0), 9.0), (at(1.0, 90.0), 8.0), (at(4.0), 7.0), (at(300.0), 7.0))
-    assert rank_pose(prediction, truth_of(), within_m=5.0) == Rank(above=2, tied=2, right=1)
-    assert rank_pose(prediction, truth_of(), within_m=5.0, within_deg=180.0) == Rank(above=1, tied=1, right=1)
-    assert rank_pose(prediction, truth_of(), within_m=2.0) == MISS
-    assert rank_pose(None, truth_of(), within_m=5.0) == MISS
-
-
-def test_an_absent_place_is_no_query_of_recall(truth_of) -> None:
-    with pytest.raises(MetricError, match="leave absent places out"):
-        rank_pose(answer((at(0.0), 1.0)), truth_of(is_present=False), within_m=5.0)
+@given(
+    answers=st.lists(st.lists(st.tuples(st.integers(0, 3), st.booleans()), max_size=6), min_size=1, max_size=5),
+)
+def test_ranks_of_many_answers_are_those_of_each(answers) -> None:
+    row = np.repeat(np.arange(len(answers)), [len(one) for one in answers])
+    scores, right = (np.array([pose[at] for one in answers for pose in one]) for at in (0, 1))
+    found = ranks_of_lists(row, scores.astype(float), right.astype(bool), len(answers))
+    for at, one in enumerate(answers):
+        alone = rank_of(*zip(*one, strict=True)) if one else MISS
+        assert (found.above[at], found.tied[at], found.right[at]) == (alone.above, alone.tied, alone.right)

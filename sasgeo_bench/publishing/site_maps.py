@@ -6,7 +6,7 @@ A script instead of a JSON file: a page that is opened from a disk may load no o
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -17,12 +17,16 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.cases import FAILURES, MEANINGS
 from sasgeo_bench.leaderboard.tables import file_stem
 from sasgeo_bench.publishing.site_source import RegionMap, SiteSource
+from sasgeo_bench.scoring.draws import seed_of_text
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.texts import plain
 
 MAPS: Final = "maps"
 _POSE: Final = ("easting_m", "northing_m", "yaw_deg")
 _MOST_M: Final = 1e8  # of any coordinate on Earth
+MOST_BYTES: Final = 1_500_000  # of all scripts, nearly
+_QUERY_BYTES: Final = 100
+_ANSWER_BYTES: Final = 32
 SOUND: Final = "as it should be"  # neither a failure nor a crash
 OUTCOMES: Final = {SOUND: "right, or rightly none", **{name: MEANINGS[name] for name in FAILURES}}
 _NUMBERS: Final = {name: at for at, name in enumerate(OUTCOMES)}
@@ -30,39 +34,53 @@ _NUMBERS: Final = {name: at for at, name in enumerate(OUTCOMES)}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceMap:
-    """A place with a map and answers: name of its script in `maps/`, its title, and how many queries it has."""
+    """A place with a map and answers: its script in `maps/`, its title, and its queries, of which some are drawn."""
 
     region: str
     file: str
     title: str
     queries: int
+    drawn: int
 
 
 def place_maps(source: SiteSource) -> dict[PlaceMap, str]:
     """Return the places of a board that have a map and answers, with the text of the script of each.
 
-    Coordinates in a script are metres from the south-western corner of its map.
+    Coordinates in a script are metres from the south-western corner of its map. Where all scripts together would be
+    larger than `MOST_BYTES`, the same share of each place's queries is drawn: those with a picture, then others by a
+    hash of their ids.
     """
     if not len(source.answers):
         return {}
     _check(source.answers)
     answers = source.answers.assign(base=source.answers["region"].map(base_of))
     pictures = {plain(case.query_id): at for at, case in enumerate(source.pictures.cases, start=1)}
+    share = MOST_BYTES / (_QUERY_BYTES * answers["query_id"].nunique() + _ANSWER_BYTES * len(answers))
     found = {}
     for at, item in enumerate(one for one in source.pictures.regions if one.bounds_m is not None):
-        part = answers[answers["base"] == item.of]
-        if not len(part):
+        whole = answers[answers["base"] == item.of]
+        if not len(whole):
             continue
+        part = _sampled(whole, share, pictures)
         spot = source.spots.get(item.of)
         title = item.of if spot is None else spot.title
         place = PlaceMap(
             region=item.of,
             file=f"{MAPS}/{file_stem(item.of)}-{at}.js",
             title=plain(title),
-            queries=int(part["query_id"].nunique()),
+            queries=int(whole["query_id"].nunique()),
+            drawn=int(part["query_id"].nunique()),
         )
         found[place] = _script(place, item, part, pictures)
     return found
+
+
+def _sampled(answers: pd.DataFrame, share: float, first: Collection[str]) -> pd.DataFrame:
+    """Return the answers to a share of the queries: the `first`, then others by a hash of their ids; one at least."""
+    if share >= 1:
+        return answers
+    ids = sorted(set(answers["query_id"]), key=lambda name: (name not in first, seed_of_text(name)))
+    return answers[answers["query_id"].isin(ids[: max(1, int(share * len(ids)))])]
 
 
 def _check(answers: pd.DataFrame) -> None:

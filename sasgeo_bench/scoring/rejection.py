@@ -117,7 +117,7 @@ def judge(
     the rejector's remark on its fit.
     """
     usable = some_rows(scores, (scores["status"] != NOT_APPLICABLE).to_numpy(bool))
-    needed = usable[[*_NEEDED]]
+    needed = usable[[*_NEEDED]].astype(dict.fromkeys(_NAMES, object))
     columns: dict[str, Any] = {
         **{name: np.full(len(usable), np.nan) for name in ("p_right", *_DECIDED)},
         "remark": np.full(len(usable), "", dtype=object),
@@ -178,7 +178,7 @@ def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taugh
     """
     usable = some_rows(scores, (scores["status"] != NOT_APPLICABLE).to_numpy(bool))
     p_right = np.where(usable["is_answered"].to_numpy(bool), usable["confidence"].to_numpy(float), np.nan)
-    needed = usable[[*_NEEDED]].assign(p_right=p_right)
+    needed = usable[[*_NEEDED]].astype(dict.fromkeys(_NAMES, object)).assign(p_right=p_right)
     accepted = {name: np.full(len(usable), np.nan) for name in _DECIDED}
     is_given = np.zeros(len(usable), dtype=bool)
     for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
@@ -222,7 +222,8 @@ def _judged(test: pd.DataFrame, fit: _Fit, predictions: Mapping[str, Prediction]
     return {**said, **_decided(fit.known, test.assign(p_right=p_right))}
 
 
-_NEEDED: Final = ("query_id", "place", "part", "country", "block", "is_answered", "is_right", "is_present")
+_NAMES: Final = ("query_id", "place", "part", "country", "block")  # of objects, which are chosen faster than texts
+_NEEDED: Final = (*_NAMES, "is_answered", "is_right", "is_present")
 # What is decided about rows from the calibration places: acceptance by each threshold, chances at each declared share.
 _DECIDED: Final = (*dict.fromkeys(metric.accepted for metric in THRESHOLDS), *map(shifted_column, PRESENT_SHARES))
 

@@ -18,7 +18,8 @@ from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables, risk_tables_by_suite
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, text_of, ties_of
-from sasgeo_bench.publishing.site import contrasts_of
+from sasgeo_bench.publishing import site_maps
+from sasgeo_bench.publishing.site import contrasts_of, site_pages
 from sasgeo_bench.publishing.site_maps import place_maps
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
@@ -395,6 +396,29 @@ def test_a_place_has_its_answers_in_metres_from_the_corner_of_its_map():
     assert said["cases"] == {"1": 1}
     assert script.isascii()
     assert place_maps(replace(whole, answers=pd.DataFrame())) == {}
+
+
+def test_of_many_answers_a_share_is_drawn_those_with_a_picture_first_and_the_page_says_so(monkeypatch):
+    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
+    some = answers_of(["graph", "raster"])
+    many = pd.concat([some.assign(query_id=some["query_id"] + f"-{at}") for at in range(100)], ignore_index=True)
+    cases = (Case(query_id="q1-42", matcher="graph", failure="aliased", file="a.png", alt=""),)
+    given = replace(source(), answers=many, pictures=Pictures(regions=(item,), cases=cases))
+    ((place, whole),) = place_maps(given).items()
+    assert (place.queries, place.drawn) == (300, 300)
+    assert "Every query of a place" in site_pages(given)["map.html"]
+    monkeypatch.setattr(site_maps, "MOST_BYTES", len(whole) // 4)
+    ((place, script),) = place_maps(given).items()
+    assert place.queries == 300
+    assert 40 < place.drawn < 90
+    assert len(script) < len(whole) // 3
+    said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
+    assert len(said["queries"]) == place.drawn
+    assert [len(rows) for _, rows in said["answers"]] == [place.drawn, place.drawn]
+    assert said["queries"][int(next(iter(said["cases"])))][0] == "q1-42"
+    page = site_pages(given)["map.html"]
+    assert f"Drawn are {place.drawn} of 300 queries" in page
+    assert f"({place.drawn} of 300)" in page
 
 
 @pytest.mark.parametrize(

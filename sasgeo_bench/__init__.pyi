@@ -10,6 +10,8 @@ from .cli.runs import run as run
 from .datasets.torch import PictureDataset as PictureDataset
 from .datasets.torch import QueryDataset as QueryDataset
 from .datasets.torch import task_pictures as task_pictures
+from .files.storage import fetch as fetch
+from .files.storage import send as send
 from .geometry.grid import Grid as Grid
 from .geometry.pose import Pose as Pose
 from .geometry.pose import Prior as Prior

@@ -74,6 +74,10 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "publish": "publishing",
         "release": "releasing",
     },
+    "Storage": {
+        "send": "storage",
+        "fetch": "storage",
+    },
     "Flights": {
         "measure-drift": "flights",
         "list-trackers": "listing",
@@ -95,6 +99,8 @@ KEPT: Final = {
     "run": "answers so far are kept; the same command asks the other queries",
     "enter": "queries and answers so far are kept; the same command goes on from there",
     "leaderboard": "queries and answers so far are kept; the same command goes on from there",
+    "send": "files that were sent are kept; the same command sends the others",
+    "fetch": "files that were fetched are kept beside the folder; the same command fetches the others",
 }
 _NOTHING: Final = "nothing is half-written, and what was there before is kept; run it again"
 

@@ -150,14 +150,21 @@ def fresh_folder(target: Path) -> Iterator[Path]:
     scratch.mkdir(parents=True)
     try:
         yield scratch
-        for path in scratch.rglob("*"):
-            _flush(path)
-        if os.path.lexists(target):  # true also for a broken link
-            target.rename(replaced)
-        scratch.rename(target)
+        replace_folder(scratch, target)
     finally:
         _clear(scratch)
         _clear(replaced)
+
+
+def replace_folder(scratch: Path, target: Path) -> None:
+    """Give a folder that is complete the name of another one, which is removed; call it under `locked`."""
+    replaced = target.parent / f".{target.name}.replaced"
+    for path in scratch.rglob("*"):
+        _flush(path)
+    if os.path.lexists(target):  # true also for a broken link
+        target.rename(replaced)
+    scratch.rename(target)
+    _clear(replaced)
 
 
 def _clear(path: Path) -> None:

@@ -126,15 +126,16 @@ def judge(
     is_judged = np.zeros(len(usable), dtype=bool)
     for rows in usable.groupby(["track", "prior_group"], sort=True).indices.values():
         group = needed.iloc[rows]
+        answers = {name: predictions[name] for name in group["query_id"][group["is_answered"].to_numpy(bool)]}
         fits: dict[bytes, _Fit] = {}  # places share their calibration places with others
         for turn in turns(group, split, is_taught=is_taught):
             test, calibration = group[turn.test], group[turn.calibration]
             if len(test) and calibration["is_answered"].any():
                 same = turn.calibration.tobytes()
                 if same not in fits:
-                    fits[same] = _Fit.of(calibration, predictions, make)
+                    fits[same] = _Fit.of(calibration, answers, make)
                 is_judged[rows[turn.test]] = True
-                found = {**_judged(test, fits[same], predictions), "is_own_calibration": turn.is_own}
+                found = {**_judged(test, fits[same], answers), "is_own_calibration": turn.is_own}
                 for name, values in found.items():
                     columns[name][rows[turn.test]] = values
     return some_rows(usable.assign(**columns), is_judged)
@@ -387,15 +388,13 @@ def evaluate_rejectors(
 def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
     """Return by rejector rows of `judge`, of the board and of acceptance, or the error; own confidence comes first."""
     results: dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception] = {}
-    answers: dict[str, Prediction] = {}  # of this entry alone, while it is judged
     for name in (OWN, *task.rules):
         try:
             if name == OWN:  # it counts as a probability
                 frame, is_calibrated = own_confidence(task.scores, task.split, is_taught=task.is_taught), True
             else:
                 rule = task.rules[name]
-                answers = answers or dict(task.predictions)
-                frame = judge(task.scores, answers, rule.make, rule.split, is_taught=task.is_taught)
+                frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
                 is_calibrated = rule.card.is_calibrated
             figures = to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
             taken = acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])

@@ -127,13 +127,15 @@ GROUP: Final = ("suite", "track", "prior_group")
 
 def queries_of(scores: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Return the query columns of scored rows, each query once."""
-    parts: list[pd.DataFrame] = []
-    seen: set[str] = set()
+    found = next(iter(scores.values())).iloc[:0]
+    whole: list[pd.Series] = []  # ids of matchers whose queries are in it: many were asked the same
     for frame in scores.values():
-        fresh = frame[~frame["query_id"].isin(seen)].drop_duplicates("query_id")
-        seen.update(fresh["query_id"])
-        parts += [fresh] if len(fresh) else []
-    return pd.concat(parts or list(scores.values())[:1], ignore_index=True)
+        ids = frame["query_id"]
+        if not any(ids.equals(one) for one in whole):
+            whole.append(ids)
+            fresh = frame[~ids.isin(found["query_id"])].drop_duplicates("query_id")
+            found = pd.concat([found, fresh], ignore_index=True) if len(found) else fresh.reset_index(drop=True)
+    return found
 
 
 def steps_frame(table: pd.DataFrame, queries: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:

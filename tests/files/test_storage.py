@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Folders in object storage come back as they were sent, whatever is cut, damaged or forged on the way."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+import sasgeo_bench as sgb
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.storage import LIST, fetch, send
+
+fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed (make install brings it)")
+
+
+@pytest.fixture(params=["memory", "file"])
+def url(request, tmp_path):
+    """A place that is empty, in memory and on a disk."""
+    if request.param == "file":
+        yield f"file://{tmp_path / 'bucket' / 'vaduz'}"
+        return
+    yield "memory://bucket/vaduz"
+    system = fsspec.filesystem("memory")
+    system.store.clear()
+    system.pseudo_dirs[:] = [""]
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder of some files, one of them deep, and what hides in it."""
+    made = tmp_path / "vaduz"
+    for name, text in {"region.json": "{}", "layers/a.tif": "a" * 5000, "layers/b.tif": "b", ".lock": ""}.items():
+        (made / name).parent.mkdir(parents=True, exist_ok=True)
+        (made / name).write_text(text, encoding="utf-8")
+    return made
+
+
+def contents(root):
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+def seen(folder):
+    return {name: data for name, data in contents(folder).items() if not name.startswith(".")}
+
+
+def place(url):
+    """The file system of an URL, and the path there."""
+    return fsspec.url_to_fs(url)
+
+
+def test_what_is_sent_comes_back_and_only_what_changed_is_moved_again(url, folder, tmp_path):
+    assert (sent := send(folder, url)).moved == sent.files == 3
+    assert sent.bytes == 5003
+    assert fetch(url, tmp_path / "here").moved == 3
+    assert contents(tmp_path / "here") == seen(folder)
+    assert send(folder, url).moved == fetch(url, tmp_path / "here").moved == 0
+    (folder / "layers" / "b.tif").write_text("B", encoding="utf-8")
+    (folder / "new.txt").write_text("new", encoding="utf-8")
+    assert send(folder, url).moved == 2
+    assert fetch(url, tmp_path / "here").moved == 2
+    assert contents(tmp_path / "here") == seen(folder)
+    (folder / "layers" / "a.tif").unlink()
+    assert send(folder, url).moved == 0
+    assert fetch(url, tmp_path / "new").moved == 3
+    with pytest.raises(StoreError, match=r"layers/a\.tif"):  # which no list says to be ours
+        fetch(url, tmp_path / "here")
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
+    system, root = place(url)
+    assert {Path(name).name for name in system.find(root)} == {"region.json", "b.tif", "new.txt", LIST}
+
+
+def test_what_was_cut_goes_on_where_it_was_and_is_nothing_until_then(url, folder, tmp_path, monkeypatch):
+    system, _ = place(url)
+    put, get, moved = type(system).put_file, type(system).get_file, []
+
+    def cut(move, most):
+        def moving(self, first, second, **more):
+            if len(moved) == most:
+                message = "the line is dead"
+                raise ConnectionError(message)
+            moved.append(first)
+            return move(self, first, second, **more)
+
+        return moving
+
+    monkeypatch.setattr("sasgeo_bench.files.storage._FILES_AT_ONCE", 1)
+    monkeypatch.setattr(type(system), "put_file", cut(put, 2))
+    with pytest.raises(StoreError, match=r"cannot be reached \(the line is dead\)"):
+        send(folder, url)
+    with pytest.raises(StoreError, match="was not sent to its end"):
+        fetch(url, tmp_path / "here")
+    monkeypatch.setattr(type(system), "put_file", put)
+    assert send(folder, url).moved == 1
+    moved.clear()
+    monkeypatch.setattr(type(system), "get_file", cut(get, 2))
+    with pytest.raises(StoreError, match="the line is dead"):
+        fetch(url, tmp_path / "here")
+    assert not (tmp_path / "here").exists()
+    monkeypatch.setattr(type(system), "get_file", get)
+    assert fetch(url, tmp_path / "here").moved == 1
+    assert contents(tmp_path / "here") == seen(folder)
+
+
+def test_a_file_that_is_not_what_was_sent_is_refused_and_the_folder_stays(url, folder, tmp_path):
+    send(folder, url)
+    fetch(url, tmp_path / "here")
+    (folder / "layers" / "b.tif").write_text("B", encoding="utf-8")
+    send(folder, url)
+    system, root = place(url)
+    system.pipe_file(f"{root}/layers/b.tif", b"x")
+    with pytest.raises(StoreError, match=r"layers/b\.tif is not what was sent: send it again"):
+        fetch(url, tmp_path / "here")
+    assert (tmp_path / "here" / "layers" / "b.tif").read_text(encoding="utf-8") == "b"
+
+
+def test_nothing_of_others_is_lost(url, folder, tmp_path):
+    system, root = place(url)
+    system.makedirs(root, exist_ok=True)
+    system.pipe_file(f"{root}/thesis.txt", b"mine")
+    with pytest.raises(StoreError, match="holds something else than a folder that was sent"):
+        send(folder, url)
+    assert system.cat_file(f"{root}/thesis.txt") == b"mine"
+    system.rm_file(f"{root}/thesis.txt")
+    send(folder, url)
+    (tmp_path / "here").mkdir()
+    (tmp_path / "here" / "notes.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"holds 1 file \(notes\.txt\) that would be lost"):
+        fetch(url, tmp_path / "here")
+    assert contents(tmp_path / "here") == {"notes.txt": b"mine"}
+
+
+@pytest.mark.parametrize("name", ["../out.txt", "/etc/out.txt", "a//b", "a/../../b", ".hidden", "a\\b", "", "a\0b"])
+def test_a_list_that_leads_out_of_the_folder_is_refused(url, folder, tmp_path, name):
+    send(folder, url)
+    system, root = place(url)
+    content = json.loads(system.cat_file(f"{root}/{LIST}"))
+    content["files"][name] = content["files"].pop("region.json")
+    system.pipe_file(f"{root}/{LIST}", json.dumps(content).encode())
+    with pytest.raises(StoreError, match="which is no file of a folder: send the folder again") as refused:
+        fetch(url, tmp_path / "here")
+    assert "\n" not in str(refused.value)
+    assert not (tmp_path / "here").exists()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", '{"made_by": "sasgeo-bench send"}', '{"made_by": "other"}', "\xff"])
+def test_a_list_that_is_none_is_refused_in_a_line(url, tmp_path, folder, text):
+    system, root = place(url)
+    system.makedirs(root, exist_ok=True)
+    system.pipe_file(f"{root}/{LIST}", text.encode("latin-1"))
+    for work in (lambda: fetch(url, tmp_path / "here"), lambda: send(folder, url)):
+        with pytest.raises(StoreError, match=r"sent\.json (is no list of files|was made by another)") as refused:
+            work()
+        assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("send", "vaduz", "nonsense://a/b"), "names no storage"),
+        (("send", "vaduz", "memory://"), "names no place in the storage"),
+        (("send", "nowhere", "memory://a/b"), "holds no file to send"),
+        (("fetch", "memory://nobody/sent", "here"), "holds no folder that was sent"),
+        (("fetch", "memory://nobody/sent", "vaduz/region.json/here"), "region.json is a file"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(folder, mistake, monkeypatch, words, told):
+    monkeypatch.chdir(folder.parent)
+    assert told in mistake(*words)
+
+
+def test_a_link_is_not_sent_nor_without_its_package(folder, monkeypatch):
+    (folder / "link").symlink_to("/etc/passwd")
+    with pytest.raises(StoreError, match="is a link"):
+        send(folder, "memory://bucket/linked")
+    (folder / "link").unlink()
+    monkeypatch.setitem(__import__("sys").modules, "fsspec", None)
+    with pytest.raises(ConfigError, match="needs the package fsspec"):
+        send(folder, "memory://bucket/vaduz")
+
+
+def test_a_region_its_tasks_and_a_run_are_the_same_at_another_place(tmp_path, lay_towns, program):
+    out, there = lay_towns(tmp_path / "out", "town-riverside"), tmp_path / "there"
+    (task,) = sgb.make_tasks(suite="clean", regions="town-riverside", n=1, up_to=True, out=out)
+    for name in ("regions/town-riverside", "tasks/clean/town-riverside", "truth/clean/town-riverside"):
+        code, said, _ = program("send", out / name, f"memory://out/{name}")
+        assert (code, "sent" in said) == (0, True)
+        code, said, _ = program("fetch", f"memory://out/{name}", there / name)
+        assert (code, "fetched" in said) == (0, True)
+        assert contents(there / name) == seen(out / name)
+    sgb.run(matcher="prior_centre", tasks=there / task.relative_to(out), out=there)
+    send(there / "runs", "memory://out/runs")
+    fetch("memory://out/runs", out / "runs")
+    board = sgb.score(predictions=out / "runs", out=out, cases=False)
+    assert (board.scores["prior_centre"]["status"] == "ok").all()

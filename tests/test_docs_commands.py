@@ -56,6 +56,7 @@ ONLY_PARSED = {
     r"--suite aerial|/aerial": "minutes of painting; tests/tasks/suites/test_pictures.py takes small ones",
     r"flight-image": "a minute of painting; tests/tasks/suites/test_flight_image.py flies a short one",
     r"--dask": "needs a scheduler; tests/running does it",
+    r"s3://": "needs a store; tests/files/test_storage.py has one in memory",
     r"^sasgeo-bench profile ": "five minutes; tests/running/test_profiling.py does a moment",
     r"^sasgeo-bench enter ": "minutes of drawing; tests/experiments/test_entering.py enters a small board",
     r"docs/results/": "needs results that a long run has stored; the walk of a matcher does it with those of the demo",

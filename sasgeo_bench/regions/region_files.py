@@ -3,7 +3,7 @@
 
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from pathlib import Path
@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import shapely
 
 from sasgeo_bench.config import check_document
@@ -213,11 +212,10 @@ def _window(grid: Grid, bounds_m: Bounds) -> tuple[int, int, int, int]:
 
 def _edges_between(ids: "NDArray[np.int64]", path: Path) -> "pd.DataFrame":
     """Read the edges between some nodes, by their numbers in ascending order; they refer to their places among them."""
-    wanted = pa.array(ids)
     table = read_kept(
         path,
         mend=_MEND,
-        keep=lambda part: pc.and_(pc.is_in(part["source"], wanted), pc.is_in(part["target"], wanted)),
+        keep=lambda part: pa.array(np.isin(part["source"], ids) & np.isin(part["target"], ids)),
     )
     edges = as_frame(table, path, mend=_MEND)
     return edges.assign(**{end: np.searchsorted(ids, edges[end].to_numpy()) for end in ("source", "target")})
@@ -325,13 +323,18 @@ def _read_near(path: Path, box: Bounds) -> pa.Table:
 
     def keep(part: pa.Table) -> pa.BooleanArray:
         """Mark the rows whose boxes meet the box."""
-        xmin, ymin, xmax, ymax = (
-            pc.struct_field(part[covering[side][0]], covering[side][1:]) for side in ("xmin", "ymin", "xmax", "ymax")
-        )
-        across = pc.and_(pc.less_equal(xmin, east), pc.greater_equal(xmax, west))
-        return pc.and_(across, pc.and_(pc.less_equal(ymin, north), pc.greater_equal(ymax, south)))
+        xmin, ymin, xmax, ymax = (_numbers_at(part, covering[side]) for side in ("xmin", "ymin", "xmax", "ymax"))
+        return pa.array((xmin <= east) & (xmax >= west) & (ymin <= north) & (ymax >= south))
 
     return read_kept(path, mend=_MEND, keep=keep, may_hold=may_hold)
+
+
+def _numbers_at(part: pa.Table, place: Sequence[str]) -> "NDArray[np.float64]":
+    """Return the numbers of a column, or of a field inside it; NaN for null."""
+    column = part[place[0]].combine_chunks()
+    for name in place[1:]:
+        column = column.field(name)
+    return np.asarray(column.to_numpy(zero_copy_only=False), dtype=np.float64)
 
 
 @cache

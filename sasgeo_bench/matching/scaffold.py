@@ -34,7 +34,7 @@ _TAKEN: Final = frozenset(
         ),
         *("pooch", "psutil", "pyarrow", "pydantic", "pyproj", "rasterio", "rich"),
         *("scipy", "shapely", "torch", "tqdm", "typer", "click"),
-        *("dask", "distributed", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
+        *("dask", "distributed", "fsspec", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
         *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),
         *("src", "test", "tests", "con", "nul", "aux", "prn"),
     }

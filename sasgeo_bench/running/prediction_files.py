@@ -179,6 +179,12 @@ def _newest(table: pa.Table, ids: Sequence[str | None], seen: set[str]) -> pa.Ta
     return table if len(rows) == len(table) else table.take(pa.array(rows, pa.int64()))
 
 
+def merged_rows(tables: Sequence[pa.Table]) -> pa.Table:
+    """Return the rows of several tables; of two for one query that of the table that comes last."""
+    seen: set[str] = set()
+    return _joined([_newest(table, table["query_id"].to_pylist(), seen) for table in reversed(tables)])
+
+
 def _joined(tables: Sequence[pa.Table]) -> pa.Table:
     """Return the rows of several tables, of which some may lack columns; an empty one where there are none."""
     plain = PART_SCHEMA.remove_metadata().empty_table()

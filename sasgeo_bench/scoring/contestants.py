@@ -239,12 +239,17 @@ def _read_runs(
         if not (len(found.table) or is_same):
             stale.append(source)
             continue
-        read[task.folder] = room.keep(found.table, partial(_rows_of_run, source, task.asked, is_tied=is_same))
+        mine = room.keep(found.table, partial(_rows_of_run, source, task.asked, is_tied=is_same))
+        read[task.folder] = partial(_both, read[task.folder], mine) if task.folder in read else mine  # as of shards
         asked.add(task.folder)
         runs.append((source, _share_of(about, found)))
-    mine = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
+    left = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
     answers = StoredAnswers(read, task_of)
-    return EntryAnswers(entry=mine, predictions=answers, held=frozenset(asked), asked=frozenset(asked)), stale
+    return EntryAnswers(entry=left, predictions=answers, held=frozenset(asked), asked=frozenset(asked)), stale
+
+
+def _both(first: Callable[[], pa.Table], second: Callable[[], pa.Table]) -> pa.Table:
+    return prediction_files.merged_rows([first(), second()])
 
 
 def _rows_of_run(source: Path, asked: Mapping[str, str], *, is_tied: bool) -> pa.Table:

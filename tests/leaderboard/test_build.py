@@ -815,6 +815,21 @@ def test_answers_that_are_none_cost_their_author_alone(out, both, alone, column,
     assert "- Failed, and not on this board: bad: " in text
 
 
+def test_shards_of_a_run_in_several_folders_are_one_run(out, tmp_path):
+    whole = board_of(out)
+    for number, keep in enumerate((lambda at: at % 2 == 0, lambda at: at % 2 == 1)):
+        for path in sorted((out / "runs").rglob("run.json")):
+            shard = tmp_path / f"shard{number}" / path.parent.relative_to(out / "runs")
+            rows = list(prediction_files.read_predictions(path.parent))
+            asked = task_files.read_asked(out / "tasks" / shard.parent.name / shard.name)
+            prediction_files.write_part(shard, [row for at, row in enumerate(rows) if keep(at)], asked=asked)
+            shutil.copyfile(path, shard / "run.json")
+    board = board_of(out, tmp_path / "shard0", tmp_path / "shard1")
+    pd.testing.assert_frame_equal(board.scores["oracle_pose"], whole.scores["oracle_pose"])
+    assert (board.scores["oracle_pose"]["status"] == "ok").all()
+    assert len(board.predictions["oracle_pose"]) == len(whole.predictions["oracle_pose"])
+
+
 def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out, both, split, monkeypatch):
     asked = {"split": split, "rejectors": (f"{__name__}:Doubt",)}
     whole = board_of(out, out / "runs", *both, **asked)

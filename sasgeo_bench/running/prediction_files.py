@@ -4,11 +4,10 @@
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final
 
 import pyarrow as pa
 
@@ -24,14 +23,12 @@ from sasgeo_bench.running.prediction_rows import (
     FLOWN_SCHEMA,
     PART_SCHEMA,
     PREDICTION_SCHEMA,
-    AnswerColumns,
     differing_columns,
     far_fault,
     prediction_row,
     predictions_of,
     row_faults,
     schema_of,
-    table_of,
 )
 from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
 from sasgeo_bench.texts import MOST_MESSAGE, json_text, one_line
@@ -261,66 +258,6 @@ def _tables_of(path: Path) -> Iterator[pa.Table]:
     for part in reversed(parts):
         table = _checked(part, is_own=part != path)
         yield _newest(table, table["query_id"].to_pylist(), seen)
-
-
-class StoredAnswers(Mapping[str, Prediction]):
-    """Answers to the queries of some tasks, read from their files when they are asked for, a task at a time.
-
-    `read` returns the rows of each task, by its folder; `task_of` is the folder of each query. Who asks in the order of
-    the tasks reads each of them once.
-    """
-
-    def __init__(self, read: Mapping[Path, Callable[[], pa.Table]], task_of: Mapping[str, Path]) -> None:
-        self._read, self._task_of = dict(read), task_of
-        self._last: tuple[Path | None, dict[str, Prediction]] = (None, {})
-
-    @classmethod
-    def of(cls, answers: Iterable[Prediction]) -> Self:
-        """Return answers that are in memory, as those of one task."""
-        listed = list(answers)
-        return cls({Path(): partial(table_of, listed)}, dict.fromkeys((item.query_id for item in listed), Path()))
-
-    def columns(self, query_ids: Iterable[str]) -> Iterator[AnswerColumns]:
-        """Yield the answers to all queries of the tasks that some queries belong to, a task at a time."""
-        asked = {self._task_of[name] for name in query_ids if name in self._task_of}
-        for task, read in self._read.items():
-            if task in asked:
-                yield AnswerColumns.of(read())
-
-    def rows(self, task: Path) -> pa.Table:
-        """Return the rows of one task. Raise `StoreError` if they cannot be read."""
-        return self._read[task]()
-
-    def __getitem__(self, query_id: str) -> Prediction:
-        """Return one answer; raise KeyError without one."""
-        task = self._task_of[query_id]
-        if task not in self._read:
-            raise KeyError(query_id)
-        return self._of(task)[query_id]
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the ids of all queries that are answered."""
-        for task in self._read:
-            yield from self._of(task)
-
-    def __len__(self) -> int:
-        """Return the number of answers."""
-        return sum(len(self._of(task)) for task in self._read)
-
-    def _of(self, task: Path) -> dict[str, Prediction]:
-        if self._last[0] != task:
-            self._last = (task, {item.query_id: item for item in predictions_of(self.rows(task))})
-        return self._last[1]
-
-    def lean(self) -> "StoredAnswers":
-        """Return the same answers without their candidates, which take far longer to read than all the rest."""
-        return StoredAnswers({task: partial(_without_poses, read) for task, read in self._read.items()}, self._task_of)
-
-
-def _without_poses(read: Callable[[], pa.Table]) -> pa.Table:
-    table = read()
-    nothing = pa.array([[]] * len(table), PREDICTION_SCHEMA.field("candidates").type)
-    return table.set_column(table.column_names.index("candidates"), "candidates", nothing)
 
 
 def _checked(part: Path, *, is_own: bool) -> pa.Table:

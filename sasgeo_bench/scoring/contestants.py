@@ -14,8 +14,8 @@ from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
-from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.running.prediction_rows import predictions_of, table_of
+from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.scoring.controls import hold_controls
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.flights import score_flights

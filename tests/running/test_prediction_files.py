@@ -13,6 +13,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files, prediction_rows
+from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.tasks.task_rows import POSE_FIELDS
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
@@ -264,7 +265,7 @@ def test_stored_answers_are_those_of_their_tasks_a_task_at_a_time(rows):
 
     first, second = rows["query_id"].to_pylist()
     task_of = {first: Path("first"), second: Path("second"), "asked": Path("second"), "elsewhere": Path("far")}
-    answers = prediction_files.StoredAnswers({task: reading(task) for task in tasks}, task_of)
+    answers = StoredAnswers({task: reading(task) for task in tasks}, task_of)
     assert dict(answers) == {item.query_id: item for item in (FULL, FAILED)}
     assert len(answers) == 2
     read.clear()

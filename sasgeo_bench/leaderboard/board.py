@@ -22,7 +22,7 @@ from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region import DATA_VERSION
-from sasgeo_bench.running.failures import LOG, Failures
+from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame
@@ -104,6 +104,7 @@ class Board:
     scores: dict[str, pd.DataFrame]
     predictions: Mapping[str, StoredAnswers]
     table: pd.DataFrame
+    failures: Failures
     with_calibration: Mapping[str, pd.DataFrame] = field(default_factory=dict)
     findings: tuple[Finding, ...] = ()
     falsifiers: tuple[Falsifier, ...] = ()
@@ -119,7 +120,6 @@ class Board:
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
     on_private: OnPrivate = field(default_factory=OnPrivate)
-    failures: Failures = field(default_factory=lambda: Failures(Path(LOG), tell=lambda _: None))
 
 
 def make_extras(request: ScoreRequest, board: Board, tell: Tell) -> list[Extra]:

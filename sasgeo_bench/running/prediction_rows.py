@@ -1,9 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of `part-*.parquet`: their schema, conversion to and from predictions, and faults of untrusted rows."""
 
-import gc
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
@@ -12,6 +10,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from numpy.typing import NDArray
 
+from sasgeo_bench.files.garbage import uncollected
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import STATUSES, Prediction
 from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
@@ -90,25 +89,13 @@ def predictions_of(table: pa.Table) -> list[Prediction]:
     column = table["candidates"].combine_chunks()
     if not len(table):
         return []
-    with _uncollected():
+    with uncollected():
         poses, scores, ends = poses_of(column), column.values.field("score").to_pylist(), column.offsets.to_pylist()
         rows = table.drop_columns(["candidates"]).to_pylist()
         return [
             _with_candidates(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
             for at in reversed(range(len(rows)))
         ]
-
-
-@contextmanager
-def _uncollected() -> Iterator[None]:
-    """Let nobody look for garbage while objects are made of which none is: that takes half of the time."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
 
 
 def table_of(predictions: Iterable[Prediction]) -> pa.Table:

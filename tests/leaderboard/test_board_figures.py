@@ -25,6 +25,7 @@ from sasgeo_bench.leaderboard.plot_tables import (
 )
 from sasgeo_bench.leaderboard.plots import draw_steps
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.sasgeo.conformal import level_name
 from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
@@ -65,7 +66,7 @@ NOTHING = StoredAnswers.of([])
 
 
 @pytest.fixture(scope="module")
-def board():
+def board(tmp_path_factory):
     tables = {"raster": asked(1), "graph": asked(2), "oracle_pose": asked(3)}
     rng = np.random.default_rng(4)
     judged = {
@@ -81,6 +82,7 @@ def board():
     levels = {level_name("gauss", 1e-2): 10.0}
     return Board(
         entries=(),
+        failures=Failures(tmp_path_factory.mktemp("board") / "failures.log", tell=lambda _: None),
         scores=tables,
         predictions={
             name: StoredAnswers.of(

@@ -24,9 +24,9 @@ from sasgeo_bench.texts import plain
 MAPS: Final = "maps"
 _POSE: Final = ("easting_m", "northing_m", "yaw_deg")
 _MOST_M: Final = 1e8  # of any coordinate on Earth
-MOST_BYTES: Final = 1_500_000  # of all scripts, nearly
-_QUERY_BYTES: Final = 100
-_ANSWER_BYTES: Final = 32
+MOST_BYTES: Final = 1_000_000  # of all scripts, nearly
+_QUERY_BYTES: Final = 95  # as of the board `modules`
+_ANSWER_BYTES: Final = 27
 SOUND: Final = "as it should be"  # neither a failure nor a crash
 OUTCOMES: Final = {SOUND: "right, or rightly none", **{name: MEANINGS[name] for name in FAILURES}}
 _NUMBERS: Final = {name: at for at, name in enumerate(OUTCOMES)}

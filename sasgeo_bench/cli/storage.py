@@ -10,8 +10,7 @@ import typer
 from sasgeo_bench.cli.console import say
 from sasgeo_bench.cli.options import Options
 from sasgeo_bench.errors import counted
-from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.files.storage import Moved, fetch, send
+from sasgeo_bench.files.storage import Moved, fetch, send, shown
 
 Url = Annotated[str, typer.Argument(help="place of the folder itself, as s3://bucket/regions/vaduz (fsspec)")]
 
@@ -34,15 +33,16 @@ class FetchOptions(Options):
 
 def send_command(options: SendOptions) -> None:
     """Copy a finished folder into object storage; files that are there already are not sent again."""
-    moved = send(given_path(options.folder), options.url)
-    say(f"{options.url}: {_text(moved, 'sent')}")
+    moved = send(options.folder, options.url)
+    say(f"{shown(options.url)}: {_text(moved, 'sent')}")
 
 
 def fetch_command(options: FetchOptions) -> None:
     """Copy a folder that was sent out of object storage, each file held against its hash."""
-    moved = fetch(options.url, given_path(options.folder))
+    moved = fetch(options.url, options.folder)
     say(f"{options.folder}: {_text(moved, 'fetched')}")
 
 
 def _text(moved: Moved, verb: str) -> str:
-    return f"{counted(moved.files, 'file')}, {moved.bytes / 1e6:.1f} MB, {moved.moved} {verb}"
+    hidden = f"; {counted(moved.hidden, 'hidden file')} left out" if moved.hidden else ""
+    return f"{counted(moved.files, 'file')}, {moved.bytes / 1e6:.1f} MB, {moved.moved} {verb}{hidden}"

@@ -162,6 +162,7 @@ def replace_folder(scratch: Path, target: Path) -> None:
     for path in scratch.rglob("*"):
         _flush(path)
     if os.path.lexists(target):  # true also for a broken link
+        _clear(replaced)
         target.rename(replaced)
     scratch.rename(target)
     _clear(replaced)
@@ -333,7 +334,7 @@ def check_site(folder: Path) -> None:
 def check_room(folder: Path) -> None:
     """Raise `StoreError` if a folder cannot be made or replaced: the work to fill it may take an hour."""
     folder = absolute(folder)
-    there = next(path for path in folder.parents if path.exists())
+    there = next((path for path in folder.parents if path.exists()), folder)
     if not there.is_dir():
         message = f"{folder} cannot be written, for {there} is a file: name another folder"
         raise StoreError(message)

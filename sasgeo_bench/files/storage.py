@@ -3,16 +3,20 @@
 
 All work happens on local disks, where a folder can be renamed at once. Storage holds finished folders: regions, tasks,
 truths, runs, boards, or all of an `out`. A list with the hash of each file is written last: without it there is nothing
-to fetch. What was cut goes on where it was.
+to fetch. What was cut goes on where it was. Nothing is removed from storage.
 """
 
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
+from shutil import copyfile
 from typing import TYPE_CHECKING, Any, Final
 
-from sasgeo_bench.errors import ConfigError, StoreError
+from pydantic import ValidationError
+
+from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, named
 from sasgeo_bench.files.folders import (
     FileRecord,
     absolute,
@@ -21,38 +25,45 @@ from sasgeo_bench.files.folders import (
     file_record,
     list_files,
     locked,
+    remove_tree,
     replace_folder,
     sha256_of,
 )
 from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.texts import json_text, one_line
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-LIST: Final = "sent.json"  # in storage alone
+LIST: Final = "sent.json"  # in storage; in a folder that is being fetched, of whose files it is
 _SENDING: Final = "sending.json"  # the same of the files so far, while others are sent
 _MADE_BY: Final = "sasgeo-bench send"
 _MOST_LIST_BYTES: Final = 500_000_000
 _FILES_AT_ONCE: Final = 64  # sent before the list of those so far is written again
+_MOST_PART_BYTES: Final = 255  # of a name of a file or folder
+_SECRET: Final = re.compile(r"(?<=://)[^/@]*@|\?.*$", re.DOTALL)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Moved:
-    """Files and bytes of a folder, and how many of the files had to be moved: the others were there."""
+    """Files and bytes of a folder, how many of the files had to be moved, and how many hidden ones were left out."""
 
     files: int
     bytes: int
     moved: int
+    hidden: int = 0
 
 
-def send(folder: Path, url: str) -> Moved:
-    """Copy a folder into storage, in place of an older copy of it.
+def send(folder: str | Path, url: str) -> Moved:
+    """Copy a folder into storage, over an older copy of it.
 
     `url` names the place of the folder itself, as in s3://bucket/regions/vaduz; fsspec knows the protocols, and reads
-    credentials from its own configuration and environment. Hidden files are left out. Raise `StoreError` if the folder
-    holds no file, or a link, or the storage holds something else there or refuses; `ConfigError` if nothing is known of
-    such an URL.
+    credentials from its own configuration and environment. Hidden files are left out. Two programs that send to one
+    place at once spoil each other's files, which `fetch` notices.
+
+    Raise `StoreError` if the folder holds no file, a link, or a name that cannot be sent, if the storage refuses, or
+    holds files there that the folder lacks; `ConfigError` if nothing is known of such an URL.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -61,72 +72,132 @@ def send(folder: Path, url: str) -> Moved:
     >>> send(folder, "memory://doc/vaduz").moved, send(folder, "memory://doc/vaduz").moved
     (1, 0)
     """
-    names = [name for name in list_files(folder) if not any(part.startswith(".") for part in PurePosixPath(name).parts)]
-    if not names:
-        message = f"{folder} holds no file to send: name the folder of a region, a task, a run or a board"
-        raise StoreError(message)
+    folder = given_path(folder)
+    names, hidden = _names_of(folder)
     records = {name: file_record(folder / name) for name in names}
     with _storage(url) as (system, root):
-        known = _read_list(system, root, LIST, url) or _read_list(system, root, _SENDING, url)
-        if known is None and system.exists(root) and system.ls(root):
-            message = f"{url} holds something else than a folder that was sent, which would be lost: name another place"
+        _check_apart(folder, system, root)
+        system.invalidate_cache()
+        known = _read_list(system, root, LIST, url) or _read_list(system, root, _SENDING, url) or _Sent()
+        sizes = {path.removeprefix(f"{root}/"): about["size"] for path, about in _found(system, root).items()}
+        others = sorted(name for name in sizes if name not in records and name not in {LIST, _SENDING})
+        others += sorted(name for name in records if name in sizes and name not in known.names)
+        if others:
+            message = (
+                f"{shown(url)} holds {one_line(named(others, 'file'))} of another folder, which would be lost: name "
+                "another place, or empty that one"
+            )
             raise StoreError(message)
-        there = {name: one for name, one in (known or {}).items() if records.get(name) == one}
+        there = {
+            name: one for name, one in records.items() if known.files.get(name) == one and sizes.get(name) == one.bytes
+        }
         left = [name for name in names if name not in there]
-        if left or known != records:
-            _write_list(system, root, _SENDING, there)
+        if left:
+            _write_list(system, root, _SENDING, there, begun=names)
             _remove(system, f"{root}/{LIST}")
         for at, name in enumerate(left, start=1):
-            system.makedirs(f"{root}/{PurePosixPath(name).parent}", exist_ok=True)
-            system.put_file(str(folder / name), f"{root}/{name}")
+            _put(system, folder / name, f"{root}/{name}")
             there[name] = records[name]
             if at % _FILES_AT_ONCE == 0:
-                _write_list(system, root, _SENDING, there)
-        for name in set(known or {}) - set(records):
-            _remove(system, f"{root}/{name}")
+                _write_list(system, root, _SENDING, there, begun=names)
         _write_list(system, root, LIST, records)
         _remove(system, f"{root}/{_SENDING}")
-    return Moved(files=len(names), bytes=sum(one.bytes for one in records.values()), moved=len(left))
+    return Moved(files=len(names), bytes=_bytes_of(records), moved=len(left), hidden=hidden)
 
 
-def fetch(url: str, folder: Path) -> Moved:
-    """Copy a folder that was sent from storage, in place of an older copy of it; whole or not at all.
+def fetch(url: str, folder: str | Path) -> Moved:
+    """Copy a folder that was sent from storage, over an older copy of it; whole or not at all.
 
     Arguments and errors are as of `send`; files that a fetch that was cut has brought are kept beside the folder. Raise
-    `StoreError`, too, if nothing was sent there, or not all, a file is not what was sent, or the folder holds files
-    that would be lost.
+    `StoreError`, too, if nothing was sent there, or not all, a file is not what was sent, or the folder is a link, or
+    holds files that would be lost.
     """
-    check_room(folder)
-    with _storage(url) as (system, root), locked(folder, tell=lambda _: None):
-        records = _read_list(system, root, LIST, url)
-        if records is None:
+    target = absolute(given_path(folder))
+    if target.is_symlink() or (target.exists() and not target.is_dir()):
+        message = f"{target} is a link, or no folder, and would be lost: name another folder"
+        raise StoreError(message)
+    check_room(target)
+    with _storage(url) as (system, root), locked(target, tell=lambda _: None):
+        sent = _read_list(system, root, LIST, url)
+        if sent is None:
             is_cut = _read_list(system, root, _SENDING, url) is not None
-            fault = (
-                "was not sent to its end: send it again" if is_cut else "holds no folder that was sent: check the URL"
-            )
-            message = f"{url} {fault}"
+            cut, nothing = "was not sent to its end: send it again", "holds no folder that was sent: check the URL"
+            message = f"{shown(url)} {cut if is_cut else nothing}"
             raise StoreError(message)
-        check_known(folder, set(records), "the folder that was sent")
-        target = absolute(folder)
-        scratch = target.with_name(f".{target.name}.fetched")
-        moved = 0
+        records = sent.files
+        check_known(target, set(records), "the folder that was sent")
+        scratch, moved = _begun(target, records), 0
         for name, record in sorted(records.items()):
             path = scratch / name
             path.parent.mkdir(parents=True, exist_ok=True)
             if not _is_there(path, record):
                 if _is_there(target / name, record):
-                    path.write_bytes((target / name).read_bytes())
+                    copyfile(target / name, path)
                 else:
                     system.get_file(f"{root}/{name}", str(path))
                     moved += 1
             if not _is_there(path, record):
                 path.unlink(missing_ok=True)
-                message = f"{url}/{name} is not what was sent: send it again"
+                message = (
+                    f"{shown(url)}/{one_line(name)} is not what was sent: remove that file there, and send the folder "
+                    "again"
+                )
                 raise StoreError(message)
-        for name in set(list_files(scratch)) - set(records):
-            (scratch / name).unlink()
+        (scratch / LIST).unlink()
         replace_folder(scratch, target)
-    return Moved(files=len(records), bytes=sum(one.bytes for one in records.values()), moved=moved)
+    return Moved(files=len(records), bytes=_bytes_of(records), moved=moved)
+
+
+def _bytes_of(records: Mapping[str, FileRecord]) -> int:
+    return sum(one.bytes for one in records.values())
+
+
+def _names_of(folder: Path) -> tuple[list[str], int]:
+    """Return the files of a folder to send, and the number of hidden ones, which are not."""
+    if not folder.is_dir():
+        fault = "is no folder" if folder.exists() else "does not exist"
+        message = f"{folder} {fault}: name the folder of a region, a task, a run or a board"
+        raise StoreError(message)
+    every = list_files(folder)
+    names = [name for name in every if not any(part.startswith(".") for part in PurePosixPath(name).parts)]
+    odd = next((name for name in names if not _is_within(name)), None)
+    if odd is not None:
+        message = (
+            f"{folder} holds {one_line(odd)!r}, a name that no storage keeps, or that this program needs: rename it"
+        )
+        raise StoreError(message)
+    if not names:
+        message = f"{folder} holds no file to send: name the folder of a region, a task, a run or a board"
+        raise StoreError(message)
+    return names, len(every) - len(names)
+
+
+def _check_apart(folder: Path, system: "AbstractFileSystem", root: str) -> None:
+    """Refuse a place on this disk that lies in the folder to send, or holds it."""
+    if "file" not in (system.protocol if isinstance(system.protocol, tuple) else (system.protocol,)):
+        return
+    here, there = folder.resolve(), Path(root).resolve()
+    if here.is_relative_to(there) or there.is_relative_to(here):
+        message = f"{folder} would be sent into itself: name a place outside of it"
+        raise StoreError(message)
+
+
+def _begun(target: Path, records: Mapping[str, FileRecord]) -> Path:
+    """Return the folder beside another one that its files are fetched into: one that was begun, or a new one."""
+    scratch = target.with_name(f".{target.name}.fetched")
+    data = _list_bytes(records)
+    mark = scratch / LIST
+    if scratch.is_dir() and not scratch.is_symlink() and mark.is_file():
+        if mark.read_bytes() == data:
+            return scratch
+        remove_tree(scratch)  # of another folder, or an older copy
+    try:
+        scratch.mkdir()
+    except FileExistsError as error:
+        message = f"{scratch} stands in the way, and is no fetch that was cut: move it away"
+        raise StoreError(message) from error
+    mark.write_bytes(data)
+    return scratch
 
 
 def _is_there(path: Path, record: FileRecord) -> bool:
@@ -134,9 +205,18 @@ def _is_there(path: Path, record: FileRecord) -> bool:
     return is_file and path.stat().st_size == record.bytes and sha256_of(path) == record.sha256
 
 
+def shown(url: str) -> str:
+    """Return an URL as a line may show it: without what may be secret.
+
+    >>> shown("ftp://me:secret@host/vaduz?token=secret")
+    'ftp://host/vaduz'
+    """
+    return one_line(_SECRET.sub("", url))
+
+
 @contextmanager
 def _storage(url: str) -> Iterator[tuple["AbstractFileSystem", str]]:
-    """Yield the file system of an URL, and the path of its place there; turn its refusals into a `StoreError`."""
+    """Yield the file system of an URL, and the path of its place there; turn its refusals into a line."""
     try:
         import fsspec  # noqa: PLC0415 - an optional dependency
     except ImportError as error:
@@ -144,62 +224,101 @@ def _storage(url: str) -> Iterator[tuple["AbstractFileSystem", str]]:
         raise ConfigError(message) from error
     try:
         system, root = fsspec.url_to_fs(url)
-    except (ValueError, ImportError) as error:
-        message = (
-            f"{one_line(url)!r} names no storage ({one_line(str(error))}): give an URL, as s3://bucket/regions/vaduz"
-        )
-        raise ConfigError(message) from error
-    if not root.strip("/"):
-        message = f"{one_line(url)!r} names no place in the storage: add a folder to it"
-        raise ConfigError(message)
-    try:
-        yield system, root.rstrip("/")
-    except StoreError:
+        yield system, _place(url, root)
+    except SasgeoError:
         raise
-    except (OSError, ValueError, RuntimeError) as error:
-        message = (
-            f"{one_line(url)} cannot be reached ({one_line(str(error) or repr(error))}): check the URL and your rights"
-        )
+    except ImportError as error:
+        message = f"{shown(url)} needs a package for such a storage ({one_line(str(error))}): install it"
+        raise ConfigError(message) from error
+    except Exception as error:  # whatever the file system of others raises
+        fault = one_line(str(error).replace(url, shown(url)) or repr(error))
+        message = f"{shown(url)} cannot be reached ({fault}): check the URL, your rights and the free space"
         raise StoreError(message) from error
 
 
-def _read_list(system: "AbstractFileSystem", root: str, name: str, url: str) -> dict[str, FileRecord] | None:
+def _place(url: str, root: str) -> str:
+    """Return the path of a place in its storage; raise `ConfigError` if it is that of all of it."""
+    if not (url.strip() and root.strip(":./")):
+        message = f"{shown(url)!r} names no place in a storage: give an URL, as s3://bucket/regions/vaduz"
+        raise ConfigError(message)
+    return re.sub("/{2,}", "/", root).rstrip("/")
+
+
+def _found(system: "AbstractFileSystem", root: str) -> dict[str, Any]:
+    """Return all files below a place, with their sizes."""
+    return dict(system.find(root, detail=True)) if system.exists(root) else {}
+
+
+def _put(system: "AbstractFileSystem", path: Path, there: str) -> None:
+    try:
+        system.makedirs(there.rpartition("/")[0], exist_ok=True)
+        system.put_file(str(path), there)
+    except FileNotFoundError as error:
+        if path.is_file():
+            raise
+        message = f"{path} went away while its folder was sent: send the folder again"
+        raise StoreError(message) from error
+
+
+@dataclass(frozen=True, slots=True)
+class _Sent:
+    """A list of files, and the names of all that were to be sent."""
+
+    files: Mapping[str, FileRecord] = field(default_factory=dict)
+    names: frozenset[str] = frozenset()
+
+
+def _read_list(system: "AbstractFileSystem", root: str, name: str, url: str) -> _Sent | None:
     """Read a list of files; None without one. Its names may come from anybody: none may lead out of the folder."""
     path = f"{root}/{name}"
     if not system.exists(path):
         return None
     try:
         content: Any = parse_json(system.cat_file(path)) if system.size(path) <= _MOST_LIST_BYTES else {}
-        is_ours = content.get("made_by") == _MADE_BY
-        files = content["files"] if is_ours else {}
-        found = {str(file): FileRecord.model_validate(record) for file, record in files.items()}
-    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        message = f"{url}/{name} is no list of files that were sent ({one_line(str(error))}): send the folder again"
+        found = {str(file): FileRecord.model_validate(record) for file, record in content["files"].items()}
+        names = frozenset(map(str, (*found, *content.get("begun", ()))))
+        is_ours = content["made_by"] == _MADE_BY
+    except (ValueError, ValidationError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        message = f"{shown(url)}/{name} is no list of files that were sent: empty that place, and send the folder again"
         raise StoreError(message) from error
-    if not is_ours:
-        message = f"{url}/{name} was made by another program, or is too large: name another place"
+    odd = next((file for file in found if not _is_within(file)), _both(found))
+    if odd is not None or not is_ours or (name == LIST and not found):
+        what = "nothing that was sent" if odd is None else f"{one_line(odd)[:60]!r}, which is no file of a folder"
+        message = f"{shown(url)}/{name} lists {what}: empty that place, and send the folder again"
         raise StoreError(message)
-    odd = next((file for file in found if not _is_within(file)), None)
-    if odd is not None:
-        message = f"{url}/{name} lists {one_line(odd)!r}, which is no file of a folder: send the folder again"
-        raise StoreError(message)
-    return found
+    return _Sent(found, names)
 
 
 def _is_within(name: str) -> bool:
-    """Return whether a name is a plain path below a folder.
+    """Return whether a name is a plain path below a folder, which storage and every disk can keep.
 
-    >>> [_is_within(name) for name in ("layers/a.tif", "../a", "/a", "a//b", ".a")]
-    [True, False, False, False, False]
+    >>> [_is_within(name) for name in ("layers/a.tif", "../a", "/a", "a//b", ".a", "sent.json")]
+    [True, False, False, False, False, False]
     """
+    is_plain = "\\" not in name and "\0" not in name and name not in {LIST, _SENDING}
     parts = name.split("/")
-    return "\\" not in name and "\0" not in name and all(part and not part.startswith(".") for part in parts)
+    sizes = (len(part.encode(errors="replace")) for part in parts)
+    return is_plain and all(
+        part and not part.startswith(".") and size <= _MOST_PART_BYTES for part, size in zip(parts, sizes, strict=True)
+    )
 
 
-def _write_list(system: "AbstractFileSystem", root: str, name: str, records: Mapping[str, FileRecord]) -> None:
+def _both(names: Iterable[str]) -> str | None:
+    """Return a name that is a file and a folder of others; None if there is none."""
+    folders = {str(parent) for name in names for parent in PurePosixPath(name).parents}
+    return next((name for name in names if name in folders), None)
+
+
+def _list_bytes(records: Mapping[str, FileRecord], begun: Sequence[str] = ()) -> bytes:
     files = {file: one.model_dump() for file, one in sorted(records.items())}
+    return json_text({"made_by": _MADE_BY, "files": files, **({"begun": list(begun)} if begun else {})}).encode()
+
+
+def _write_list(
+    system: "AbstractFileSystem", root: str, name: str, records: Mapping[str, FileRecord], begun: Sequence[str] = ()
+) -> None:
     system.makedirs(root, exist_ok=True)
-    system.pipe_file(f"{root}/{name}", json_text({"made_by": _MADE_BY, "files": files}).encode())
+    system.pipe_file(f"{root}/{name}", _list_bytes(records, begun))
 
 
 def _remove(system: "AbstractFileSystem", path: str) -> None:

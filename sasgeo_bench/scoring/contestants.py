@@ -193,7 +193,7 @@ def _answers_of_file(
     places: dict[Path | None, list[int]] = {}
     for at, name in enumerate(rows["query_id"].to_pylist()):
         places.setdefault(task_of.get(name), []).append(at)
-    read = {task.folder: partial(rows.take, places.get(task.folder, [])) for task in tasks}
+    read = {task.folder: partial(rows.take, pa.array(places.get(task.folder, []), pa.int64())) for task in tasks}
     held = frozenset(task.folder for task in tasks if task.folder in places)
     answers = StoredAnswers(read, task_of)
     return EntryAnswers(entry=entry, predictions=answers, held=held, asked=frozenset(task.folder for task in asked))

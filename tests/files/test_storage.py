@@ -59,14 +59,10 @@ def test_what_is_sent_comes_back_and_only_what_changed_is_moved_again(url, folde
     assert send(folder, url).moved == 2
     assert fetch(url, tmp_path / "here").moved == 2
     assert contents(tmp_path / "here") == seen(folder)
-    (folder / "layers" / "a.tif").unlink()
-    assert send(folder, url).moved == 0
-    assert fetch(url, tmp_path / "new").moved == 3
-    with pytest.raises(StoreError, match=r"layers/a\.tif"):  # which no list says to be ours
-        fetch(url, tmp_path / "here")
+    assert sent.hidden == 1
     assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".")] == []
     system, root = place(url)
-    assert {Path(name).name for name in system.find(root)} == {"region.json", "b.tif", "new.txt", LIST}
+    assert {Path(name).name for name in system.find(root)} == {"region.json", "a.tif", "b.tif", "new.txt", LIST}
 
 
 def test_what_was_cut_goes_on_where_it_was_and_is_nothing_until_then(url, folder, tmp_path, monkeypatch):
@@ -108,35 +104,88 @@ def test_a_file_that_is_not_what_was_sent_is_refused_and_the_folder_stays(url, f
     send(folder, url)
     system, root = place(url)
     system.pipe_file(f"{root}/layers/b.tif", b"x")
-    with pytest.raises(StoreError, match=r"layers/b\.tif is not what was sent: send it again"):
+    with pytest.raises(StoreError, match=r"layers/b\.tif is not what was sent: remove that file there, and send"):
         fetch(url, tmp_path / "here")
     assert (tmp_path / "here" / "layers" / "b.tif").read_text(encoding="utf-8") == "b"
+    system.rm_file(f"{root}/layers/b.tif")
+    assert send(folder, url).moved == 1
+    system.pipe_file(f"{root}/layers/a.tif", b"short")  # of another size: sent again without a word
+    assert send(folder, url).moved == 1
+    assert fetch(url, tmp_path / "here").moved == 1
+    assert contents(tmp_path / "here") == seen(folder)
 
 
-def test_nothing_of_others_is_lost(url, folder, tmp_path):
+def test_storage_loses_nothing_of_others(url, folder, tmp_path):
     system, root = place(url)
     system.makedirs(root, exist_ok=True)
     system.pipe_file(f"{root}/thesis.txt", b"mine")
-    with pytest.raises(StoreError, match="holds something else than a folder that was sent"):
+    with pytest.raises(StoreError, match=r"holds 1 file \(thesis\.txt\) of another folder"):
         send(folder, url)
-    assert system.cat_file(f"{root}/thesis.txt") == b"mine"
     system.rm_file(f"{root}/thesis.txt")
+    send(folder, url)
+    system.pipe_file(f"{root}/notes", b"theirs")  # beside a folder that was sent, and in the way of a file
+    (folder / "notes").write_text("mine", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"\(notes\) of another folder"):
+        send(folder, url)
+    assert system.cat_file(f"{root}/notes") == b"theirs"
+    system.rm_file(f"{root}/notes")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "task.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(StoreError, match=r"holds 3 files .* of another folder"):
+        send(tmp_path / "other", url)
+    (folder / "layers" / "a.tif").unlink()
+    with pytest.raises(StoreError, match=r"layers/a\.tif"):  # an older copy loses nothing, either
+        send(folder, url)
+    assert fetch(url, tmp_path / "new").moved == 3
+
+
+def test_a_fetch_loses_nothing_of_others(url, folder, tmp_path):
     send(folder, url)
     (tmp_path / "here").mkdir()
     (tmp_path / "here" / "notes.txt").write_text("mine", encoding="utf-8")
     with pytest.raises(StoreError, match=r"holds 1 file \(notes\.txt\) that would be lost"):
         fetch(url, tmp_path / "here")
+    (tmp_path / "file").write_text("mine", encoding="utf-8")
+    (tmp_path / "link").symlink_to(tmp_path / "here")
+    (tmp_path / "dangling").symlink_to(tmp_path / "nowhere")
+    for name in ("file", "link", "dangling"):
+        with pytest.raises(StoreError, match="is a link, or no folder, and would be lost"):
+            fetch(url, tmp_path / name)
+    (tmp_path / ".new.fetched").mkdir()
+    (tmp_path / ".new.fetched" / "notes.txt").write_text("mine", encoding="utf-8")
+    (tmp_path / ".far.fetched").symlink_to(tmp_path / "here")
+    (tmp_path / ".old.fetched").write_text("mine", encoding="utf-8")
+    for name in ("new", "far", "old"):
+        with pytest.raises(StoreError, match="stands in the way, and is no fetch that was cut: move it away"):
+            fetch(url, tmp_path / name)
     assert contents(tmp_path / "here") == {"notes.txt": b"mine"}
+    assert contents(tmp_path / ".new.fetched") == {"notes.txt": b"mine"}
+    assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
 
 
-@pytest.mark.parametrize("name", ["../out.txt", "/etc/out.txt", "a//b", "a/../../b", ".hidden", "a\\b", "", "a\0b"])
+def test_what_a_fetch_of_another_folder_left_is_no_part_of_this_one(url, folder, tmp_path):
+    send(folder, url)
+    system, root = place(url)
+    system.pipe_file(f"{root}/region.json", b"x")
+    with pytest.raises(StoreError, match="is not what was sent"):
+        fetch(url, tmp_path / "here")
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "layers").write_text("a file", encoding="utf-8")  # a folder there
+    send(tmp_path / "other", f"{url}-other")
+    fetch(f"{url}-other", tmp_path / "here")
+    assert contents(tmp_path / "here") == {"layers": b"a file"}
+
+
+@pytest.mark.parametrize(
+    "name", ["../out.txt", "/etc/out.txt", "a//b", "a/../../b", ".hidden", "a\\b", "", "a\0b", "x" * 300, "layers"]
+)
 def test_a_list_that_leads_out_of_the_folder_is_refused(url, folder, tmp_path, name):
     send(folder, url)
     system, root = place(url)
     content = json.loads(system.cat_file(f"{root}/{LIST}"))
     content["files"][name] = content["files"].pop("region.json")
     system.pipe_file(f"{root}/{LIST}", json.dumps(content).encode())
-    with pytest.raises(StoreError, match="which is no file of a folder: send the folder again") as refused:
+    with pytest.raises(StoreError, match="which is no file of a folder: empty that place, and send") as refused:
         fetch(url, tmp_path / "here")
     assert "\n" not in str(refused.value)
     assert not (tmp_path / "here").exists()
@@ -148,7 +197,9 @@ def test_a_list_that_is_none_is_refused_in_a_line(url, tmp_path, folder, text):
     system.makedirs(root, exist_ok=True)
     system.pipe_file(f"{root}/{LIST}", text.encode("latin-1"))
     for work in (lambda: fetch(url, tmp_path / "here"), lambda: send(folder, url)):
-        with pytest.raises(StoreError, match=r"sent\.json (is no list of files|was made by another)") as refused:
+        with pytest.raises(
+            StoreError, match=r"sent\.json (is no list of files|lists nothing).*: empty that place"
+        ) as refused:
             work()
         assert "\n" not in str(refused.value)
 
@@ -156,16 +207,26 @@ def test_a_list_that_is_none_is_refused_in_a_line(url, tmp_path, folder, text):
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("send", "vaduz", "nonsense://a/b"), "names no storage"),
-        (("send", "vaduz", "memory://"), "names no place in the storage"),
-        (("send", "nowhere", "memory://a/b"), "holds no file to send"),
+        (("send", "vaduz", "nonsense://a/b"), "nonsense://a/b cannot be reached (Protocol not known"),
+        (("send", "vaduz", "memory://"), "names no place in a storage"),
+        (("send", "vaduz", "ftp://me:secret@127.0.0.1:1/a?token=secret"), "ftp://127.0.0.1:1/a cannot be reached"),
+        (("send", "vaduz", "vaduz/layers/copy"), "would be sent into itself"),
+        (("send", "nowhere", "memory://a/b"), "does not exist"),
+        (("send", "vaduz/region.json", "memory://a/b"), "is no folder"),
+        (("send", "vaduz/empty", "memory://a/b"), "holds no file to send"),
+        (("send", "odd", "memory://a/b"), "holds 'a\\\\b', a name that no storage keeps"),
+        (("fetch", "memory://nobody/sent", "/"), "/ is a mount point"),
         (("fetch", "memory://nobody/sent", "here"), "holds no folder that was sent"),
         (("fetch", "memory://nobody/sent", "vaduz/region.json/here"), "region.json is a file"),
     ],
 )
 def test_mistakes_are_told_in_a_line(folder, mistake, monkeypatch, words, told):
     monkeypatch.chdir(folder.parent)
-    assert told in mistake(*words)
+    (folder / "empty").mkdir()
+    (folder.parent / "odd").mkdir()
+    (folder.parent / "odd" / "a\\b").write_text("", encoding="utf-8")
+    assert told in (line := mistake(*words))
+    assert "secret" not in line
 
 
 def test_a_link_is_not_sent_nor_without_its_package(folder, monkeypatch):

@@ -830,6 +830,15 @@ def test_shards_of_a_run_in_several_folders_are_one_run(out, tmp_path):
     assert len(board.predictions["oracle_pose"]) == len(whole.predictions["oracle_pose"])
 
 
+def test_a_file_without_a_row_misses_everything_and_costs_nobody_else(out, both, alone, tmp_path):
+    empty = pq.read_table(both[0]).slice(0, 0)
+    pq.write_table(empty.set_column(0, "query_id", pa.array([], pa.string())), tmp_path / "empty.parquet")
+    board = board_of(out, both[0], tmp_path / "empty.parquet")
+    assert board.failures.found == {}
+    assert set(board.scores["empty"]["status"]) == {"missing"}
+    pd.testing.assert_frame_equal(board.scores["good"], alone.scores["good"])
+
+
 def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out, both, split, monkeypatch):
     asked = {"split": split, "rejectors": (f"{__name__}:Doubt",)}
     whole = board_of(out, out / "runs", *both, **asked)

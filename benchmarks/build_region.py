@@ -11,6 +11,7 @@ Andorra (2025) and of the Faroes (2017) in a folder that SASGEO_EXTRACTS or --ex
 
 import argparse
 import json
+import os
 import resource
 import shutil
 import statistics
@@ -20,7 +21,6 @@ import tempfile
 import time
 from pathlib import Path
 
-import matplotlib as mpl
 import psutil
 
 from sasgeo_bench.regions.build import build_region, plan_build
@@ -82,8 +82,9 @@ def medians(of: str, runs: int, extracts: list[Path]) -> dict[str, float]:
     """Medians of several processes."""
     folders = [word for folder in extracts for word in ("--extracts", str(folder))]
     command = [sys.executable, __file__, "--of", of, *folders]
+    environment = os.environ | {"ARROW_DEFAULT_MEMORY_POOL": "system"}  # as the program itself does
     rows = [
-        json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)  # noqa: S603
+        json.loads(subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stdout)  # noqa: S603
         for _ in range(runs)
     ]
     return {name: statistics.median(row[name] for row in rows) for name in rows[0]}
@@ -91,6 +92,8 @@ def medians(of: str, runs: int, extracts: list[Path]) -> dict[str, float]:
 
 def draw(rows: dict[str, dict[str, float]], path: Path) -> None:
     """Draw time and memory against the mapped area."""
+    import matplotlib as mpl  # noqa: PLC0415 - only a plot needs it, and what is measured has its memory, too
+
     mpl.use("svg")
     from matplotlib import pyplot as plt  # noqa: PLC0415 - only a plot needs it
 

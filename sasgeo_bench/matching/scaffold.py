@@ -33,7 +33,7 @@ _TAKEN: Final = frozenset(
             "pandas",
         ),
         *("pooch", "psutil", "pyarrow", "pydantic", "pyproj", "rasterio", "rich"),
-        *("scipy", "shapely", "torch", "tqdm", "typer", "click"),
+        *("scipy", "shapely", "tifffile", "torch", "tqdm", "typer", "click"),
         *("dask", "distributed", "fsspec", "sasgeo_baselines", "sasgeo_bench", "skimage", "sklearn", "statsmodels"),
         *("hatchling", "hypothesis", "jinja2", "mlcroissant", "pip", "pystac", "pytest", "rio_cogeo", "setuptools"),
         *("src", "test", "tests", "con", "nul", "aux", "prn"),

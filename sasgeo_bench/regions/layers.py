@@ -1,21 +1,25 @@
 # SPDX-License-Identifier: Apache-2.0
 """Burn features into one raster per class, by the cell-centre rule; read and write `layers.tif` window by window."""
 
-from collections.abc import Callable, Sequence
+import itertools
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import numpy as np
+import pyarrow as pa
 import rasterio
 import shapely
 from affine import Affine
 from numpy.typing import NDArray
-from rasterio.enums import Resampling
 from rasterio.errors import RasterioError, RasterioIOError
 from rasterio.windows import Window
+from tifffile import TiffFile, TiffPage, TiffWriter
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
@@ -172,8 +176,11 @@ def _crossings(
 BLOCK_CELLS: Final = 512
 WINDOW_CELLS: Final = 1024  # 13 classes of one window take 14 MB, whatever the size of the region
 _CACHE_BYTES: Final = 24 * 2**20
+_REDUCED, _ZSTD, _GDAL_NODATA = 1, 50000, 42113  # of TIFF: a smaller version; a codec; a tag
 _BIGTIFF_CELLS: Final = 2**31  # compressed, such a file stays far below the 4 GiB that need BigTIFF
 
+In = TypeVar("In")
+Out = TypeVar("Out")
 PaintWindow = Callable[[Grid], NDArray[np.uint8] | None]  # None where nothing is mapped
 
 
@@ -187,33 +194,30 @@ def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callab
     """Write the layer stack of a region, with one band per class; raise `StoreError` if the file cannot be written.
 
     `paint` takes an overview factor (1 for the map itself) and returns what burns one window: Grid -> uint8 (C, rows,
-    cols), or None where nothing is mapped.
+    cols), or None where nothing is mapped. The next level is painted in another thread while one is burnt.
 
     A cloud-optimized file holds its overviews before the full raster, smallest first. GDAL's own COG driver writes
-    everything twice to get there. Here the empty overviews are laid out first and then every level is burnt from the
-    vectors into its place, so memory and time are those of one pass. The raster is filled by the handle that made it:
-    one that is opened again packs at GDAL's default level, in three times the time.
+    everything twice to get there, and its empty overviews are made by reading the empty raster. Here all levels are
+    laid out empty, and each is burnt from the vectors into its place: packed blocks are added at the end of the file,
+    and where they lie is noted last. So memory and time are those of one pass.
     """
     factors = overview_factors(grid)
-    options = {"GDAL_CACHEMAX": _CACHE_BYTES, "SPARSE_OK_OVERVIEW": "YES", "GDAL_TIFF_OVR_BLOCKSIZE": BLOCK_CELLS}
-    packing = {"COMPRESS_OVERVIEW": "ZSTD", "ZSTD_LEVEL_OVERVIEW": 1}
     try:
-        with rasterio.Env(**options, **packing), _laid_out(path, grid, classes) as target:
-            if factors:
-                target.build_overviews(list(factors), Resampling.nearest)
-            for level in reversed(range(len(factors))):
-                with rasterio.open(path, "r+", overview_level=level) as overview:
-                    _fill(overview, grid.coarsen(factors[level]), paint(factors[level]))
-            _fill(target, grid, paint(1))
+        _lay_out(path, grid, classes, factors)
+        with TiffFile(path, mode="r+") as file, ThreadPoolExecutor(1) as painting, ThreadPoolExecutor(1) as packing:
+            levels = list(zip((1, *factors), (page.aspage() for page in file.pages), strict=True))[::-1]
+            painters = _in_turn(painting, paint, (factor for factor, _ in levels))
+            for (factor, page), burn_window in zip(levels, painters, strict=True):
+                _fill(page, grid.coarsen(factor), burn_window, packing)
     except (RasterioError, RasterioIOError, OSError) as error:
         message = f"{path} cannot be written ({error}): check the free space and the rights of its folder"
         raise StoreError(message) from error
 
 
-def _laid_out(path: Path, grid: Grid, classes: tuple[str, ...]) -> rasterio.io.DatasetWriter:
-    """Open a new raster with its names and licence; no block is stored yet."""
+def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence[int]) -> None:
+    """Write the headers of all levels, with names and licence; no block is stored yet."""
     is_big = len(classes) * grid.rows * grid.cols > 16 * _BIGTIFF_CELLS
-    target = rasterio.open(
+    with rasterio.open(
         path,
         "w",
         driver="GTiff",
@@ -229,31 +233,86 @@ def _laid_out(path: Path, grid: Grid, classes: tuple[str, ...]) -> rasterio.io.D
         blockysize=BLOCK_CELLS,
         interleave="band",
         compress="zstd",
-        zstd_level=1,
         sparse_ok=True,
         bigtiff="YES" if is_big else "NO",
-    )
-    target.descriptions = classes
-    target.update_tags(TIFFTAG_COPYRIGHT=ATTRIBUTION, attribution=ATTRIBUTION, licence=LICENCE)
-    return target
+    ) as target:
+        target.descriptions = classes
+        target.update_tags(TIFFTAG_COPYRIGHT=ATTRIBUTION, attribution=ATTRIBUTION, licence=LICENCE)
+    with TiffWriter(path, append=True) as levels:
+        for size in map(grid.coarsen, factors):
+            levels.write(
+                itertools.repeat(b""),
+                shape=(len(classes), size.rows, size.cols),
+                dtype="uint8",
+                tile=(BLOCK_CELLS, BLOCK_CELLS),
+                photometric="minisblack",
+                planarconfig="separate" if len(classes) > 1 else None,
+                compression="deflate",  # until `_fill` notes its own; no block is packed here
+                subfiletype=_REDUCED,
+                extratags=[(_GDAL_NODATA, "s", 0, str(OUTSIDE), True)],
+                metadata=None,
+                software=False,
+            )
 
 
-def _fill(target: rasterio.io.DatasetWriter, grid: Grid, burn: PaintWindow) -> None:
-    """Burn a window while GDAL packs the previous one, which needs no interpreter; at most two are held.
+def _fill(page: TiffPage, grid: Grid, burn_window: PaintWindow, packing: ThreadPoolExecutor) -> None:
+    """Burn a window while the one before is packed, which needs no interpreter, and add them to the file in order.
 
-    Windows beyond the mapped area are not stored: a block that is missing reads as OUTSIDE, the value of no data.
+    Blocks beyond the mapped area are not stored: one that is missing reads as OUTSIDE, the value of no data.
     """
-    with ThreadPoolExecutor(max_workers=1) as executor:
-        packing: Future[None] | None = None
-        for row, col, window in grid.windows(WINDOW_CELLS):
-            layers = burn(window)
-            if layers is None:
-                continue
-            if packing is not None:
-                packing.result()
-            packing = executor.submit(target.write, layers, window=Window(col, row, window.cols, window.rows))
-        if packing is not None:
-            packing.result()
+    down, across = (-(-side // BLOCK_CELLS) for side in grid.shape)
+    places = np.zeros((2, len(page.tags["TileOffsets"].value) // (down * across), down, across), np.uint64)
+    file = page.parent.filehandle
+    end = file.seek(0, os.SEEK_END)
+    corners, windows = itertools.tee(grid.windows(WINDOW_CELLS))
+    packed = _in_turn(packing, _packed, (burn_window(window) for *_, window in windows))
+    for (top, left, _), blocks in zip(corners, packed, strict=True):
+        for (band, row, col), block in blocks:
+            places[:, band, top // BLOCK_CELLS + row, left // BLOCK_CELLS + col] = end, len(block)
+            end += file.write(block)
+    for name, values in zip(("TileOffsets", "TileByteCounts"), places, strict=True):
+        page.tags[name].overwrite(values.ravel().tolist())
+    page.tags["Compression"].overwrite(_ZSTD)
+
+
+def _packed(layers: NDArray[np.uint8] | None) -> list[tuple[tuple[int, int, int], bytes]]:
+    """Pack the blocks of a window that hold mapped ground, each with its band, row and column among the blocks."""
+    if layers is None:
+        return []
+    found = []
+    for at in itertools.product(range(len(layers)), *(range(0, side, BLOCK_CELLS) for side in layers.shape[1:])):
+        band, top, left = at
+        block = layers[band, top : top + BLOCK_CELLS, left : left + BLOCK_CELLS]
+        lowest, highest = int(block.min()), int(block.max())
+        if lowest == OUTSIDE:
+            continue
+        place = (band, top // BLOCK_CELLS, left // BLOCK_CELLS)
+        found.append((place, _packed_plain(lowest) if lowest == highest else _packed_block(block)))
+    return found
+
+
+def _packed_block(block: NDArray[np.uint8]) -> bytes:
+    """Pack a block; one that reaches beyond the raster is filled up."""
+    whole = np.full((BLOCK_CELLS, BLOCK_CELLS), OUTSIDE, dtype=np.uint8)
+    whole[: block.shape[0], : block.shape[1]] = block
+    return bytes(pa.Codec("zstd", compression_level=1).compress(whole, asbytes=True))
+
+
+@cache
+def _packed_plain(value: int) -> bytes:
+    """Pack a block of one value, which most are: a class is at few places."""
+    return _packed_block(np.full((BLOCK_CELLS, BLOCK_CELLS), value, dtype=np.uint8))
+
+
+def _in_turn(pool: ThreadPoolExecutor, work: Callable[[In], Out], items: Iterable[In]) -> Iterator[Out]:
+    """Yield the results of work done in a thread, in the order of the items; the next one is worked on meanwhile."""
+    ahead: deque[Future[Out]] = deque()
+    for item in items:
+        ahead.append(pool.submit(work, item))
+        if len(ahead) > 1:
+            yield ahead.popleft().result()
+    while ahead:
+        yield ahead.popleft().result()
 
 
 def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import cv2
 import numpy as np
 import rasterio
 import rasterio.shutil
@@ -346,6 +345,8 @@ def is_empty(rgb: NDArray[np.uint8], colour: Sequence[int], *, diameter_px: int)
     >>> is_empty(mosaic, (255, 255, 255), diameter_px=3)[4].astype(int)
     array([1, 1, 1, 1, 1, 0, 0, 0, 0])
     """
+    import cv2  # noqa: PLC0415 - 25 MB that few regions need: most have no imagery
+
     target = np.array(colour, dtype=np.int16)[:, None, None]
     is_near = (np.abs(rgb.astype(np.int16) - target) <= _EMPTY_LEVELS).all(axis=0)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter_px, diameter_px))

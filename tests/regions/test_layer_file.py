@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from tifffile import TiffFile
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
@@ -71,16 +72,31 @@ def test_ground_that_is_not_mapped_is_not_stored_and_reads_as_unknown(tmp_path):
     assert (read_layers(tmp_path / "sparse.tif") == burn_layers(drawn, GRID)).all()
 
 
-def test_blocks_are_packed_at_the_level_that_was_asked_for(written, tmp_path):
-    """A raster that is opened again packs at GDAL's default level, which takes three times as long."""
-    path = tmp_path / "plain.tif"
-    with rasterio.open(written) as source, rasterio.open(path, "w", **source.profile | {"zstd_level": 1}) as target:
-        target.write(source.read())
-    sizes = []
-    for each in (written, path):
-        with rasterio.open(each) as source:
-            sizes.append([source.block_size(band, row, col) for band in (1, 2) for row in range(4) for col in range(8)])
-    assert sizes[0] == sizes[1]
+def test_only_blocks_with_mapped_ground_are_in_the_file(tmp_path):
+    west, _, _, north = GRID.bounds_m
+    corner = shapely.orient_polygons(np.array([shapely.box(west, north - 100.0, west + 100.0, north)], dtype=object))
+    drawn = replace(paint(), coverage=corner)
+    write_layers(tmp_path / "corner.tif", GRID, CLASSES, lambda _: lambda window: burn_mapped(drawn, window))
+    with TiffFile(tmp_path / "corner.tif") as file:
+        stored = [sum(size > 0 for size in page.databytecounts) for page in file.pages]
+    assert stored == [len(CLASSES)] * 3
+
+
+def test_a_file_of_more_than_4_gib_has_its_own_layout(tmp_path, monkeypatch):
+    monkeypatch.setattr(layers, "_BIGTIFF_CELLS", 1)
+    drawn = paint()
+    write_layers(tmp_path / "big.tif", GRID, CLASSES, lambda _: lambda window: burn_layers(drawn, window))
+    assert (tmp_path / "big.tif").read_bytes()[:4] == b"II+\x00"
+    assert (read_layers(tmp_path / "big.tif") == burn_layers(drawn, GRID)).all()
+    with rasterio.open(tmp_path / "big.tif", overview_level=1) as source:
+        assert (source.read() == burn_layers(drawn, GRID.coarsen(16))).all()
+
+
+def test_a_fault_while_a_level_is_painted_or_burnt_is_the_fault_of_the_build(tmp_path):
+    with pytest.raises(ZeroDivisionError):
+        write_layers(tmp_path / "a.tif", GRID, CLASSES, lambda _: lambda window: window.rows // 0)
+    with pytest.raises(KeyError, match="16"):
+        write_layers(tmp_path / "b.tif", GRID, CLASSES, {}.__getitem__)
 
 
 def test_a_window_is_read_alone(written):

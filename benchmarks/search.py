@@ -105,7 +105,7 @@ def resized(field: Field, side: int) -> Field:
     more = max(0, -top, -left)
     rows, cols = slice(top + more, top + more + side), slice(left + more, left + more + side)
     around = ((more, more), (more, more))
-    return Field(
+    return Field.of(
         grid=field.grid.window(top, left, side, side),
         layers=np.pad(field.layers, ((0, 0), *around), mode="symmetric")[:, rows, cols].copy(),
         known=np.pad(field.known, around, mode="symmetric")[rows, cols].copy(),
@@ -182,7 +182,7 @@ def load(path: Path) -> tuple[Field, list[Template]]:
             Template(weights=held[f"weights{at}"], known=held[f"known{at}"], cell_size_m=view_cell_m)
             for at in range(count)
         ]
-    return Field(grid=grid, layers=layers, known=known), templates
+    return Field.of(grid=grid, layers=layers, known=known), templates
 
 
 def seconds(call: Callable[[], object]) -> tuple[float, float]:

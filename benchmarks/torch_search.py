@@ -67,7 +67,7 @@ def town(side: int, rng: np.random.Generator) -> Field:
                 box = (tuple(rng.uniform(0, side, 2)), tuple(rng.uniform(0.5, 1.5, 2) * size), rng.uniform(0, 180))
                 cv2.fillPoly(layer, [np.rint(cv2.boxPoints(box)).astype(np.int32)], FULL)
     grid = Grid(epsg=32632, west_m=5e5, north_m=5.3e6, cell_size_m=CELL_M, rows=side, cols=side)
-    return Field(grid=grid, layers=layers, known=np.full((side, side), FULL, np.uint8))
+    return Field.of(grid=grid, layers=layers, known=np.full((side, side), FULL, np.uint8))
 
 
 def patches(share: float, rng: np.random.Generator) -> NDArray[np.bool_]:

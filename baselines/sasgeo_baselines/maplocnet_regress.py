@@ -198,7 +198,7 @@ def field_of(region: Region) -> Field:
     layers = np.zeros((len(region.classes), *grid.shape), dtype=np.uint8)
     for name, into in zip(region.classes, layers, strict=True):
         into[:] = _shrunk((region.layer(name) == PRESENT) & known, factor)
-    return Field(grid=grid, layers=layers, known=np.where(share > _FULL // 2, _FULL, 0).astype(np.uint8))
+    return Field.of(grid=grid, layers=layers, known=np.where(share > _FULL // 2, _FULL, 0).astype(np.uint8))
 
 
 def _shrunk(layer: NDArray[np.bool_], factor: int) -> NDArray[np.uint8]:

@@ -80,15 +80,17 @@ def read_field(
     around = ((0, -region.grid.rows % factor), (0, -region.grid.cols % factor))
     known = _share(region.known(), around, grid) > FULL // 2
     stamped = None if trust is None else strata(region)
-    layers = np.zeros((len(region.classes), *grid.shape), dtype=np.uint8)
-    for at, (name, into) in enumerate(zip(region.classes, layers, strict=True)):
+    cells = np.zeros((*grid.shape, len(region.classes) + 1), dtype=np.uint8)
+    cells[known, -1] = FULL
+    for at, name in enumerate(region.classes):
         if trust is None or stamped is None:
             shares, weights = [_share(region.layer(name) == PRESENT, around, grid)], np.ones(1)
         else:
             shares, weights = [_share(stamped[at] == index, around, grid) for index in range(STRATA)], trust[at]
-        into[:] = _degree(shares, weights, likeness[at], grid)
-        into[~known] = 0
-    return Field(grid=grid, layers=layers, known=np.where(known, np.uint8(FULL), np.uint8(0)))
+        degree = _degree(shares, weights, likeness[at], grid)
+        degree[~known] = 0
+        cells[..., at] = degree
+    return Field(grid=grid, cells=cells)
 
 
 def store_field(
@@ -125,8 +127,7 @@ def store_field(
             round(shift_m / grid.cell_size_m)
             for shift_m in (field.grid.north_m - window.north_m, window.west_m - field.grid.west_m)
         )
-        inner = np.s_[row : row + window.rows, col : col + window.cols]
-        return Field(grid=window, layers=field.layers[:, *inner], known=field.known[inner])
+        return Field(grid=window, cells=field.cells[row : row + window.rows, col : col + window.cols])
 
     return store_levels(into, grid, len(manifest.classes), paint, key=key)
 
@@ -274,10 +275,10 @@ class RasterView:
         weights, known = summed[: len(active)], summed[len(active) :]
         total = np.zeros((len(poses), len(self.weights)))
         for row, pose in zip(total, poses, strict=True):
-            to_map = between(frame, pose, field.grid)
-            row[active] = np.einsum("cij,ij->c", known, warped(field.known, to_map, frame.shape).astype(np.float32))
+            under = warped(field.cells, between(frame, pose, field.grid), frame.shape)
+            row[active] = np.einsum("cij,ij->c", known, under[..., -1].astype(np.float32))
             for at, layer in zip(active.tolist(), weights, strict=True):
-                row[at] += np.vdot(layer, warped(field.layers[at], to_map, frame.shape).astype(np.float32))
+                row[at] += np.vdot(layer, under[..., at].astype(np.float32))
         return total / FULL
 
     def levelled(self) -> Self:

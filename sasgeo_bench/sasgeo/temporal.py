@@ -331,10 +331,7 @@ class _Scored:
 
     def of_scales(self, pose: Pose) -> NDArray[np.float64]:
         """Return the score of a pose at each of `_SCALES`."""
-        row, col = self.field.grid.to_cells(np.array([(pose.easting_m, pose.northing_m)]))[0].astype(int).tolist()
-        reach = math.ceil(self.template.reach_m * math.exp(_SCALES[-1]) / self.field.grid.cell_size_m) + 2
-        near = self.field.cut((row, col, row + 1, col + 1), reach)
-        view = LevelView.of(near, self.template, 1)
+        view = LevelView.of(self.field, self.template, 1)
         return self.weight * np.array([view.score(replace(pose, scale=math.exp(one))) for one in _SCALES])
 
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Scores of a view on the window of a belief."""
 
-import math
 from typing import Final
 
 import cv2
@@ -61,8 +60,6 @@ def _scores(
     found = np.zeros((len(yaws_deg), (bottom - top) // factor, (right - left) // factor), dtype=np.float32)
     if bottom <= 0 or right <= 0 or top >= field.grid.rows or left >= field.grid.cols:
         return found
-    if factor == 1:  # the map's own cells are cut out: a level of all of them would double the memory
-        field = field.cut(belief.box, math.ceil(template.reach_m / field.grid.cell_size_m) + 1)
     west_m, south_m, east_m, north_m = belief.grid.bounds_m
     scored = surface(
         field,

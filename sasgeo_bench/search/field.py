@@ -64,9 +64,9 @@ class Levels(Protocol):
 class Field:
     """Layers of a map for the bands of a template.
 
-    `layers`, uint8 of shape (K, rows, cols), are the degrees to which the map holds each class, 0..FULL; 0 where it is
-    unknown. `known`, uint8 of shape (rows, cols), is FULL where the map is known, else 0. Beyond the grid it is
-    unknown.
+    `cells`, uint8 of shape (rows, cols, K + 1), are the degrees to which the map holds each class, 0..FULL; 0 where it
+    is unknown. The last band is FULL where the map is known, else 0. Beyond the grid it is unknown. Bands of a cell lie
+    together, since a search reads them together.
 
     Raises
     ------
@@ -75,31 +75,37 @@ class Field:
     """
 
     grid: Grid
-    layers: NDArray[np.uint8]
-    known: NDArray[np.uint8]
+    cells: NDArray[np.uint8]
     _levels: dict[int, Level] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check shapes and types; lock the arrays."""
-        shapes = (self.layers.shape, self.known.shape)
-        if self.layers.ndim != _AXES or not self.layers.shape[1:] == self.known.shape == self.grid.shape:
-            message = f"a field has layers (K, rows, cols) and known (rows, cols), {self.grid.shape}, got {shapes}"
+        """Check shape and type; lock the cells."""
+        if self.cells.ndim != _AXES or self.cells.shape[:2] != self.grid.shape:
+            message = f"a field has cells (rows, cols, K + 1), {self.grid.shape}, got {self.cells.shape}"
             raise ShapeError(message)
-        if self.layers.dtype != np.uint8 or self.known.dtype != np.uint8:
-            message = f"a field holds uint8, got {self.layers.dtype} and {self.known.dtype}"
+        if self.cells.dtype != np.uint8:
+            message = f"a field holds uint8, got {self.cells.dtype}"
             raise ShapeError(message)
-        self.layers.flags.writeable = False
-        self.known.flags.writeable = False
+        self.cells.flags.writeable = False
 
-    def cut(self, box: tuple[int, int, int, int], margin: int) -> Self:
-        """Return the part under a box, top, left, bottom and right in cells, with a margin; cells are shared."""
-        top, left = max(0, box[0] - margin), max(0, box[1] - margin)
-        bottom, right = min(self.grid.rows, box[2] + margin), min(self.grid.cols, box[3] + margin)
-        return type(self)(
-            grid=self.grid.window(top, left, bottom - top, right - left),
-            layers=self.layers[:, top:bottom, left:right],
-            known=self.known[top:bottom, left:right],
-        )
+    @classmethod
+    def of(cls, *, grid: Grid, layers: NDArray[np.uint8], known: NDArray[np.uint8]) -> Self:
+        """Return the field of layers, shape (K, rows, cols), and of known cells, (rows, cols); raise `ShapeError`."""
+        shapes = (layers.shape, known.shape)
+        if layers.ndim != _AXES or not layers.shape[1:] == known.shape == grid.shape:
+            message = f"a field has layers (K, rows, cols) and known (rows, cols), {grid.shape}, got {shapes}"
+            raise ShapeError(message)
+        return cls(grid=grid, cells=np.stack((*layers, known), axis=-1))
+
+    @property
+    def layers(self) -> NDArray[np.uint8]:
+        """Return the degrees to which the map holds each class, shape (K, rows, cols): a view of the cells."""
+        return np.moveaxis(self.cells[..., :-1], -1, 0)
+
+    @property
+    def known(self) -> NDArray[np.uint8]:
+        """Return FULL where the map is known, else 0, shape (rows, cols): a view of the cells."""
+        return self.cells[..., -1]
 
     def level(self, factor: int) -> Level:
         """Return the map in cells of `factor` of its own a side; each level is made once."""
@@ -162,14 +168,16 @@ def _level(field: Field, factor: int) -> Level:
     """Spread each thin class by a large cell, then average."""
     grid = field.grid.coarsen(factor)
     if factor == 1:
-        cells = np.stack((*field.layers, field.known), axis=-1)
-        return Level(factor=1, grid=grid, cells=cells, thinner=np.ones(cells.shape[-1]))
+        return Level(factor=1, grid=grid, cells=field.cells, thinner=np.ones(field.cells.shape[-1]))
     kernel = round_kernel(factor)
-    spread = [_spread(band, kernel) for band in field.layers]
-    bands, thinner = [*(band for band, _ in spread), field.known], [*(share for _, share in spread), 1.0]
     size, around = (grid.cols, grid.rows), ((0, -field.grid.rows % factor), (0, -field.grid.cols % factor))
-    pooled = [cv2.resize(np.pad(band, around), size, interpolation=cv2.INTER_AREA) for band in bands]
-    return Level(factor=factor, grid=grid, cells=np.stack(pooled, axis=-1), thinner=np.array(thinner))
+    cells, thinner = np.empty((*grid.shape, field.cells.shape[-1]), dtype=np.uint8), np.ones(field.cells.shape[-1])
+    for at in range(len(thinner)):
+        band = np.ascontiguousarray(field.cells[..., at])
+        if at < len(thinner) - 1:  # the last one says where the map is known
+            band, thinner[at] = _spread(band, kernel)
+        cells[..., at] = cv2.resize(np.pad(band, around), size, interpolation=cv2.INTER_AREA)
+    return Level(factor=factor, grid=grid, cells=cells, thinner=thinner)
 
 
 def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:

@@ -58,7 +58,7 @@ def search(
     >>> rng = np.random.default_rng(0)
     >>> town = np.where(rng.random((1, 64, 64)) < 0.1, FULL, 0).astype(np.uint8)
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=64)
-    >>> field = Field(grid=grid, layers=town, known=np.full((64, 64), FULL, np.uint8))
+    >>> field = Field.of(grid=grid, layers=town, known=np.full((64, 64), FULL, np.uint8))
     >>> seen = (town[:, 20:52, 10:42] / FULL).astype(np.float32)
     >>> view = Template(weights=2 * seen - 0.5, known=-seen[0], cell_size_m=1.0)
     >>> where = Prior(center_m=None, radius_m=None, yaw_deg=0.0, yaw_sigma_deg=2.0, scale_sigma=0.0)

@@ -120,7 +120,7 @@ def store_levels(
     >>> from tempfile import mkdtemp
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=64)
     >>> town = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (1, 64, 64), p=[0.9, 0.1])
-    >>> whole = Field(grid=grid, layers=town, known=np.full((64, 64), 255, np.uint8))
+    >>> whole = Field.of(grid=grid, layers=town, known=np.full((64, 64), 255, np.uint8))
     >>> stored = store_levels(Path(mkdtemp()) / "town", grid, 1, lambda _: whole, factors=(1, 2, 4))
     >>> all(np.array_equal(stored.level(at).cells, whole.level(at).cells) for at in (1, 2, 4))
     True
@@ -144,7 +144,7 @@ def store_levels(
                 for row, col, window in grid.windows(window_cells):
                     field = paint(window)
                     if field is not None:
-                        base[row : row + window.rows, col : col + window.cols] = field.level(1).cells
+                        base[row : row + window.rows, col : col + window.cols] = field.cells
                 shares = {1: np.ones(bands + 1)}
                 for factor in factors:
                     if factor > 1:

@@ -96,7 +96,7 @@ def surface(
     >>> rng = np.random.default_rng(0)
     >>> town = np.where(rng.random((1, 64, 64)) < 0.1, 255, 0).astype(np.uint8)
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=64)
-    >>> field = Field(grid=grid, layers=town, known=np.full((64, 64), 255, np.uint8))
+    >>> field = Field.of(grid=grid, layers=town, known=np.full((64, 64), 255, np.uint8))
     >>> seen = np.rot90(town[:, 20:51, 10:41] / np.float32(255), axes=(1, 2))
     >>> view = Template(weights=2 * seen - 0.5, known=-seen[0], cell_size_m=1.0)
     >>> scored = surface(field, view, center_m=(28.0, 30.0), radius_m=8.0, yaws_deg=[0, 90, 180, 270])

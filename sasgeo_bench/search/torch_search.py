@@ -77,7 +77,7 @@ def search_batch(
     >>> from sasgeo_bench.geometry.grid import Grid
     >>> town = np.where(np.random.default_rng(0).random((1, 64, 64)) < 0.1, FULL, 0).astype(np.uint8)
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=64)
-    >>> field = Field(grid=grid, layers=town, known=np.full((64, 64), FULL, np.uint8))
+    >>> field = Field.of(grid=grid, layers=town, known=np.full((64, 64), FULL, np.uint8))
     >>> seen = (town[:, 20:52, 10:42] / FULL).astype(np.float32)
     >>> views = [Template(weights=2 * s - 0.5, known=-s[0], cell_size_m=1.0) for s in (seen, seen[:, ::-1, ::-1])]
     >>> anywhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
@@ -121,7 +121,7 @@ class BatchSearch:
             raise ShapeError(message)
         groups: dict[tuple[object, ...], list[int]] = {}
         for at, template in enumerate(templates):
-            if len(template.weights) != len(self.field.layers):
+            if len(template.bands) != self.field.cells.shape[-1]:
                 message = f"templates[{at}] has {len(template.weights)} classes, the map {len(self.field.layers)}"
                 raise ShapeError(message)
             if len(template.active):

@@ -29,7 +29,7 @@ def a_grid(side, cell_m=1.0):
 def as_field(grid, layers):
     """A map of PRESENT, ABSENT and, where nothing is known, 255."""
     known = np.where((layers == FULL).any(axis=0), 0, FULL).astype(np.uint8)
-    return Field(grid=grid, layers=np.where(layers == PRESENT, FULL, 0).astype(np.uint8), known=known)
+    return Field.of(grid=grid, layers=np.where(layers == PRESENT, FULL, 0).astype(np.uint8), known=known)
 
 
 def as_template(cells, cell_m=1.0):
@@ -268,9 +268,9 @@ def test_a_map_of_larger_cells_than_the_view():
 def test_what_does_not_fit_is_refused():
     grid = a_grid(8)
     with pytest.raises(ShapeError, match="known"):
-        Field(grid=grid, layers=np.zeros((1, 8, 8), np.uint8), known=np.zeros((8, 7), np.uint8))
+        Field.of(grid=grid, layers=np.zeros((1, 8, 8), np.uint8), known=np.zeros((8, 7), np.uint8))
     with pytest.raises(ShapeError, match="uint8"):
-        Field(grid=grid, layers=np.zeros((1, 8, 8)), known=np.zeros((8, 8)))
+        Field.of(grid=grid, layers=np.zeros((1, 8, 8)), known=np.zeros((8, 8)))
     with pytest.raises(ShapeError, match="finite"):
         Template(weights=np.full((1, 2, 2), np.nan, np.float32), known=np.zeros((2, 2), np.float32), cell_size_m=1.0)
     with pytest.raises(ShapeError, match="weights"):

@@ -31,7 +31,7 @@ def whole():
     known = np.full((ROWS, COLS), FULL, np.uint8)
     known[:WINDOW, : 2 * WINDOW] = 0
     layers[:, known == 0] = 0
-    return Field(grid=GRID, layers=layers, known=known)
+    return Field.of(grid=GRID, layers=layers, known=known)
 
 
 def part_of(whole):
@@ -43,7 +43,7 @@ def part_of(whole):
         row, col = round((GRID.north_m - window.north_m) / 2.0), round((window.west_m - GRID.west_m) / 2.0)
         cut = np.s_[row : row + window.rows, col : col + window.cols]
         known = whole.known[cut].copy()
-        return Field(grid=window, layers=whole.layers[:, *cut].copy(), known=known) if known.any() else None
+        return Field.of(grid=window, layers=whole.layers[:, *cut].copy(), known=known) if known.any() else None
 
     return paint, asked
 

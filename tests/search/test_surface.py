@@ -26,7 +26,7 @@ def town():
     layers = (rng.random((2, SIDE // 4, SIDE // 4)) < 0.2).repeat(4, axis=1).repeat(4, axis=2)
     known = np.full((SIDE, SIDE), FULL, dtype=np.uint8)
     known[:30, :30] = 0
-    return Field(grid=GRID, layers=np.where(known > 0, FULL * layers, 0).astype(np.uint8), known=known)
+    return Field.of(grid=GRID, layers=np.where(known > 0, FULL * layers, 0).astype(np.uint8), known=known)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_squares_wider_than_one_transform_are_joined(view):
     rng = np.random.default_rng(0)
     grid = Grid(epsg=32632, west_m=0.0, north_m=0.0, cell_size_m=2.0, rows=8, cols=600)
     layers = np.where(rng.random((2, *grid.shape)) < 0.2, FULL, 0).astype(np.uint8)
-    long = Field(grid=grid, layers=layers, known=np.full(grid.shape, FULL, dtype=np.uint8))
+    long = Field.of(grid=grid, layers=layers, known=np.full(grid.shape, FULL, dtype=np.uint8))
     scored = surface(long, view, center_m=(600.0, -8.0), radius_m=600.0, yaws_deg=[0.0])
     assert scored.scores.shape == (1, 8, 600)
     for pose, score in poses_of(scored, count=20):

@@ -49,7 +49,7 @@ def town():
     layers[:, :, -8:] = 0
     known = np.full((SIDE, SIDE), FULL, np.uint8)
     known[:, -8:] = 0
-    return Field(
+    return Field.of(
         grid=Grid(epsg=32632, west_m=1000.0, north_m=9000.0, cell_size_m=1.0, rows=SIDE, cols=SIDE),
         layers=layers,
         known=known,

@@ -137,7 +137,7 @@ def field_of(state: State, classes: Sequence[str], prior: Prior, *, reach_m: flo
     known = bits >> np.uint32(31) == 0
     layers = [_coarse((bits >> np.uint32(state.classes.index(name)) & 1 > 0) & known, factor) for name in classes]
     grid = state.grid.window(top, left, rows, cols).coarsen(factor)
-    return Field(grid=grid, layers=np.stack(layers), known=_coarse(known, factor))
+    return Field.of(grid=grid, layers=np.stack(layers), known=_coarse(known, factor))
 
 
 def _window(bits: NDArray[np.uint32], top: int, left: int, shape: tuple[int, int]) -> NDArray[np.uint32]:

@@ -175,7 +175,7 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         places_m = lattice_m(view.prior, self._grid, step_m=STEP * view.side_m)
         tiles = [at_place(place_m, view.prior) for place_m in places_m[disc.holds(places_m)]]
         found = [mode for mode in self._matched(view, tiles, [disc] * len(tiles), most=TOP) if mode is not None]
-        return thinned(sorted(found, key=lambda mode: -mode.score), APART_M)[:count]
+        return thinned(sorted(found, key=lambda mode: -mode.score), APART_M, count)
 
     def near(self, view: Sight, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the pose that the tile around each candidate gives; of all but the best it is the candidate's own."""

@@ -212,7 +212,7 @@ class BrmGrid(PlaceMatcher[Sight]):
         windows = [Pose(easting_m=east_m, northing_m=north_m, yaw_deg=0.0) for east_m, north_m in places_m.tolist()]
         near = replace(view.search, plan=replace(view.search.plan, around_m=NEAR_M)).candidates(windows)
         found = sorted((mode for mode in near if mode and disc.has(mode.pose)), key=lambda mode: -mode.score)
-        return thinned(found, APART_M)[:count]
+        return thinned(found, APART_M, count)
 
     def near(self, view: Sight, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best overlap near each candidate."""

@@ -136,7 +136,7 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
             if pose is None or not view.allows(pose, disc):
                 pose, inliers = tile.pose, 0
             found.append(Matched(pose=pose, score=score, inliers=inliers))
-        return thinned(sorted(found, key=lambda mode: -mode.score), APART_M)[:count]
+        return thinned(sorted(found, key=lambda mode: -mode.score), APART_M, count)
 
     def diagnostics(self, view: Objects, found: Sequence[Mode]) -> dict[str, float]:
         """Return how many matched objects agree on the first answer, and their share of the objects of the view."""

@@ -118,7 +118,7 @@ class Pairs:
     def peaks(self, disc: Disc, yaws_deg: list[float], *, count: int) -> list[Mode]:
         """Return up to `count` poses that most pairs vote for, best first, `PEAKS_APART_M` from each other."""
         found = [mode for yaw_deg in yaws_deg for mode in self._peaks(disc, yaw_deg)]
-        return thinned(sorted(found, key=lambda mode: -mode.score), PEAKS_APART_M)[:count]
+        return thinned(sorted(found, key=lambda mode: -mode.score), PEAKS_APART_M, count)
 
     def _peaks(self, disc: Disc, yaw_deg: float) -> Iterator[Mode]:
         """Yield the best places of one heading."""

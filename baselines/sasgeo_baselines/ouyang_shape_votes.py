@@ -95,7 +95,7 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
                 mixture.place_m.tolist(), mixture.yaw_deg.tolist(), mixture.height.tolist(), strict=True
             )
         ]
-        return thinned(found, APART_M)[:count]
+        return thinned(found, APART_M, count)
 
     def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
         """Return the credibility of the mixture, that around the first candidate in retrieval."""

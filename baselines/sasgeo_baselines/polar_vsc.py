@@ -189,11 +189,11 @@ class PolarVsc(PlaceMatcher[Sight]):
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the best correlations of sectors around the places whose rings are alike."""
         start = self._turned(view, self._map.places_m[self._shortlist(view, disc)])
-        best = points_of([mode.pose for mode in thinned(start, APART_M)[: max(REFINED, count)]])
+        best = points_of([mode.pose for mode in thinned(start, APART_M, max(REFINED, count))])
         steps_m = CELL_M * np.array(list(product(range(-AROUND, AROUND + 1), repeat=2)))
         found = self._turned(view, (best[:, None] + steps_m).reshape(-1, 2))
         wide = disc.wider(CELL_M)
-        return thinned((mode for mode in found if wide.has(mode.pose)), APART_M)[:count]
+        return thinned((mode for mode in found if wide.has(mode.pose)), APART_M, count)
 
     def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
         """Return the least p-value of the rings at the best place, and the share of rings that pass there."""

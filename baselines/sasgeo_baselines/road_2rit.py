@@ -218,7 +218,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         few_m = points_m[:: max(1, len(points_m) // FIRST_POINTS)]
         first = np.argsort(-self._roads.hits(few_m, poses), kind="stable")[:TESTED]
         modes = self._judged(view, [pose_of(row) for row in poses[first]])
-        best = thinned(modes, TWICE_M)[:SETTLED]
+        best = thinned(modes, TWICE_M, SETTLED)
         settled = [self._roads.settled(view.roads, mode.pose, disc.wider(SLACK_M)) for mode in best]
         return thinned(self._judged(view, settled), APART_M)
 

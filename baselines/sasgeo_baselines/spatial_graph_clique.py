@@ -63,7 +63,7 @@ class SpatialGraphClique(ObjectMatcher):
             mode = mode and self._at(pairs, mode.pose)  # once more: a peak is up to half a step of the heading off
             if mode is not None and view.allows(mode.pose, disc):
                 found.append(mode)
-        return thinned(sorted(found, key=lambda mode: -mode.score), APART_M)[:count]
+        return thinned(sorted(found, key=lambda mode: -mode.score), APART_M, count)
 
     def _at(self, pairs: Pairs, pose: Pose) -> Mode | None:
         """Return the pose of the largest clique of pairs near a pose; None if they are fewer than three."""

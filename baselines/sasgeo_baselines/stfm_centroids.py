@@ -190,7 +190,7 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
     def modes(self, view: PatternSight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses that most matches vote for."""
         crowds = self.votes(view, disc).crowds(count=TRIED)
-        return thinned((crowd.mode for crowd in crowds), APART_M)[:count]
+        return thinned((crowd.mode for crowd in crowds), APART_M, count)
 
     def votes(self, view: PatternSight, disc: Disc) -> Votes:
         """Return the poses of the most alike objects that the prior allows."""

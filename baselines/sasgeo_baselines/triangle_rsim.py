@@ -200,7 +200,7 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
         settled = (self._settled(view, crowd.mode.pose) for crowd in crowds)
         poses = [pose for pose in settled if view.allows(pose, disc)]
         modes = [Mode(pose=pose, score=round(view.check.agreement(pose), 9)) for pose in poses]
-        return thinned(sorted(modes, key=lambda mode: -mode.score), APART_M)[:count]
+        return thinned(sorted(modes, key=lambda mode: -mode.score), APART_M, count)
 
     def votes(self, view: BuildingSight, disc: Disc) -> Votes:
         """Return the poses of like triangles that the prior allows, the rarer a triangle the more weight."""

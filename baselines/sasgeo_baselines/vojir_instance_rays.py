@@ -245,7 +245,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         shortlist = near[np.argsort(away, kind="stable")[: int(self.numbers["shortlist"])]]
         best = thinned(_ranked(self._turned(view, self._places_m[shortlist]), disc.wider(STEP_M)), APART_M)
         refined = self._refined(view, best[: max(REFINED, count)])
-        return thinned(_ranked(refined, disc.wider(STEPS_M[0])), APART_M)[:count]
+        return thinned(_ranked(refined, disc.wider(STEPS_M[0])), APART_M, count)
 
     def _described(self, buildings: BuildingMap, step_m: float) -> Iterator[tuple[Points, Floats]]:
         """Yield places of a map and their magnitudes, tile by tile."""

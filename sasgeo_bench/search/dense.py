@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import Pose, wrap_deg
+from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.search.correlation import Correlation
 from sasgeo_bench.search.field import FULL, Level, Levels, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Disc, Mode, Null, Tile, Turns
@@ -93,22 +93,22 @@ class _Peaks:
 
     def separate(self, most: int, turns: Turns) -> list[int]:
         """Return indices of the best peaks, none next to a better one in place, heading and scale at once."""
+        turn_deg, step = NEXT * turns.yaw_step_deg + _NOTHING, NEXT * turns.scale_step + _NOTHING
         chosen: list[int] = []
-        at_cell: dict[tuple[int, int], list[int]] = {}
-        for at, (row, col) in enumerate(zip(self.row.tolist(), self.col.tolist(), strict=True)):
+        at_cell: dict[tuple[int, int], list[tuple[float, float]]] = {}
+        columns = (column.tolist() for column in (self.row, self.col, self.yaw_deg, self.scale))
+        for at, (row, col, yaw_deg, scale) in enumerate(zip(*columns, strict=True)):
             if len(chosen) == most:
                 break
             cells = product((row - 1, row, row + 1), (col - 1, col, col + 1))
-            if not any(self._is_near(at, other, turns) for cell in cells for other in at_cell.get(cell, ())):
+            if not any(
+                abs((yaw_deg - other_deg + 180) % 360 - 180) < turn_deg and abs(scale - other) < step
+                for cell in cells
+                for other_deg, other in at_cell.get(cell, ())
+            ):
                 chosen.append(at)
-                at_cell.setdefault((row, col), []).append(at)
+                at_cell.setdefault((row, col), []).append((yaw_deg, scale))
         return chosen
-
-    def _is_near(self, at: int, other: int, turns: Turns) -> bool:
-        """Return whether two peaks have neighbouring headings and scales."""
-        off_deg = abs(float(wrap_deg(self.yaw_deg[at] - self.yaw_deg[other])))
-        is_turned = off_deg >= NEXT * turns.yaw_step_deg + _NOTHING
-        return not is_turned and abs(self.scale[at] - self.scale[other]) < NEXT * turns.scale_step + _NOTHING
 
     def mode(self, at: int, point_m: tuple[float, float]) -> Mode:
         """Return a peak as a mode at a place in metres."""

@@ -108,7 +108,7 @@ class Search:
         followed = self._followed(guesses, [self.disc], patches=self.patches)
         near = self.within(1)  # dropped modes were limited by larger cells
         inside = (guess.mode for guess in followed if near.holds(np.array([place_m(guess.mode.pose)]))[0])
-        return Found(modes=tuple(thinned(inside, self.plan.apart_m)[:count]), null=null)
+        return Found(modes=tuple(thinned(inside, self.plan.apart_m, count)), null=null)
 
     def _proposed(self, starts: Sequence[Pose]) -> list[Guess]:
         """Score proposed poses on the coarsest level."""

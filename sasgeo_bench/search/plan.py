@@ -70,10 +70,12 @@ def place_m(pose: Pose) -> tuple[float, float]:
     return (pose.easting_m, pose.northing_m)
 
 
-def thinned(modes: Iterable[Mode], apart_m: float) -> list[Mode]:
-    """Drop modes that lie nearer than a distance to a better one."""
+def thinned(modes: Iterable[Mode], apart_m: float, most: int | None = None) -> list[Mode]:
+    """Drop modes that lie nearer than a distance to a better one; `most` are returned, by default all of the others."""
     kept: list[Mode] = []
     for mode in modes:
+        if len(kept) == most:
+            break
         if all(math.dist(place_m(mode.pose), place_m(other.pose)) >= apart_m for other in kept):
             kept.append(mode)
     return kept

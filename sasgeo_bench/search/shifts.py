@@ -152,8 +152,8 @@ class ShiftSearch:
         factor = self._factor(plan.coarse_m)
         tiles = list(self._tiles(factor, disc))
         found = [mode for modes in self._best(tiles, factor, self._yaws_deg) for mode in modes]
-        best = thinned(_ranked(found), plan.apart_m)[: max(plan.refined, count)]
-        return thinned(_ranked(self._refined(mode, disc) for mode in best), plan.apart_m)[:count]
+        best = thinned(_ranked(found), plan.apart_m, max(plan.refined, count))
+        return thinned(_ranked(self._refined(mode, disc) for mode in best), plan.apart_m, count)
 
     def candidates(self, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best pose near each candidate; None where the map shows nothing."""

@@ -16,7 +16,7 @@ from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, o
 from sasgeo_bench.search.dense import _Peaks
 from sasgeo_bench.search.field import FULL, Field, Template
 from sasgeo_bench.search.find import Search, exhaustive, rank, score_at, search
-from sasgeo_bench.search.plan import Plan, all_around, posterior
+from sasgeo_bench.search.plan import Mode, Plan, all_around, posterior, thinned
 
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
 AGREE, EXTRA, MISSED = 1.0, 0.6, 0.4
@@ -320,3 +320,16 @@ def test_a_pose_that_is_given_is_followed_where_the_search_would_not_look(place)
     assert off(alone, truth)[1] > 60.0
     assert off(given, truth)[0] < 1.0
     assert search(place[2], template, turned, starts=[]).modes[0].pose == alone
+
+
+def test_thinning_ends_with_the_last_mode_that_is_asked_for():
+    asked = []
+
+    def modes():
+        for at in range(9):
+            asked.append(at)
+            yield Mode(pose=Pose(easting_m=10.0 * at, northing_m=0.0, yaw_deg=0.0), score=-float(at))
+
+    assert [mode.score for mode in thinned(modes(), 15.0, 2)] == [0.0, -2.0]
+    assert asked == [0, 1, 2, 3]
+    assert [mode.score for mode in thinned(modes(), 15.0)] == [0.0, -2.0, -4.0, -6.0, -8.0]

@@ -4,6 +4,7 @@
 import logging
 import os
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import chdir, contextmanager
@@ -192,28 +193,46 @@ class _Tried(NamedTuple, Generic[Found]):
 
 
 def _found_on_cluster(work: Callable[[Item], Found], items: Sequence[Item], address: str) -> Iterator[Found]:
-    """Yield results in order; an item that fails for want of a file or of room is tried by each other worker once."""
-    from distributed import KilledWorker  # noqa: PLC0415 - an optional dependency, of which `connected` tells
+    """Yield results in the order of the items."""
+    early: dict[int, Found] = {}
+    following = 0
+    with connected(address) as client:
+        for number, found in done_on(client, work, items):
+            early[number] = found
+            while following in early:
+                yield early.pop(following)
+                following += 1
+
+
+def done_on(client: "Client", work: Callable[[Item], Found], items: Sequence[Item]) -> Iterator[tuple[int, Found]]:
+    """Yield number and result of each item of a cluster as it is done.
+
+    An item whose worker dies is given to another; one that fails for want of a file or of room is tried by each other
+    worker once. Raise `StoreError` if workers die on an item over and over; the last error, if no worker can do one.
+    """
+    from distributed import KilledWorker, as_completed  # noqa: PLC0415 - an optional dependency, of which `connected` tells
 
     try_ = partial(_try, work, os.getcwd())  # noqa: PTH109 - a text
-    with connected(address) as client:
-        futures = client.map(try_, items, pure=False)
-        for item, first in zip(items, futures, strict=True):
-            future, failed = first, set[str]()
-            while True:
-                try:
-                    tried: _Tried[Found] = future.result()
-                except KilledWorker as error:
-                    message = "dask workers died over and over on the same item: give them more memory, and go on"
-                    raise StoreError(message) from error
-                if tried.error is None:
-                    yield cast("Found", tried.result)
-                    break
-                failed.add(tried.worker)
-                others = sorted(set(client.scheduler_info(n_workers=-1)["workers"]) - failed)
-                if not others:
-                    raise tried.error
-                future = client.submit(try_, item, pure=False, workers=others)
+    numbers = {future: number for number, future in enumerate(client.map(try_, items, pure=False))}
+    failed: defaultdict[int, set[str]] = defaultdict(set)
+    pending = as_completed(numbers)
+    for future in pending:
+        number = numbers.pop(future)
+        try:
+            tried: _Tried[Found] = future.result()
+        except KilledWorker as error:
+            message = "dask workers died over and over on the same item: give them more memory, and go on"
+            raise StoreError(message) from error
+        if tried.error is None:
+            yield number, cast("Found", tried.result)
+            continue
+        failed[number].add(tried.worker)
+        others = sorted(set(client.scheduler_info(n_workers=-1)["workers"]) - failed[number])
+        if not others:
+            raise tried.error
+        again = client.submit(try_, items[number], pure=False, workers=others)
+        numbers[again] = number
+        pending.add(again)
 
 
 def _try(work: Callable[[Item], Found], folder: str, item: Item) -> _Tried[Found]:

@@ -4,9 +4,11 @@
 import os
 import random
 import resource
+import shutil
 import signal
 import threading
-from contextlib import nullcontext, suppress
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import replace
 from functools import partial
 
 import pytest
@@ -68,9 +70,37 @@ def drawn(out, where):
     )
 
 
-@pytest.mark.slow
-def test_workers_that_are_killed_stalled_or_full_change_no_byte(cluster, tmp_path):
-    drawn(tmp_path / "one", None)
+def answered(out, where):
+    """Ask two matchers all that was drawn; their answers without what they cost, which differs from run to run."""
+    for matcher in ("random", "prior_centre"):
+        sgb.run(matcher=matcher, tasks=sorted(out.glob("tasks/*/*")), out=out, dask=where)
+    found = {}
+    for run in sorted(out.glob("runs/*/*/*/*")):
+        matcher = run.relative_to(out / "runs").parts[0]
+        rows = (replace(row, latency_s=None, matcher_s=None) for row in sgb.read_predictions(run))
+        found |= {(matcher, row.query_id): row for row in rows}
+    return found
+
+
+def scored(out, where):
+    """Score all answers, with a rejector; the tables of the board as they lie in its folder."""
+    name = "alone" if where is None else "shared"
+    sgb.score(
+        predictions=out / "runs",
+        name=name,
+        rejector=["margin"],
+        split="demo",
+        draws=200,
+        cases=False,
+        dask=where,
+        out=out,
+    )
+    return {path.name: path.read_bytes() for path in sorted((out / "boards" / name).glob("*.parquet"))}
+
+
+@contextmanager
+def disturbed(cluster):
+    """While entered, one worker stalls, one can write nothing, and of the others one is killed every 3 seconds."""
     ended, killed, chance = threading.Event(), [], random.Random(0)  # noqa: S311 - which worker is killed
     with distributed.Client(cluster.scheduler_address) as client:
         numbers = client.run(os.getpid)
@@ -89,17 +119,37 @@ def test_workers_that_are_killed_stalled_or_full_change_no_byte(cluster, tmp_pat
         killer = threading.Thread(target=kill_some)
         killer.start()
         try:
-            folders = drawn(tmp_path / "eight", cluster.scheduler_address)
+            yield
         finally:
             ended.set()
             killer.join()
             with suppress(ProcessLookupError):  # the scheduler has given it up, and its nanny has ended it
                 os.kill(numbers[stalled], signal.SIGCONT)
     assert killed
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_stalled_or_full_change_no_byte(cluster, tmp_path):
+    drawn(tmp_path / "one", None)
+    with disturbed(cluster):
+        folders = drawn(tmp_path / "eight", cluster.scheduler_address)
     assert len(folders) == 2 * len(TOWNS)
     one, eight = contents(tmp_path / "one"), contents(tmp_path / "eight")
     assert sorted(eight) == sorted(one)
     assert [name for name in one if one[name] != eight[name]] == []
+
+
+@pytest.mark.slow
+def test_workers_that_are_killed_stalled_or_full_change_no_answer_and_no_figure(cluster, tmp_path):
+    drawn(tmp_path / "one", None)
+    shutil.copytree(tmp_path / "one", tmp_path / "eight")
+    alone = answered(tmp_path / "one", None)
+    figures = scored(tmp_path / "one", None)
+    with disturbed(cluster):
+        shared = answered(tmp_path / "eight", cluster.scheduler_address)
+        assert scored(tmp_path / "one", cluster.scheduler_address) == figures
+    assert len(alone) > 100
+    assert shared == alone
 
 
 @pytest.mark.slow
@@ -144,6 +194,7 @@ def test_workers_that_die_over_and_over_end_the_work_with_one_line(monkeypatch):
         def map(self, *_, **__):
             return [Future()]
 
+    monkeypatch.setattr("distributed.as_completed", iter)
     monkeypatch.setattr("sasgeo_bench.progress.connected", lambda _: nullcontext(Client()))
     with pytest.raises(StoreError, match="died over and over on the same item"):
         list(spread(square, range(1), dask="tcp://here:1"))

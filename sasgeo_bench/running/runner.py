@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
@@ -13,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.follower import card_on_flights
-from sasgeo_bench.progress import Lines, Progress, Tell, connected
+from sasgeo_bench.progress import Lines, Progress, Tell, connected, done_on
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -33,27 +34,20 @@ _MOST_QUERIES: Final = 256  # of a chunk, which has `LEAST_ITEMS` at least
 def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iterator[tuple[int, int, Cost]]:
     """Ask all pending queries on a cluster whose workers all reach the same folders and have the plugin.
 
-    Yields for each chunk that is done the number of its part, its queries, and its cost. A chunk whose dask worker
-    dies is given to another, which asks only queries without a row. Raises `StoreError` if the workers of a chunk die
-    again and again; written rows stay.
+    Yields for each chunk that is done the number of its part, its queries, and its cost. A chunk whose worker dies, or
+    cannot write, is given to another, which asks only queries without a row. Raises as `progress.done_on`; written rows
+    stay.
     """
-    from distributed import KilledWorker, as_completed  # noqa: PLC0415
-
     threads = max(1, sum(client.nthreads().values()))
-    where = {}
     # Other tasks' ids need not travel with every chunk, nor the blocks of a split.
     bare = replace(plan, parts=(), request=replace(plan.request, split=None))
+    numbers, chunks = [], []
     for number, part in enumerate(parts):
         for ids in _chunks(part.left, threads, unit_of_task(part.about)):
-            chunk = replace(part, left=ids, asked={name: part.asked[name] for name in ids})
-            where[client.submit(_answer_chunk, bare, chunk, pure=False)] = (number, len(ids))
-    for future in as_completed(where):
-        try:
-            cost = future.result()
-        except KilledWorker as error:
-            message = "dask workers died over and over on the same queries: give them more memory, and run again"
-            raise StoreError(message) from error
-        yield (*where[future], cost)
+            numbers.append(number)
+            chunks.append(replace(part, left=ids, asked={name: part.asked[name] for name in ids}))
+    for at, cost in done_on(client, partial(_answer_chunk, bare), chunks):
+        yield numbers[at], len(chunks[at].left), cost
 
 
 def _chunks(ids: Sequence[str], threads: int, unit_of: Callable[[str], str]) -> Iterator[tuple[str, ...]]:

@@ -23,6 +23,7 @@ from pathlib import Path
 
 import psutil
 
+from benchmarks.growth import draw
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, read_region_file
 
@@ -90,27 +91,14 @@ def medians(of: str, runs: int, extracts: list[Path]) -> dict[str, float]:
     return {name: statistics.median(row[name] for row in rows) for name in rows[0]}
 
 
-def draw(rows: dict[str, dict[str, float]], path: Path) -> None:
+def draw_countries(rows: dict[str, dict[str, float]], path: Path) -> None:
     """Draw time and memory against the mapped area."""
-    import matplotlib as mpl  # noqa: PLC0415 - only a plot needs it, and what is measured has its memory, too
-
-    mpl.use("svg")
-    from matplotlib import pyplot as plt  # noqa: PLC0415 - only a plot needs it
-
-    plt.rcParams |= {"svg.hashsalt": "growth", "svg.fonttype": "none", "font.size": 8}
-    figure, charts = plt.subplots(1, 2, figsize=(6.4, 2.6), layout="constrained")
-    countries: dict[str, list[dict[str, float]]] = {}
-    for name, row in rows.items():
-        countries.setdefault(name.partition(",")[0], []).append(row)
-    for chart, column, title in zip(
-        charts, ("cpu_s", "peak_mb"), ("processor time (s)", "peak memory (MB)"), strict=True
-    ):
-        for marker, (name, some) in zip("sDo", countries.items(), strict=True):
-            chart.plot([row["mapped_km2"] for row in some], [row[column] for row in some], f"{marker}-", label=name)
-        highest = max(row[column] for row in rows.values())
-        chart.set(xlabel="mapped area (km²), cells of 1 m", ylabel=title, ylim=(0, 1.1 * highest), xlim=(0, None))
-    charts[0].legend()
-    figure.savefig(path, metadata={"Date": None})
+    charts: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for column, title in (("cpu_s", "processor time (s)"), ("peak_mb", "peak memory (MB)")):
+        lines = charts[title] = {}
+        for name, row in rows.items():
+            lines.setdefault(name.partition(",")[0], []).append((row["mapped_km2"], row[column]))
+    draw(path, charts, xlabel="mapped area (km²), cells of 1 m")
 
 
 def main() -> None:
@@ -134,7 +122,7 @@ def main() -> None:
             figures = f"{row['mapped_km2']:10.0f} {row['seconds']:7.1f} {row['cpu_s']:7.1f} {row['peak_mb']:8.0f}"
             print(f"{name:22} {figures}", flush=True)
         if given.plot:
-            draw(found, given.plot)
+            draw_countries(found, given.plot)
         return
     print(f"medians of {given.runs} runs; Liechtenstein 2025-09-19, 1 m cells, 13 classes")
     print(f"{'km2':>5} {'s':>7} {'CPU s':>7} {'km2/s':>7} {'peak MB':>8}")

@@ -25,6 +25,7 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.growth import draw
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.leaderboard.board import ScoreRequest
@@ -212,6 +213,7 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="+", default=SIZES, help="matchers x queries, as 10x1000")
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--keep", type=Path, help="folder of made-up answers, which are made once")
+    parser.add_argument("--plot", type=Path, help="file to draw time and memory against rows to, as SVG")
     parser.add_argument("--score", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--whole", action="store_true", help=argparse.SUPPRESS)
     said = parser.parse_args()
@@ -221,6 +223,7 @@ def main() -> None:
     print(f"medians of {said.runs} runs; {DRAWS} draws, {len(SUITES)} suites, {PLACES} places of 4 blocks\n")
     print("| matchers | queries | s | CPU s | peak MB | whole command, s | CPU s | peak MB |")
     print("|---:|---:|---:|---:|---:|---:|---:|---:|")
+    charts: dict[str, dict[str, list[tuple[float, float]]]] = {}
     with tempfile.TemporaryDirectory() as scratch:
         for size in said.sizes:
             matchers, queries = map(int, size.split("x"))
@@ -232,7 +235,12 @@ def main() -> None:
             for is_whole in (False, True):
                 one = measured(root, is_whole=is_whole, runs=said.runs)
                 cells += [f"{one['s']:.1f}", f"{one['cpu_s']:.1f}", f"{one['mb']:.0f}"]
+                label = "whole command" if is_whole else "intervals and ranks"
+                for title, column in (("time (s)", "s"), ("peak memory (MB)", "mb")):
+                    charts.setdefault(title, {}).setdefault(label, []).append((matchers * queries, one[column]))
             print(f"| {' | '.join(cells)} |", flush=True)
+    if said.plot:
+        draw(said.plot, charts, xlabel="rows (matchers x queries)")
 
 
 if __name__ == "__main__":

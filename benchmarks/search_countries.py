@@ -37,6 +37,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import cv2
 import numpy as np
 
+from benchmarks.growth import draw
 from benchmarks.search import ANYWHERE, LEAST_DENSITY, LISTED, THREADS, Look, peak_mb, read, seconds
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
@@ -245,6 +246,7 @@ def main() -> None:
     parser.add_argument("--tiles", type=int, default=0, help="views to search for by tiles, too: minutes each")
     parser.add_argument("--ways", nargs="+", choices=WAYS, default=WAYS, help="where the levels of the map lie")
     parser.add_argument("--beams", nargs="+", type=int, default=(), help="times the beam of a town to compare")
+    parser.add_argument("--plot", type=Path, help="file to draw fixes and memory against area to, as SVG")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     given = parser.parse_args()
     cv2.setNumThreads(1)
@@ -252,7 +254,7 @@ def main() -> None:
         way, name, threads = given.measure
         print(json.dumps(measure(way, name, int(threads), given)))
         return
-    sizes = []
+    sizes, charts = [], dict[str, dict[str, list[tuple[float, float]]]]()
     if not given.beams:
         print("| region | km2 | map | cores | ready, s | MB | fix, s | CPU s | peak MB | right | by tiles | higher |")
         print(f"|---|---:|---|{'---:|' * 9}")
@@ -273,6 +275,9 @@ def main() -> None:
             continue
         for way, threads in ((way, threads) for way in given.ways for threads in THREADS):
             row = in_a_process(way, name, threads, given)
+            label = f"{way}, {threads} {'core' if threads == 1 else 'cores'}"
+            for title, column in (("a fix (s)", "wall_s"), ("peak memory (MB)", "peak_mb")):
+                charts.setdefault(title, {}).setdefault(label, []).append((km2, row[column]))
             tiled = f"{row['same']} | {row['higher']}" if threads == 1 and given.tiles and way == "stored" else " | "
             print(
                 f"| {name} | {km2:.0f} | {way} | {threads} | {row['ready_s']:.2f} | {row['ready_mb']:.0f} | "
@@ -284,6 +289,8 @@ def main() -> None:
         sizes.append((name, km2, wall_s, cpu_s, files, made(folder, levels)))
     if given.beams:
         return
+    if given.plot:
+        draw(given.plot, charts, xlabel="mapped area (km²), cells of 2 m")
     print("\n| region | stored in s | CPU s | kB/km2: levels | layers | vectors | ms/km2: levels | layers | vectors |")
     print(f"|---|{'---:|' * 8}")
     for name, km2, wall_s, cpu_s, files, spent in sizes:

@@ -175,8 +175,8 @@ def profile(
         if result is not None and result.text is None:
             message = f"{plan.card.name} learned nothing: {result.status}: {result.message}"
             raise MatchError(message)
-        asked = _asked(plan, request, is_pictured=manifest.imagery is not None)
-        queries = counted(len(asked), "query", "queries")
+        asked, count = _asked(plan, request, is_pictured=manifest.imagery is not None)
+        queries = counted(len(asked), "query", "queries") + (f", the first of {count}," if count > len(asked) else "")
         tell(f"{plan.card.name}: {queries} on {region.name}, again and again for {request.sustain_s:g} s")
         reach = reach_of(plan.request, (region,))
         with Worker(spec=request.spec, reach=reach, limits=plan.request.limits) as worker:
@@ -242,8 +242,8 @@ def plan_profile(request: ProfileRequest) -> RunPlan:
     return plan
 
 
-def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> list[bytes]:
-    """Return the rows of the queries to ask, `MOST_ASKED` at most; flights in order."""
+def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tuple[list[bytes], int]:
+    """Return the rows of the queries to ask, `MOST_ASKED` at most, flights in order; and how many could be asked."""
     reasons: Counter[str] = Counter()
     found: list[bytes] = []
     for part in plan.parts:
@@ -258,7 +258,7 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> list
         why = " and ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
         message = f"{plan.card.name} can be asked none of the {counted(reasons.total(), 'query', 'queries')}: {why}"
         raise ConfigError(message)
-    return found
+    return found, reasons[""]
 
 
 def _far(query: Query, radius_m: float | None) -> str | None:

@@ -125,6 +125,10 @@ def find_entries(
                 files.append(_file_entry(path))
             continue
         found = sorted(path.rglob(prediction_files.RUN))
+        for folder in sorted({part.parent for part in path.rglob("part-*.parquet")} - {run.parent for run in found}):
+            with _noted(failures, str(folder)):
+                message = f"{folder} holds answers and no {prediction_files.RUN}: run the matcher again, they are kept"
+                raise StoreError(message)
         if not found:
             message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
             raise StoreError(message)

@@ -28,6 +28,7 @@ from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
@@ -607,6 +608,18 @@ def test_a_file_may_not_pass_for_a_control(out, tmp_path, name):
     submission(out, tmp_path / f"{name}.parquet")
     with pytest.raises(ConfigError, match=f"'{name}' is the name of a control of every board: choose another name"):
         find_entries([tmp_path / f"{name}.parquet"])
+
+
+def test_answers_without_their_run_are_named_and_cost_themselves_alone(out, tmp_path):
+    run = next((out / "runs").rglob("run.json"))
+    run.unlink()
+    with pytest.raises(StoreError, match=r"holds answers and no run.json: run the matcher again, they are kept"):
+        find_entries([out / "runs"])
+    told = []
+    failures = Failures(tmp_path / "failures.log", tell=told.append)
+    (entry,) = find_entries([out / "runs"], failures=failures)
+    assert (entry.name, len(entry.sources)) == ("oracle_pose", len(TOWNS) - 1)
+    assert str(run.parent) in told[0]
 
 
 def test_what_is_named_twice_counts_once(out, tmp_path):

@@ -237,10 +237,10 @@ def main() -> None:
                 cells += [f"{one['s']:.1f}", f"{one['cpu_s']:.1f}", f"{one['mb']:.0f}"]
                 label = "whole command" if is_whole else "intervals and ranks"
                 for title, column in (("time (s)", "s"), ("peak memory (MB)", "mb")):
-                    charts.setdefault(title, {}).setdefault(label, []).append((matchers * queries, one[column]))
+                    charts.setdefault(title, {}).setdefault(label, []).append((matchers * queries / 1000, one[column]))
             print(f"| {' | '.join(cells)} |", flush=True)
     if said.plot:
-        draw(said.plot, charts, xlabel="rows (matchers x queries)")
+        draw(said.plot, charts, xlabel="thousands of rows (matchers x queries)")
 
 
 if __name__ == "__main__":

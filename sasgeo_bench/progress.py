@@ -126,12 +126,13 @@ def connected(address: str) -> Iterator["Client"]:
             message = f"--dask must be local:N with N >= 1, or a scheduler's address, got {address!r}"
             raise ConfigError(message)
         with (
-            # One thread each: a chunk waits for one matcher's process. No dashboard: it would open a port.
+            # One thread each: a chunk waits for one matcher's process. The page that dask serves anyway is for this
+            # machine alone, at any port: by default it is for all, and a warning where another cluster has that port.
             LocalCluster(
                 n_workers=int(count),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
                 silence_logs=logging.CRITICAL,
             ) as cluster,
             Client(cluster) as client,

@@ -90,7 +90,7 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
     """Hold the lock of a folder; a second run says so and waits. Raise `StoreError` if the lock cannot be made.
 
     The file of the lock is removed while it is still held. Whoever waits for it then holds a file without a name, sees
-    that, and tries again by the name (`filelock`, since 3.21).
+    that, and tries again by the name (`filelock`, which removes none itself since 3.30).
     """
     folder = absolute(folder)
     lock = FileLock(folder.parent / f".{folder.name}.lock")

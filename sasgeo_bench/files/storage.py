@@ -7,7 +7,7 @@ to fetch. What was cut goes on where it was. Nothing is removed from storage.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
@@ -42,6 +42,7 @@ _MADE_BY: Final = "sasgeo-bench send"
 _MOST_LIST_BYTES: Final = 500_000_000
 _FILES_AT_ONCE: Final = 64  # sent before the list of those so far is written again
 _MOST_PART_BYTES: Final = 255  # of a name of a file or folder
+_CONTENT: Final = {"region.json": ("id",), "task.json": ("suite", "region"), "run.json": ("hash", "suite", "region")}
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@|\?.*$", re.DOTALL)
 
 
@@ -63,7 +64,8 @@ def send(folder: str | Path, url: str) -> Moved:
     place at once spoil each other's files, which `fetch` notices.
 
     Raise `StoreError` if the folder holds no file, a link, or a name that cannot be sent, if the storage refuses, or
-    holds files there that the folder lacks; `ConfigError` if nothing is known of such an URL.
+    holds another region, task or run there, or files that the folder lacks; `ConfigError` if nothing is known of such
+    an URL.
 
     >>> import tempfile
     >>> folder = Path(tempfile.mkdtemp())
@@ -74,7 +76,7 @@ def send(folder: str | Path, url: str) -> Moved:
     """
     folder = given_path(folder)
     names, hidden = _names_of(folder)
-    records = {name: file_record(folder / name) for name in names}
+    records, content = {name: file_record(folder / name) for name in names}, _content_of(folder)
     with _storage(url) as (system, root):
         _check_apart(folder, system, root)
         system.invalidate_cache()
@@ -82,6 +84,7 @@ def send(folder: str | Path, url: str) -> Moved:
         sizes = {path.removeprefix(f"{root}/"): about["size"] for path, about in _found(system, root).items()}
         others = sorted(name for name in sizes if name not in records and name not in {LIST, _SENDING})
         others += sorted(name for name in records if name in sizes and name not in known.names)
+        _check_same(known.content, content, shown(url), "another place, or empty that one")
         if others:
             message = (
                 f"{shown(url)} holds {one_line(named(others, 'file'))} of another folder, which would be lost: name "
@@ -93,14 +96,14 @@ def send(folder: str | Path, url: str) -> Moved:
         }
         left = [name for name in names if name not in there]
         if left:
-            _write_list(system, root, _SENDING, there, begun=names)
+            _write_list(system, root, _SENDING, _Sent(there, frozenset(names), content))
             _remove(system, f"{root}/{LIST}")
         for at, name in enumerate(left, start=1):
             _put(system, folder / name, f"{root}/{name}")
             there[name] = records[name]
             if at % _FILES_AT_ONCE == 0:
-                _write_list(system, root, _SENDING, there, begun=names)
-        _write_list(system, root, LIST, records)
+                _write_list(system, root, _SENDING, _Sent(there, frozenset(names), content))
+        _write_list(system, root, LIST, _Sent(records, frozenset(names), content))
         _remove(system, f"{root}/{_SENDING}")
     return Moved(files=len(names), bytes=_bytes_of(records), moved=len(left), hidden=hidden)
 
@@ -125,8 +128,9 @@ def fetch(url: str, folder: str | Path) -> Moved:
             message = f"{shown(url)} {cut if is_cut else nothing}"
             raise StoreError(message)
         records = sent.files
+        _check_same(_content_of(target), sent.content, str(target), "another folder")
         check_known(target, set(records), "the folder that was sent")
-        scratch, moved = _begun(target, records), 0
+        scratch, moved = _begun(target, sent), 0
         for name, record in sorted(records.items()):
             path = scratch / name
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -182,10 +186,30 @@ def _check_apart(folder: Path, system: "AbstractFileSystem", root: str) -> None:
         raise StoreError(message)
 
 
-def _begun(target: Path, records: Mapping[str, FileRecord]) -> Path:
+def _content_of(folder: Path) -> str:
+    """Return what a region, a task or a run says that it is; empty for another folder, or a damaged one.
+
+    >>> _content_of(Path("nowhere"))
+    ''
+    """
+    for name, keys in _CONTENT.items():
+        with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
+            about: Any = parse_json((folder / name).read_bytes())
+            return "/".join(str(about[key]) for key in keys)
+    return ""
+
+
+def _check_same(there: str, content: str, where: str, elsewhere: str) -> None:
+    """Refuse to put one region, task or run over another one: their files have the same names."""
+    if there and content and there != content:
+        message = f"{where} holds {one_line(there)}, and {one_line(content)} would replace it: name {elsewhere}"
+        raise StoreError(message)
+
+
+def _begun(target: Path, sent: "_Sent") -> Path:
     """Return the folder beside another one that its files are fetched into: one that was begun, or a new one."""
     scratch = target.with_name(f".{target.name}.fetched")
-    data = _list_bytes(records)
+    data = _list_bytes(sent)
     mark = scratch / LIST
     if scratch.is_dir() and not scratch.is_symlink() and mark.is_file():
         if mark.read_bytes() == data:
@@ -262,10 +286,11 @@ def _put(system: "AbstractFileSystem", path: Path, there: str) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Sent:
-    """A list of files, and the names of all that were to be sent."""
+    """A list of files, the names of all that were to be sent, and what their folder says that it is."""
 
     files: Mapping[str, FileRecord] = field(default_factory=dict)
     names: frozenset[str] = frozenset()
+    content: str = ""
 
 
 def _read_list(system: "AbstractFileSystem", root: str, name: str, url: str) -> _Sent | None:
@@ -286,7 +311,7 @@ def _read_list(system: "AbstractFileSystem", root: str, name: str, url: str) -> 
         what = "nothing that was sent" if odd is None else f"{one_line(odd)[:60]!r}, which is no file of a folder"
         message = f"{shown(url)}/{name} lists {what}: empty that place, and send the folder again"
         raise StoreError(message)
-    return _Sent(found, names)
+    return _Sent(found, names, str(content.get("content", "")))
 
 
 def _is_within(name: str) -> bool:
@@ -309,16 +334,15 @@ def _both(names: Iterable[str]) -> str | None:
     return next((name for name in names if name in folders), None)
 
 
-def _list_bytes(records: Mapping[str, FileRecord], begun: Sequence[str] = ()) -> bytes:
-    files = {file: one.model_dump() for file, one in sorted(records.items())}
-    return json_text({"made_by": _MADE_BY, "files": files, **({"begun": list(begun)} if begun else {})}).encode()
+def _list_bytes(sent: _Sent) -> bytes:
+    files = {file: one.model_dump() for file, one in sorted(sent.files.items())}
+    begun = sorted(sent.names) if sent.names - set(files) else []
+    return json_text({"made_by": _MADE_BY, "content": sent.content, "files": files, "begun": begun}).encode()
 
 
-def _write_list(
-    system: "AbstractFileSystem", root: str, name: str, records: Mapping[str, FileRecord], begun: Sequence[str] = ()
-) -> None:
+def _write_list(system: "AbstractFileSystem", root: str, name: str, sent: _Sent) -> None:
     system.makedirs(root, exist_ok=True)
-    system.pipe_file(f"{root}/{name}", _list_bytes(records, begun))
+    system.pipe_file(f"{root}/{name}", _list_bytes(sent))
 
 
 def _remove(system: "AbstractFileSystem", path: str) -> None:

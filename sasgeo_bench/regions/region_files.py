@@ -129,10 +129,10 @@ def read_region(
     path : str or Path
         Folder of the region.
     bounds_m : tuple of float, optional
-        West, south, east, north of the part, metres in the region's CRS; by default all of the map. The part has every
-        cell that they touch, whole features that meet these cells, the nodes among them, numbered anew, and the edges
-        between those. No more is read, but to check the hashes: of a country a town takes the memory of a town. What
-        the manifest counts is of the whole map.
+        West, south, east, north of the part, metres in the region's CRS; by default all of the map, beyond whose edge
+        no part reaches. The part has every cell that they touch, whole features that meet these cells, the nodes among
+        them, numbered anew, and the edges between those. No more is read, but to check the hashes: of a country a town
+        takes the memory of a town. What the manifest counts is of the whole map.
     around, around_layer : callable
         Give a context that is entered while something is read that the region keeps, and one for a layer that it does
         not keep.
@@ -145,7 +145,7 @@ def read_region(
     StoreError
         If a file is missing, changed or unreadable: all are checked against their hashes now.
     GridError
-        If the bounds are none, or lie beyond the map.
+        If the bounds are no box, or lie beyond the map.
     """
     from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
 
@@ -198,14 +198,24 @@ def read_region(
 
 def _window(grid: Grid, bounds_m: Bounds) -> tuple[int, int, int, int]:
     """Return first row and column, rows and columns of the cells that bounds touch; cut at the edge of the map."""
-    part = Grid.from_bounds(*bounds_m, cell_size_m=grid.cell_size_m, epsg=grid.epsg)
+    try:
+        west_m, south_m, east_m, north_m = map(float, bounds_m)
+    except (TypeError, ValueError):
+        west_m = south_m = east_m = north_m = math.nan
+    if not all(map(math.isfinite, (west_m, south_m, east_m, north_m))):
+        message = f"bounds_m are west, south, east, north, finite metres in the CRS of the map, got {bounds_m!r}"
+        raise GridError(message)
+    part = Grid.from_bounds(west_m, south_m, east_m, north_m, cell_size_m=grid.cell_size_m, epsg=grid.epsg)
     top, left = (
         round(shift_m / grid.cell_size_m) for shift_m in (grid.north_m - part.north_m, part.west_m - grid.west_m)
     )
     row, col = max(top, 0), max(left, 0)
     rows, cols = min(top + part.rows, grid.rows) - row, min(left + part.cols, grid.cols) - col
     if rows < 1 or cols < 1:
-        message = f"the bounds {tuple(bounds_m)} lie beyond the map: it has {grid.bounds_m} (west, south, east, north)"
+        message = (
+            f"the bounds {tuple(bounds_m)} lie beyond the map: it has {grid.bounds_m} (west, south, east, north, "
+            f"metres in EPSG:{grid.epsg})"
+        )
         raise GridError(message)
     return row, col, rows, cols
 

@@ -239,6 +239,25 @@ def test_a_link_is_not_sent_nor_without_its_package(folder, monkeypatch):
         send(folder, "memory://bucket/vaduz")
 
 
+def region_of(folder, name):
+    folder.mkdir(parents=True)
+    (folder / "region.json").write_text(json.dumps({"id": name}), encoding="utf-8")
+    return folder
+
+
+def test_one_region_does_not_replace_another(tmp_path, url):
+    vaduz, town = (region_of(tmp_path / name, name) for name in ("vaduz", "town"))
+    send(vaduz, url)
+    with pytest.raises(StoreError, match="holds vaduz, and town would replace it: name another place, or empty that"):
+        send(town, url)
+    with pytest.raises(StoreError, match="town holds town, and vaduz would replace it: name another folder"):
+        fetch(url, town)
+    assert json.loads((town / "region.json").read_text(encoding="utf-8")) == {"id": "town"}
+    (vaduz / "region.json").write_text(json.dumps({"id": "vaduz", "data_version": 3}), encoding="utf-8")
+    assert send(vaduz, url).moved == 1
+    assert fetch(url, tmp_path / "again").files == 1
+
+
 def test_a_region_its_tasks_and_a_run_are_the_same_at_another_place(tmp_path, lay_towns, program):
     out, there = lay_towns(tmp_path / "out", "town-riverside"), tmp_path / "there"
     (task,) = sgb.make_tasks(suite="clean", regions="town-riverside", n=1, up_to=True, out=out)

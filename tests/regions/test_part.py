@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A part of a region is what lies there of the whole, and no more of the files is read than that takes."""
 
+import math
+
 import numpy as np
 import pandas as pd
 import pyarrow.parquet as pq
@@ -122,7 +124,14 @@ def test_where_nothing_is_mapped_a_part_is_empty(folder, whole, monkeypatch):
 
 @pytest.mark.parametrize(
     ("bounds", "words"),
-    [((0.0, 0.0, 10.0, 10.0), "beyond the map: it has"), ((1.0, 0.0, 0.0, 1.0), "must grow from west to east")],
+    [
+        ((0.0, 0.0, 10.0, 10.0), r"beyond the map: it has .* metres in EPSG:\d+"),
+        ((1.0, 0.0, 0.0, 1.0), "must grow from west to east"),
+        *(
+            (one, "bounds_m are west, south, east, north")
+            for one in ((1, 2, 3), 5, "west", (math.inf,) * 4, (None,) * 4)
+        ),
+    ],
 )
 def test_bounds_that_are_none_or_elsewhere_are_refused(folder, bounds, words):
     with pytest.raises(GridError, match=words):

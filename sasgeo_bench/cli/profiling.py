@@ -21,7 +21,9 @@ class ProfileOptions(Options):
     tasks: Annotated[list[Path], typer.Option(help="task folder, OUT/tasks/SUITE/REGION; may be repeated, of one map")]
     cores: Annotated[int, typer.Option(help="processors that the matcher and this program share")] = 1
     memory_mb: Annotated[int, typer.Option(help="MB (10^6 bytes) for all processes of the matcher")] = 2000
-    seconds: Annotated[float, typer.Option(help="how long it is asked, one query after the other")] = 300.0
+    seconds: Annotated[
+        float, typer.Option(help="how long it is asked, one query after the other; 20 queries at least")
+    ] = 300.0
     radius: Annotated[
         float | None, typer.Option(metavar="METRES", help="only queries whose prior is a disc of at most this radius")
     ] = None

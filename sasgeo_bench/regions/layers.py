@@ -176,7 +176,8 @@ def _crossings(
 BLOCK_CELLS: Final = 512
 WINDOW_CELLS: Final = 1024  # 13 classes of one window take 14 MB, whatever the size of the region
 _CACHE_BYTES: Final = 24 * 2**20
-_REDUCED, _ZSTD, _GDAL_NODATA = 1, 50000, 42113  # of TIFF: a smaller version; a codec; a tag
+_REDUCED, _ZSTD = 1, 50000  # of TIFF: a smaller version, a codec
+_COPYRIGHT, _GDAL_METADATA, _GDAL_NODATA = 33432, 42112, 42113  # tags of TIFF
 _BIGTIFF_CELLS: Final = 2**31  # compressed, such a file stays far below the 4 GiB that need BigTIFF
 
 In = TypeVar("In")
@@ -238,6 +239,8 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence
     ) as target:
         target.descriptions = classes
         target.update_tags(TIFFTAG_COPYRIGHT=ATTRIBUTION, attribution=ATTRIBUTION, licence=LICENCE)
+    with TiffFile(path) as file:
+        about = [(tag, "s", 0, file.pages[0].aspage().tags[tag].value, True) for tag in (_COPYRIGHT, _GDAL_METADATA)]
     with TiffWriter(path, append=True) as levels:
         for size in map(grid.coarsen, factors):
             levels.write(
@@ -249,7 +252,7 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence
                 planarconfig="separate" if len(classes) > 1 else None,
                 compression="deflate",  # until `_fill` notes its own; no block is packed here
                 subfiletype=_REDUCED,
-                extratags=[(_GDAL_NODATA, "s", 0, str(OUTSIDE), True)],
+                extratags=[*about, (_GDAL_NODATA, "s", 0, str(OUTSIDE), True)],
                 metadata=None,
                 software=False,
             )

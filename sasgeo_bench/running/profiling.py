@@ -40,7 +40,8 @@ class ProfileRequest:
 
     `spec` is a matcher's name or module:Class; `tasks` are folders of one map. Its processes and ours share `cores`
     processors, and may hold `memory_bytes`. Queries are asked one after the other, from the first again at their end,
-    for `sustain_s` seconds; with `radius_m`, those alone whose prior is a disc of at most this radius.
+    for `sustain_s` seconds and 20 answers at least; with `radius_m`, those alone whose prior is a disc of at most this
+    radius.
     """
 
     spec: str
@@ -81,7 +82,8 @@ class Profile:
     `start_s` is the time until its process had loaded it, `prepare_s` that for the map, and `first_s` that of the first
     fix, which is not among `fixes`. `index_bytes` is by how much the process grew while it prepared the map, of whose
     files it may read `map_bytes`; `peak_bytes` is the most that all its processes held at once; a query has
-    `query_bytes` on the average. `joules` are those of all the computer during `fixes`, None without a counter.
+    `query_bytes` on the average. `joules` are those of all the computer during `fixes`, None without a counter. Priors
+    are discs of `radius_m` at most, or any.
     """
 
     matcher: str
@@ -102,6 +104,7 @@ class Profile:
     fixes: tuple[Fix, ...]
     readings: tuple[Reading, ...]
     isolation: Mapping[str, str] = field(default_factory=dict)
+    radius_m: float | None = None
 
     @property
     def statuses(self) -> dict[str, int]:
@@ -209,6 +212,7 @@ def profile(
                 fixes=tuple(fixes),
                 readings=tuple(readings),
                 isolation=dict(worker.isolation),
+                radius_m=request.radius_m,
             )
 
 

@@ -125,6 +125,9 @@ def test_an_overview_is_the_same_map_at_a_coarser_cell(level, written):
     grid = GRID.coarsen((4, 16)[level])
     with rasterio.open(written, overview_level=level) as source:
         assert (source.read() == burn_layers(paint(), grid)).all()
+        assert source.tags()["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+        assert source.tags()["TIFFTAG_COPYRIGHT"] == "(c) OpenStreetMap contributors, ODbL"
+        assert source.descriptions == CLASSES
 
 
 def tile_offsets(path):

@@ -14,7 +14,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
 from sasgeo_bench.search.dense import _Peaks
-from sasgeo_bench.search.field import FULL, Field, Template
+from sasgeo_bench.search.field import FULL, Field, Template, between, warped
 from sasgeo_bench.search.find import Search, exhaustive, rank, score_at, search
 from sasgeo_bench.search.plan import Mode, Plan, all_around, posterior, thinned
 
@@ -333,3 +333,19 @@ def test_thinning_ends_with_the_last_mode_that_is_asked_for():
     assert [mode.score for mode in thinned(modes(), 15.0, 2)] == [0.0, -2.0]
     assert asked == [0, 1, 2, 3]
     assert [mode.score for mode in thinned(modes(), 15.0)] == [0.0, -2.0, -4.0, -6.0, -8.0]
+
+
+@pytest.mark.parametrize("pose", [(32_950.0, 30.0), (16_000.5, 12.25), (-5.0, 20.0), (90_000.0, 20.0)])
+def test_a_map_that_is_longer_than_opencv_warps_is_read_under_the_view(pose):
+    rng = np.random.default_rng(4)
+    long = rng.integers(0, 256, (64, 33_000, 2), dtype=np.uint8)
+    at = Pose(easting_m=pose[0], northing_m=pose[1], yaw_deg=30.0)
+    frame = Grid(epsg=0, west_m=-16.0, north_m=16.0, cell_size_m=1.0, rows=32, cols=32)
+    found = warped(
+        long,
+        between(frame, at, Grid(epsg=0, west_m=0.0, north_m=64.0, cell_size_m=1.0, rows=64, cols=33_000)),
+        (32, 32),
+    )
+    left = int(np.clip(pose[0] - 100, 0, 32_700))
+    part = Grid(epsg=0, west_m=float(left), north_m=64.0, cell_size_m=1.0, rows=64, cols=300)
+    np.testing.assert_array_equal(found, warped(long[:, left : left + 300], between(frame, at, part), (32, 32)))

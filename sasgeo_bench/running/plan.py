@@ -26,6 +26,7 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_rows import asked_under, tie_key
+from sasgeo_bench.texts import MOST_CANDIDATES
 
 MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
@@ -285,6 +286,9 @@ def _check(request: RunRequest) -> None:
             message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
             raise ConfigError(message)
     _check_sizes(limits)
+    if request.top_k > MOST_CANDIDATES:
+        message = f"--top-k must be at most {MOST_CANDIDATES}, the bound of an answer, got {request.top_k}"
+        raise ConfigError(message)
     strange = next((status for status in request.again if status not in STATUSES), None)
     if strange is not None:
         message = f"--again must be one of {', '.join(STATUSES)}, got {strange!r}"

@@ -236,6 +236,17 @@ def in_a_process(way: str, name: str, threads: int, given: argparse.Namespace) -
     return dict(json.loads(done.stdout))
 
 
+def print_sizes(sizes: list[tuple[str, float, float, float, tuple[int, ...], tuple[float, ...]]]) -> None:
+    """Print what maps take on disk, and the cells of a km2."""
+    columns = ("stored in s", "CPU s", "kB/km2: levels", "layers", "vectors", "ms/km2: levels", "layers", "vectors")
+    print(f"\n| region | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}")
+    for name, km2, wall_s, cpu_s, files, spent in sizes:
+        taken = " | ".join(f"{count / 1e3 / km2:.1f}" for count in files)
+        print(
+            f"| {name} | {wall_s:.1f} | {cpu_s:.1f} | {taken} | {' | '.join(f'{1e3 * each:.1f}' for each in spent)} |"
+        )
+
+
 def main() -> None:
     """Print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -256,8 +267,8 @@ def main() -> None:
         return
     sizes, charts = [], dict[str, dict[str, list[tuple[float, float]]]]()
     if not given.beams:
-        print("| region | km2 | map | cores | ready, s | MB | fix, s | CPU s | peak MB | right | by tiles | higher |")
-        print(f"|---|---:|---|{'---:|' * 9}")
+        names = "region | km2 | map | cores | ready, s | MB | fix, s | CPU s | peak MB | right | by tiles | higher"
+        print(f"| {names} |\n|---|---:|---|{'---:|' * 9}")
     for name in given.regions:
         folder, levels = region_of(name, given), levels_of(name, given)
         manifest = read_manifest(folder)
@@ -275,9 +286,9 @@ def main() -> None:
             continue
         for way, threads in ((way, threads) for way in given.ways for threads in THREADS):
             row = in_a_process(way, name, threads, given)
-            label = f"{way}, {threads} {'core' if threads == 1 else 'cores'}"
+            line = f"{way}, {threads} core{'s' * (threads > 1)}"
             for title, column in (("a fix (s)", "wall_s"), ("peak memory (MB)", "peak_mb")):
-                charts.setdefault(title, {}).setdefault(label, []).append((km2, row[column]))
+                charts.setdefault(title, {}).setdefault(line, []).append((km2, row[column]))
             tiled = f"{row['same']} | {row['higher']}" if threads == 1 and given.tiles and way == "stored" else " | "
             print(
                 f"| {name} | {km2:.0f} | {way} | {threads} | {row['ready_s']:.2f} | {row['ready_mb']:.0f} | "
@@ -291,13 +302,7 @@ def main() -> None:
         return
     if given.plot:
         draw(given.plot, charts, xlabel="mapped area (km²), cells of 2 m")
-    print("\n| region | stored in s | CPU s | kB/km2: levels | layers | vectors | ms/km2: levels | layers | vectors |")
-    print(f"|---|{'---:|' * 8}")
-    for name, km2, wall_s, cpu_s, files, spent in sizes:
-        taken = " | ".join(f"{count / 1e3 / km2:.1f}" for count in files)
-        print(
-            f"| {name} | {wall_s:.1f} | {cpu_s:.1f} | {taken} | {' | '.join(f'{1e3 * each:.1f}' for each in spent)} |"
-        )
+    print_sizes(sizes)
 
 
 if __name__ == "__main__":

@@ -10,9 +10,8 @@ from sasgeo_bench.cli.interrupts import exit_interrupted, interrupted_by_signals
 def main() -> None:
     """Run the program; an interrupt while it is still being imported is one line as well."""
     with interrupted_by_signals():
-        os.environ.setdefault(
-            "ARROW_DEFAULT_MEMORY_POOL", "system"
-        )  # Arrow's own keeps what was freed: 25 to 50 MB of a build
+        # Arrow's own pool keeps what was freed: 25 to 50 MB of a build.
+        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
         try:
             from sasgeo_bench.cli import program  # noqa: PLC0415 - takes a third of a second, in which users press Ctrl-C
 

@@ -22,16 +22,30 @@ _EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere
 
 
 def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> "gpd.GeoDataFrame":
-    """Return a table of perceived vectors, with coordinates rounded to a decimetre."""
+    """Return a table of perceived vectors, with coordinates rounded to a decimetre; polygons stay valid.
+
+    An outline that rounding would turn over itself is cut there, and its largest part stays; one that vanishes is
+    dropped.
+
+    >>> lap = shapely.Polygon([(0, 0), (4, 0), (4, 0.06), (0.04, 0.04), (4, 3), (0, 3)])
+    >>> vector_table([("building", 0, False, lap)]).geometry.is_valid.tolist()
+    [True]
+    """
     shapes = np.array([row[3] for row in rows], dtype=object)
     rounded = shapely.transform(shapes, lambda at: at.round(_DECIMALS) + 0.0) if len(rows) else shapes
+    is_outline = shapely.get_dimensions(shapes) == 2  # noqa: PLR2004 - polygons
+    for at in np.flatnonzero(is_outline & ~shapely.is_valid(rounded)).tolist():
+        parts = shapely.get_parts(shapely.set_precision(shapely.make_valid(shapes[at]), 10.0**-_DECIMALS))
+        parts = parts[shapely.area(parts) > 0]
+        rounded[at] = max(parts, key=lambda part: part.area, default=None)
+    kept = [at for at, shape in enumerate(rounded) if shape is not None]
     return gpd.GeoDataFrame(
         {
-            "class": np.array([row[0] for row in rows], dtype=object),
-            "level": np.array([row[1] for row in rows], dtype=np.int16),
-            "is_bridge": np.array([row[2] for row in rows], dtype=bool),
+            "class": np.array([rows[at][0] for at in kept], dtype=object),
+            "level": np.array([rows[at][1] for at in kept], dtype=np.int16),
+            "is_bridge": np.array([rows[at][2] for at in kept], dtype=bool),
         },
-        geometry=gpd.GeoSeries(rounded, dtype="geometry"),
+        geometry=gpd.GeoSeries(rounded[kept], dtype="geometry"),
     )
 
 

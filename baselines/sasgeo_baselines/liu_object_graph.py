@@ -190,7 +190,8 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
 def _taken(nodes: Nodes, rows: Ints) -> Nodes:
     """Return the nodes of some rows, without relations."""
     own = {
-        name: getattr(nodes, name)[rows] for name in ("places_m", "kind", "degree", "area_m2", "arms_deg", "feature")
+        name: getattr(nodes, name)[rows]
+        for name in ("places_m", "kind", "degree", "area_m2", "reach_m", "arms_deg", "feature")
     }
     return Nodes(**own, pairs=np.zeros((0, 2), dtype=np.int64), relation=np.zeros(0, dtype=np.int64))
 

@@ -117,12 +117,14 @@ def _pull(places_m: Floats, stretch_m: Floats) -> Floats:
 class _Stage:
     """A view at a pose: its nodes on the map, map nodes around, and the (negative) scores of unmatched nodes.
 
-    `around` are rows of the map nodes.
+    `around` are rows of the map nodes; `is_judged` leaves out patches that reach beyond the view, of which the place
+    and the area depend on what nobody sees.
     """
 
     pose: Pose
     places_m: Floats
     around: Ints
+    is_judged: Bools
     lost_seen: Floats
     lost_mapped: Floats
 
@@ -191,6 +193,7 @@ class _Judge:
         local_m = inverse(pose).to_map(nodes.places_m[around])
         half_m = np.array(self.seen.visible.shape[:0:-1]) * self.seen.cell_size_m / 2
         is_whole = (np.abs(local_m) + nodes.radius_m[around, None] / pose.scale < half_m).all(axis=1)
+        out_m = (nodes.reach_m[around] - self._gate_m[kind]) / pose.scale
         is_due = is_whole & self.seen.shows(local_m, kind)
         places_m = pose.to_map(ours.places_m)
         counts = ~self.seen.is_cut & self.mapped.knows(places_m) & (self.mapped.density_per_m2[ours.kind] > 0)
@@ -198,6 +201,7 @@ class _Judge:
             pose=pose,
             places_m=places_m,
             around=around,
+            is_judged=(nodes.reach_m[around] == 0) | (np.abs(local_m) + out_m[:, None] < half_m).all(axis=1),
             lost_seen=np.where(counts, np.log(_by_kind(self.rules, "extra")[ours.kind]), 0.0),
             lost_mapped=np.where(is_due, np.log1p(-_by_kind(self.rules, "hit")[kind]), 0.0),
         )
@@ -222,7 +226,10 @@ class _Judge:
         """Return pairs of one kind within the gate and their scores."""
         ours = self.seen.nodes
         row, there = self.mapped.like(stage.places_m + shift_m, ours.kind, self._gate_m[ours.kind])
-        pairs = _Pairs(seen=row, mapped=np.searchsorted(stage.around, there), score=np.zeros(len(row)))
+        place = np.searchsorted(stage.around, there)
+        is_judged = stage.is_judged[place]
+        row, there, place = row[is_judged], there[is_judged], place[is_judged]
+        pairs = _Pairs(seen=row, mapped=place, score=np.zeros(len(row)))
         off_2 = (self._offsets_m(stage, pairs) ** 2).sum(axis=1)
         for rules, own in self._by_drawing(_IS_DRAWN[ours.kind[row]]):
             pairs.score[own] = self._alike(stage.pose, row[own], there[own], off_2[own], rules)

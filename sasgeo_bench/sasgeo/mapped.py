@@ -12,9 +12,10 @@ from scipy.spatial import cKDTree
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg
+from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.network import LAYERS
 from sasgeo_bench.regions.region import MapGraph, Region
-from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS, Bools, Floats, Ints, Nodes, nodes_of, patches_of
+from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS, Bools, Floats, Ints, Nodes, in_plan, nodes_of, patches_of
 
 Bits = NDArray[np.uint64]
 
@@ -117,8 +118,9 @@ class MappedGraph:
     def make(cls, graph: MapGraph, features: gpd.GeoDataFrame, *, known: Bools, grid: Grid) -> Self:
         """Prepare a graph that was derived from features."""
         ways = features[features["class"].isin(list(LAYERS)).to_numpy()]
-        parts = (nodes_of(graph, ways, "vectors"), nodes_of(graph, ways, "mask"), patches_of(features))
-        nodes = Nodes.joined(parts)
+        plan = in_plan(ways)
+        in_masks = nodes_of(build_graph(plan, bounds_m=grid.bounds_m), plan, "mask")
+        nodes = Nodes.joined((nodes_of(graph, ways, "vectors"), in_masks, patches_of(features)))
         return cls(
             nodes=nodes,
             tree=cKDTree(_raised(nodes.places_m, nodes.kind)),

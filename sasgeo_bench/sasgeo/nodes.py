@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 from sasgeo_bench.regions.graph import RELATIONS
-from sasgeo_bench.regions.network import LAYERS, ROAD, make_chains, make_network
+from sasgeo_bench.regions.network import LAYERS, ROAD, VERTEX_M, find_crossings, make_chains, make_network
 from sasgeo_bench.regions.region import MapGraph
 from sasgeo_bench.regions.shapes import centroids, groups_within
 
@@ -85,11 +85,11 @@ _ALONG_WAYS: Final = [RELATIONS.index(name) for name in ("connectivity", "crossi
 _TOWARDS_DEG: Final = 45.0
 _PASSING: Final = 2
 _PLAIN_CROSSING: Final = 4  # arms of two roads that cross
+_DECIMALS: Final = 3  # of places, as those of features: a millimetre
 
-_BY_NODE: Final = ("places_m", "kind", "degree", "area_m2", "arms_deg", "feature")  # fields of `Nodes`
+_BY_NODE: Final = ("places_m", "kind", "degree", "area_m2", "reach_m", "arms_deg", "feature")  # fields of `Nodes`
 _IN_A_MASK: Final = {
     "intersection": "mask intersection",
-    "crossing": "mask intersection",
     "dead_end": "mask dead_end",
     "level_crossing": "mask rail crossing",
     "road_rail_crossing": "mask rail crossing",
@@ -105,7 +105,8 @@ class Nodes:
     `places_m`, shape (N, 2), are easting and northing of a map, (right, up) of a view; `kind` is an index into
     `NODE_KINDS`. `degree` counts the roads that meet: 0 where none do or several junctions are one. `area_m2` is that
     of buildings and patches, else NaN. `arms_deg`, shape (N, MOST_ARMS), are bearings of the roads that leave a
-    junction or an end, NaN behind the last one. `pairs`, shape (E, 2), are edges and `relation` their index into
+    junction or an end, NaN behind the last one. `reach_m` is how far a patch extends from its place, 0 for other nodes.
+    `pairs`, shape (E, 2), are edges and `relation` their index into
     `graph.RELATIONS`. `feature` is the `osm_id` of a node's feature, -1 for several.
     """
 
@@ -113,6 +114,7 @@ class Nodes:
     kind: Ints
     degree: Ints
     area_m2: Floats
+    reach_m: Floats
     arms_deg: Floats
     pairs: Ints
     relation: Ints
@@ -159,6 +161,7 @@ def nothing() -> Nodes:
         kind=none,
         degree=none,
         area_m2=np.zeros(0),
+        reach_m=np.zeros(0),
         arms_deg=np.zeros((0, MOST_ARMS)),
         pairs=none.reshape(0, 2),
         relation=none,
@@ -166,11 +169,51 @@ def nothing() -> Nodes:
     )
 
 
+def in_plan(ways: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
+    """Return ways as a mask shows them: the visible ones, with a vertex wherever roads cross.
+
+    A mask does not tell a bridge over a road from a junction, so both must give the same nodes, arms and connections.
+
+    Examples
+    --------
+    >>> ways = gpd.GeoDataFrame(
+    ...     {"class": ["road_minor", "road_major"], "is_visible": True},
+    ...     geometry=shapely.from_wkt(["LINESTRING (0 0, 40 0)", "LINESTRING (9 -30, 9 30)"]),
+    ... )
+    >>> in_plan(ways).geometry.to_wkt().tolist()
+    ['MULTILINESTRING ((0 0, 9 0, 40 0))', 'MULTILINESTRING ((9 -30, 9 0, 9 30))']
+    """
+    ways = ways[ways["is_visible"].to_numpy(dtype=bool)]
+    network = make_network(ways)
+    found = find_crossings(network)
+    is_road = (network.layer[found.segments] == ROAD).all(axis=1)
+    segments, shares, en_m = found.segments[is_road], found.shares[is_road], found.en_m[is_road].round(_DECIMALS)
+    if not len(segments):
+        return ways
+    # Where one of both has a vertex at the crossing already, the other gets the same.
+    tips_m = network.vertices[network.ends[segments].reshape(-1, 4)]
+    off_m = np.hypot(*np.moveaxis(tips_m - en_m[:, None], 2, 0))
+    nearest = off_m.argmin(axis=1)
+    rows = np.arange(len(segments))
+    en_m = np.where((off_m[rows, nearest] <= 2 * VERTEX_M)[:, None], tips_m[rows, nearest], en_m)
+    between: dict[int, list[tuple[float, list[float]]]] = {}
+    for segment, share, place in zip(segments.ravel(), shares.ravel(), np.repeat(en_m, 2, axis=0), strict=True):
+        between.setdefault(int(segment), []).append((float(share), place.tolist()))
+    shapes = np.asarray(ways.geometry.array).copy()
+    for row in np.unique(network.way[segments]).tolist():
+        lines = []
+        for segment in np.flatnonzero(network.way == row).tolist():
+            start, end = network.vertices[network.ends[segment]].tolist()
+            lines.append([start, *(place for _, place in sorted(between.get(segment, ()))), end])
+        shapes[row] = shapely.MultiLineString(lines)
+    return ways.set_geometry(gpd.GeoSeries(shapes, index=ways.index, crs=ways.crs))
+
+
 def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> Nodes:
     """Return the nodes of a graph as vectors or as a mask show them.
 
-    In a mask, crossing roads meet, junctions within a road's width merge, and buildings come from `patches_of`. The
-    arms of junctions come from `features`.
+    The arms of junctions come from `features`, of which the graph was made. For a mask both are of ways `in_plan`;
+    junctions within a road's width merge, and buildings come from `patches_of`.
     """
     table = graph.nodes
     names = table["kind"].to_numpy(dtype=object)
@@ -181,11 +224,15 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
     kind = np.array([INDEX[renamed[name]] if name in renamed else -1 for name in names], dtype=np.int64)
     places_m = np.asarray(shapely.get_coordinates(table.geometry.to_numpy())).reshape(-1, 2)
     code = {name: at for at, name in enumerate(RELATIONS)}
+    degree = np.where(names == "crossing", _PLAIN_CROSSING, table["degree"].to_numpy(dtype=np.int64))
+    if drawing == "mask":
+        degree[names == "level_crossing"] = 0  # as where the railway passes over the road
     found = Nodes(
         places_m=places_m,
         kind=kind,
-        degree=np.where(names == "crossing", _PLAIN_CROSSING, table["degree"].to_numpy(dtype=np.int64)),
+        degree=degree,
         area_m2=np.where(names == "building", table["area_m2"].to_numpy(dtype=np.float64), np.nan),
+        reach_m=np.zeros(len(names)),
         arms_deg=arms_of(features, places_m),
         pairs=graph.edges[["source", "target"]].to_numpy(dtype=np.int64),
         relation=np.array([code[name] for name in graph.edges["relation"]], dtype=np.int64),
@@ -218,6 +265,7 @@ def _blurred(nodes: Nodes) -> Nodes:
         kind=nodes.kind[first],
         degree=np.where(size == 1, nodes.degree[first], count),
         area_m2=nodes.area_m2[first],
+        reach_m=nodes.reach_m[first],
         arms_deg=np.where(has_arms[:, None], outer, np.nan),
         pairs=pairs[is_edge],
         relation=nodes.relation[is_edge],
@@ -312,16 +360,20 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
         group = groups_within(shapes, TOUCH_M)
         area_m2: Floats = np.bincount(group, weights=shapely.area(shapes)).astype(np.float64)
         weight = shapely.area(shapes) / area_m2[group]
-        middle = [np.bincount(group, weights=weight * part) for part in centroids(shapes).T]
+        middle = np.column_stack([np.bincount(group, weights=weight * part) for part in centroids(shapes).T])
+        corners_m, owner = shapely.get_coordinates(shapes, return_index=True)
+        reach_m = np.zeros(len(area_m2))
+        np.maximum.at(reach_m, group[owner], np.hypot(*(corners_m - middle[group[owner]]).T))
         count, is_one = len(area_m2), np.bincount(group) == 1
         last = np.full(count, -1)
         last[group] = features["osm_id"].to_numpy(dtype=np.int64)[chosen]
         parts.append(
             Nodes(
-                places_m=np.column_stack(middle),
+                places_m=middle,
                 kind=np.full(count, INDEX[f"{name} patch"]),
                 degree=np.zeros(count, dtype=np.int64),
                 area_m2=area_m2,
+                reach_m=reach_m,
                 arms_deg=np.full((count, MOST_ARMS), np.nan),
                 pairs=np.zeros((0, 2), dtype=np.int64),
                 relation=np.zeros(0, dtype=np.int64),

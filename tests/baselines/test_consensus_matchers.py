@@ -162,6 +162,7 @@ def nodes(places_m, areas_m2=None, names=None):
         kind=np.array([INDEX[name] for name in names or ["building patch"] * count], dtype=np.int64),
         degree=np.zeros(count, dtype=np.int64),
         area_m2=np.full(count, 100.0) if areas_m2 is None else np.asarray(areas_m2, dtype=np.float64),
+        reach_m=np.zeros(count),
         arms_deg=np.full((count, MOST_ARMS), np.nan),
         pairs=np.zeros((0, 2), dtype=np.int64),
         relation=np.zeros(0, dtype=np.int64),

@@ -28,6 +28,7 @@ def nodes(places_m, names=None):
         kind=np.array(kinds, dtype=np.int64),
         degree=np.zeros(count, dtype=np.int64),
         area_m2=np.full(count, 100.0),
+        reach_m=np.zeros(count),
         arms_deg=np.full((count, MOST_ARMS), np.nan),
         pairs=np.zeros((0, 2), dtype=np.int64),
         relation=np.zeros(0, dtype=np.int64),

@@ -136,6 +136,7 @@ def junctions(places_m, arms_deg):
         kind=np.full(count, JUNCTIONS[0]),
         degree=np.full(count, 3),
         area_m2=np.full(count, np.nan),
+        reach_m=np.zeros(count),
         arms_deg=arms,
         pairs=np.zeros((0, 2), dtype=np.int64),
         relation=np.zeros(0, dtype=np.int64),

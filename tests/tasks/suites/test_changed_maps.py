@@ -47,8 +47,8 @@ def steps(pairs):
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_all_that_differs_between_variants_is_the_map(flown, name):
-    made = flown(name)
+def test_all_that_differs_between_variants_is_the_map(flown, name, root):
+    made = flown(name, root)
     control = made.of("control")
     assert searched(made, control) is made.airspace.scene.map
     regions = {pairs[0][0].region for pairs in made.views.values()}
@@ -61,8 +61,8 @@ def test_all_that_differs_between_variants_is_the_map(flown, name):
         assert [step.increment for step in steps(pairs)] == [step.increment for step in steps(control)]
 
 
-def test_a_flight_leaves_the_map_once_in_its_middle_and_comes_back(flown):
-    made = flown("flight-off-map")
+def test_a_flight_leaves_the_map_once_in_its_middle_and_comes_back(flown, root):
+    made = flown("flight-off-map", root)
     control, stress, falsifier = (made.of(role) for role in ("control", "stress", "falsifier"))
     assert on_map(control).all()
     assert on_map(falsifier).all()
@@ -90,8 +90,8 @@ def test_a_place_off_the_map_has_its_pose_and_its_distance_and_no_map_can_answer
     assert all(truth.measured["is_seen"] for _, truth in stress)
 
 
-def test_the_map_of_the_falsifier_loses_as_much_where_no_view_of_the_flight_shows_it(flown):
-    made = flown("flight-off-map")
+def test_the_map_of_the_falsifier_loses_as_much_where_no_view_of_the_flight_shows_it(flown, root):
+    made = flown("flight-off-map", root)
     control, stress, falsifier = (made.of(role) for role in ("control", "stress", "falsifier"))
     lost = [searched(made, pairs).known.sum() for pairs in (control, stress, falsifier)]
     assert lost[0] - lost[1] == pytest.approx(lost[0] - lost[2], rel=0.01)
@@ -110,8 +110,8 @@ def test_what_a_map_lost_is_not_among_its_features_either(flown):
     assert made.airspace.scene.map.features.geometry.intersects(hole).any()
 
 
-def test_views_of_a_copied_stretch_are_the_same_at_both_places_and_later_ones_are_not(flown):
-    made = flown("flight-alias")
+def test_views_of_a_copied_stretch_are_the_same_at_both_places_and_later_ones_are_not(flown, root):
+    made = flown("flight-alias", root)
     stress = made.of("stress")
     variant, state = next(variant for variant in made.views if variant.role == "stress"), searched(made, stress)
     is_copied = np.array([truth.measured["is_copied"] == 1 for _, truth in stress])
@@ -146,8 +146,8 @@ def test_the_start_and_its_copy_both_lie_in_the_disc_and_no_view_shows_changed_g
             np.testing.assert_array_equal(*views)
 
 
-def test_the_mirror_image_of_the_falsifier_changes_the_same_ground_and_no_view_fits_it(flown):
-    made = flown("flight-alias")
+def test_the_mirror_image_of_the_falsifier_changes_the_same_ground_and_no_view_fits_it(flown, root):
+    made = flown("flight-alias", root)
     plot, base = made.flight.plot, made.airspace.scene.map
     assert plot.stress.area.equals(plot.falsifier.area)
     differing = [(searched(made, made.of(role)).bits.bits != base.bits.bits).mean() for role in ("stress", "falsifier")]

@@ -101,8 +101,8 @@ def test_truths_say_when_each_view_was_taken_at_speeds_that_a_drone_flies(flown,
 
 
 @pytest.mark.parametrize("name", SEEN)
-def test_control_and_stress_see_the_same_with_the_same_errors_and_a_falsifier_errs_anew(flown, name):
-    made = flown(name)
+def test_control_and_stress_see_the_same_with_the_same_errors_and_a_falsifier_errs_anew(flown, name, root):
+    made = flown(name, root)
     control = made.of("control")
     for variant, pairs in made.views.items():
         is_same = (cells(pairs) == cells(control)).all()
@@ -110,8 +110,8 @@ def test_control_and_stress_see_the_same_with_the_same_errors_and_a_falsifier_er
 
 
 @pytest.mark.parametrize("name", OWN_DRAWS[1:])
-def test_the_odometer_of_a_falsifier_drifts_otherwise(flown, name):
-    control, falsifier = (flown(name).of(role) for role in ("control", "falsifier"))
+def test_the_odometer_of_a_falsifier_drifts_otherwise(flown, name, root):
+    control, falsifier = (flown(name, root).of(role) for role in ("control", "falsifier"))
     off_m = np.abs(steps(control)[1:] - steps(falsifier)[1:])
     assert (off_m > 1e-6).all()
 
@@ -139,8 +139,8 @@ def test_views_are_so_unevenly_spaced_that_knowing_it_tells_no_odometers_scale(f
     assert lengths_m.std() / lengths_m.mean() > 0.12
 
 
-def test_odometers_of_flight_clean_have_the_drift_of_their_profiles(flown):
-    made = flown("flight-clean")
+def test_odometers_of_flight_clean_have_the_drift_of_their_profiles(flown, root):
+    made = flown("flight-clean", root)
     kinds = [variant.kind for variant in sorted(made.views, key=lambda item: item.strength) if variant.role == "stress"]
     assert kinds == [f"F1 {name}" for name in flight_clean.PROFILES]
     spreads = [np.median(covariances(made.of("stress", kind))[1:, 8]) for kind in kinds]
@@ -148,8 +148,8 @@ def test_odometers_of_flight_clean_have_the_drift_of_their_profiles(flown):
     assert len(set(spreads)) == len(kinds)
 
 
-def test_a_gap_hides_exactly_the_views_within_it_and_the_falsifier_as_many_that_are_scattered(flown):
-    made = flown("flight-gap")
+def test_a_gap_hides_exactly_the_views_within_it_and_the_falsifier_as_many_that_are_scattered(flown, root):
+    made = flown("flight-gap", root)
     control = made.of("control")
     assert seen(control).all()
     distance_m = made.flight.views.distance_m
@@ -171,8 +171,8 @@ def test_a_gap_hides_exactly_the_views_within_it_and_the_falsifier_as_many_that_
     np.testing.assert_array_equal(cells(falsifier)[seen(falsifier)], cells(control)[seen(falsifier)])
 
 
-def test_a_carried_drone_comes_from_as_far_as_said_and_goes_on_as_the_control(flown):
-    made = flown("flight-kidnap")
+def test_a_carried_drone_comes_from_as_far_as_said_and_goes_on_as_the_control(flown, root):
+    made = flown("flight-kidnap", root)
     control, middle = made.of("control"), made.flight.middle
     for kind in (flight_kidnap.TOLD, flight_kidnap.UNTOLD):
         pairs = made.of("stress", kind)
@@ -192,15 +192,15 @@ def test_a_carried_drone_comes_from_as_far_as_said_and_goes_on_as_the_control(fl
     np.testing.assert_array_equal(np.delete(told, middle, axis=0), np.delete(untold, middle, axis=0))
 
 
-def test_an_odometer_that_is_unaware_of_the_carrying_says_the_step_of_the_control(flown):
-    made = flown("flight-kidnap")
+def test_an_odometer_that_is_unaware_of_the_carrying_says_the_step_of_the_control(flown, root):
+    made = flown("flight-kidnap", root)
     untold, control = (steps(made.of(*which)) for which in (("stress", flight_kidnap.UNTOLD), ("control",)))
     np.testing.assert_array_equal(untold[made.flight.middle], control[made.flight.middle])
     assert not np.isnan(untold[1:]).any()
 
 
-def test_the_falsifier_of_carrying_is_the_control_with_one_step_of_which_nothing_is_said(flown):
-    made = flown("flight-kidnap")
+def test_the_falsifier_of_carrying_is_the_control_with_one_step_of_which_nothing_is_said(flown, root):
+    made = flown("flight-kidnap", root)
     falsifier, control = made.of("falsifier"), made.of("control")
     np.testing.assert_array_equal(cells(falsifier), cells(control))
     is_lost = np.isnan(steps(falsifier)[1:, 0])
@@ -208,15 +208,15 @@ def test_the_falsifier_of_carrying_is_the_control_with_one_step_of_which_nothing
     np.testing.assert_array_equal(steps(falsifier)[1:][~is_lost], steps(control)[1:][~is_lost])
 
 
-def test_an_optimistic_odometer_says_the_same_and_believes_a_ninth_of_the_covariance(flown):
-    made = flown("flight-overconfident")
+def test_an_optimistic_odometer_says_the_same_and_believes_a_ninth_of_the_covariance(flown, root):
+    made = flown("flight-overconfident", root)
     control, stress = made.of("control"), made.of("stress")
     np.testing.assert_array_equal(steps(stress), steps(control))
     np.testing.assert_allclose(9 * covariances(stress)[1:], covariances(control)[1:])
 
 
-def test_less_and_less_is_known_of_a_start_and_the_rest_of_the_flight_is_the_same(flown):
-    made = flown("flight-start")
+def test_less_and_less_is_known_of_a_start_and_the_rest_of_the_flight_is_the_same(flown, root):
+    made = flown("flight-start", root)
     control, falsifier = made.of("control"), made.of("falsifier")
     assert control[0][0].prior == falsifier[0][0].prior
     assert (control[0][0].prior.radius_m, control[0][0].prior.yaw_sigma_deg) == (100.0, 5.0)
@@ -230,8 +230,8 @@ def test_less_and_less_is_known_of_a_start_and_the_rest_of_the_flight_is_the_sam
     assert FLIGHT_SUITES["flight-start"].refusal(START)
 
 
-def test_ages_search_the_older_maps_with_the_same_views_and_odometry(flown):
-    made = flown("flight-real-age")
+def test_ages_search_the_older_maps_with_the_same_views_and_odometry(flown, root):
+    made = flown("flight-real-age", root)
     control, stresses = made.of("control"), [item for item in made.views if item.role == "stress"]
     assert {query.region for query, _ in control} == {"town-suburb"}
     assert {truth.changed_share for _, truth in control} == {0.0}

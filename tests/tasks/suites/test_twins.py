@@ -97,24 +97,24 @@ def test_copies_lie_a_whole_number_of_cells_away(carried, name):
 
 
 @pytest.mark.parametrize("name", ["instance-twins", "alias"])
-def test_masks_of_a_place_and_its_copy_are_the_same_cell_by_cell(carried, name):
-    made = carried(name)
+def test_masks_of_a_place_and_its_copy_are_the_same_cell_by_cell(carried, name, root):
+    made = carried(name, root)
     for site, pose in pairs(made):
         truth, twin = view(made.scene.map, site.pose), view(made.scene.map, pose)
         assert (truth.cells == 1).any()
         np.testing.assert_array_equal(truth.cells, twin.cells)
 
 
-def test_masks_of_an_overpass_and_a_level_junction_are_the_same_but_for_the_bridge(carried):
-    made = carried("grade-separation")
+def test_masks_of_an_overpass_and_a_level_junction_are_the_same_but_for_the_bridge(carried, root):
+    made = carried("grade-separation", root)
     for site, pose in pairs(made):
         truth, twin = view(made.scene.map, site.pose), view(made.scene.map, pose)
         differ = {name for name in truth.classes if (truth.layer(name) != twin.layer(name)).any()}
         assert differ == {"bridge"}
 
 
-def test_masks_of_topology_twins_are_nearly_the_same(carried):
-    made = carried("topology-twins")
+def test_masks_of_topology_twins_are_nearly_the_same(carried, root):
+    made = carried("topology-twins", root)
     for site, pose in pairs(made):
         truth, twin = view(made.scene.map, site.pose), view(made.scene.map, pose)
         assert 0 < changed_share(truth, twin) < 0.08
@@ -123,15 +123,15 @@ def test_masks_of_topology_twins_are_nearly_the_same(carried):
 
 
 @pytest.mark.parametrize("name", CHANGED)
-def test_a_twin_differs_from_its_place_by_its_vectors(carried, name):
-    made = carried(name)
+def test_a_twin_differs_from_its_place_by_its_vectors(carried, name, root):
+    made = carried(name, root)
     for site, pose in pairs(made):
         assert amount(made, site.pose) != amount(made, pose)
 
 
 @pytest.mark.parametrize("name", ["topology-twins", "instance-twins"])
-def test_at_every_second_site_the_change_is_at_the_original_and_not_at_its_copy(carried, name):
-    made = carried(name)
+def test_at_every_second_site_the_change_is_at_the_original_and_not_at_its_copy(carried, name, root):
+    made = carried(name, root)
     assert {site.index % 2 for site in made.sites} == {0, 1}
     for site, pose in pairs(made):
         original = original_of(made, site)
@@ -252,8 +252,8 @@ def test_discs_that_are_copied_do_not_have_the_site_in_their_middle(carried, nam
 
 
 @pytest.mark.parametrize("name", ["topology-twins", "instance-twins", "grade-separation", "alias"])
-def test_all_that_any_view_shows_is_within_what_is_copied(carried, name):
-    made = carried(name)
+def test_all_that_any_view_shows_is_within_what_is_copied(carried, name, root):
+    made = carried(name, root)
     largest = 1 + 2 * made.suite.card.group.scale_sigma
     for site, pose in pairs(made):
         for yaw_deg in (0.0, 45.0, site.pose.yaw_deg):
@@ -309,8 +309,8 @@ def test_layers_of_topology_twins_show_every_junction_as_at_one_of_both_places()
 
 
 @pytest.mark.parametrize("name", ["topology-twins", "grade-separation"])
-def test_vectors_of_the_falsifier_are_of_the_same_one_of_both_places_whichever_is_seen(carried, name):
-    made = carried(name)
+def test_vectors_of_the_falsifier_are_of_the_same_one_of_both_places_whichever_is_seen(carried, name, root):
+    made = carried(name, root)
     for site, pose in pairs(made):
         plain_at, changed_at = (pose, site.pose) if is_changed(site) else (site.pose, pose)
         wanted = changed_at if made.suite.falsifier_sees_change else plain_at
@@ -321,16 +321,16 @@ def test_vectors_of_the_falsifier_are_of_the_same_one_of_both_places_whichever_i
 
 
 @pytest.mark.parametrize("name", [*CHANGED, "volatile-lure"])
-def test_nothing_but_a_guess_is_left_where_no_vector_tells_the_two_places_apart(carried, name):
-    made = carried(name)
+def test_nothing_but_a_guess_is_left_where_no_vector_tells_the_two_places_apart(carried, name, root):
+    made = carried(name, root)
     for variant in made.suite.variants:
         is_guess = name in CHANGED and variant.role != "stress"
         ceilings = {made.draw(site, variant).measured.get(CEILING, 1.0) for site in made.sites}
         assert ceilings == {0.5 if is_guess else 1.0}
 
 
-def test_vectors_of_the_instance_falsifier_follow_from_the_mask(carried):
-    made = carried("instance-twins")
+def test_vectors_of_the_instance_falsifier_follow_from_the_mask(carried, root):
+    made = carried("instance-twins", root)
     falsifier = next(item for item in made.suite.variants if item.role == "falsifier")
     for site in made.sites:
         draft = made.draw(site, falsifier)
@@ -338,8 +338,8 @@ def test_vectors_of_the_instance_falsifier_follow_from_the_mask(carried):
         assert draft.vectors.geometry.area.sum() == pytest.approx(mask.sum())
 
 
-def test_no_view_of_a_grade_separation_shows_the_bridge_layer(carried):
-    made = carried("grade-separation")
+def test_no_view_of_a_grade_separation_shows_the_bridge_layer(carried, root):
+    made = carried("grade-separation", root)
     for variant in made.suite.variants:
         for site in made.sites:
             draft = made.draw(site, variant)
@@ -354,8 +354,8 @@ def test_no_view_of_a_grade_separation_shows_the_bridge_layer(carried):
 # The lure
 
 
-def test_a_changed_world_agrees_with_its_place_on_what_is_stable_and_with_the_lure_on_the_rest(carried):
-    made = carried("volatile-lure")
+def test_a_changed_world_agrees_with_its_place_on_what_is_stable_and_with_the_lure_on_the_rest(carried, root):
+    made = carried("volatile-lure", root)
     assert {site.is_copy for site in made.sites} == {True, False}  # it works both ways
     for site, pose in pairs(made):
         world, truth, lure = (
@@ -376,15 +376,15 @@ def test_a_changed_world_agrees_with_its_place_on_what_is_stable_and_with_the_lu
         )
 
 
-def test_without_a_change_the_original_of_a_lure_is_as_it_was(carried):
-    made = carried("volatile-lure")
+def test_without_a_change_the_original_of_a_lure_is_as_it_was(carried, root):
+    made = carried("volatile-lure", root)
     for site in made.sites:
         at = original_of(made, site)
         np.testing.assert_array_equal(view(made.scene.map, at).cells, view(made.plain.map, at).cells)
 
 
-def test_a_lure_has_as_much_of_everything_as_its_place(carried):
-    made = carried("volatile-lure")
+def test_a_lure_has_as_much_of_everything_as_its_place(carried, root):
+    made = carried("volatile-lure", root)
     for site in made.sites:
         original = original_of(made, site)
         item = next(

@@ -360,7 +360,8 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
         group = groups_within(shapes, TOUCH_M)
         area_m2: Floats = np.bincount(group, weights=shapely.area(shapes)).astype(np.float64)
         weight = shapely.area(shapes) / area_m2[group]
-        middle = np.column_stack([np.bincount(group, weights=weight * part) for part in centroids(shapes).T])
+        parts_m = [np.bincount(group, weights=weight * part) for part in centroids(shapes).T]
+        middle: Floats = np.column_stack(parts_m)
         corners_m, owner = shapely.get_coordinates(shapes, return_index=True)
         reach_m = np.zeros(len(area_m2))
         np.maximum.at(reach_m, group[owner], np.hypot(*(corners_m - middle[group[owner]]).T))

@@ -178,7 +178,7 @@ _UNTAUGHT: Final = f"without train places its rates are those set by hand; {_LIM
 def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -> MatcherCard:
     return MatcherCard(
         name=name,
-        version="2" if _CORRELATED in ours else "1",
+        version=str(1 + (_CORRELATED in ours) + bool({_GRAPH_FITTED, _GRAPH_BY_HAND}.intersection(ours))),
         title=title,
         source=_SOURCE.format(what=what),
         ours="; ".join((_OURS, *ours)),

@@ -13,10 +13,16 @@ from sasgeo_bench.cli.console import print_table, tell
 from sasgeo_bench.errors import FlightError, counted
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.parquet import write_frame
+from sasgeo_bench.flights.axes import Axes
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, measure_drift, pair_run
 from sasgeo_bench.flights.drift_fit import fit_profile
 from sasgeo_bench.flights.drift_profile import write_drift_profile
 from sasgeo_bench.flights.tum import read_tum
+
+AxesFlag = Annotated[
+    Axes | None,
+    typer.Option(help="axes of TUM files: up (third axis up), or camera (right, down, ahead: KITTI, ORB-SLAM)"),
+]
 
 
 def measure_drift_command(
@@ -24,13 +30,14 @@ def measure_drift_command(
     estimate: Annotated[list[Path], typer.Option(help="estimate of it; one for each --truth, in the same order")],
     lengths_m: Annotated[str, typer.Option(metavar="M,M,...", help="lengths of segments, metres of path")] = "10,50",
     lost_s: Annotated[float, typer.Option(min=0, help="seconds without a pose that are a lost stretch")] = LOST_S,
+    axes: AxesFlag = None,
     results: Annotated[Path | None, typer.Option(help="also write the figures into this Parquet file")] = None,
     profile: Annotated[Path | None, typer.Option(help="also write a profile that was fitted, a TOML file")] = None,
 ) -> None:
     """Measure drift of odometry against truth by segment length; runs of one truth file are one cluster."""
     lengths = _read_lengths(lengths_m)
     _check_outputs([*truth, *estimate], [path for path in (results, profile) if path is not None])
-    runs = _read_runs(truth, estimate, lost_s)
+    runs = _read_runs(truth, estimate, lost_s, axes)
     flights = counted(len({run.sequence for run in runs}), "sequence")
     tell(f"{counted(len(runs), 'run')} of {flights}, {sum(run.path_m for run in runs):.0f} m tracked")
     figures = measure_drift(runs, lengths_m=lengths)
@@ -59,15 +66,15 @@ def _read_lengths(text: str) -> list[float]:
     return lengths
 
 
-def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float) -> list[PairedRun]:
+def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float, axes: Axes | None) -> list[PairedRun]:
     """Read pairs of files; each truth is read once."""
     if len(truth) != len(estimate):
         message = f"give one --estimate for each --truth, got {len(truth)} truths and {len(estimate)} estimates"
         raise FlightError(message)
-    truths = {path: read_tum(path) for path in dict.fromkeys(truth)}
+    truths = {path: read_tum(path, axes=axes) for path in dict.fromkeys(truth)}
     runs = []
     for true_path, path in zip(truth, estimate, strict=True):
-        believed = read_tum(path)
+        believed = read_tum(path, axes=axes)
         try:
             run = pair_run(truths[true_path], believed, sequence=str(true_path.resolve()), lost_s=lost_s)
         except FlightError as error:

@@ -13,18 +13,20 @@ import numpy as np
 
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.flights.axes import Axes, in_axes
 from sasgeo_bench.flights.trajectory import Trajectory
 
 MOST_BYTES: Final = 300_000_000  # of text, unpacked
 MOST_POSES: Final = 2_000_000
 _COLUMNS: Final = 8
+_KITTI: Final = 12  # numbers of a 3 x 4 matrix
 _LARGEST: Final = 1e12  # seconds or metres: what is larger has another unit
 _GZIP: Final = b"\x1f\x8b"
 _FORM: Final = "a line is 'time_s x y z qx qy qz qw', 8 numbers with spaces between"
 _UNIT: Final = 1e-3  # as in trajectory.py, which names the pose; here the line is named
 
 
-def read_tum(path: Path) -> Trajectory:
+def read_tum(path: Path, *, axes: Axes | None = None) -> Trajectory:
     r"""Read a trajectory from a TUM file, whole or not at all.
 
     Parameters
@@ -32,11 +34,14 @@ def read_tum(path: Path) -> Trajectory:
     path : Path
         Text, or gzipped text, which is told by its first bytes. Lines that begin with "#" and empty lines are skipped.
         `MOST_BYTES` of unpacked text and `MOST_POSES` are read at most.
+    axes : {"up", "camera"}, optional
+        Axes of the file: third axis up, or right, down and ahead of a camera, as KITTI and ORB-SLAM have them. By
+        default third axis up; a path that shows another is refused (`sasgeo_bench.flights.axes`).
 
     Returns
     -------
     Trajectory
-        Times in seconds as in the file; the file's frame, whose third axis must point up.
+        Times in seconds as in the file; the file's frame, or that with its third axis up.
 
     Raises
     ------
@@ -76,7 +81,8 @@ def read_tum(path: Path) -> Trajectory:
         message = f"{path} holds no pose: {_FORM}"
         raise FlightError(message)
     poses = np.frombuffer(table).reshape(-1, _COLUMNS)
-    return Trajectory(time_s=poses[:, 0], position_m=poses[:, 1:4], quaternion_xyzw=poses[:, 4:])
+    flown = Trajectory(time_s=poses[:, 0], position_m=poses[:, 1:4], quaternion_xyzw=poses[:, 4:])
+    return in_axes(flown, axes, path)
 
 
 def write_tum(trajectory: Trajectory, path: Path) -> None:
@@ -116,13 +122,15 @@ def _decoded(line: bytes, where: str) -> str:
 
 def _pose(line: str, where: str) -> list[float]:
     """Return the eight numbers of a line; raise `FlightError` if they are no pose."""
-    words = line.split(maxsplit=_COLUMNS)  # a line may be as long as the file
+    words = line.split(maxsplit=_KITTI)  # a line may be as long as the file
     try:
         values = [float(word) for word in words]
     except ValueError:
         values = []
     if len(values) != _COLUMNS or "_" in line or not all(map(math.isfinite, values)):
         count = f"{len(words)} words" if len(words) < _COLUMNS else "more than 8 words"
+        if len(words) == _KITTI:
+            count = "12 numbers, a pose of KITTI without its time (join times.txt, then --axes camera)"
         found = count if len(words) != _COLUMNS else "words that are no finite numbers"
         message = f"{where}: {found}: {_FORM}"
         raise FlightError(message)

@@ -41,6 +41,10 @@ class LogSource:
         where = self.path.name if number is None else f"{self.path.name}, {self.unit} {number}"
         return FlightError(f"{where}: {text}")
 
+    def warn(self, text: str) -> None:
+        """Warn of what is not read of the file."""
+        warnings.warn(f"{plain(self.path.name)}: {text}", stacklevel=2)
+
     def number(self, text: str | None, name: str, number: int) -> float:
         """Return a finite number out of the file; raise `FlightError` for anything else."""
         if text is None or not text.strip():
@@ -95,6 +99,8 @@ class FlightLog:
         Height above the ground or the place of take-off, metres; never one above the sea.
     yaw_deg, pitch_deg, roll_deg : ndarray, shape (N,), optional
         Attitude of the body, degrees, yaw from true north; in the order of angles of `sensing.camera.Attitude`.
+    told : tuple of str
+        Of a table: what was read of which column, in which unit.
     """
 
     lon_deg: Floats
@@ -104,9 +110,12 @@ class FlightLog:
     yaw_deg: Floats | None = None
     pitch_deg: Floats | None = None
     roll_deg: Floats | None = None
+    told: tuple[str, ...] = ()
 
     @classmethod
-    def of(cls, source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats]) -> Self:
+    def of(
+        cls, source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats], *, told: tuple[str, ...] = ()
+    ) -> Self:
         """Return a log of checked columns; `numbers` are the lines or points in the file, for messages.
 
         Points at 0, 0 before the first fix are left out, and so are points that repeat the time of the point before, or
@@ -123,8 +132,8 @@ class FlightLog:
         _check_places(source, numbers, columns)
         is_new = np.append(True, _gained(columns) != 0)[: len(numbers)]
         if not is_new.all():
-            told = "time" if "time_s" in columns else "place"
-            _tell_left_out(source, int((~is_new).sum()), f"with the {told} of the point before")
+            same = "time" if "time_s" in columns else "place"
+            tell_left_out(source, int((~is_new).sum()), f"with the {same} of the point before")
             numbers, columns = np.asarray(numbers)[is_new], {name: column[is_new] for name, column in columns.items()}
         if len(numbers) < 2:  # noqa: PLR2004 - a way
             message = f"a flight has two points at least, the log has {len(numbers)}: export more of it"
@@ -134,7 +143,12 @@ class FlightLog:
             if name in columns:
                 text = f"{name} lies beyond {most:g}: mend the value, or name the column by its unit"
                 _check(source, numbers, np.abs(columns[name]) <= most, text)
-        return cls(**columns)
+        return cls(
+            lon_deg=columns["lon_deg"],
+            lat_deg=columns["lat_deg"],
+            **{name: columns.get(name) for name in ("time_s", "height_m", *_ANGLES)},
+            told=told,
+        )
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -150,7 +164,7 @@ def first_fix(source: LogSource, lon_deg: Floats, lat_deg: Floats) -> int:
     """Return the index of the first point that is not at 0, 0, and warn of those before; 0 if there is none."""
     first = int(np.argmax((lon_deg != 0) | (lat_deg != 0))) if len(lon_deg) else 0
     if first:
-        _tell_left_out(source, first, "at 0, 0 before the first fix")
+        tell_left_out(source, first, "at 0, 0 before the first fix")
     return first
 
 
@@ -209,5 +223,6 @@ def _gained(columns: Mapping[str, Floats]) -> Floats:
     return np.diff(columns["time_s"]) if "time_s" in columns else steps_m(columns["lon_deg"], columns["lat_deg"])
 
 
-def _tell_left_out(source: LogSource, count: int, which: str) -> None:
-    warnings.warn(f"{plain(source.path.name)}: left out {counted(count, 'point')} {which}", stacklevel=2)
+def tell_left_out(source: LogSource, count: int, which: str) -> None:
+    """Warn of points that are left out."""
+    source.warn(f"left out {counted(count, 'point')} {which}")

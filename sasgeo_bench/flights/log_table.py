@@ -1,89 +1,58 @@
 # SPDX-License-Identifier: Apache-2.0
-"""CSV logs with latitude and longitude, as PX4 and ArduPilot are exported: names of columns, and rules for units.
+"""CSV logs with latitude and longitude, and position files of RTKLIB: rows, places, times, heights, angles.
 
-A name is compared without its topic ("GPS." of "GPS.Lat"), in small letters, everything else than letters and digits
-as "_". Names decide units; where they do not, these rules do, and what they leave open is refused:
-
-- latitude and longitude are degrees; if all are whole numbers and one is beyond 180, they are 1e-7 degrees;
-- time: dates are ISO 8601; numbers are in the one unit of s, ms, us and ns by which the flight has a mean speed of
-  0.1 to 100 m/s, of which there is one at most;
-- heights are metres; whole numbers of which one is beyond 10,000 are millimetres, as in MAVLink;
-- angles are degrees if one is beyond 2 pi; whole numbers of which one is beyond 360 are 0.01 degrees, as in MAVLink.
+A unit is what the name of a column or the format says, else what `LogFacts` says, else it is asked for. It is never
+guessed from the size of the values. Latitude and longitude without a unit are degrees.
 """
 
-import csv
 import math
 import re
 from array import array
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.flights.log_points import FASTEST_MPS, FlightLog, LogSource, first_fix, shown, steps_m
-from sasgeo_bench.texts import message_of
+from sasgeo_bench.flights.log_clock import Clock, is_clock
+from sasgeo_bench.flights.log_formats import PX4, QUANTITIES, Column, Format, Layout, find_layout
+from sasgeo_bench.flights.log_points import FlightLog, LogSource, first_fix, shown, tell_left_out
+from sasgeo_bench.flights.log_rows import Lines, read_lines
+from sasgeo_bench.flights.log_units import UNITS, LogFacts, choices_of
+from sasgeo_bench.texts import plain
 
 Floats = NDArray[np.float64]
 
-_FOOT_M: Final = 0.3048
-_DEG: Final = math.degrees(1.0)  # of a radian
-_AXES: Final = ("yaw", "pitch", "roll")
-_SLOWEST_MPS: Final = FASTEST_MPS / 1000  # a thousandth: units lie a factor of 1000 apart, so one fits at most
-_TIME_UNITS: Final = (1.0, 1e-3, 1e-6, 1e-9)
-_DATE: Final = re.compile(r"\d[-/.:]\d+[-/.:]\d|\dT\d")  # of a time that is no number, in any order
-_MOST_NAMES: Final = 12  # of columns in a message
-_HIGHEST_M: Final = 10_000.0  # whole numbers beyond are no metres
-
-# Field -> name -> factor to s, m or degrees; None where the rules decide.
-COLUMNS: Final = MappingProxyType(
-    {
-        "latitude": dict.fromkeys(("lat", "latitude", "lat_deg", "latitude_deg", "latitude_degrees")),
-        "longitude": dict.fromkeys(
-            ("lon", "lng", "long", "longitude", "lon_deg", "lng_deg", "longitude_deg", "longitude_degrees")
-        ),
-        "time": dict.fromkeys(("time", "timestamp", "datetime", "date_time", "datetime_utc", "utc", "gps_time"))
-        | dict.fromkeys(("time_s", "timestamp_s", "time_sec", "seconds", "elapsed_s"), 1.0)
-        | dict.fromkeys(("time_ms", "timems", "timestamp_ms", "time_boot_ms", "time_millisecond"), 1e-3)
-        | dict.fromkeys(("time_us", "timeus", "timestamp_us", "time_usec"), 1e-6),
-        "height": dict.fromkeys(("relative_alt", "rel_alt", "alt_rel", "relalt", "altituderelative", "height", "agl"))
-        | dict.fromkeys(("relative_alt_m", "height_m", "height_agl_m", "height_above_takeoff_m", "agl_m"), 1.0)
-        | dict.fromkeys(("relative_alt_mm",), 1e-3)
-        | dict.fromkeys(("height_above_takeoff_feet", "height_ft", "agl_ft"), _FOOT_M),
-        "yaw": dict.fromkeys(("yaw", "heading", "hdg", "compass_heading"))
-        | dict.fromkeys(("yaw_deg", "heading_deg", "hdg_deg", "compass_heading_degrees"), 1.0)
-        | dict.fromkeys(("yaw_rad", "heading_rad"), _DEG),
-        **{
-            axis: {axis: None, f"{axis}_deg": 1.0, f"{axis}_degrees": 1.0, f"{axis}_rad": _DEG}
-            for axis in ("pitch", "roll")
-        },
-    }
-)
+_MAY_LACK: Final = ("height", "yaw", "pitch", "roll")
+_UNKNOWN: Final = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
+_DMS: Final = re.compile(r"(\d+)\s*(?:deg|°)\s*(\d+)\s*'\s*(\d+(?:\.\d+)?)\s*\"\s*([NSEW])")
+_LAST_BOOT_US: Final = 1e14  # three years: no PX4 runs for longer, so later times count from 1970
+_HALF_TURN: Final = 180.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Column:
-    """A column that is read."""
+class _Table:
+    """Values of the lines that are points, in the units of the file; NaN where one is unknown."""
 
-    at: int
-    name: str  # as in the file
-    factor: float | None
-    is_date: bool = False
-
-    def value(self, source: LogSource, field: str, row: Sequence[str], number: int) -> float:
-        """Return what a line has in this column."""
-        text = row[self.at]
-        return source.moment(text, number) if self.is_date else source.number(text, field, number)
+    numbers: "array[int]" = field(default_factory=lambda: array("q"))
+    values: "dict[str, array[float]]"
+    has_dates: bool = False
 
 
-def read_csv(path: Path) -> FlightLog:
-    r"""Read a CSV log; raise `FlightError` if it is not sound, or a column or its unit is ambiguous.
+def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
+    r"""Read a CSV log, or a position file of RTKLIB (.pos).
 
-    The separator is a comma, a semicolon or a tab. Empty lines, and lines that begin with "#", are skipped. Columns
-    that no name stands for, altitudes above the sea among them, are not read.
+    The separator is a comma, a semicolon or a tab, or what a first line such as "sep=;" says. Decimals have a comma
+    where the separator is none. Empty lines, and lines that begin with "#", are skipped; a line of units below the
+    header belongs to the names. Altitudes above the sea or the ellipsoid are no heights, and are not read.
+
+    Raises
+    ------
+    FlightError
+        If the table is not sound, a unit is open, or it is open what a column is.
 
     Examples
     --------
@@ -97,132 +66,245 @@ def read_csv(path: Path) -> FlightLog:
     >>> log.lat_deg.tolist(), log.time_s.tolist()
     ([47.14, 47.1401], [0.0, 1.0])
     """
+    facts = facts or LogFacts()
     source = LogSource(path=path, unit="line")
-    rows = _rows(source)
-    _, header = next(rows, (0, []))
-    found = _find(source, header)
-    numbers = array("q")
-    values = {field: array("d") for field in found}
-    for number, row in rows:
-        if len(row) != len(header):
-            message = f"{len(row)} cells, the head has {len(header)}: mend the line"
-            raise source.fault(message, number)
-        if not numbers and "time" in found:
-            found["time"] = _dated(found["time"], row)
-        numbers.append(number)
-        source.check_count(len(numbers))
-        for field, column in found.items():
-            values[field].append(column.value(source, field, row, number))
-    # Before the unit of time is found by the speed: from 0, 0 it is a long way.
-    places = (np.array(values[field]) for field in ("longitude", "latitude"))
-    start = first_fix(source, *places)
-    columns = _converted(source, found, {field: np.array(column[start:]) for field, column in values.items()})
-    return FlightLog.of(source, numbers[start:], columns)
+    lines = read_lines(source)
+    layout = find_layout(source, lines.header, facts)
+    table = _read(source, layout, lines)
+    values = {name: np.array(column) for name, column in table.values.items()}
+    # Before the units: what is logged before the first fix tells nothing.
+    start = first_fix(source, values["longitude"], values["latitude"])
+    numbers = np.array(table.numbers)[start:]
+    values = {name: column[start:] for name, column in values.items()}
+    layout = layout if table.has_dates else _as_px4(layout, values)
+    numbers, values = _known(source, layout.format, numbers, values)
+    columns, told = _converted(source, layout, facts, values, has_dates=table.has_dates)
+    if not layout.format.is_sorted and "time_s" in columns:
+        order = np.argsort(columns["time_s"], kind="stable")
+        numbers, columns = numbers[order], {name: column[order] for name, column in columns.items()}
+        columns["time_s"] = columns["time_s"] - columns["time_s"][:1]
+    return FlightLog.of(source, numbers.tolist(), columns, told=told)
 
 
-def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
-    """Yield number and cells of each line that has any."""
-    source.check_size()
-    line = 0
+# Values
+
+
+def _read(source: LogSource, layout: Layout, lines: Lines) -> _Table:
+    """Return the values of the lines that are points; warn of those that are none."""
+    table = _Table(values={name: array("d") for name in layout.fields})
+    gate, clock = _Gate(layout=layout), Clock(source=source)
+    time = layout.fields.get("time")
+    # The first point tells.
+    has_dates: bool | None = False if time is None or time.unit is not None else None
+    decimal = ""
+    for number, cells in lines.rows:
+        row = _trimmed(source, cells, len(lines.header), number)
+        if not gate.lets(row):
+            continue
+        table.numbers.append(number)
+        source.check_count(len(table.numbers))
+        places = [row[layout.fields[name].at] for name in ("latitude", "longitude")]
+        decimal = decimal or ("," if any("," in text for text in places) else ".")
+        if has_dates is None and time is not None:
+            has_dates = is_clock(row[time.at])
+        for name, column in layout.fields.items():
+            text = row[column.at]
+            if name == "time" and has_dates:
+                value = clock.seconds(text, row[layout.date.at] if layout.date else "", number)
+            elif name in _MAY_LACK and _is_unknown(text):
+                value = math.nan
+            else:
+                value = _number(source, text, name, number, decimal)
+            table.values[name].append(value)
+    for which, count in gate.left.items():
+        tell_left_out(source, count, which)
+    return replace(table, has_dates=bool(has_dates))
+
+
+@dataclass(slots=True, kw_only=True)
+class _Gate:
+    """Lets lines through that are points of one receiver, and counts the others by reason."""
+
+    layout: Layout
+    receiver: str | None = None
+    left: "Counter[str]" = field(default_factory=Counter)
+
+    def lets(self, row: Sequence[str]) -> bool:
+        """Return whether a line is a point: it has a fix, a place, and the receiver of the first point."""
+        reason = self._reason(row)
+        if reason:
+            self.left[reason] += 1
+        return not reason
+
+    def _reason(self, row: Sequence[str]) -> str:
+        fields, receiver = self.layout.fields, self.layout.receiver
+        if _has_no_fix(self.layout, row):
+            return "without a fix"
+        if all(_is_unknown(row[fields[name].at]) for name in ("latitude", "longitude")):
+            return "without a place"
+        if receiver is not None:
+            cell = row[receiver.at].strip()
+            self.receiver = cell if self.receiver is None else self.receiver
+            if cell != self.receiver:
+                return f"of other receivers than {plain(receiver.name)} = {plain(self.receiver)}"
+        return ""
+
+
+def _trimmed(source: LogSource, cells: list[str], count: int, number: int) -> list[str]:
+    """Return as many cells as the header has; empty ones beyond are trailing separators."""
+    if len(cells) < count or any(cell.strip() for cell in cells[count:]):
+        message = f"{len(cells)} cells, the head has {count}: mend the line"
+        raise source.fault(message, number)
+    return cells[:count]
+
+
+def _has_no_fix(layout: Layout, row: Sequence[str]) -> bool:
+    """Return whether the receiver says that it has no fix."""
+    if layout.fix is None:
+        return False
     try:
-        with source.path.open(encoding="utf-8-sig", newline="") as file:
-            head = next((text for text in file if text.strip() and not text.startswith("#")), "")
-            file.seek(0)
-            reader = csv.reader(file, delimiter=max(",;\t", key=head.count), strict=True)
-            for row in reader:
-                line = reader.line_num
-                if any(cell.strip() for cell in row) and not row[0].startswith("#"):
-                    yield line, row
-    except (OSError, UnicodeDecodeError) as error:
-        message = f"no text in UTF-8 ({message_of(error)}): export it anew"
-        raise source.fault(message) from error
-    except csv.Error as error:
-        message = f"no sound CSV ({message_of(error)}): mend the line"
-        raise source.fault(message, line + 1) from error
+        return float(row[layout.fix.at]) < layout.least_fix
+    except ValueError:
+        return False
 
 
-def _find(source: LogSource, header: Sequence[str]) -> dict[str, _Column]:
-    """Return the column of each field; one whose name has a unit goes before one without."""
-    keys = [re.sub(r"[^a-z0-9]+", "_", name.strip().lower().rpartition(".")[2]).strip("_") for name in header]
-    found = {}
-    for field, names in COLUMNS.items():
-        matches = [_Column(at=at, name=header[at], factor=names[key]) for at, key in enumerate(keys) if key in names]
-        stated = [column for column in matches if column.factor is not None] or matches
-        if len(stated) > 1:
-            message = f"{field} is ambiguous, columns {_listed([item.name for item in stated])}: keep one of them"
+def _is_unknown(text: str) -> bool:
+    return text.strip().lower() in _UNKNOWN
+
+
+def _number(source: LogSource, text: str, name: str, number: int, decimal: str) -> float:
+    match = _DMS.fullmatch(text.strip()) if QUANTITIES[name] == "place" else None
+    if match:
+        degrees = int(match[1]) + int(match[2]) / 60 + float(match[3]) / 3600
+        if (match[4] in "NS") != (name == "latitude"):
+            message = f"{name} is {shown(text)}: check which column is which"
+            raise source.fault(message, number)
+        return -degrees if match[4] in "SW" else degrees
+    if decimal == ",":
+        if "." in text:
+            message = f"{name} is {shown(text)} where others have a decimal comma: write all alike"
+            raise source.fault(message, number)
+        text = text.replace(",", ".")
+    return source.number(text, name, number)
+
+
+def _as_px4(layout: Layout, values: dict[str, Floats]) -> Layout:
+    """Return the layout of PX4 for a few of its columns: `timestamp` first, and all of the message's integers.
+
+    PX4 counts from its start, so times that count from 1970 are of another format, whose unit is open.
+    """
+    time = layout.fields.get("time")
+    if time is None:
+        return layout
+    is_boot_time = float(values["time"].max(initial=0)) < _LAST_BOOT_US
+    if layout.format is PX4 and not is_boot_time:
+        return replace(layout, fields={**layout.fields, "time": replace(time, unit=None)})
+    is_px4 = (
+        not layout.format.name
+        and is_boot_time
+        and time.unit is None
+        and layout.keys[0] == "timestamp"
+        and {"lat", "lon", "alt"} <= set(layout.keys)
+        and _is_count(values)
+        and bool((values["time"] == np.rint(values["time"])).all())
+    )
+    if not is_px4:
+        return layout
+    units = {"time": "us", **dict.fromkeys(("yaw", "pitch", "roll"), "rad")}
+    fields = {name: replace(column, unit=column.unit or units.get(name)) for name, column in layout.fields.items()}
+    return replace(layout, format=PX4, fields=fields)
+
+
+def _is_count(values: dict[str, Floats]) -> bool:
+    """Return whether places are whole numbers that are no degrees."""
+    places = np.concatenate([values["latitude"], values["longitude"]])
+    return bool((places == np.rint(places)).all()) and float(np.abs(places).max(initial=0)) > _HALF_TURN
+
+
+def _known(
+    source: LogSource, told: Format, numbers: NDArray[np.int64], values: dict[str, Floats]
+) -> tuple[NDArray[np.int64], dict[str, Floats]]:
+    """Return points of which all is known: a column that says nothing is left out, else the points without a value."""
+    if told.no_yaw is not None and "yaw" in values:
+        values["yaw"] = np.where(values["yaw"] == told.no_yaw, np.nan, values["yaw"])
+    for name in _MAY_LACK:
+        if name in ("pitch", "roll") and "yaw" not in values:
+            values.pop(name, None)  # no attitude without a heading
+        elif name in values and len(numbers) and np.isnan(values[name]).all():
+            source.warn(f"no line has a {name}: read without")
+            del values[name]
+    for name in _MAY_LACK:
+        is_known = ~np.isnan(values[name]) if name in values else np.ones(len(numbers), dtype=bool)
+        if not is_known.all():
+            tell_left_out(source, int((~is_known).sum()), f"without a {name}")
+            numbers, values = numbers[is_known], {key: column[is_known] for key, column in values.items()}
+    return numbers, values
+
+
+# Units
+
+
+def _converted(
+    source: LogSource, layout: Layout, facts: LogFacts, values: dict[str, Floats], *, has_dates: bool
+) -> tuple[dict[str, Floats], tuple[str, ...]]:
+    """Return the columns of a log in seconds, metres and degrees, and a line on each."""
+    counts = layout.format.counts and _is_count(values)
+    columns, told = {}, []
+    for name, column in values.items():
+        quantity = QUANTITIES[name]
+        at = layout.fields[name]
+        if name == "time" and has_dates:
+            _check_said(source, at, "dates", facts.time_unit, "time")
+            columns["time_s"] = (column - column[:1]).round(6)
+            told.append(f"time: {shown(at.name)}, as dates or clocks have it")
+            continue
+        if quantity == "place":
+            unit = _place_unit(source, at, facts, values, counts=counts)
+        else:
+            # What is scaled of a message is scaled by its reader's taste.
+            is_open = layout.format.counts and at.unit in ("mm", "cdeg") and not counts
+            unit = _unit(source, replace(at, unit=None) if is_open else at, quantity, facts)
+        factor = UNITS[quantity][unit]
+        if quantity == "place":
+            # As the nearest numbers to what is meant: 0.1 times 3 is not 0.3.
+            columns[f"{name[:3]}_deg"] = (column * factor).round(7) if unit == "e7" else column
+        else:
+            base = column - column[:1] if name == "time" else column
+            columns[{"time": "time_s", "height": "height_m"}.get(name, f"{name}_deg")] = base * factor
+        told.append(f"{name}: {shown(at.name)}, {unit}" + (f" ({layout.format.name})" if layout.format.name else ""))
+    return columns, tuple(told)
+
+
+def _place_unit(source: LogSource, at: Column, facts: LogFacts, values: dict[str, Floats], *, counts: bool) -> str:
+    """Return the unit of places: degrees, unless the format counts or it is said."""
+    if at.unit is None and facts.place_unit is None:
+        if counts:
+            return "e7"
+        if _is_count(values):
+            message = (
+                f"column {shown(at.name)} holds whole numbers that are no degrees: say --place-unit e7, or mend them"
+            )
             raise source.fault(message)
-        if stated:
-            found[field] = stated[0]
-    lacking = [field for field in ("latitude", "longitude") if field not in found]
-    if lacking:
-        names_text = _listed(header) if header else "none"
-        message = f"no column of {' and '.join(lacking)}, found {names_text}: name them lat and lon"
+        return "deg"
+    return _unit(source, at, "place", facts)
+
+
+def _unit(source: LogSource, at: Column, quantity: str, facts: LogFacts) -> str:
+    """Return the unit that a name, a format or the user states; raise `FlightError` if none does, or both differ."""
+    said = facts.unit(quantity)
+    if at.unit is not None:
+        _check_said(source, at, at.unit, said, quantity)
+        return at.unit
+    if said is None:
+        choices = choices_of(quantity)
+        said = f"{', '.join(choices[:-1])} or {choices[-1]}"
+        example = {"time": "time_s", "height": "height_m", "angle": "yaw_deg"}.get(quantity, "lat_deg")
+        message = f"column {shown(at.name)} states no unit: say --{quantity}-unit {said}, or name it as in {example}"
         raise source.fault(message)
-    return found if "yaw" in found else {field: found[field] for field in found if field not in _AXES}
+    return said
 
 
-def _listed(names: Sequence[str]) -> str:
-    more = ", ..." if len(names) > _MOST_NAMES else ""
-    return ", ".join(shown(name) for name in names[:_MOST_NAMES]) + more
-
-
-def _dated(column: _Column, row: Sequence[str]) -> _Column:
-    """Return a column of time as that of dates, if its first cell is one."""
-    is_date = column.factor is None and _DATE.search(row[column.at]) is not None
-    return replace(column, is_date=True, factor=1.0) if is_date else column
-
-
-def _converted(source: LogSource, found: dict[str, _Column], values: dict[str, Floats]) -> dict[str, Floats]:
-    """Return the columns of a log in seconds, metres and degrees."""
-    lat, lon = values["latitude"], values["longitude"]
-    columns = {"lon_deg": lon, "lat_deg": lat}
-    if _is_whole(lat, lon) and max(np.abs(lat).max(initial=0), np.abs(lon).max(initial=0)) > 180:  # noqa: PLR2004
-        # As the nearest numbers to what is meant: 0.1 times 3 is not 0.3.
-        columns = {name: (column * 1e-7).round(7) for name, column in columns.items()}
-    if "time" in found:
-        columns["time_s"] = _times(source, found["time"], values["time"], columns)
-    if "height" in found:
-        height, factor = values["height"], found["height"].factor
-        is_mm = _is_whole(height) and np.abs(height).max(initial=0) > _HIGHEST_M
-        columns["height_m"] = height * (factor or (1e-3 if is_mm else 1.0))
-    if "yaw" in found:
-        axes = [axis for axis in _AXES if axis in found]
-        factor = _angle_factor(source, [found[axis] for axis in axes], [values[axis] for axis in axes])
-        columns |= {f"{axis}_deg": values[axis] * (found[axis].factor or factor) for axis in axes}
-    return columns
-
-
-def _is_whole(*columns: Floats) -> bool:
-    return all(bool((column == np.rint(column)).all()) for column in columns)
-
-
-def _times(source: LogSource, column: _Column, ticks: Floats, places: dict[str, Floats]) -> Floats:
-    """Return seconds since the first point."""
-    ticks = ticks - ticks[:1]
-    if column.is_date:
-        return ticks.round(6)
-    if column.factor is not None or not ticks[-1:].any() or (np.diff(ticks) < 0).any():  # refused as they are
-        return ticks * (column.factor or 1.0)
-    with np.errstate(all="ignore"):  # places are checked later, what is none on Earth has no distance
-        per_tick = float(np.nansum(steps_m(places["lon_deg"], places["lat_deg"]))) / float(ticks[-1])
-    fitting = [unit for unit in _TIME_UNITS if _SLOWEST_MPS <= per_tick / unit < FASTEST_MPS]
-    if not fitting:
-        message = (
-            f"column {shown(column.name)} fits no unit of time, by which the mean speed would be {_SLOWEST_MPS:g} to "
-            f"{FASTEST_MPS:g} m/s: name it time_s, time_ms or time_us"
-        )
+def _check_said(source: LogSource, at: Column, unit: str, said: str | None, quantity: str) -> None:
+    if said is not None and said != unit:
+        message = f"column {shown(at.name)} is in {unit}, not in {said}: leave out --{quantity}-unit"
         raise source.fault(message)
-    return ticks * fitting[0]
-
-
-def _angle_factor(source: LogSource, columns: Sequence[_Column], angles: Sequence[Floats]) -> float:
-    """Return the factor to degrees of the columns whose names state no unit; they share one."""
-    open_ones = [at for at, column in enumerate(columns) if column.factor is None]
-    most = max((float(np.abs(angles[at]).max(initial=0)) for at in open_ones), default=math.inf)
-    if most > 360 and open_ones and _is_whole(*(angles[at] for at in open_ones)):  # noqa: PLR2004 - a turn
-        return 0.01
-    if most <= 2 * math.pi:
-        names = _listed([columns[at].name for at in open_ones])
-        message = f"angles may be radians or degrees, columns {names}: name them like yaw_deg or yaw_rad"
-        raise source.fault(message)
-    return 1.0

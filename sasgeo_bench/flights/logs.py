@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flights out of files: GPX, KML, CSV with latitude and longitude, TUM; brought onto a region and cut to it."""
+"""Flights out of files: GPX, KML, tables with latitude and longitude, TUM; brought onto a region and cut to it."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, steps_m
 from sasgeo_bench.flights.log_table import read_csv
+from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.log_xml import read_gpx, read_kml
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory
@@ -24,21 +26,20 @@ from sasgeo_bench.texts import plain
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-SUFFIXES: Final = (".gpx", ".kml", ".csv", ".tum", ".txt", ".tum.gz", ".txt.gz")
+SUFFIXES: Final = (".gpx", ".kml", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".txt.gz")
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones nobody knows where the drone was
 
-_TUM: Final = SUFFIXES[3:]
+_TUM: Final = SUFFIXES[4:]
 _LOWEST_M: Final = 5.0  # lower poses are of a drone that stands, takes off or lands
-_SPEED_MPS: Final = 10.0  # of a log without times
 _COURSE_S: Final = 1.0  # before and after a pose, over which its course is measured
 _HOVER_M: Final = 1.0  # a shorter way has no course
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
-def read_log(path: Path) -> FlightLog:
-    """Read a GPX, KML or CSV log by its suffix; raise `FlightError` if it is not sound, or of another kind.
+def read_log(path: Path, facts: LogFacts | None = None) -> FlightLog:
+    """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
-    A line drawn in KML has no times: `read_flight` flies it at an even speed.
+    `facts` say what a table does not. A line drawn in KML has no times: `read_flight` flies it at an even speed.
 
     >>> import tempfile
     >>> line = "<coordinates>9.52,47.14,80 9.53,47.15,80</coordinates><altitudeMode>relativeToGround</altitudeMode>"
@@ -49,12 +50,21 @@ def read_log(path: Path) -> FlightLog:
     >>> log.lat_deg.tolist(), log.height_m.tolist(), log.time_s
     ([47.14, 47.15], [80.0, 80.0], None)
     """
-    readers = {".gpx": read_gpx, ".kml": read_kml, ".csv": read_csv}
-    reader = readers.get(path.suffix.lower())
+    suffix = path.suffix.lower()
+    if suffix in (".csv", ".pos"):
+        return read_csv(path, facts)
+    if facts is not None:
+        facts.check_untold(path)
+    reader = {".gpx": read_gpx, ".kml": read_kml}.get(suffix)
     if reader is None:
         message = f"{path.name} is no flight log that is read: {', '.join(SUFFIXES)} are (unzip a .kmz, export a .ulg)"
         raise FlightError(message)
     return reader(path)
+
+
+def is_tum(path: Path) -> bool:
+    """Return whether a file is a trajectory of poses, by its suffix."""
+    return path.name.lower().endswith(_TUM)
 
 
 def read_flight(
@@ -64,7 +74,7 @@ def read_flight(
     margin_m: float = MARGIN_M,
     least_m: float = SHORTEST_M,
     height_m: float | None = None,
-    speed_mps: float = _SPEED_MPS,
+    facts: LogFacts | None = None,
     step_s: float = 0.2,
 ) -> Trajectory:
     r"""Read a flight log and return its longest stretch inside a region.
@@ -72,7 +82,8 @@ def read_flight(
     Parameters
     ----------
     path : Path
-        GPX, KML, CSV, or TUM (.tum, .txt), whose positions are easting, northing and height of the region's CRS.
+        GPX, KML, CSV, positions of RTKLIB (.pos), or TUM (.tum, .txt), whose positions are easting, northing and height
+        of the region's CRS.
     region : Region
         The stretch lies over its mapped ground.
     margin_m : float
@@ -81,8 +92,8 @@ def read_flight(
         Shortest stretch that is taken, metres.
     height_m : float, optional
         Height above the ground that is kept throughout, metres; it replaces the heights in the log.
-    speed_mps : float
-        Even speed of a log without times, metres a second.
+    facts : LogFacts, optional
+        What the file does not say: units of a table, axes of a TUM file, the speed of a log without times (10 m/s).
     step_s : float
         Seconds between poses.
 
@@ -121,17 +132,21 @@ def read_flight(
     >>> round(flown.distance_m[-1] / 100), round(np.mean(flown.yaw_deg))
     (8, 88)
     """
-    wishes = {"least_m": least_m, "height_m": height_m, "speed_mps": speed_mps, "step_s": step_s}
+    facts = facts or LogFacts()
+    wishes = {"least_m": least_m, "height_m": height_m, "step_s": step_s}
     for name, value in wishes.items():
         if value is not None and not (math.isfinite(value) and value > 0):
             message = f"{name} must be positive, got {value!r}"
             raise FlightError(message)
-    log = None if path.name.lower().endswith(_TUM) else read_log(path)
+    if height_m is not None:
+        facts = replace(facts, height_unit="none")  # what is not read has no unit to be asked for
+    log = None if is_tum(path) else read_log(path, facts)
     if log is None:
-        logged = read_tum(path)
+        facts.check_untold(path)
+        logged = read_tum(path, axes=facts.axes)
         logged = logged if height_m is None else _at_height(logged, height_m)
     else:
-        logged = _on_grid(log, path, region.manifest.epsg, height_m, speed_mps)
+        logged = _on_grid(log, path, region.manifest.epsg, height_m, facts.speed_mps)
     flown = _resampled(logged, path, step_s)
     is_known = np.ones(len(flown) - 1, dtype=bool)
     if log is None or log.time_s is not None:

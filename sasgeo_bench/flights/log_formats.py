@@ -1,0 +1,331 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Columns of tables with latitude and longitude: formats that are told by their names, and any other table.
+
+A name is compared in small letters, its words joined by "_", with and without its topic ("GPS." of "GPS.Lat"). Where
+the units of a format come from: the table in `docs/concepts/flights.md`.
+"""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Final
+
+from sasgeo_bench.flights.log_points import LogSource, shown
+from sasgeo_bench.flights.log_units import WORDS, LogFacts
+
+QUANTITIES: Final = MappingProxyType(
+    {
+        "latitude": "place",
+        "longitude": "place",
+        "time": "time",
+        "height": "height",
+        "yaw": "angle",
+        "pitch": "angle",
+        "roll": "angle",
+    }
+)
+# Field -> names without their unit, of a table of any format.
+NAMES: Final = MappingProxyType(
+    {
+        "latitude": ("lat", "latitude", "gps_lat", "gps_latitude", "gpslatitude"),
+        "longitude": ("lon", "lng", "long", "longitude", "gps_lon", "gps_lng", "gps_longitude", "gpslongitude"),
+        "time": (
+            *("time", "timestamp", "t", "date_time", "datetime", "utc", "gps_time", "gpst", "elapsed", "elapsed_time"),
+            *("date_time_utc", "datetime_utc", "utc_time", "time_utc", "time_boot", "flight_time", "fly_time"),
+            *("date_time_original", "datetime_original"),
+        ),
+        "height": (
+            *("height", "agl", "relative_alt", "rel_alt", "alt_rel", "relalt", "altitude_relative", "altituderelative"),
+            *("relative_altitude", "rel_home_alt", "height_agl", "alt_agl", "altitude_agl", "height_above_takeoff"),
+            *("height_above_ground",),
+        ),
+        "yaw": ("yaw", "heading", "hdg", "compass_heading"),
+        "pitch": ("pitch",),
+        "roll": ("roll",),
+    }
+)
+# Of what no height above the ground is: altitudes, which are not read.
+ALTITUDES: Final = ("alt", "altitude", "ele", "elevation", "amsl", "alt_amsl", "altitude_amsl", "alt_msl")
+
+_DATES: Final = ("date", "date_local", "date_utc", "gps_date")
+_MOST_NAMES: Final = 12  # of columns in a message
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Format:
+    """A format that is told by names of columns.
+
+    Parameters
+    ----------
+    name : str
+        For messages.
+    signs : tuple of frozenset
+        Names, all of one set, that tell the format: as names are compared, or as they are written.
+    columns : mapping
+        Field -> name -> unit; the first name that is there is read. None: it holds dates, or the unit is asked for.
+        Fields that are missing here are looked for by their common names; those with no name are never there.
+    counts : bool
+        Places, and what is "mm" or "cdeg" here, are integers as the message has them, if places are whole numbers.
+    fix : mapping
+        Name -> least value that is a fix.
+    receiver : str
+        Name of the column that numbers receivers.
+    no_yaw : float, optional
+        Yaw that means unknown.
+    is_sorted : bool
+        Whether lines are in the order of time.
+    """
+
+    name: str = ""
+    signs: tuple[frozenset[str], ...] = ()
+    columns: Mapping[str, Mapping[str, str | None]] = field(default_factory=dict)
+    counts: bool = False
+    fix: Mapping[str, float] = field(default_factory=lambda: {"fix_type": 2.0})
+    receiver: str = ""
+    no_yaw: float | None = None
+    is_sorted: bool = True
+
+
+PX4: Final = Format(
+    name="PX4",
+    signs=(
+        *(
+            frozenset({"timestamp", "lat", "lon", sign})
+            for sign in ("alt_ellipsoid", "timestamp_sample", "satellites_used", "terrain_alt", "time_utc_usec")
+        ),
+        frozenset({"timestamp", "latitude_deg", "longitude_deg", "altitude_msl_m"}),
+    ),
+    columns={"time": {"timestamp": "us"}, "yaw": {"heading": "rad", "yaw": "rad"}, "pitch": {}, "roll": {}},
+    counts=True,
+)
+_ANY: Final = Format()
+FORMATS: Final = (
+    Format(
+        name="DJI",
+        signs=(frozenset({"osd_latitude", "osd_longitude"}),),
+        columns={
+            "latitude": {"osd_latitude": "deg"},
+            "longitude": {"osd_longitude": "deg"},
+            "time": {
+                "osd_fly_time_s": "s",
+                "custom_update_time_local": None,
+                "custom_update_time": None,
+                "osd_fly_time": None,
+            },
+            "height": {"osd_height_m": "m", "osd_height_ft": "ft", "osd_height": None},
+            "yaw": {"osd_yaw_360": "deg", "osd_yaw": "deg"},
+            "pitch": {"osd_pitch": "deg"},
+            "roll": {"osd_roll": "deg"},
+        },
+    ),
+    Format(
+        name="MAVLink",
+        signs=(
+            frozenset({"time_boot_ms", "relative_alt", "lat", "lon"}),
+            frozenset({"relative_alt", "hdg", "vx", "vy", "lat", "lon"}),
+            frozenset({"time_usec", "fix_type", "lat", "lon"}),
+            frozenset({"global_position_int_lat", "global_position_int_lon"}),
+            frozenset({"gps_raw_int_lat", "gps_raw_int_lon"}),
+        ),
+        columns={
+            "time": {"time_boot_ms": "ms", "time_usec": "us", "timestamp": None},
+            "height": {"relative_alt": "mm"},
+            "yaw": {"hdg": "cdeg"},
+            "pitch": {"attitude_pitch": "rad"},
+            "roll": {"attitude_roll": "rad"},
+        },
+        counts=True,
+        no_yaw=65535.0,
+    ),
+    Format(
+        name="ArduPilot",
+        signs=(frozenset({"TimeUS", "Lat", "Lng"}), frozenset({"TimeMS", "Lat", "Lng"})),
+        columns={
+            "time": {"time_us": "us", "time_ms": "ms"},
+            "height": {"rel_home_alt": "m", "rel_alt": "m"},
+            "yaw": {"yaw": "deg"},
+            "pitch": {"pitch": "deg"},
+            "roll": {"roll": "deg"},
+        },
+        counts=True,
+        fix={"status": 2.0},
+        receiver="i",
+        no_yaw=0.0,
+    ),
+    Format(
+        name="RTKLIB",
+        signs=(
+            frozenset({"latitude_deg", "longitude_deg", "q", "ns"}),
+            frozenset({"latitude_deg", "longitude_deg", "sdn_m"}),
+            frozenset({"latitude_deg", "longitude_deg", "gpst"}),
+        ),
+        columns={"time": {"gpst": None, "utc": None, "jst": None, "time": None}, "height": {}},
+        fix={"q": 1.0},
+    ),
+    Format(
+        name="ROS",
+        signs=(frozenset({"field_latitude", "field_longitude"}),),
+        columns={
+            "latitude": {"field_latitude": "deg"},
+            "longitude": {"field_longitude": "deg"},
+            "time": {"time": "ns", "field_header_stamp": "ns"},
+            "height": {},
+        },
+        fix={"field_status_status": 0.0},
+    ),
+    Format(
+        name="exiftool",
+        signs=(frozenset({"SourceFile", "GPSLatitude", "GPSLongitude"}),),
+        columns={
+            "time": {"sub_sec_date_time_original": None, "date_time_original": None},
+            "height": {"relative_altitude": "m"},
+            "yaw": {"flight_yaw_degree": "deg"},
+            "pitch": {"flight_pitch_degree": "deg"},
+            "roll": {"flight_roll_degree": "deg"},
+        },
+        is_sorted=False,
+    ),
+    PX4,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """A column that is read; `unit` is None if neither its name nor the format tells it."""
+
+    at: int
+    name: str
+    unit: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layout:
+    """What is read of a table."""
+
+    format: Format
+    keys: tuple[str, ...]  # of all columns, without their topics
+    fields: dict[str, Column]
+    date: Column | None = None
+    receiver: Column | None = None
+    fix: Column | None = None
+    least_fix: float = 0.0
+
+
+def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> Layout:
+    """Return the columns of a table.
+
+    Raise `FlightError` if places are missing, two columns may be meant, or a column that no name stands for may be the
+    time.
+    """
+    short = [key_of(name.rpartition(".")[2]) for name in header]
+    keys = [(short[at], key_of(name)) for at, name in enumerate(header)]
+    names = {key for both in keys for key in both} | {name.rpartition(".")[2].strip() for name in header}
+    told = next((one for one in FORMATS if any(sign <= names for sign in one.signs)), _ANY)
+    found: dict[str, Column] = {}
+    for name in NAMES:
+        matches = list(_matches(name, header, keys, told))
+        if len(matches) > 1:  # of several messages, that of the places
+            matches = [column for column in matches if _topic(column) == _topic(found.get("latitude"))] or matches
+        if len(matches) > 1:
+            message = f"{name} is ambiguous, columns {listed([item.name for item in matches])}: keep one of them"
+            raise source.fault(message)
+        if matches:
+            found[name] = matches[0]
+    lacking = [name for name in ("latitude", "longitude") if name not in found]
+    if lacking:
+        message = (
+            f"no column of {' and '.join(lacking)}, found {listed(header) if header else 'none'}: name them lat and lon"
+        )
+        raise source.fault(message)
+    fix = next((name for name in told.fix if name in names), "")
+    topic = _topic(found["latitude"])
+    layout = Layout(
+        format=told,
+        keys=tuple(short),
+        fields={name: column for name, column in found.items() if facts.unit(QUANTITIES[name]) != "none"},
+        date=_named(header, keys, _DATES),
+        receiver=_named([name if _topic_of(name) == topic else "" for name in header], keys, (told.receiver,)),
+        fix=_named(header, keys, (fix,)),
+        least_fix=told.fix.get(fix, 0.0),
+    )
+    if "time" not in found and facts.time_unit != "none":
+        _check_no_time(source, header, keys, layout)
+    return layout
+
+
+def key_of(name: str) -> str:
+    """Return a name as names are compared.
+
+    >>> [key_of(name) for name in ("OSD.flyTime [s]", "TimeUS", "compass_heading(degrees)", "Heading (°)")]
+    ['osd_fly_time_s', 'time_us', 'compass_heading_degrees', 'heading_deg']
+    """
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", name.strip()).lower()
+    words = words.replace("°", "deg").replace("\u00b5", "u").replace("\u03bc", "u")
+    return re.sub(r"^time(?=[mu]s$)", "time_", re.sub(r"[^a-z0-9]+", "_", words).strip("_"))
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names as messages list them: the first twelve."""
+    more = ", ..." if len(names) > _MOST_NAMES else ""
+    return ", ".join(shown(name) for name in names[:_MOST_NAMES]) + more
+
+
+def _matches(name: str, header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format) -> list[Column]:
+    """Return the columns of a field: by the format, else by its names, of which those with a unit go first."""
+    if name in told.columns:
+        found = ((key, unit) for key, unit in told.columns[name].items() if any(key in both for both in keys))
+        best, unit = next(found, ("", None))
+        return [Column(at=at, name=header[at], unit=unit) for at, both in enumerate(keys) if best and best in both]
+    matches = []
+    for at, both in enumerate(keys):
+        units = [unit for is_it, unit in (_unit_of(key, name) for key in both) if is_it]
+        if units:
+            matches.append(Column(at=at, name=header[at], unit=units[0]))
+    return [column for column in matches if column.unit] or matches
+
+
+def _topic(column: Column | None) -> str | None:
+    return None if column is None else _topic_of(column.name)
+
+
+def _topic_of(name: str) -> str:
+    return name.strip().rpartition(".")[0]
+
+
+def _unit_of(key: str, name: str) -> tuple[bool, str | None]:
+    """Return whether a key stands for a field, and the unit that it states."""
+    words = WORDS[QUANTITIES[name]]
+    if name == "time" and key in words and len(key) > 2:  # noqa: PLR2004 - "seconds", and no "s"
+        return True, words[key]
+    for base in NAMES[name]:
+        if key == base:
+            return True, None
+        if key.startswith(f"{base}_") and key[len(base) + 1 :] in words:
+            return True, words[key[len(base) + 1 :]]
+    return False, None
+
+
+def _named(header: Sequence[str], keys: Sequence[tuple[str, str]], names: Sequence[str]) -> Column | None:
+    """Return the first column of some names; a column whose header is empty is none."""
+    places = (at for at, both in enumerate(keys) if header[at] and any(name and name in both for name in names))
+    at = next(places, None)
+    return None if at is None else Column(at=at, name=header[at])
+
+
+def _check_no_time(source: LogSource, header: Sequence[str], keys: Sequence[tuple[str, str]], layout: Layout) -> None:
+    """Raise `FlightError` if a column that is not known may be the time."""
+    known = {column.at for column in (layout.receiver, layout.fix, *layout.fields.values()) if column is not None}
+    open_ones = [header[at] for at, both in enumerate(keys) if at not in known and not _is_no_time(both)]
+    if open_ones:
+        message = (
+            f"no column of time is known, it may be one of {listed(open_ones)}: name it time_s, time_ms or time_us, or "
+            "say --time-unit none if the log has no times"
+        )
+        raise source.fault(message)
+
+
+def _is_no_time(both: tuple[str, str]) -> bool:
+    heights = (f"{base}_{word}" for base in ALTITUDES for word in WORDS["height"])
+    known = {*ALTITUDES, *heights}
+    return any(key in known or any(_unit_of(key, name)[0] for name in NAMES if name != "time") for key in both)

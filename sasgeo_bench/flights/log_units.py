@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Units of flight logs: by what words names state them, and what is said of a log whose file does not."""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+from typing import Final, Literal
+
+from sasgeo_bench.errors import FlightError
+from sasgeo_bench.flights.axes import AXES, Axes
+from sasgeo_bench.texts import plain
+
+TimeUnit = Literal["s", "ms", "us", "ns", "none"]
+HeightUnit = Literal["m", "cm", "mm", "ft", "none"]
+AngleUnit = Literal["deg", "cdeg", "rad", "none"]
+PlaceUnit = Literal["deg", "e7"]
+
+SPEED_MPS: Final = 10.0  # of a log without times
+
+# Quantity -> unit -> factor to s, m or degrees.
+UNITS: Final = MappingProxyType(
+    {
+        "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+        "height": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "ft": 0.3048},
+        "angle": {"deg": 1.0, "cdeg": 0.01, "rad": math.degrees(1.0)},
+        "place": {"deg": 1.0, "e7": 1e-7},
+    }
+)
+# Quantity -> end of a name -> unit.
+WORDS: Final = MappingProxyType(
+    {
+        "time": dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s")
+        | dict.fromkeys(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"), "ms")
+        | dict.fromkeys(("us", "usec", "usecs", "micros", "microsecond", "microseconds"), "us")
+        | dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosecond", "nanoseconds"), "ns"),
+        "height": dict.fromkeys(("m", "meter", "meters", "metre", "metres"), "m")
+        | dict.fromkeys(("cm", "centimeters", "centimetres"), "cm")
+        | dict.fromkeys(("mm", "millimeters", "millimetres"), "mm")
+        | dict.fromkeys(("ft", "feet", "foot"), "ft"),
+        "angle": dict.fromkeys(("deg", "degs", "degree", "degrees", "360"), "deg")
+        | dict.fromkeys(("cdeg", "centideg", "centidegrees", "0_01_deg"), "cdeg")
+        | dict.fromkeys(("rad", "rads", "radian", "radians"), "rad"),
+        "place": dict.fromkeys(("deg", "degs", "degree", "degrees", "dd"), "deg")
+        | dict.fromkeys(("e7", "1e7", "dege7", "deg_e7", "1e_7", "1e_7_deg", "1e_7deg"), "e7"),
+    }
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogFacts:
+    """What the file of a log does not say itself.
+
+    Parameters
+    ----------
+    time_unit : {"s", "ms", "us", "ns", "none"}, optional
+        Unit of a table's times whose column does not name it; "none": no column is the time.
+    height_unit : {"m", "cm", "mm", "ft", "none"}, optional
+        Unit of heights; "none": heights are not read.
+    angle_unit : {"deg", "cdeg", "rad", "none"}, optional
+        Unit of yaw, pitch and roll (cdeg: 0.01 degrees); "none": they are not read.
+    place_unit : {"deg", "e7"}, optional
+        Unit of latitude and longitude (e7: 1e-7 degrees).
+    axes : {"up", "camera"}, optional
+        Axes of a TUM file (`sasgeo_bench.flights.axes`).
+    speed_mps : float
+        Even speed of a log without times, metres a second.
+
+    Raises
+    ------
+    FlightError
+        If a unit or axes are none of these, or the speed is not positive.
+    """
+
+    time_unit: TimeUnit | None = None
+    height_unit: HeightUnit | None = None
+    angle_unit: AngleUnit | None = None
+    place_unit: PlaceUnit | None = None
+    axes: Axes | None = None
+    speed_mps: float = SPEED_MPS
+
+    def __post_init__(self) -> None:
+        """Check the values."""
+        for quantity in UNITS:
+            unit, choices = self.unit(quantity), choices_of(quantity)
+            if unit is not None and unit not in choices:
+                message = f"{quantity}_unit must be one of {', '.join(choices)}, got {unit!r}"
+                raise FlightError(message)
+        if self.axes is not None and self.axes not in AXES:
+            message = f"axes must be one of {', '.join(AXES)}, got {self.axes!r}"
+            raise FlightError(message)
+        if not (math.isfinite(self.speed_mps) and self.speed_mps > 0):
+            message = f"speed_mps must be positive, got {self.speed_mps!r}"
+            raise FlightError(message)
+
+    def unit(self, quantity: str) -> str | None:
+        """Return the unit that is said of a quantity."""
+        units = {
+            "time": self.time_unit,
+            "height": self.height_unit,
+            "angle": self.angle_unit,
+            "place": self.place_unit,
+        }
+        return units[quantity]
+
+    def check_untold(self, path: Path) -> None:
+        """Raise `FlightError` if a unit is said of a file that is no table: its format states them all."""
+        for quantity in UNITS:
+            if self.unit(quantity) not in (None, "none"):
+                message = f"{plain(path.name)} is no table, and its units are known: leave out --{quantity}-unit"
+                raise FlightError(message)
+
+
+def choices_of(quantity: str) -> tuple[str, ...]:
+    """Return the units of a quantity, and "none" where it may be left out.
+
+    >>> choices_of("place"), choices_of("angle")
+    (('deg', 'e7'), ('deg', 'cdeg', 'rad', 'none'))
+    """
+    return (*UNITS[quantity], *(("none",) if quantity != "place" else ()))

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Commands about flights and their odometry."""
+"""Commands about flights: what a log holds, its stretch over a region, and the drift of odometry."""
 
 import math
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, tell
+from sasgeo_bench.cli.console import print_table, say, tell
+from sasgeo_bench.cli.options import Options
 from sasgeo_bench.errors import FlightError, counted
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.parquet import write_frame
@@ -17,12 +20,82 @@ from sasgeo_bench.flights.axes import Axes
 from sasgeo_bench.flights.drift import LOST_S, PairedRun, measure_drift, pair_run
 from sasgeo_bench.flights.drift_fit import fit_profile
 from sasgeo_bench.flights.drift_profile import write_drift_profile
-from sasgeo_bench.flights.tum import read_tum
+from sasgeo_bench.flights.log_points import FlightLog, steps_m
+from sasgeo_bench.flights.log_units import SPEED_MPS, AngleUnit, HeightUnit, LogFacts, PlaceUnit, TimeUnit
+from sasgeo_bench.flights.logs import is_tum, read_flight, read_log
+from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M
+from sasgeo_bench.flights.trajectory import Trajectory
+from sasgeo_bench.flights.tum import read_tum, write_tum
+from sasgeo_bench.regions.region_files import read_region
 
 AxesFlag = Annotated[
     Axes | None,
     typer.Option(help="axes of TUM files: up (third axis up), or camera (right, down, ahead: KITTI, ORB-SLAM)"),
 ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightOptions(Options):
+    """Flags of `read-flight`."""
+
+    file: Annotated[Path, typer.Argument(help="GPX, KML, CSV, RTKLIB .pos, or TUM in the region's CRS (.tum, .txt)")]
+    region: Annotated[Path | None, typer.Option(help="folder of a built region: cut the flight to it")] = None
+    tum: Annotated[Path | None, typer.Option(help="TUM file to write the stretch over the region into")] = None
+    height_m: Annotated[float | None, typer.Option(help="height above the ground to keep, instead of the log's")] = None
+    least_m: Annotated[float, typer.Option(min=1, help="shortest stretch that is taken, metres")] = SHORTEST_M
+    margin_m: Annotated[float, typer.Option(min=0, help="least distance from ground without a map")] = MARGIN_M
+    speed_mps: Annotated[float, typer.Option(min=0.1, help="even speed of a log without times, m/s")] = SPEED_MPS
+    time_unit: Annotated[
+        TimeUnit | None, typer.Option(help="of times whose column does not name it; none: no column is the time")
+    ] = None
+    height_unit: Annotated[
+        HeightUnit | None, typer.Option(help="of heights whose column does not name it; none: do not read them")
+    ] = None
+    angle_unit: Annotated[
+        AngleUnit | None,
+        typer.Option(help="of yaw, pitch and roll (cdeg: 0.01 degrees); none: do not read them"),
+    ] = None
+    place_unit: Annotated[PlaceUnit | None, typer.Option(help="of latitude and longitude (e7: 1e-7 degrees)")] = None
+    axes: AxesFlag = None
+
+    @property
+    def facts(self) -> LogFacts:
+        """Return what the file does not say."""
+        return LogFacts(
+            time_unit=self.time_unit,
+            height_unit=self.height_unit,
+            angle_unit=self.angle_unit,
+            place_unit=self.place_unit,
+            axes=self.axes,
+            speed_mps=self.speed_mps,
+        )
+
+
+def read_flight_command(flight: FlightOptions) -> None:
+    """Read a flight log and print what was read, in which units; cut it to a region, and write that as TUM."""
+    _check_outputs([flight.file], [flight.tum] if flight.tum else [])
+    if flight.tum is not None and flight.region is None:
+        message = "--tum needs --region: the stretch over a region is what is written"
+        raise FlightError(message)
+    if flight.region is not None:
+        region = read_region(flight.region)
+        flown = read_flight(
+            flight.file,
+            region,
+            margin_m=flight.margin_m,
+            least_m=flight.least_m,
+            height_m=flight.height_m,
+            facts=flight.facts,
+        )
+        say(f"over {region.manifest.id}: {_summary(flown)}")
+        if flight.tum is not None:
+            write_tum(flown, flight.tum)
+            tell(f"wrote {flight.tum}")
+    elif is_tum(flight.file):
+        flight.facts.check_untold(flight.file)
+        say(_summary(read_tum(flight.file, axes=flight.axes)))
+    else:
+        _show(read_log(flight.file, flight.facts))
 
 
 def measure_drift_command(
@@ -52,6 +125,31 @@ def measure_drift_command(
         for row in fitted.parameters.to_dict("records"):
             tell(f"{row['name']} = {row['value']:.3f} [{row['lo']:.3f}, {row['hi']:.3f}]")
         tell(f"wrote {profile}: add where the data come from and where the profile must not be believed")
+
+
+def _summary(flown: Trajectory) -> str:
+    height_m = flown.position_m[:, 2]
+    return (
+        f"{counted(len(flown), 'pose')}, {flown.distance_m[-1]:.0f} m over the ground, {np.ptp(flown.time_s):.1f} s, "
+        f"third axis {height_m.min():.1f} to {height_m.max():.1f} m"
+    )
+
+
+def _show(log: FlightLog) -> None:
+    """Print what was read of a log."""
+    way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
+    lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
+    say(f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}")
+    for line in log.told:
+        say(line)
+    for name, unit in (("height_m", "m"), ("yaw_deg", "deg"), ("pitch_deg", "deg"), ("roll_deg", "deg")):
+        values = getattr(log, name)
+        if values is not None:
+            say(f"{name.partition('_')[0]} from {values.min():.1f} to {values.max():.1f} {unit}")
+    if log.time_s is None:
+        tell(f"no times: a flight has an even speed (--speed-mps, {SPEED_MPS:g} m/s)")
+    if log.height_m is None:
+        tell("no height above the ground: a flight needs --height-m")
 
 
 def _read_lengths(text: str) -> list[float]:

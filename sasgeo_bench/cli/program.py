@@ -79,6 +79,7 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "fetch": "storage",
     },
     "Flights": {
+        "read-flight": "flights",
         "measure-drift": "flights",
         "list-trackers": "listing",
         "new-tracker": "trackers",

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that measures drift: a table to stdout, files that are asked for, mistakes on one line."""
+"""The commands of flights: what was read, figures of drift, files that are asked for, mistakes on one line."""
 
 import gzip
 
@@ -11,7 +11,8 @@ from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.flights.drift_profile import load_profile, read_drift_profile
 from sasgeo_bench.flights.odometry import dead_reckon, draw_odometry
 from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.flights.tum import write_tum
+from sasgeo_bench.flights.tum import read_tum, write_tum
+from sasgeo_bench.regions.region_files import read_region
 
 
 @pytest.fixture
@@ -103,3 +104,73 @@ def test_a_profile_that_cannot_be_named_or_written_gets_one_line_after_the_table
         assert code == 2
         assert told in err.splitlines()[-1]
         assert "position_pct" in out
+
+
+# Logs
+
+ROWS = "".join(f"{at}000,49.005,{11.001 + at * 6.838e-5:.7f},328.084,90\n" for at in range(6))
+
+
+def test_what_is_read_of_a_log_is_printed_with_its_columns_and_units(program, tmp_path) -> None:
+    (tmp_path / "log.csv").write_text("time_ms,lat,lon,height_ft,heading_deg\n" + ROWS)
+    code, out, err = program("read-flight", "log.csv")
+    assert (code, err) == (0, "")
+    assert out.splitlines() == [
+        "6 points, 25 m, 5.0 s, 5.00 m/s on average",
+        "latitude: 'lat', deg",
+        "longitude: 'lon', deg",
+        "time: 'time_ms', ms",
+        "height: 'height_ft', ft",
+        "yaw: 'heading_deg', deg",
+        "height from 100.0 to 100.0 m",
+        "yaw from 90.0 to 90.0 deg",
+    ]
+
+
+def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_path) -> None:
+    (tmp_path / "log.csv").write_text("t,lat,lon,height,heading\n" + ROWS)
+    words: list[str] = []
+    for quantity, unit in (("time", "ms"), ("height", "ft"), ("angle", "none")):
+        assert f"states no unit: say --{quantity}-unit" in mistake("read-flight", "log.csv", *words)
+        words += [f"--{quantity}-unit", unit]
+    assert "height from 100.0 to 100.0 m" in program("read-flight", "log.csv", *words)[1]
+    assert "heading" not in program("read-flight", "log.csv", *words)[1]
+    (tmp_path / "line.csv").write_text("lat,lon\n49.005,11.001\n49.005,11.002\n")
+    _, out, err = program("read-flight", "line.csv")
+    assert out.startswith("2 points, 73 m, no times\n")
+    assert "no times: a flight has an even speed (--speed-mps, 10 m/s)" in err
+    assert "no height above the ground: a flight needs --height-m" in err
+
+
+def test_the_stretch_over_a_region_is_written_as_tum(program, mistake, lay_towns, tmp_path) -> None:
+    folder = lay_towns(tmp_path / "out", "town-grid") / "regions" / "town-grid"
+    west, south, east, north = read_region(folder).grid.bounds_m
+    at = np.linspace(west, east, 201)
+    poses = np.column_stack(
+        [np.arange(201.0), at, 0 * at + (south + north) / 2, 0 * at + 80, *[0 * at] * 3, 0 * at + 1]
+    )
+    np.savetxt(tmp_path / "run.txt", poses)
+    code, out, err = program("read-flight", "run.txt", "--region", folder, "--least-m", "500", "--tum", "cut.txt")
+    assert code == 0, err
+    assert out.startswith("over town-grid: ")
+    cut = read_tum(tmp_path / "cut.txt")
+    assert cut.position_m[[0, -1], 0] == pytest.approx([west + 100, east - 100], abs=3)
+    assert program("read-flight", "cut.txt")[1] == out.removeprefix("over town-grid: ")
+    assert "--tum needs --region" in mistake("read-flight", "run.txt", "--tum", "other.txt")
+    assert "run.txt is named twice" in mistake("read-flight", "run.txt", "--region", folder, "--tum", "run.txt")
+
+
+def test_a_cameras_axes_are_refused_and_read_where_they_are_said(program, mistake, tmp_path) -> None:
+    at = np.linspace(0, 300, 301)
+    turn = np.radians(60 * np.sin(at / 50))
+    east, north = (np.concatenate([[0], np.cumsum(f(turn[:-1]))]) for f in (np.sin, np.cos))
+    for name, scale in (("truth.txt", 1.0), ("estimate.txt", 1.05)):
+        poses = [at / 10, scale * east, 0 * at, scale * north, 0 * at, np.sin(turn / 2), 0 * at, np.cos(turn / 2)]
+        np.savetxt(tmp_path / name, np.column_stack(poses))
+    words = ("--truth", "truth.txt", "--estimate", "estimate.txt", "--lengths-m", "100")
+    assert "say --axes camera" in mistake("measure-drift", *words)
+    assert "say --axes camera" in mistake("read-flight", "truth.txt")
+    _, out, _ = program("measure-drift", *words, "--axes", "camera")
+    position = next(line.split() for line in out.splitlines() if line.startswith("position_pct "))
+    assert float(position[2]) == pytest.approx(4.7, abs=0.3)
+    assert "301 poses, 300 m over the ground" in program("read-flight", "truth.txt", "--axes", "camera")[1]

@@ -42,7 +42,7 @@ DOCUMENTS = (
         if path.relative_to(ROOT).as_posix() not in GUIDES
     ),
     *("README.md", "CONTRIBUTING.md", "submissions/README.md"),
-    *(f"{folder}/README.md" for folder in ("pipelines", "regions", "splits", "benchmarks")),
+    *(f"{folder}/README.md" for folder in ("pipelines", "regions", "splits", "benchmarks", "findings")),
 )
 
 # Commands of the program that are not run, each with its reason; all are held against its flags.
@@ -75,6 +75,7 @@ OTHERS = {
     r"^pip install -e my-(matcher|segmenter|tracker)$": "done by hand: an installation needs the package registry",
     r"^(sha256sum|install -m 600) ": "programs of the system",
     r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
+    r"^bash findings/": "installs packages from the registry",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",
     r"^python answer\.py ": "tests/experiments/test_board_queries.py runs this program on a small board",
     r"^python benchmarks/segmenters\.py ": "minutes; tests/scoring/test_segmenter_program.py makes a small board",

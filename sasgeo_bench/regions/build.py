@@ -235,6 +235,9 @@ def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading, tell: Tell)
 
     name, path = plan.folder.name, scratch / ORTHO
     tell(f"{name}: cutting {counted(len(plan.pictures), 'picture')} to the region")
+    for picture in plan.pictures:
+        if picture.bands.note:
+            tell(f"{name}: {picture.entry.file}: {picture.bands.note}")
     grid = ortho_grid(plan.pictures, plan.grid)
     write_ortho(path, plan.pictures, grid)
     record = OrthoRecord.unmeasured(tuple(item.record() for item in plan.pictures), grid)

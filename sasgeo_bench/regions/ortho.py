@@ -13,19 +13,20 @@ import rasterio
 import rasterio.shutil
 from affine import Affine
 from numpy.typing import NDArray
-from pyproj import Transformer
+from pyproj import CRS, Transformer
 from pyproj.exceptions import ProjError
-from rasterio.enums import ColorInterp, MaskFlags, Resampling
+from rasterio.enums import ColorInterp, Resampling
 from rasterio.errors import CRSError, RasterioError
 from rasterio.vrt import WarpedVRT
-from rasterio.warp import transform_bounds
 from rasterio.windows import Window
 
 from sasgeo_bench.errors import GridError, ImageryError
 from sasgeo_bench.files.folders import file_record
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.regions.bands import RGB, Bands, find_bands, selected
 from sasgeo_bench.regions.imagery import BANDS, PictureRecord
 from sasgeo_bench.regions.imagery_files import ImageryEntry
+from sasgeo_bench.texts import one_line
 
 MOST_PIXELS: Final = 4_000_000_000  # of a picture
 MOST_ORTHO_PIXELS: Final = 2_000_000_000  # of what is cut out of all; what holds no picture counts too
@@ -43,12 +44,13 @@ _SNAP: Final = 0.05  # of a pixel: a little coarser will do, rather than a third
 
 @dataclass(frozen=True, kw_only=True)
 class Picture:
-    """A checked picture: its file, its entry in the region file, its bounds in the region's CRS and its resolution."""
+    """A checked picture: its file, its entry in the region file, its bounds in the region's CRS, resolution, bands."""
 
     path: Path
     entry: ImageryEntry
     bounds_m: tuple[float, float, float, float]
     gsd_m: float
+    bands: Bands = RGB
 
     def record(self) -> PictureRecord:
         """Return what `region.json` says of the picture."""
@@ -67,7 +69,7 @@ class Picture:
 
 
 def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
-    """Check a picture before any pixel is decoded.
+    """Check a picture; no pixel is decoded but some of an alpha band.
 
     Raises
     ------
@@ -77,8 +79,10 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
     try:
         with _opened(path) as source:
             _check_kind(path, source)
-            bounds_m = transform_bounds(source.crs, f"EPSG:{grid.epsg}", *source.bounds, densify_pts=_EDGE_POINTS)
-            gsd_m = max(_ground_resolution_m(source, grid.epsg), entry.gsd_m or 0.0)
+            to_grid = Transformer.from_crs(source.crs.to_wkt(), grid.epsg, always_xy=True)
+            bounds_m = to_grid.transform_bounds(*_box(source), densify_pts=_EDGE_POINTS, errcheck=True)
+            bands = find_bands(path, source)
+            gsd_m = max(_ground_resolution_m(source, to_grid), entry.gsd_m or 0.0)
     except (CRSError, ProjError) as error:
         message = f"{path} cannot be projected to EPSG:{grid.epsg} ({error}): check its coordinate reference system"
         raise ImageryError(message) from error
@@ -92,7 +96,7 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
             f"{path} shows {_text(bounds_m)}, the region is {_text(grid.bounds_m)} (EPSG:{grid.epsg}): leave it out"
         )
         raise ImageryError(message)
-    return Picture(path=path, entry=entry, bounds_m=bounds_m, gsd_m=gsd_m)
+    return Picture(path=path, entry=entry, bounds_m=bounds_m, gsd_m=gsd_m, bands=bands)
 
 
 @contextmanager
@@ -114,10 +118,11 @@ def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
     if source.crs is None or source.transform.is_identity:
         message = f"{path} says no place (a CRS and a transform): get a georeferenced one, or write them with gdal_edit"
         raise ImageryError(message)
-    if source.count < len(BANDS) or set(source.dtypes[: len(BANDS)]) != {"uint8"}:
+    crs = CRS.from_wkt(source.crs.to_wkt())
+    if not (crs.is_geographic or crs.is_projected):
         message = (
-            f"{path} has {source.count} band(s) of {source.dtypes[0]}, imagery is 8-bit red, green and blue: convert "
-            "it (gdal_translate -ot Byte -scale, or -expand rgb for a palette)"
+            f"{path} has the coordinate reference system {one_line(crs.name)[:60]!r}, which is neither geographic nor "
+            "projected, as that of a building site: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
         )
         raise ImageryError(message)
     if source.width * source.height > MOST_PIXELS:
@@ -127,11 +132,17 @@ def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
         raise ImageryError(message)
 
 
-def _ground_resolution_m(source: rasterio.io.DatasetReader, epsg: int) -> float:
+def _box(source: rasterio.io.DatasetReader) -> tuple[float, float, float, float]:
+    """Return the box around a picture in its own CRS, whichever way its rows and columns run."""
+    cols, rows = np.array([0, source.width] * 2), np.repeat([0, source.height], 2)
+    x, y = source.transform @ (cols, rows)
+    return float(x.min()), float(y.min()), float(x.max()), float(y.max())
+
+
+def _ground_resolution_m(source: rasterio.io.DatasetReader, to_grid: Transformer) -> float:
     """Return the side of a square with the ground area of the middle pixel, metres in the region's CRS."""
     col, row = source.width / 2, source.height / 2
     across, down = source.transform @ (np.array([col, col + 1, col]), np.array([row, row, row + 1]))
-    to_grid = Transformer.from_crs(source.crs.to_wkt(), epsg, always_xy=True)
     (x, across_x, down_x), (y, across_y, down_y) = to_grid.transform(across, down, errcheck=True)
     area_m2 = abs((across_x - x) * (down_y - y) - (across_y - y) * (down_x - x))
     return math.sqrt(area_m2)
@@ -294,7 +305,9 @@ class _Warped:
     def __init__(self, picture: Picture, stack: ExitStack, grid: Grid) -> None:
         self._picture = picture
         source = stack.enter_context(_opened(picture.path))
-        has_alpha = MaskFlags.alpha in source.mask_flag_enums[0]
+        view = selected(source, picture.bands)
+        if view is not None:
+            source = stack.enter_context(rasterio.open(view, driver="VRT"))
         self._view = stack.enter_context(
             WarpedVRT(
                 source,
@@ -303,7 +316,7 @@ class _Warped:
                 height=grid.rows,
                 width=grid.cols,
                 resampling=Resampling.cubic,
-                add_alpha=not has_alpha,
+                add_alpha=ColorInterp.alpha not in source.colorinterp,
                 warp_mem_limit=64,
             )
         )
@@ -340,6 +353,8 @@ class _Warped:
 def is_empty(rgb: NDArray[np.uint8], colour: Sequence[int], *, diameter_px: int) -> NDArray[np.bool_]:
     """Return where a whole disc has one colour, within what JPEG does to it; `rgb` is of shape (3, rows, cols).
 
+    A disc of an even diameter is taken a pixel wider: it has no middle pixel, and OpenCV would shift what it finds.
+
     >>> mosaic = np.zeros((3, 9, 9), dtype=np.uint8)
     >>> mosaic[:, :, :5], mosaic[:, 4, 7] = 254, 254
     >>> is_empty(mosaic, (255, 255, 255), diameter_px=3)[4].astype(int)
@@ -349,6 +364,7 @@ def is_empty(rgb: NDArray[np.uint8], colour: Sequence[int], *, diameter_px: int)
 
     target = np.array(colour, dtype=np.int16)[:, None, None]
     is_near = (np.abs(rgb.astype(np.int16) - target) <= _EMPTY_LEVELS).all(axis=0)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (diameter_px, diameter_px))
+    odd_px = diameter_px | 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (odd_px, odd_px))
     opened = cv2.morphologyEx(is_near.view(np.uint8), cv2.MORPH_OPEN, kernel, borderType=cv2.BORDER_REPLICATE)
     return np.asarray(opened > 0)

@@ -23,6 +23,10 @@ _HALVINGS: Final = 8  # of the step in which a ray met the ground, before the re
 _LOWEST_M, _HIGHEST_M = -12_000.0, 9_000.0  # what is outside is no height of a ground in metres
 _CHUNK: Final = 200_000  # rays followed at a time
 _MOST_STEPS: Final = 4_000  # of one cell each
+_UNITS_M: Final = dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0) | {
+    **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
+    **dict.fromkeys(("us survey foot", "us_survey_foot", "us-ft", "ftus", "us foot", "foot_us"), 1200 / 3937),
+}
 _MOST_CELLS: Final = 400_000_000
 
 
@@ -164,8 +168,9 @@ Ground = Plane | Dem
 def read_dem(path: Path, grid: Grid) -> Dem:
     """Read heights out of a GeoTIFF, brought onto a lattice; raise `CameraError` if that cannot be done whole.
 
-    Heights are in metres; the file may be in any CRS that GDAL knows, and is resampled bilinearly. A file without CRS,
-    with several bands, or one that does not cover the lattice is refused.
+    Heights are in metres or feet, with the scale and offset that the file states; it may be in any CRS that GDAL knows,
+    and is resampled bilinearly. A file without CRS, with several bands, or one that does not cover the lattice is
+    refused.
     """
     if grid.rows * grid.cols > _MOST_CELLS:
         message = f"a ground of {grid.rows} x {grid.cols} cells is too large: cut a smaller lattice, or larger cells"
@@ -173,6 +178,7 @@ def read_dem(path: Path, grid: Grid) -> Dem:
     try:
         with rasterio.open(path) as source:
             _check_source(path, source)
+            unit_m, scale, offset = _unit_m(path, source), source.scales[0], source.offsets[0]
             with WarpedVRT(
                 source,
                 crs=f"EPSG:{grid.epsg}",
@@ -195,7 +201,20 @@ def read_dem(path: Path, grid: Grid) -> Dem:
             "has no height; name a file that reaches beyond it on every side"
         )
         raise CameraError(message)
+    if (scale, offset, unit_m) != (1.0, 0.0, 1.0):
+        cells_m = ((cells_m * scale + offset) * unit_m).astype(np.float32)
     return Dem(grid=grid, cells_m=cells_m)
+
+
+def _unit_m(path: Path, source: rasterio.DatasetReader) -> float:
+    """Return the unit of a file's heights in metres; files that name none are in metres."""
+    unit = (source.units[0] or "metre").strip().lower()
+    if unit not in _UNITS_M:
+        message = (
+            f"{path} has heights in {unit[:40]!r}, metres or feet are read: convert it (gdal_calc.py, gdal_edit.py)"
+        )
+        raise CameraError(message)
+    return _UNITS_M[unit]
 
 
 def _check_source(path: Path, source: rasterio.DatasetReader) -> None:

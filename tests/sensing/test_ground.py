@@ -95,6 +95,39 @@ def test_heights_in_degrees_are_reprojected(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("unit", "scale", "offset", "unit_m"),
+    [("metre", 0.1, 100.0, 1.0), ("ft", 1.0, 0.0, 0.3048), ("US survey foot", 2.0, -3.0, 1200 / 3937)],
+)
+def test_scale_offset_and_unit_of_heights_are_heeded(unit, scale, offset, unit_m, tmp_path):
+    path = write_dem(tmp_path / "dem.tif", slope_of(rise=1.0), dtype="int16", nodata=-32768)
+    with rasterio.open(path, "r+") as file:
+        file.units, file.scales, file.offsets = (unit,), (scale,), (offset,)
+    expected = (slope_of(rise=1.0).cells_m * scale + offset) * unit_m
+    np.testing.assert_allclose(read_dem(path, GRID).cells_m, expected, rtol=1e-6)
+
+
+def test_heights_in_feet_by_their_reference_system_are_read_as_feet(tmp_path):
+    path = write_dem(tmp_path / "dem.tif", slope_of(), crs="EPSG:32632+8228")  # NAVD88 height (ft)
+    np.testing.assert_allclose(read_dem(path, GRID).cells_m, slope_of().cells_m * 0.3048, rtol=1e-6)
+
+
+@pytest.mark.parametrize("turn", [(slice(None, None, -1), slice(None)), (slice(None), slice(None, None, -1))])
+def test_heights_of_rows_in_any_direction_are_the_same(turn, tmp_path):
+    rows, cols = turn
+    grid, dem = GRID, slope_of()
+    west_m, south_m, east_m, north_m = grid.bounds_m
+    to_north, to_west = rows.step == -1, cols.step == -1
+    transform = rasterio.Affine(
+        -10.0 if to_west else 10.0, 0, east_m if to_west else west_m,
+        0, 10.0 if to_north else -10.0, south_m if to_north else north_m,
+    )  # fmt: skip
+    path = write_dem(tmp_path / "dem.tif", Dem(grid=grid, cells_m=np.ascontiguousarray(dem.cells_m[turn])))
+    with rasterio.open(path, "r+") as file:
+        file.transform = transform
+    np.testing.assert_allclose(read_dem(path, GRID).cells_m, dem.cells_m, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
     ("how", "hint"),
     [
         ({"crs": None}, "no CRS"),
@@ -107,6 +140,14 @@ def test_a_file_that_is_no_ground_is_refused_on_one_line(tmp_path, how, hint):
     with pytest.raises(CameraError, match=hint) as caught:
         read_dem(path, GRID)
     assert "\n" not in str(caught.value)
+
+
+def test_heights_in_an_unknown_unit_are_refused(tmp_path):
+    path = write_dem(tmp_path / "dem.tif", slope_of())
+    with rasterio.open(path, "r+") as file:
+        file.units = ("dBZ",)
+    with pytest.raises(CameraError, match="heights in 'dbz', metres or feet"):
+        read_dem(path, GRID)
 
 
 def test_a_file_that_is_no_raster_is_refused(tmp_path):

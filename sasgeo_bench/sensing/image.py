@@ -25,6 +25,8 @@ _WITHIN_8_BITS: Final = frozenset(
     {"1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB"}
 )
 _16_BITS: Final = 65535
+_KIND: Final = 254  # TIFF's NewSubfileType
+_REDUCED: Final = 1  # its bit of a preview, as raw photos (DNG) have one in front
 
 
 def decode_image(
@@ -102,6 +104,9 @@ def _check_head(image: Image.Image, name: str, most_pixels: int) -> None:
         message = (
             f"{name} has {width} x {height} pixels, at most {most_pixels} are decoded: cut it, or scale it down, first"
         )
+        raise ImageError(message)
+    if getattr(image, "tag_v2", {}).get(_KIND, 0) & _REDUCED:
+        message = f"{name} begins with what is a preview of another picture in the file: export it as JPEG"
         raise ImageError(message)
     if image.mode not in _WITHIN_8_BITS and not image.mode.startswith("I;16"):
         message = f"{name} holds numbers of kind {image.mode!r}, not colours: export it with 8 or 16 bits a band"

@@ -3,34 +3,35 @@
 
 import datetime as dt
 import math
-import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import pyproj
-from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL import ExifTags
 
 from sasgeo_bench.errors import CameraError, ImageError
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
 from sasgeo_bench.sensing.intrinsics import Intrinsics
-from sasgeo_bench.texts import message_of
+from sasgeo_bench.sensing.photo_angles import DJI, SKYDIO, altitude_m, body_angles, camera_angles, height_above_m
+from sasgeo_bench.sensing.photo_heads import PhotoHead, Xmp, number_of, positive_of, read_head
+from sasgeo_bench.sensing.photo_lens import Lens, Size
 
 MOST_BYTES: Final = 64 * 2**20  # of a photo
 MOST_PIXELS: Final = 200_000_000
 
 _STRAIGHT_DOWN_DEG: Final = -90.0
-_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
-_WIDEST_SENSOR: Final = 1.55  # width / height; a wider photo is cut out of a sensor of 4 : 3
-_FOCAL_PX: Final = (0.3, 20.0)  # in widths of the picture: limits of a calibrated focal length that can be meant
+_HORIZON_DEG: Final = 90.0 - 1e-6  # of tilt; the optical axis of a camera that leans more meets no level ground
 _STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
+_UNITS_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's units of FocalPlaneXResolution
 
-# EXIF's orientation -> right and down of the upright picture in those of the sensor; the others mirror.
+# EXIF's orientation -> right and down of the upright picture in those of the sensor; 0 is none, the others mirror.
 _TURNS: Final[dict[int, tuple[tuple[int, int], tuple[int, int]]]] = {
+    0: ((1, 0), (0, 1)),
     1: ((1, 0), (0, 1)),
     3: ((-1, 0), (0, -1)),
     6: ((0, -1), (1, 0)),
@@ -44,8 +45,9 @@ class Photo:
 
     `width_px`, `height_px` are of the upright picture, as `decode_image` returns it; `orientation` is EXIF's number.
     Longitude and latitude are WGS 84. `height_m` counts from the place of take-off, `altitude_m` from the sea (by GNSS
-    or barometer, often tens of metres off). Angles are those of the drone's maker, against true north: `gimbal` of the
-    camera, with pitch -90 straight down, and `flight` of the body.
+    or barometer, often tens of metres off). Angles are against true north: `gimbal` of the camera, with pitch -90
+    straight down whatever the drone's maker counts from, and `flight` of the body. `gimbal_fault` says why the file's
+    angles of the camera are not understood.
     """
 
     name: str
@@ -57,10 +59,9 @@ class Photo:
     height_m: float | None = None
     altitude_m: float | None = None
     gimbal: Attitude | None = None
+    gimbal_fault: str = ""
     flight: Attitude | None = None
-    focal_mm: float | None = None
-    focal_35mm: float | None = None
-    focal_px: float | None = None
+    lens: Lens = Lens()  # noqa: RUF009 - it is frozen
     taken_at: dt.datetime | None = None
     model: str = ""
 
@@ -68,27 +69,22 @@ class Photo:
         """Return a pinhole by the calibrated focal length in the XMP, else by the one on 35 mm film.
 
         The latter compares diagonals of sensors. A photo of 16 : 9 is taken for a cut out of a sensor of 4 : 3 as wide.
-        Expect an error of 1 to 3 %; for better, calibrate the lens. Raise `CameraError` if the photo has neither.
+        Expect an error of 1 to 3 %; for better, calibrate the lens. Raise `CameraError` if the photo has neither, or
+        was cut or zoomed so that neither belongs to it.
 
-        >>> photo = Photo(name="a.jpg", width_px=4000, height_px=3000, focal_35mm=20.0)
+        >>> photo = Photo(name="a.jpg", width_px=4000, height_px=3000, lens=Lens(film_mm=20.0))
         >>> round(photo.intrinsics().focal_px[0])
         2311
         """
-        focal_px = self.focal_px if self.focal_px is not None else self._focal_by_film()
+        size_px = (self.width_px, self.height_px)
+        stored_px = size_px[::-1] if _TURNS[self.orientation][0][0] == 0 else size_px
+        focal_px = self.lens.focal_px(self.name, stored_px)
         return Intrinsics(
             width_px=self.width_px,
             height_px=self.height_px,
             focal_px=(focal_px, focal_px),
             centre_px=(self.width_px / 2, self.height_px / 2),
         )
-
-    def _focal_by_film(self) -> float:
-        if self.focal_35mm is None:
-            message = f"{self.name} has no focal length on 35 mm film: give the camera's intrinsics"
-            raise CameraError(message)
-        long_px, short_px = max(self.width_px, self.height_px), min(self.width_px, self.height_px)
-        sensor_px = math.hypot(long_px, short_px if long_px <= _WIDEST_SENSOR * short_px else long_px * 3 / 4)
-        return self.focal_35mm * sensor_px / _FILM_DIAGONAL_MM
 
     def camera(
         self, *, epsg: int | None = None, height_m: float | None = None, intrinsics: Intrinsics | None = None
@@ -112,13 +108,23 @@ class Photo:
         Raises
         ------
         CameraError
-            If the photo lacks place, height or gimbal angles.
+            If the photo lacks place, height or gimbal angles, if its height is not above the ground, or if it looks
+            at the horizon or above.
         """
         height_m = self.height_m if height_m is None else height_m
+        if self.gimbal_fault:
+            message = f"{self.name} has {self.gimbal_fault}: make the camera by `Camera.pointed`"
+            raise CameraError(message)
         if self.lon_deg is None or self.lat_deg is None or height_m is None or self.gimbal is None:
             facts = {"GPS": self.lon_deg, "height above take-off": height_m, "gimbal angles": self.gimbal}
             lacking = ", ".join(name for name, value in facts.items() if value is None)
             message = f"{self.name} has no pose: {lacking} missing; use the drone's own file, not an edited copy"
+            raise CameraError(message)
+        if not height_m > 0:
+            message = (
+                f"{self.name} was taken {height_m:+g} m above the ground or the place of take-off: give its own height "
+                "above the ground (height_m)"
+            )
             raise CameraError(message)
         crs = epsg or utm_epsg(self.lon_deg, self.lat_deg)
         east_m, north_m, convergence_deg = _to_grid(self.lon_deg, self.lat_deg, crs)
@@ -130,6 +136,12 @@ class Photo:
             body=Attitude(yaw_deg=self.gimbal.yaw_deg + convergence_deg),
             mount=Mount(tilt_deg=self.gimbal.pitch_deg - _STRAIGHT_DOWN_DEG, roll_deg=self.gimbal.roll_deg),
         )
+        if not sensor.tilt_deg < _HORIZON_DEG:
+            message = (
+                f"{self.name} looks at the horizon or the sky (gimbal pitch {self.gimbal.pitch_deg:+.1f}, -90 is "
+                "straight down; some drones write 0 for unknown): leave it out, or make the camera by `Camera.pointed`"
+            )
+            raise CameraError(message)
         return sensor.upright(_TURNS[self.orientation])
 
 
@@ -148,45 +160,31 @@ def read_photo(path: Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = M
     Nothing is decoded; limits are on the bytes of the file and the pixels that its head announces. What a file does not
     say is None, so that a photo without pose is refused only where its pose is asked for (`Photo.camera`).
     """
-    try:
-        _check_bytes(path, most_bytes)
-        with warnings.catch_warnings(), Image.open(path, formats=("JPEG", "MPO", "TIFF")) as image:
-            warnings.simplefilter("ignore")  # of Pillow: odd metadata; what is needed and odd is refused here
-            return _photo_of(path.name, image, most_pixels)
-    except ImageError:
-        raise
-    except (UnidentifiedImageError, Image.DecompressionBombError) as error:
-        message = f"{path} is no JPEG or TIFF of a size that can be read ({message_of(error)}): check the file"
-        raise ImageError(message) from error
-    except FileNotFoundError as error:
-        message = f"there is no photo {path}: check the path"
-        raise ImageError(message) from error
-    except Exception as error:  # Pillow and its XML reader fail at damaged files with errors of many kinds
-        message = f"{path} has damaged metadata ({message_of(error)}): copy it again from the drone"
-        raise ImageError(message) from error
+    _check_bytes(path, most_bytes)
+    return _photo_of(path.name, read_head(path), most_pixels)
 
 
 def _check_bytes(path: Path, most_bytes: int) -> None:
-    size = path.stat().st_size
+    size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
     if size > most_bytes:
         message = f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first"
         raise ImageError(message)
 
 
-def _photo_of(name: str, image: Image.Image, most_pixels: int) -> Photo:
-    width_px, height_px = image.size
-    if width_px * height_px > most_pixels:
+def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:
+    width_px, height_px = head.size_px
+    if width_px * height_px > most_pixels or min(head.size_px) < 1:
         message = f"{name} has {width_px} x {height_px} pixels, at most {most_pixels} are read: scale it down first"
         raise ImageError(message)
-    exif = image.getexif()
-    inner, xmp = exif.get_ifd(ExifTags.IFD.Exif), dict(_leaves(image.getxmp()))
-    orientation = exif.get(ExifTags.Base.Orientation, 1)
+    orientation = head.exif.get(ExifTags.Base.Orientation, 1)
     if orientation not in _TURNS:
-        message = f"{name} is mirrored (EXIF orientation {orientation!r}): use the drone's own file"
+        message = f"{name} is mirrored or damaged (EXIF orientation {orientation!r}): use the drone's own file"
         raise ImageError(message)
     if _TURNS[orientation][0][0] == 0:
         width_px, height_px = height_px, width_px
-    lon_deg, lat_deg = _place(exif.get_ifd(ExifTags.IFD.GPSInfo))
+    lon_deg, lat_deg = _place(head.gps)
+    make = _text(head.exif.get(ExifTags.Base.Make))
+    angles = camera_angles(head.xmp, make)
     return Photo(
         name=name,
         width_px=width_px,
@@ -194,53 +192,52 @@ def _photo_of(name: str, image: Image.Image, most_pixels: int) -> Photo:
         orientation=orientation,
         lon_deg=lon_deg,
         lat_deg=lat_deg,
-        height_m=_number(xmp.get("RelativeAltitude")),
-        altitude_m=_number(xmp.get("AbsoluteAltitude")),
-        gimbal=_attitude(xmp, "Gimbal"),
-        flight=_attitude(xmp, "Flight"),
-        focal_mm=_positive(inner.get(ExifTags.Base.FocalLength)),
-        focal_35mm=_positive(inner.get(ExifTags.Base.FocalLengthIn35mmFilm)),
-        focal_px=_calibrated(xmp, max(image.size)),
-        taken_at=_time(inner.get(ExifTags.Base.DateTimeOriginal)),
-        model=str(exif.get(ExifTags.Base.Model, "")).strip("\0 "),
+        height_m=height_above_m(head.xmp),
+        altitude_m=altitude_m(head.xmp),
+        gimbal=angles.attitude,
+        gimbal_fault=angles.fault,
+        flight=body_angles(head.xmp),
+        lens=_lens(head.inner, head.xmp, make),
+        taken_at=_time(head.inner.get(ExifTags.Base.DateTimeOriginal)),
+        model=_text(head.exif.get(ExifTags.Base.Model)),
     )
 
 
-def _leaves(tree: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield name and text of everything in XMP; names have no prefix, whether attribute or element."""
-    for name, value in tree.items():
-        for item in value if isinstance(value, list) else [value]:
-            if isinstance(item, Mapping):
-                yield from _leaves(item)
-            elif isinstance(item, str):
-                yield name, item
+def _text(value: object) -> str:
+    return "" if value is None else str(value).strip("\0 ")
 
 
-def _number(value: Any) -> float | None:  # noqa: ANN401 - whatever metadata hold
-    """Return a finite number out of EXIF or XMP, which may hold text, fractions of zero or nothing."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if math.isfinite(number) else None
+def _lens(inner: Mapping[int, Any], xmp: Xmp, make: str) -> Lens:
+    calibrated_px, calibrated_size_px = _calibration(xmp)
+    across, down = (
+        positive_of(inner.get(tag)) for tag in (ExifTags.Base.ExifImageWidth, ExifTags.Base.ExifImageHeight)
+    )
+    a_unit = positive_of(inner.get(ExifTags.Base.FocalPlaneXResolution))
+    unit_mm = _UNITS_MM.get(inner.get(ExifTags.Base.FocalPlaneResolutionUnit, 2))
+    return Lens(
+        focal_mm=positive_of(inner.get(ExifTags.Base.FocalLength)),
+        film_mm=positive_of(inner.get(ExifTags.Base.FocalLengthIn35mmFilm)),
+        calibrated_px=calibrated_px,
+        calibrated_size_px=calibrated_size_px,
+        sensor_px_mm=a_unit / unit_mm if a_unit and unit_mm else None,
+        native_size_px=(across, down) if across and down else None,
+        zoom=positive_of(inner.get(ExifTags.Base.DigitalZoomRatio)),
+        make=make,
+    )
 
 
-def _positive(value: Any) -> float | None:  # noqa: ANN401 - as above
-    number = _number(value)
-    return number if number is not None and number > 0 else None
+def _calibration(xmp: Xmp) -> tuple[float | None, Size | None]:
+    """Return the calibrated focal length, pixels, and the size of the picture with that optical centre in its middle.
 
-
-def _calibrated(xmp: Mapping[str, str], side_px: int) -> float | None:
-    focal_px = _positive(xmp.get("CalibratedFocalLength"))
-    low, high = _FOCAL_PX
-    return focal_px if focal_px is not None and low * side_px <= focal_px <= high * side_px else None
-
-
-def _attitude(xmp: Mapping[str, str], whose: str) -> Attitude | None:
-    roll_deg, pitch_deg, yaw_deg = (_number(xmp.get(f"{whose}{axis}Degree")) for axis in ("Roll", "Pitch", "Yaw"))
-    if roll_deg is None or pitch_deg is None or yaw_deg is None:
-        return None
-    return Attitude(roll_deg=roll_deg, pitch_deg=pitch_deg, yaw_deg=yaw_deg)
+    DJI's centre counts from the picture's corner, Skydio's from the middle of its first pixel.
+    """
+    focal_px = positive_of(xmp.get((DJI, "CalibratedFocalLength")))
+    uri, axis, half_px = (DJI, "", 0.0) if focal_px else (SKYDIO, "/", 0.5)
+    if not focal_px:
+        both = [positive_of(xmp.get((SKYDIO, f"CalibratedFocalLength/{side}"))) for side in "XY"]
+        focal_px = sum(both) / 2 if all(both) else None  # type: ignore[arg-type]
+    across, down = (positive_of(xmp.get((uri, f"CalibratedOpticalCenter{axis}{side}"))) for side in "XY")
+    return focal_px, (2 * (across + half_px), 2 * (down + half_px)) if across and down else None
 
 
 def _place(gps: Mapping[int, Any]) -> tuple[float, float] | tuple[None, None]:
@@ -255,7 +252,7 @@ def _place(gps: Mapping[int, Any]) -> tuple[float, float] | tuple[None, None]:
 def _degrees(parts: object, side: object, plus: str, minus: str) -> float | None:
     if not isinstance(parts, tuple) or len(parts) != 3 or side not in (plus, minus):  # noqa: PLR2004 - deg, min, s
         return None
-    numbers = [_number(part) for part in parts]
+    numbers = [number_of(part) for part in parts]
     if None in numbers:
         return None
     degrees = float(np.dot(np.array(numbers, dtype=np.float64), (1, 1 / 60, 1 / 3600)))

@@ -45,7 +45,7 @@ def xmp_of(pose, *, as_elements=False):
 def write_photo(path, *, gps=ZURICH, xmp=xmp_of(POSE), focal=20, orientation=None, size=(400, 300)):  # noqa: B008
     """A photo of nothing, with the metadata of a drone's."""
     exif = Image.Exif()
-    if orientation:
+    if orientation is not None:
         exif[ExifTags.Base.Orientation] = orientation
     exif.get_ifd(ExifTags.IFD.GPSInfo).update(gps)
     if focal:
@@ -64,7 +64,7 @@ def photo_path(tmp_path: Path) -> Path:
 def test_place_height_angles_and_focal_length_are_read(photo_path, as_elements):
     photo = read_photo(write_photo(photo_path, xmp=xmp_of(POSE, as_elements=as_elements)))
     assert (photo.lon_deg, photo.lat_deg) == (pytest.approx(8.5), pytest.approx(47.375))
-    assert (photo.height_m, photo.focal_35mm) == (50.0, 20.0)
+    assert (photo.height_m, photo.lens.film_mm) == (50.0, 20.0)
     assert (photo.gimbal.yaw_deg, photo.gimbal.pitch_deg, photo.flight.roll_deg) == (90.0, -60.0, -1.0)
     assert photo.taken_at == dt.datetime(2024, 5, 1, 10, 20, 30)  # noqa: DTZ001 - the drone names no zone
 
@@ -99,6 +99,7 @@ def test_a_wide_photo_is_cut_out_of_a_sensor_of_four_to_three(photo_path):
 @pytest.mark.parametrize(
     ("orientation", "to_stored"),
     [
+        (0, lambda col, row: (col, row)),  # unknown
         (1, lambda col, row: (col, row)),
         (3, lambda col, row: (400 - col, 300 - row)),
         (6, lambda col, row: (row, 300 - col)),
@@ -134,6 +135,11 @@ def without(*names):
         ({"xmp": xmp_of({})}, "gimbal angles missing"),
         ({"xmp": ""}, "height above take-off, gimbal angles missing"),
         ({"focal": None}, "focal length"),
+        ({"xmp": xmp_of(POSE | {"RelativeAltitude": "-12.30"})}, r"-12\.3 m above the ground .*give its own height"),
+        ({"xmp": xmp_of(POSE | {"RelativeAltitude": "0.00"})}, r"\+0 m above the ground"),
+        ({"xmp": xmp_of(POSE | {"GimbalPitchDegree": "+0.00"})}, "looks at the horizon or the sky"),
+        ({"xmp": xmp_of(POSE | {"GimbalPitchDegree": "+90.00"})}, r"gimbal pitch \+90\.0"),
+        ({"xmp": xmp_of(POSE | {"GimbalPitchDegree": "-170", "GimbalRollDegree": "180"}), "focal": None}, "focal"),
     ],
 )
 def test_a_photo_without_pose_is_refused_on_one_line_where_its_pose_is_asked_for(photo_path, how, hint):
@@ -147,6 +153,10 @@ def test_a_photo_without_pose_is_refused_on_one_line_where_its_pose_is_asked_for
 def test_a_height_of_ones_own_stands_in_for_a_missing_one(photo_path):
     photo = read_photo(write_photo(photo_path, xmp=xmp_of(without("RelativeAltitude"))))
     assert photo.camera(height_m=33.0).height_m == 33.0
+    below = read_photo(write_photo(photo_path, xmp=xmp_of(POSE | {"RelativeAltitude": "-12.30"})))
+    assert below.camera(height_m=33.0).height_m == 33.0
+    with pytest.raises(CameraError, match="height_m"):
+        below.camera(height_m=-1.0)
 
 
 BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><x:xmpmeta xmlns:x="adobe:ns:meta/">&b;</x:xmpmeta>'
@@ -156,6 +166,7 @@ BOMB = '<!DOCTYPE x [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><x:xmpmeta xmlns:x=
     ("how", "limits", "hint"),
     [
         ({"orientation": 2}, {}, "mirrored"),
+        ({"orientation": 9}, {}, "orientation 9"),
         ({"xmp": "<x:xmpmeta>"}, {}, "damaged metadata"),
         ({"xmp": BOMB}, {}, "damaged metadata"),
         ({}, {"most_bytes": 100}, "at most 100 are read"),

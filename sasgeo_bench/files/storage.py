@@ -43,6 +43,7 @@ _MOST_LIST_BYTES: Final = 500_000_000
 _FILES_AT_ONCE: Final = 64  # sent before the list of those so far is written again
 _MOST_PART_BYTES: Final = 255  # of a name of a file or folder
 _CONTENT: Final = {"region.json": ("id",), "task.json": ("suite", "region"), "run.json": ("hash", "suite", "region")}
+_MARKERS: Final = ("/", "_$folder$")  # ends of keys without bytes that consoles and Hadoop make for a folder
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@|\?.*$", re.DOTALL)
 
 
@@ -269,8 +270,9 @@ def _place(url: str, root: str) -> str:
 
 
 def _found(system: "AbstractFileSystem", root: str) -> dict[str, Any]:
-    """Return all files below a place, with their sizes."""
-    return dict(system.find(root, detail=True)) if system.exists(root) else {}
+    """Return all files below a place, with their sizes; a marker of a folder holds nothing, and is none."""
+    found = dict(system.find(root, detail=True)) if system.exists(root) else {}
+    return {path: about for path, about in found.items() if about["size"] or not path.endswith(_MARKERS)}
 
 
 def _put(system: "AbstractFileSystem", path: Path, there: str) -> None:

@@ -139,6 +139,21 @@ def test_storage_loses_nothing_of_others(url, folder, tmp_path):
     assert fetch(url, tmp_path / "new").moved == 3
 
 
+def test_markers_of_folders_as_consoles_make_them_are_no_files_of_others(folder, tmp_path, monkeypatch):
+    url = "memory://bucket/marked"
+    system, root = place(url)
+    find = type(system).find
+    markers = {f"{root}{end}": {"size": 0, "type": "file"} for end in ("/", "/layers/", "/layers_$folder$")}
+    system.makedirs(root, exist_ok=True)
+    monkeypatch.setattr(type(system), "find", lambda *given, **more: find(*given, **more) | markers)
+    assert send(folder, url).moved == fetch(url, tmp_path / "here").moved == 3
+    markers[f"{root}/thesis/"] = {"size": 4, "type": "file"}  # bytes, whatever their name
+    with pytest.raises(StoreError, match="of another folder"):
+        send(folder, url)
+    monkeypatch.undo()
+    system.rm(root, recursive=True)
+
+
 def test_a_fetch_loses_nothing_of_others(url, folder, tmp_path):
     send(folder, url)
     (tmp_path / "here").mkdir()

@@ -43,6 +43,10 @@ class FolderReader:
         """Return the names of the folders in a folder, sorted; raise `DatasetError` if it is missing."""
         return [path.name for path in self._entries(relative) if path.is_dir()]
 
+    def files(self, relative: str) -> list[str]:
+        """Return the names of the files in a folder, sorted."""
+        return [path.name for path in self._entries(relative) if path.is_file()]
+
     def images(self, relative: str) -> list[str]:
         """Return the names of the images in a folder, sorted; other files are counted in `skipped`.
 

@@ -3,7 +3,7 @@
 
 import datetime as dt
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -44,7 +44,10 @@ def read_visloc(reader: FolderReader) -> Dataset:
     frames = [frame for flight in flights for frame in _read_frames(reader, flight)]
     there = [sheet for sheet in sheets if sheet.flight in flights]
     tiles = [tile for sheet in there for tile in cut_tiles(_measured(reader, sheet))]
-    return Dataset(card=CARD, items=(*frames, *tiles), notes=(*_notes(flights, sheets, frames, tiles), *reader.notes()))
+    parted = [_file_of(sheet) for sheet in there if not reader.has(_file_of(sheet))]
+    notes = [f"{named(parted, 'map')} in parts: each is read as the mosaic of its parts"] if parted else []
+    notes += [*_notes(flights, sheets, frames, tiles), *reader.notes()]
+    return Dataset(card=CARD, items=(*frames, *tiles), notes=tuple(notes))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,10 +133,46 @@ def _day(text: str) -> dt.date | None:
         return None
 
 
+def _file_of(corners: _Corners) -> str:
+    return f"{corners.flight}/satellite{corners.name}.tif"
+
+
 def _measured(reader: FolderReader, corners: _Corners) -> MapSheet:
-    relative = f"{corners.flight}/satellite{corners.name}.tif"
-    width_px, height_px = read_size_px(reader.file(relative), shown=relative)
+    """Measure a map; one that the table has as a whole, and the folder in a grid of parts, is their mosaic."""
+    relative = _file_of(corners)
+    parts = {} if reader.has(relative) else _parts(reader, corners)
+    if parts:
+        width_px, height_px = _mosaic_px(parts, relative)
+    else:
+        width_px, height_px = read_size_px(reader.file(relative), shown=relative)
     return MapSheet(name=corners.name, flight=corners.flight, box=corners.box, width_px=width_px, height_px=height_px)
+
+
+def _parts(reader: FolderReader, corners: _Corners) -> dict[tuple[int, int], tuple[int, int]]:
+    """Return width and height of each part `satelliteNN_RR-CC.tif` of a map by its row and column, from 1 on."""
+    part = re.compile(rf"satellite{corners.name}_((?!00)[0-9]{{2}})-((?!00)[0-9]{{2}})\.tif")
+    found = [part.fullmatch(name) for name in reader.files(corners.flight)]
+    return {
+        (int(name[1]), int(name[2])): read_size_px(
+            reader.file(f"{corners.flight}/{name[0]}"), shown=f"{corners.flight}/{name[0]}"
+        )
+        for name in found
+        if name is not None
+    }
+
+
+def _mosaic_px(parts: Mapping[tuple[int, int], tuple[int, int]], relative: str) -> tuple[int, int]:
+    """Return width and height of a grid of parts; raise `DatasetError` if one is missing or does not fit."""
+    rows, cols = (range(1, max(at[axis] for at in parts) + 1) for axis in (0, 1))
+    grid = [(row, col) for row in rows for col in cols]
+    lacking = [f"_{row:02}-{col:02}" for row, col in grid if (row, col) not in parts]
+    if lacking:
+        message = f"{relative} is in parts, and {named(lacking, 'part')} is missing: copy all of them"
+        raise DatasetError(message)
+    if any(parts[at][0] != parts[1, at[1]][0] or parts[at][1] != parts[at[0], 1][1] for at in grid):
+        message = f"{relative} is in parts of sizes that make no grid: copy them again"
+        raise DatasetError(message)
+    return sum(parts[1, col][0] for col in cols), sum(parts[row, 1][1] for row in rows)
 
 
 def _notes(

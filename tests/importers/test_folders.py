@@ -146,6 +146,43 @@ def test_a_flight_may_have_a_map_in_parts(tmp_path):
     assert {item.group for item in tiles} == {"09"}
 
 
+PARTS = {"01-01": (1100, 700), "01-02": (948, 700), "02-01": (1100, 324), "02-02": (948, 324)}
+
+
+def in_parts(root: Path, parts: dict[str, tuple[int, int]]) -> Path:
+    """The set as it is published: the table has one map of flight 09, and its folder has it in parts."""
+    writers.write_flight(root, "09", [(116.005, 29.715)])
+    writers.write_maps(root, {"09": writers.BOX}, size=(1, 1))
+    (root / "09" / "satellite09.tif").unlink()
+    for name, size in parts.items():
+        writers.write_tiff(root / "09" / f"satellite09_{name}.tif", *size)
+    return root
+
+
+def test_a_map_in_parts_with_one_row_in_the_table_is_their_mosaic(tmp_path):
+    found = read_dataset(in_parts(tmp_path / "parts", PARTS), "uav-visloc")
+    whole = tmp_path / "whole"
+    writers.write_flight(whole, "09", [(116.005, 29.715)])
+    writers.write_maps(whole, {"09": writers.BOX}, size=(2048, 1024))
+    assert found.items == read_dataset(whole, "uav-visloc").items
+    assert found.count("gallery") == 10
+    assert "1 map (09/satellite09.tif) in parts: each is read as the mosaic of its parts" in found.notes
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"02-01": None}, "09/satellite09.tif is in parts, and 1 part (_02-01) is missing"),
+        ({"02-02": (948, 300)}, "sizes that make no grid"),
+        (dict.fromkeys(PARTS), "holds no 09/satellite09.tif"),
+        ({"03-01": (5, 5)}, "1 part (_03-02) is missing"),
+    ],
+)
+def test_parts_that_make_no_map_are_refused(changed, told, tmp_path):
+    parts = {name: size for name, size in (PARTS | changed).items() if size}
+    assert told in refusal("uav-visloc", in_parts(tmp_path, parts))
+
+
 def test_the_table_of_maps_may_have_a_space_in_its_name(tmp_path):
     root = writers.write_visloc(tmp_path)
     (root / "satellite_coordinates_range.csv").rename(root / "satellite_ coordinates_range.csv")

@@ -25,6 +25,8 @@ _WITHIN_8_BITS: Final = frozenset(
     {"1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB"}
 )
 _16_BITS: Final = 65535
+_OPAQUE: Final = 255
+_MOST_BETWEEN: Final = 0.1  # of a TIFF's pixels, at the edges of a mask, are neither opaque nor transparent
 _KIND: Final = 254  # TIFF's NewSubfileType
 _REDUCED: Final = 1  # its bit of a preview, as raw photos (DNG) have one in front
 
@@ -52,7 +54,8 @@ def decode_image(
     Raises
     ------
     ImageError
-        In one line, if the image is empty, too large, truncated or damaged, or holds no colours (32-bit numbers).
+        In one line, if the image is empty, too large, truncated or damaged, holds no colours (32-bit numbers), or is a
+        TIFF whose alpha is no mask, or whose first picture is a preview.
 
     Examples
     --------
@@ -80,7 +83,7 @@ def _decoded(data: bytes, name: str, most_pixels: int) -> Picture:
     try:
         with Image.open(BytesIO(data), formats=_FORMATS) as image:  # reads the head alone
             _check_head(image, name, most_pixels)
-            return _to_rgb(ImageOps.exif_transpose(image))
+            return _to_rgb(ImageOps.exif_transpose(image), name, is_tiff=image.format == "TIFF")
     except ImageError:
         raise
     except Image.DecompressionBombError as error:
@@ -113,7 +116,7 @@ def _check_head(image: Image.Image, name: str, most_pixels: int) -> None:
         raise ImageError(message)
 
 
-def _to_rgb(image: Image.Image) -> Picture:
+def _to_rgb(image: Image.Image, name: str, *, is_tiff: bool) -> Picture:
     """Return the bands of a decoded image as 8-bit red, green and blue."""
     if image.mode.startswith("I;16"):
         grey = np.asarray(image).astype(np.uint32)
@@ -121,6 +124,13 @@ def _to_rgb(image: Image.Image) -> Picture:
         return np.repeat(bytes_[:, :, None], 3, axis=2)
     if image.has_transparency_data:
         seen = image.convert("RGBA")
+        alpha = np.asarray(seen.getchannel("A"))
+        if is_tiff and ((alpha > 0) & (alpha < _OPAQUE)).mean() > _MOST_BETWEEN:
+            message = (
+                f"{name} has a band that calls itself alpha and holds a picture, such as near infrared: write its red, "
+                "green and blue alone (gdal_translate -b 1 -b 2 -b 3)"
+            )
+            raise ImageError(message)
         image = Image.new("RGBA", seen.size, (0, 0, 0, 255))
         image.alpha_composite(seen)
     return np.array(image.convert("RGB"), dtype=np.uint8)

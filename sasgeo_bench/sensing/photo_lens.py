@@ -25,7 +25,7 @@ class Lens:
 
     `film_mm` is the focal length on 35 mm film. `calibrated_px` belongs to a picture of `calibrated_size_px` (twice the
     optical centre). `sensor_px_mm` are pixels of the sensor to a millimetre, of a picture of `native_size_px`, which is
-    the size that EXIF names. `zoom` is the digital one.
+    the size that EXIF names. `zoom` is the digital one. `projection` is empty for a pinhole, else such as "fisheye".
     """
 
     focal_mm: float | None = None
@@ -36,6 +36,7 @@ class Lens:
     native_size_px: Size | None = None
     zoom: float | None = None
     make: str = ""
+    projection: str = ""
 
     def focal_px(self, name: str, size_px: Size) -> float:
         """Return the focal length in pixels of a picture of a size; raise `CameraError` if there is none for it.
@@ -47,6 +48,9 @@ class Lens:
         >>> lens.focal_px("a.jpg", (2000, 1500))
         1833.335
         """
+        if self.projection:
+            message = f"{name} is a {self.projection} picture, which no pinhole describes: give the camera's intrinsics"
+            raise CameraError(message)
         calibrated, film = self._by_calibration(name, size_px), self._by_film(name, size_px)
         sensor = self._by_sensor(name, size_px)
         if calibrated is None and film is not None and sensor is not None and abs(film / sensor - 1) > _AGREES:

@@ -17,9 +17,10 @@ from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
 from sasgeo_bench.sensing.intrinsics import Intrinsics
-from sasgeo_bench.sensing.photo_angles import DJI, SKYDIO, altitude_m, body_angles, camera_angles, height_above_m
+from sasgeo_bench.sensing.photo_angles import DJI, PIX4D, SKYDIO, altitude_m, body_angles, camera_angles, height_above_m
 from sasgeo_bench.sensing.photo_heads import PhotoHead, Xmp, number_of, positive_of, read_head
 from sasgeo_bench.sensing.photo_lens import Lens, Size
+from sasgeo_bench.texts import one_line
 
 MOST_BYTES: Final = 64 * 2**20  # of a photo
 MOST_PIXELS: Final = 200_000_000
@@ -27,6 +28,7 @@ MOST_PIXELS: Final = 200_000_000
 _STRAIGHT_DOWN_DEG: Final = -90.0
 _HORIZON_DEG: Final = 90.0 - 1e-6  # of tilt; the optical axis of a camera that leans more meets no level ground
 _STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
+_PANORAMA: Final = "http://ns.google.com/photos/1.0/panorama"
 _UNITS_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's units of FocalPlaneXResolution
 
 # EXIF's orientation -> right and down of the upright picture in those of the sensor; 0 is none, the others mirror.
@@ -223,7 +225,14 @@ def _lens(inner: Mapping[int, Any], xmp: Xmp, make: str) -> Lens:
         native_size_px=(across, down) if across and down else None,
         zoom=positive_of(inner.get(ExifTags.Base.DigitalZoomRatio)),
         make=make,
+        projection=_projection(xmp),
     )
+
+
+def _projection(xmp: Xmp) -> str:
+    """Return the projection of a fisheye or a panorama, empty for the picture of a pinhole."""
+    model = xmp.get((PIX4D, "ModelType"), "perspective").lower()
+    return one_line(xmp.get((_PANORAMA, "ProjectionType"), "" if model == "perspective" else model))[:40]
 
 
 def _calibration(xmp: Xmp) -> tuple[float | None, Size | None]:

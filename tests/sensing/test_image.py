@@ -204,3 +204,19 @@ def test_an_aerial_image_fits_its_camera(changes: dict[str, object], fault: str)
 def test_labels_fit_their_picture(classes: tuple[str, ...], labels: np.ndarray, fault: str) -> None:
     with pytest.raises(ImageError, match=fault):
         LabelledImage(image=aerial(), classes=classes, labels=labels, place="oslo")
+
+
+def tiff_of(alpha):
+    image = Image.fromarray(np.dstack([np.full((20, 20, 3), 90, np.uint8), alpha]), "RGBA")
+    encoded = BytesIO()
+    image.save(encoded, "TIFF")
+    return encoded.getvalue()
+
+
+def test_infrared_in_a_tiff_that_calls_itself_alpha_does_not_darken_the_picture():
+    infrared = np.random.default_rng(1).integers(1, 200, (20, 20), dtype=np.uint8)
+    with pytest.raises(ImageError, match=r"chip.tif has a band that calls itself alpha .* -b 1 -b 2 -b 3"):
+        decode_image(tiff_of(infrared), name="chip.tif")
+    mask = np.full((20, 20), 255, np.uint8)
+    mask[:3], mask[3] = 0, 128
+    assert decode_image(tiff_of(mask))[:, 0, 0].tolist() == [0] * 3 + [45] + [90] * 16

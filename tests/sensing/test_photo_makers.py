@@ -103,6 +103,12 @@ def skydio(yaw, pitch, roll):
     return part_of(SKYDIO, {"CameraOrientationNED": angles, "RelativeAltitude": HEIGHT_M})
 
 
+def skydio_by_attributes(yaw, pitch, roll):
+    inside = f'<q:CameraOrientationNED q:Roll="{roll}" q:Pitch="{pitch}" q:Yaw="{yaw}"/>'
+    height = f'q:RelativeAltitude="{HEIGHT_M}"'
+    return f'<rdf:Description rdf:about="" xmlns:q="{SKYDIO}" {height}>{inside}</rdf:Description>'
+
+
 def pix4d(yaw, pitch, roll):
     return part_of(PIX4D, {"Yaw": yaw, "Pitch": pitch, "Roll": roll, "AboveGroundAltitude": HEIGHT_M})
 
@@ -120,6 +126,7 @@ POINTED = [
     ("Autel Robotics", pix4d(90, 30, 0), 90, (AHEAD_30, 0)),  # older firmware
     ("Parrot", part_of(PARROT, gimbal(180, -60, names="Camera{}Degree")) + pix4d(0, 0, 0), 180, (0, -AHEAD_30)),
     ("Skydio", skydio(90, -60, 0), 90, (AHEAD_30, 0)),
+    ("Skydio", skydio_by_attributes(90, -60, 0), 90, (AHEAD_30, 0)),
     ("Sentera", pix4d(90, 30, 0), 90, (AHEAD_30, 0)),
     ("Sentera", pix4d(0, 0, 0), 0, (0, 0)),
     ("Sentera", pix4d(0, -5, 0), 0, (0, -HEIGHT_M * math.tan(math.radians(5)))),
@@ -246,6 +253,19 @@ def test_a_focal_length_of_another_picture_is_refused_on_one_line(how, facts, wo
         photo.intrinsics()
     assert "\n" not in str(caught.value)
     assert "intrinsics" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("uri", "facts", "word"),
+    [
+        (PIX4D, {"ModelType": "fisheye"}, "fisheye"),
+        ("http://ns.google.com/photos/1.0/panorama/", {"ProjectionType": "equirectangular"}, "equirectangular"),
+    ],
+)
+def test_a_picture_that_no_pinhole_takes_has_no_focal_length(uri, facts, word, tmp_path):
+    photo = read_photo(write(tmp_path / "a.jpg", packet_of(part_of(DJI, CALIBRATED), part_of(uri, facts))))
+    with pytest.raises(CameraError, match=f"is a {word} picture, which no pinhole describes"):
+        photo.camera()
 
 
 def test_a_calibrated_focal_length_in_another_unit_is_not_taken():

@@ -6,8 +6,10 @@ from pathlib import Path
 from typing import Final, Self
 
 import numpy as np
+import pyproj
 import rasterio
 from numpy.typing import NDArray
+from pyproj.exceptions import ProjError
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
@@ -15,6 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from sasgeo_bench.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.texts import one_line
 
 Points = NDArray[np.float64]
 
@@ -177,7 +180,7 @@ def read_dem(path: Path, grid: Grid) -> Dem:
         raise CameraError(message)
     try:
         with rasterio.open(path) as source:
-            _check_source(path, source)
+            _check_source(path, source, grid.epsg)
             unit_m, scale, offset = _unit_m(path, source), source.scales[0], source.offsets[0]
             with WarpedVRT(
                 source,
@@ -217,10 +220,18 @@ def _unit_m(path: Path, source: rasterio.DatasetReader) -> float:
     return _UNITS_M[unit]
 
 
-def _check_source(path: Path, source: rasterio.DatasetReader) -> None:
+def _check_source(path: Path, source: rasterio.DatasetReader, epsg: int) -> None:
     if source.crs is None:
         message = f"{path} has no CRS: write one into it (gdal_edit.py -a_srs EPSG:...), or name another file"
         raise CameraError(message)
+    try:
+        pyproj.Transformer.from_crs(source.crs.to_wkt(), epsg)
+    except ProjError as error:
+        message = (
+            f"{path} has the coordinate reference system {one_line(source.crs.to_wkt())[:60]!r}, from which there is no "
+            f"way to EPSG:{epsg}: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
+        )
+        raise CameraError(message) from error
     if source.count != 1 or np.dtype(source.dtypes[0]).kind not in "iuf":
         message = (
             f"{path} is no file of heights: it has {source.count} bands of {source.dtypes[0]}, one of numbers is needed"

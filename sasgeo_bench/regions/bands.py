@@ -19,9 +19,9 @@ _COLOURS: Final = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
 _SILENT: Final = frozenset({ColorInterp.undefined, ColorInterp.gray, ColorInterp.alpha})  # say nothing of a colour
 _WORD: Final = re.compile(r"\b(red|green|blue)\b(?!\W*edge)", re.IGNORECASE)  # not the red edge
 _BITS: Final = 8
-_OPAQUE: Final = 255
 _SAMPLES: Final = 8  # blocks along each side of a picture that are looked at
 _SAMPLE_PX: Final = 1024  # of a block, where it is larger
+_BETWEEN: Final = (2, 249)  # levels of an alpha that are neither transparent nor opaque; 1 is, in masks of 0 and 1
 _MOST_BETWEEN: Final = 0.1  # of the pixels of a mask, at its edges, are neither opaque nor transparent
 
 
@@ -61,13 +61,11 @@ def find_bands(path: Path, source: rasterio.io.DatasetReader) -> Bands:
     if bits != str(_BITS):
         message = f"{path} has colours of {bits} bits, imagery has 8: convert it (gdal_translate -ot Byte -scale)"
         raise ImageryError(message)
-    alpha, note = alphas[0] if alphas else None, colours.note
+    alpha, notes = alphas[0] if alphas else None, [colours.note] if colours.note else []
     if alpha is not None and not _is_mask(source, alpha):
-        note = "; ".join(
-            filter(None, (note, f"its band {alpha} calls itself alpha and holds a picture: it hides nothing"))
-        )
+        notes.append(f"its band {alpha} calls itself alpha and holds a picture, such as infrared: it hides nothing")
         alpha = None
-    return Bands(rgb=colours.rgb, alpha=alpha, note=note)
+    return Bands(rgb=colours.rgb, alpha=alpha, note="; ".join(notes))
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,12 +118,13 @@ def _is_mask(source: rasterio.io.DatasetReader, band: int) -> bool:
     tall, wide = source.block_shapes[band - 1]
     tops = np.unique(np.linspace(0, (source.height - 1) // tall, _SAMPLES).astype(int)) * tall
     lefts = np.unique(np.linspace(0, (source.width - 1) // wide, _SAMPLES).astype(int)) * wide
+    low, high = _BETWEEN
     between = total = 0
     for top in tops.tolist():
         for left in lefts.tolist():
             rows, cols = min(tall, _SAMPLE_PX, source.height - top), min(wide, _SAMPLE_PX, source.width - left)
             alpha = source.read(band, window=Window(left, top, cols, rows))
-            between += int(((alpha > 0) & (alpha < _OPAQUE)).sum())
+            between += int(((alpha >= low) & (alpha <= high)).sum())
             total += alpha.size
     return between <= _MOST_BETWEEN * total
 

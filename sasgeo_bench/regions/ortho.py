@@ -317,6 +317,7 @@ class _Warped:
                 width=grid.cols,
                 resampling=Resampling.cubic,
                 add_alpha=ColorInterp.alpha not in source.colorinterp,
+                init_dest_nodata=False,  # else alpha, too, is that value where there is no picture
                 warp_mem_limit=64,
             )
         )

@@ -228,8 +228,8 @@ def _check_source(path: Path, source: rasterio.DatasetReader, epsg: int) -> None
         pyproj.Transformer.from_crs(source.crs.to_wkt(), epsg)
     except ProjError as error:
         message = (
-            f"{path} has the coordinate reference system {one_line(source.crs.to_wkt())[:60]!r}, from which there is no "
-            f"way to EPSG:{epsg}: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
+            f"{path} has the coordinate reference system {one_line(source.crs.to_wkt())[:60]!r}, from which no way "
+            f"leads to EPSG:{epsg}: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
         )
         raise CameraError(message) from error
     if source.count != 1 or np.dtype(source.dtypes[0]).kind not in "iuf":

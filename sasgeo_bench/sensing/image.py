@@ -25,7 +25,7 @@ _WITHIN_8_BITS: Final = frozenset(
     {"1", "L", "LA", "La", "P", "PA", "RGB", "RGBA", "RGBa", "RGBX", "CMYK", "YCbCr", "LAB"}
 )
 _16_BITS: Final = 65535
-_OPAQUE: Final = 255
+_BETWEEN: Final = (2, 249)  # levels of an alpha that are neither transparent nor opaque
 _MOST_BETWEEN: Final = 0.1  # of a TIFF's pixels, at the edges of a mask, are neither opaque nor transparent
 _KIND: Final = 254  # TIFF's NewSubfileType
 _REDUCED: Final = 1  # its bit of a preview, as raw photos (DNG) have one in front
@@ -125,7 +125,7 @@ def _to_rgb(image: Image.Image, name: str, *, is_tiff: bool) -> Picture:
     if image.has_transparency_data:
         seen = image.convert("RGBA")
         alpha = np.asarray(seen.getchannel("A"))
-        if is_tiff and ((alpha > 0) & (alpha < _OPAQUE)).mean() > _MOST_BETWEEN:
+        if is_tiff and ((alpha >= _BETWEEN[0]) & (alpha <= _BETWEEN[1])).mean() > _MOST_BETWEEN:
             message = (
                 f"{name} has a band that calls itself alpha and holds a picture, such as near infrared: write its red, "
                 "green and blue alone (gdal_translate -b 1 -b 2 -b 3)"

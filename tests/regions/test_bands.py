@@ -119,6 +119,8 @@ CUT = {
     "alpha second": Made((R, SHOWN, G, B), (Is.red, Is.alpha, Is.green, Is.blue)),
     "alpha after infrared": Made((RGB, INFRARED, SHOWN), (*RGB_ALPHA[:3], NO, Is.alpha)),
     "alpha last, black is empty too": Made((RGB, SHOWN), RGB_ALPHA, profile={"nodata": 0}),
+    "alpha last, white is empty too": Made((RGB, SHOWN), RGB_ALPHA, profile={"nodata": 255}),
+    "alpha of 0 and 1": Made((RGB, SHOWN // 255), RGB_ALPHA),
     "alpha and a mask": Made((RGB, FULL), RGB_ALPHA, mask=SHOWN[0]),
     "a mask that shows more than alpha": Made((SHOWN, RGB), ALPHA_RGB, mask=FULL[0], beside=True),
     "a mask of other bands": Made((RGB[::-1],), BGR, mask=SHOWN[0]),
@@ -132,8 +134,10 @@ CUT = {
     ),
 }
 NOTED = {
-    "infrared that calls itself alpha": (Made((RGB, INFRARED), RGB_ALPHA), "its band 4 calls itself alpha and holds a"),
-    "infrared of two values": (Made((RGB, INFRARED // 100 * 130), RGB_ALPHA), "its band 4 calls itself alpha"),
+    "infrared that calls itself alpha": (
+        Made((RGB, INFRARED), RGB_ALPHA),
+        "band 4 calls itself alpha and holds a picture",
+    ),
     "bands without a word": (Made((RGB, INFRARED), GREY, profile=MINISBLACK), r"bands \(1, 2, 3\) are taken as red"),
 }
 

@@ -131,8 +131,11 @@ def test_heights_of_rows_in_any_direction_are_the_same(turn, tmp_path):
     ("how", "hint"),
     [
         ({"crs": None}, "no CRS"),
-        ({"crs": rasterio.crs.CRS.from_wkt('LOCAL_CS["a site",UNIT["metre",1]]')}, "no way to EPSG:32632: write the"),
-        ({"crs": "IAU_2015:30100"}, "no way to EPSG:32632"),  # the Moon
+        (
+            {"crs": rasterio.crs.CRS.from_wkt('LOCAL_CS["a site",UNIT["metre",1]]')},
+            "no way leads to EPSG:32632: write the",
+        ),
+        ({"crs": "IAU_2015:30100"}, "no way leads to EPSG:32632"),  # the Moon
         ({"count": 3, "dtype": "uint8"}, "no file of heights"),
         ({"nodata": 1.0}, "does not cover"),
     ],

@@ -64,7 +64,8 @@ class Lens:
             message = f"{name} has no focal length on 35 mm film: give the camera's intrinsics"
             raise CameraError(message)
         zoom = self.zoom or 1.0
-        if zoom != 1.0 and (calibrated is not None or film is None or self.make.lower() not in _NOT_IN_FILM):
+        leaves_out = calibrated is None and film is not None and self.make.lower() in _NOT_IN_FILM
+        if zoom < 1.0 or (zoom > 1.0 and not leaves_out):
             message = (
                 f"{name} has a digital zoom of {zoom:g}, which its focal length may count or not: give the camera's "
                 "intrinsics"

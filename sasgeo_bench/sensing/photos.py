@@ -28,6 +28,7 @@ MOST_PIXELS: Final = 200_000_000
 _STRAIGHT_DOWN_DEG: Final = -90.0
 _HORIZON_DEG: Final = 90.0 - 1e-6  # of tilt; the optical axis of a camera that leans more meets no level ground
 _STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
+_TIFF: Final = "http://ns.adobe.com/tiff/1.0"
 _PANORAMA: Final = "http://ns.google.com/photos/1.0/panorama"
 _UNITS_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's units of FocalPlaneXResolution
 
@@ -185,7 +186,7 @@ def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:
     if _TURNS[orientation][0][0] == 0:
         width_px, height_px = height_px, width_px
     lon_deg, lat_deg = _place(head.gps)
-    make = _text(head.exif.get(ExifTags.Base.Make))
+    make = _text(head.exif.get(ExifTags.Base.Make)) or head.xmp.get((_TIFF, "Make"), "")
     angles = camera_angles(head.xmp, make)
     return Photo(
         name=name,

@@ -133,6 +133,7 @@ POINTED = [
     ("Sentera", pix4d(0, 0, 10), 0, (-SIDE_10, 0)),  # right wing down: the camera looks to the left
     ("Sentera", pix4d(90, 0, 10), 90, (0, SIDE_10)),
     ("senseFly", pix4d(0, 0, 10), 0, (SIDE_10, 0)),
+    ("", pix4d(0, 0, 10) + part_of("http://ns.adobe.com/tiff/1.0/", {"Make": "senseFly"}), 0, (SIDE_10, 0)),
 ]
 
 
@@ -239,6 +240,7 @@ UNFIT = [
     ("cut, by EXIF", {"size": (300, 300), "inner": dict(zip(PIXELS, FULL, strict=True))}, gimbal(), "cut out of"),
     ("three sizes", {"size": (200, 150), "inner": dict(zip(PIXELS, (800, 600), strict=True))}, CALIBRATED, "of 800 x"),
     ("zoom of others", {"make": "X", "inner": {ZOOM: 2.0}}, gimbal(), "digital zoom of 2"),
+    ("zoom out", {"make": "DJI", "inner": {ZOOM: 0.5}}, gimbal(), "digital zoom of 0.5"),
     ("zoom of a calibrated one", {"make": "DJI", "inner": {ZOOM: 2.0}}, CALIBRATED, "digital zoom of 2"),
     ("film against sensor", {"inner": sensor(80.0)}, gimbal(), "two focal lengths, 277 px by 35 mm film and 704 px"),
     ("nothing", {"film": None}, gimbal(), "no focal length"),

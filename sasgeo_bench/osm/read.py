@@ -20,7 +20,8 @@ from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features
 from sasgeo_bench.osm.geojson import scan_geojson
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.osm.mapped import Mapped, box_text, lonlat_box, map_ground, project
-from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits, scan_file
+from sasgeo_bench.osm.passes import scan_file
+from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits
 from sasgeo_bench.osm.snapshot import Snapshot, open_snapshot
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
 

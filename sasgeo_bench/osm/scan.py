@@ -1,28 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One pass over an OSM file: ways and areas with a key of the taxonomy, and their classes by the rules."""
+"""What a pass over map data finds: rows of ways and areas, their classes by the rules, and their geometry."""
 
 import datetime as dt
 import struct
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import groupby
-from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import numpy as np
 import osmium
 import shapely
 
-from sasgeo_bench.files.garbage import uncollected
-from sasgeo_bench.osm.coverage import find_gaps
-from sasgeo_bench.osm.snapshot import elements
+from sasgeo_bench.osm.multipolygons import Kind, Tags, kind_keys
 from sasgeo_bench.osm.taxonomy import Classification, Label, Taxonomy, classify
 
 LANE_WIDTH_M: Final = 3.25  # between the 2.75 m and 3.75 m lanes of the German RAS-Q 96 cross sections
 DEFAULT_BRIDGE_WIDTH_M: Final = 4.0
 WIDTH_RANGE_M: Final = (0.3, 80.0)
-MIN_RING_POINTS: Final = 3
 _NO: Final = (None, "no", "false", "0")
 _AREA_MODIFIERS: Final = ("tunnel", "layer", "location", "parking", "width")
 _LINE_MODIFIERS: Final = ("tunnel", "layer", "location", "width", "lanes")
@@ -30,8 +25,7 @@ _LINE_MODIFIERS: Final = ("tunnel", "layer", "location", "width", "lanes")
 # Where the first point lies in the WKB of a line and of a multipolygon's first ring, and readers of N points.
 _FIRST_POINT: Final = {2: 9, 6: 22}
 _POINT_BYTES: Final = 16
-_SEVERAL_LINES: Final = 5  # the type in the WKB of a way that lacks nodes
-_COAST: Final = ("natural", "coastline")
+SEVERAL_LINES: Final = 5  # the type in the WKB of a way that lacks nodes
 _POINTS: Final = tuple(struct.Struct(f"<{2 * count}d") for count in range(40))
 
 Get = Callable[[str], str | None]
@@ -96,6 +90,7 @@ class Classifier:
         self._taxonomy = taxonomy
         self._scan = scan
         self._line_keys, self._area_keys = taxonomy.keys_of("line"), taxonomy.keys_of("area")
+        self.kind_keys = kind_keys(taxonomy.keys)
         self._lines: dict[tuple[str | None, ...], Classification] = {}
         self._areas: dict[tuple[str | None, ...], Classification] = {}
         self._kinds: dict[tuple[object, ...], int] = {}
@@ -131,6 +126,11 @@ class Classifier:
             return kept  # a closed way is read as a line too; of a relation there is no other line
         along = (replace(label, is_outline=not label.is_filled) for label in line)
         return (*kept, *(label for label in along if label.is_outline or not labels))
+
+    def as_outer_way(self, tags: Tags) -> Kind:
+        """Return what an outer way of a multipolygon would be as a closed way by itself."""
+        labels = () if tags.get("area") == "no" else self.area_labels(tags.get, is_relation=False)
+        return Kind(labels, _traits(tags, labels, is_area=True).hidden_by)
 
     def kind(self, get: Get, labels: tuple[Label, ...], *, is_area: bool) -> int:
         """Return the index of the object's traits in `Scan.traits`; count objects hidden from above."""
@@ -216,142 +216,6 @@ def reaches(wkb: bytes, box: Box) -> bool:
     return max(longitudes) >= west and min(longitudes) <= east and max(latitudes) >= south and min(latitudes) <= north
 
 
-def scan_file(path: Path, taxonomy: Taxonomy, *, box: Box) -> Scan:
-    """Read every way and area that carries a key of the taxonomy and may reach into a box.
-
-    `path` is a sorted OSM file with one state of the world (`open_snapshot`); `box` is west, south, east, north,
-    degrees. Objects certainly outside it are neither classified nor counted; `Scan.tally` counts all others that are
-    not used, by reason. osmium raises `RuntimeError` on a damaged file, which `open_snapshot` turns into an
-    `ExtractError`.
-    """
-    scan = Scan()
-    classifier = Classifier(taxonomy, scan)
-    expected = _survey(path, taxonomy, classifier, scan.tally)
-    assembled: set[int] = set()
-    with uncollected():
-        for item in _ways_and_areas(path, taxonomy):
-            if not item.is_area():
-                _scan_way(item, scan, classifier, expected.ways, box)
-            elif _scan_area(item, scan, classifier, box):  # an area without a ring stays among the lost
-                if item.from_way():
-                    assembled.add(item.orig_id())
-                else:
-                    expected.relations.pop(item.orig_id(), None)
-    for identifier in [key for key, item in expected.relations.items() if item.is_building]:
-        if assembled.intersection(expected.relations[identifier].outer):
-            del expected.relations[identifier]
-            scan.tally.drops["building relation whose outline is a building itself"] += 1
-    lost = expected.ways - assembled
-    if lost or expected.relations:
-        _scan_lost(path, lost, expected.relations, scan, classifier)
-    return scan
-
-
-def _ways_and_areas(path: Path, taxonomy: Taxonomy) -> Iterator[Any]:
-    """Yield ways with a key of lines and all areas, in one pass; filters and assembly of areas run in C++."""
-    with_key = osmium.filter.KeyFilter(*taxonomy.keys)
-    processor = osmium.FileProcessor(str(path)).with_locations().with_areas(with_key)
-    kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.AREA)
-    lines = osmium.filter.KeyFilter(*taxonomy.keys_of("line"))
-    lines.enable_for(osmium.osm.WAY)
-    return elements(processor.with_filter(kinds).with_filter(with_key).with_filter(lines))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Relation:
-    """An area relation before it is assembled: its labels and its member ways by role."""
-
-    labels: tuple[Label, ...]
-    tags: dict[str, str]
-    version: int
-    timestamp: Any
-    outer: tuple[int, ...]
-    inner: tuple[int, ...]
-    is_building: bool
-
-
-@dataclass(slots=True)
-class _Expected:
-    """Closed ways and relations that carry an area class; what osmium assembles is removed again."""
-
-    ways: set[int] = field(default_factory=set)
-    relations: dict[int, _Relation] = field(default_factory=dict)
-
-
-def _survey(path: Path, taxonomy: Taxonomy, classifier: Classifier, tally: Tally) -> _Expected:
-    """List the objects that should become areas: the main pass sees only those that did."""
-    line_keys = taxonomy.keys_of("line")
-    area_keys = tuple(key for key in taxonomy.keys_of("area") if key not in line_keys)
-    keyed, typed = osmium.filter.KeyFilter(*area_keys), osmium.filter.KeyFilter("type")
-    keyed.enable_for(osmium.osm.WAY)
-    typed.enable_for(osmium.osm.RELATION)
-    expected = _Expected()
-    source = osmium.FileProcessor(str(path), osmium.osm.WAY | osmium.osm.RELATION)
-    for item in elements(source.with_filter(keyed).with_filter(typed)):
-        if item.is_relation():
-            relation = _area_relation(item, classifier)
-            if relation is not None:
-                expected.relations[item.id] = relation
-        elif item.is_closed():
-            expected.ways.add(item.id)
-        elif not any(key in item.tags for key in line_keys):
-            key = next(key for key in area_keys if key in item.tags)
-            tally.drops[f"open way with the area key {key!r}, anywhere in the extract"] += 1
-    return expected
-
-
-def _scan_way(way: Any, scan: Scan, classifier: Classifier, closed: set[int], box: Box) -> None:  # noqa: ANN401
-    """Take a way as a line if a line rule holds; remember it if an area of it must follow."""
-    get, wkb = way.tags.get, line_wkb(way, scan.tally)
-    if (wkb is None or wkb[1] == _SEVERAL_LINES) and classifier.as_line(get).line:
-        scan.gaps[way.id] = find_gaps(way)
-    if wkb is None:
-        return
-    if get(_COAST[0]) == _COAST[1]:
-        scan.coast.append(wkb)
-    if not reaches(wkb, box):
-        scan.far.append(wkb)
-        return
-    found = classifier.as_line(get)
-    if way.is_closed():
-        area_tag = get("area")
-        has_area_class = bool(classifier.as_area(get).area)
-        if area_tag != "no" and (has_area_class or (area_tag == "yes" and found.line)):
-            closed.add(way.id)
-        if area_tag == "yes" and not has_area_class:
-            return  # filled, not drawn along its outline
-    elif not found.line:
-        reasons = [f"no rule for {text}" for text in found.unknown] or ["open way with an area class"]
-        scan.tally.drops.update(reasons)
-    if found.line:
-        kind = classifier.kind(get, found.line, is_area=False)
-        scan.rows.append(ScanRow(wkb, kind, way.id, False, way.version, way.timestamp))  # noqa: FBT003
-    else:
-        scan.far.append(wkb)
-
-
-def _scan_area(area: Any, scan: Scan, classifier: Classifier, box: Box) -> bool:  # noqa: ANN401
-    """Take an assembled area; return False if osmium gives one without a ring."""
-    try:
-        wkb = bytes.fromhex(_FACTORY.create_multipolygon(area))
-    except RuntimeError:  # osmium's geometry_error: the rings were too broken to assemble
-        return False
-    if not reaches(wkb, box):
-        scan.far.append(wkb)
-        return True
-    get = area.tags.get
-    is_relation = not area.from_way()
-    labels = classifier.area_labels(get, is_relation=is_relation)
-    if labels:
-        kind = classifier.kind(get, labels, is_area=True)
-        scan.rows.append(ScanRow(wkb, kind, area.orig_id(), is_relation, area.version, area.timestamp))
-        return True
-    scan.far.append(wkb)
-    if not classifier.as_line(get).line:
-        scan.tally.drops.update(f"no rule for {text}" for text in classifier.as_area(get).unknown)
-    return True
-
-
 def line_wkb(way: Any, tally: Tally) -> bytes | None:  # noqa: ANN401
     """Return the WKB of a way; of the remaining pieces if nodes are missing, None if nothing remains."""
     try:
@@ -378,93 +242,9 @@ def _pieces(way: Any, tally: Tally) -> list[list[tuple[float, float]]]:  # noqa:
     return [[node for node in run if node is not None] for run in runs if len(set(run)) > 1]
 
 
-def _area_relation(item: Any, classifier: Classifier) -> _Relation | None:  # noqa: ANN401
-    """Return a relation that should become an area: a multipolygon, or type=building, which osmium ignores."""
-    kind = item.tags.get("type")
-    if kind not in ("multipolygon", "building"):
+def area_wkb(area: Any) -> bytes | None:  # noqa: ANN401
+    """Return the WKB of an area, None if its rings were too broken to assemble."""
+    try:
+        return bytes.fromhex(_FACTORY.create_multipolygon(area))
+    except RuntimeError:  # osmium's geometry_error
         return None
-    tags = dict(item.tags)
-    if kind == "building":
-        tags.setdefault("building", "yes")
-    labels = classifier.area_labels(tags.get, is_relation=True)
-    if not labels:
-        return None
-    ways = [(member.role, member.ref) for member in item.members if member.type == "w"]
-    return _Relation(
-        labels=labels,
-        tags=tags,
-        version=item.version,
-        timestamp=item.timestamp,
-        outer=tuple(ref for role, ref in ways if role in ("outer", "outline", "")),
-        inner=tuple(ref for role, ref in ways if role == "inner"),
-        is_building=kind == "building",
-    )
-
-
-def _scan_lost(
-    path: Path, closed: set[int], relations: dict[int, _Relation], scan: Scan, classifier: Classifier
-) -> None:
-    """Repair what osmium could not assemble: rings that lack nodes or cross themselves, relations cut at an edge."""
-    members = {ref for relation in relations.values() for ref in (*relation.outer, *relation.inner)}
-    lines: dict[int, shapely.Geometry] = {}
-    ways = osmium.FileProcessor(str(path)).with_locations().with_filter(osmium.filter.EntityFilter(osmium.osm.WAY))
-    for way in elements(ways.with_filter(osmium.filter.IdFilter(closed | members))):
-        wkb = line_wkb(way, scan.tally)
-        get = way.tags.get
-        labels = classifier.area_labels(get, is_relation=False)
-        if (wkb is None or wkb[1] == _SEVERAL_LINES) and (labels or way.id in members):
-            scan.gaps[way.id] = find_gaps(way)
-        if wkb is None:
-            continue
-        lines[way.id] = shapely.from_wkb(wkb)
-        if way.id in closed and get("area") == "no":
-            scan.tally.drops["area=no on an area class"] += 1
-        elif way.id in closed and labels:
-            area = _ring_area(lines[way.id])
-            _add_mended(
-                scan, way, area, classifier.kind(get, labels, is_area=True), what="closed way", identifier=way.id
-            )
-    for identifier, relation in sorted(relations.items()):
-        area = _relation_area(relation, lines)
-        kind = classifier.kind(relation.tags.get, relation.labels, is_area=True)
-        _add_mended(scan, relation, area, kind, what="relation", identifier=identifier)
-
-
-def _add_mended(
-    scan: Scan,
-    item: Any,  # noqa: ANN401 - an osmium way or a _Relation: what has a version and a timestamp
-    area: shapely.Geometry,
-    kind: int,
-    *,
-    what: str,
-    identifier: int,
-) -> None:
-    is_relation = what == "relation"
-    if shapely.area(area) == 0.0:
-        scan.tally.drops[f"{what} with no closed ring left"] += 1
-        return
-    if not (is_relation and item.is_building):
-        scan.tally.notes[f"{what} broken or cut at the clip edge: its closed rings were kept"] += 1
-    scan.rows.append(ScanRow(bytes(shapely.to_wkb(area)), kind, identifier, is_relation, item.version, item.timestamp))
-
-
-def _ring_area(line: shapely.Geometry) -> shapely.Geometry:
-    """Return the area within a closed way; missing nodes are bridged, a ring that crosses itself is split."""
-    coordinates = shapely.get_coordinates(line)
-    if len(np.unique(coordinates, axis=0)) < MIN_RING_POINTS:
-        return shapely.Polygon()
-    return _polygons_of(shapely.make_valid(shapely.polygons(shapely.linearrings(coordinates))))
-
-
-def _relation_area(relation: _Relation, lines: dict[int, shapely.Geometry]) -> shapely.Geometry:
-    """Return closed outer rings less closed inner rings, from the member ways that are present."""
-    outer, inner = (
-        shapely.union_all(shapely.get_parts(shapely.polygonize([lines[ref] for ref in refs if ref in lines])))
-        for refs in (relation.outer, relation.inner)
-    )
-    return _polygons_of(shapely.make_valid(shapely.difference(outer, inner)))
-
-
-def _polygons_of(geometry: shapely.Geometry) -> shapely.Geometry:
-    parts = shapely.get_parts(shapely.get_parts(geometry))
-    return shapely.MultiPolygon([part for part in parts if part.geom_type == "Polygon"])

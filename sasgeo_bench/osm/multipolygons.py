@@ -166,7 +166,7 @@ def roles_by_place(relation: Relation, area: shapely.Geometry, lines: Mapping[in
     holes = shapely.difference(shapely.boundary(area), shapely.union_all(shapely.get_exterior_ring(parts)))
     inner = {ref for ref in relation.unsure if ref in lines and shapely.covers(holes, lines[ref])}
     outer = tuple(ref for ref in relation.outer if ref not in inner)
-    return replace(relation, outer=outer, inner=(*relation.inner, *sorted(inner)))
+    return replace(relation, outer=outer, inner=(*relation.inner, *sorted(inner)), unsure=frozenset())
 
 
 def mended_ring(line: shapely.Geometry) -> shapely.Geometry:

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import osmium
 import shapely
 
@@ -303,18 +304,19 @@ def _add_mended(
 
 def _count_once(scan: Scan, relations: dict[int, Relation]) -> frozenset[int]:
     """Take from ways the classes that they gave to areas of relations; return the ways that are in such an area."""
-    drawn: dict[int, set[tuple[str, bool, bool]]] = {}
+    areas: dict[int, list[ScanRow]] = {}
     for row in scan.rows:
         if row.is_relation and row.osm_id in relations:
             for ref in relations[row.osm_id].taken:
-                drawn.setdefault(ref, set()).update(_drawn(scan.traits[row.kind]))
+                areas.setdefault(ref, []).append(row)
     kinds: dict[tuple[int, tuple[Label, ...]], int] = {}
-    for index in [index for index, row in enumerate(scan.rows) if row.osm_id in drawn and not row.is_relation]:
+    for index in [index for index, row in enumerate(scan.rows) if row.osm_id in areas and not row.is_relation]:
         row, traits = scan.rows[index], scan.traits[scan.rows[index].kind]
         if not traits.is_area:
             continue
-        own = zip(traits.labels, _drawn(traits), strict=True)
-        labels = tuple(label for label, key in own if key not in drawn[row.osm_id])
+        given = [area for area in areas[row.osm_id] if _shares_ground(row, area, relations[area.osm_id])]
+        drawn = {key for area in given for key in _drawn(scan.traits[area.kind])}
+        labels = tuple(label for label, key in zip(traits.labels, _drawn(traits), strict=True) if key not in drawn)
         kind = kinds.get((row.kind, labels))
         if kind is None:
             kind = kinds[row.kind, labels] = len(scan.traits)
@@ -323,7 +325,15 @@ def _count_once(scan: Scan, relations: dict[int, Relation]) -> frozenset[int]:
         if not labels and traits.hidden_by is not None:
             scan.tally.hidden[traits.hidden_by] -= 1
     scan.rows = [row for row in scan.rows if scan.traits[row.kind].labels]
-    return frozenset(drawn)
+    return frozenset(areas)
+
+
+def _shares_ground(way: ScanRow, area: ScanRow, relation: Relation) -> bool:
+    """Return whether a closed way is an outer ring of an area: by its role, or by its place where that says nothing."""
+    if way.osm_id not in relation.unsure:
+        return True
+    pair = shapely.make_valid(shapely.from_wkb(np.array([way.wkb, area.wkb], dtype=object)))
+    return bool(shapely.area(shapely.intersection(*pair)) > 0)
 
 
 def _drawn(traits: Traits) -> list[tuple[str, bool, bool]]:

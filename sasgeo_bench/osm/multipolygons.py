@@ -10,7 +10,8 @@ is read as osm2pgsql read it in those years (`tagtransform.cpp` of 2014):
   relation has a name is lost to both.
 - Outer ways that say what they are must agree: the area has the classes that all of them have. osm2pgsql took the tags
   that all have, so that `natural=wood` beside `landuse=forest` was no wood; GDAL takes those of the first outer way
-  with tags. An outer way with no such key says nothing and disagrees with nothing.
+  with tags. An outer way with no such key says nothing and disagrees with nothing, but for a ring without a role: what
+  it is part of is not known.
 - An inner way whose tags all stand on the area too is a hole; one with other tags is an area of its own.
 - No class counts twice: neither on a relation and its outer ways, nor on an area and an inner way that is its hole.
 
@@ -139,8 +140,10 @@ def adopt_tags(
         return relation
     shared = set.intersection(*({_drawn(label) for label in kind.labels} for kind in kinds))
     labels = tuple(label for label in kinds[0].labels if _drawn(label) in shared)
-    is_plain = len(speaking) == len(outer) and all(way.is_closed for way in outer.values())
-    if not labels or (is_plain and not relation.inner):
+    silent = outer.keys() - speaking.keys()
+    if not labels or any(outer[ref].is_closed for ref in silent & relation.unsure):
+        return relation
+    if not (silent or relation.inner) and all(way.is_closed for way in outer.values()):
         return relation
     common = frozenset.intersection(*(frozenset(way.tags.items()) for way in speaking.values()))
     tags = {**dict(common), **relation.tags}

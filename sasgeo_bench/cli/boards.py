@@ -24,7 +24,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipe
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
 from sasgeo_bench.leaderboard.rejection_tables import risk_tables
 from sasgeo_bench.leaderboard.tables import text_of
-from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, warnings_of
+from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_folder import is_pack
@@ -318,5 +318,5 @@ def show_board(board: Board) -> None:
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
-    for line in warnings_of(board.table):
+    for line in (*map_lines(vars(board)), *warnings_of(board.table)):
         tell(line)

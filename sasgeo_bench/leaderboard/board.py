@@ -97,7 +97,7 @@ class Board:
     of flights those of their first view, `views` the rows of views of flights by matcher (`flights.view_frame`), and
     `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so
     does `predictions`. `apart` are the reasons for excluding entries from ranks, `on_private` the results on a private
-    seed, `failures` the entries that failed, and why.
+    seed, `failures` the entries that failed, and why. `data_version` is that of the maps that were asked about.
     """
 
     entries: tuple[Entry, ...]
@@ -120,6 +120,7 @@ class Board:
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
     on_private: OnPrivate = field(default_factory=OnPrivate)
+    data_version: int = DATA_VERSION
 
 
 def make_extras(request: ScoreRequest, board: Board, tell: Tell) -> list[Extra]:
@@ -185,7 +186,7 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
     return {
         "scorer_version": SCORER_VERSION,
         "task_version": max((item["task_version"] for item in board.tasks), default=TASK_VERSION),
-        "data_version": request.kept.get("data_version") or DATA_VERSION,  # of the maps that were asked about
+        "data_version": board.data_version,
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
         "libraries": _libraries(),
         "pipeline": dict(request.pipeline) or None,

@@ -14,6 +14,7 @@ from sasgeo_bench.leaderboard.board import Board, ScoreRequest, make_extras, wri
 from sasgeo_bench.leaderboard.board_files import check_board, read_board
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
 from sasgeo_bench.progress import Lines, Progress, Tell
+from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
 from sasgeo_bench.scoring.contestants import (
     Contest,
@@ -159,6 +160,7 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
         apart=apart,
         on_private=on_private,
         failures=failures,
+        data_version=request.kept.get("data_version") or DATA_VERSION,
     )
 
 

@@ -15,7 +15,7 @@ from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
-from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
 from sasgeo_bench.scoring.controls import ALPHA, Falsifier, Verdict, verdict_frame
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.strata import ALL
@@ -25,6 +25,7 @@ from sasgeo_bench.tasks.task_files import FAILED_PICTURES
 from sasgeo_bench.texts import markdown, markdown_item, tex
 
 _FLIGHT: Final = primary_of(SEQUENCE).name
+_NEW_STYLE: Final = "2017"  # from this year on the tags of multipolygons stand on their relations
 _FEW_BLOCKS, _FEW_PLACES = 36, 12  # fewer are too few to speak of other places
 
 
@@ -50,6 +51,33 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
                     rest = f"lacks {row} and counts as a miss" if count == 1 else f"lack {row} and count as misses"
                     warnings.append(f"{matcher}: {counted(count, *names)} {rest}.")
     return warnings
+
+
+def map_lines(about: Mapping[str, Any]) -> list[str]:
+    """Return what is wrong with the maps of a board that an earlier data version read; empty if nothing is.
+
+    >>> tasks = [{"region": name, "map_date": "2014-11-04"} for name in ("bayreuth", "bayreuth+alias", "krems")]
+    >>> print(*map_lines({"data_version": 2, "tasks": tasks}))  # doctest: +NORMALIZE_WHITESPACE
+    Old maps: its 2 maps of before 2017 were read with old-style multipolygons as areas of their outer ways (yards and
+    clearings filled, areas of several open ways missing); maps of data version 3 and later have them right.
+    >>> map_lines({"data_version": 3, "tasks": tasks})
+    []
+    """
+    if (about.get("data_version") or DATA_VERSION) >= OLD_STYLE_DATA_VERSION:
+        return []
+    old = {
+        str(task["region"]).split("+")[0]
+        for task in about.get("tasks", ())
+        if (task.get("map_date") or _NEW_STYLE) < _NEW_STYLE and not str(task["region"]).startswith(MADE_UP)
+    }
+    if not old:
+        return []
+    line = (
+        f"Old maps: its {counted(len(old), 'map')} of before {_NEW_STYLE} {'was' if len(old) == 1 else 'were'} read "
+        "with old-style multipolygons as areas of their outer ways (yards and clearings filled, areas of several open "
+        f"ways missing); maps of data version {OLD_STYLE_DATA_VERSION} and later have them right."
+    )
+    return [line]
 
 
 def control_lines(verdicts: Sequence[Verdict]) -> list[str]:
@@ -169,6 +197,7 @@ def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], **more: Any) -
         *control_lines(more.get("verdicts", ())),
         *seed_lines(about),
         *sealed_lines(about),
+        *map_lines(about),
         *warnings_of(board),
         *training_lines(about),
         *segmenter_lines(about),

@@ -16,7 +16,7 @@ from sasgeo_bench.publishing.release_files import (
     places_of,
 )
 from sasgeo_bench.publishing.release_metadata import QUERY_TEXTS, TRUTH_TEXTS, cite_as
-from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.regions.region import ATTRIBUTION, MADE_UP
 from sasgeo_bench.texts import markdown, markdown_code, quoted
 
 CARD: Final = "README.md"
@@ -288,7 +288,7 @@ def _composition(release: Release) -> str:
     area_km2, dates = _area_km2(release), sorted(item.manifest.extract.date for item in release.maps)
     objects = _sum(item.manifest.counts for item in release.maps)
     parts = _sum(task.parts for task in release.tasks)
-    made_up = [name for name in release.regions if name.startswith(("town-", "demo-"))]
+    made_up = [name for name in release.regions if name.startswith(MADE_UP)]
     towns = f", {len(made_up)} of them made up by a program" if made_up else ""
     queries = ", ".join(f"{part} {count}" for part, count in parts.items())
     kept = "All truths are in the release." if release.with_truth else "Truths of test queries are kept back."

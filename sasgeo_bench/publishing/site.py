@@ -27,7 +27,7 @@ from sasgeo_bench.leaderboard.rejection_tables import (
 )
 from sasgeo_bench.leaderboard.scene_tables import scene_tables
 from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
-from sasgeo_bench.leaderboard.text import control_lines, segmenter_lines, training_lines, warnings_of
+from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.publishing.site_maps import OUTCOMES as ANSWER_OUTCOMES
@@ -321,7 +321,7 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "seed_line": seed_lines(source.about)[0],
         "sealed_lines": sealed_lines(source.about),
         "seeds": seed_table(source.about),
-        "warnings": warnings_of(source.board),
+        "warnings": [*map_lines(source.about), *warnings_of(source.board)],
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }

@@ -24,9 +24,11 @@ from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.osm.coverage import CLOSE_M
 from sasgeo_bench.osm.features import SEA
 from sasgeo_bench.osm.mapped import box_text, project
+from sasgeo_bench.osm.multipolygons import area_relation, kind_keys
 from sasgeo_bench.osm.read import Reading, read_extract
 from sasgeo_bench.osm.scan import Box, Tally, line_wkb
 from sasgeo_bench.osm.snapshot import OBJECTS, elements, is_history, open_snapshot, read_header
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 # Prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix for what is gone, on the keys of our classes.
 _PREFIXES: Final = ("demolished", "razed", "removed", "was", "abandoned", "destroyed")
@@ -87,6 +89,7 @@ def read_lifecycle(path: Path, *, epsg: int) -> Lifecycle:
         is_gone = any(key in tags for key in _GONE_KEYS)
         if (is_gone or any(key in tags for key in _CONSTRUCTION_KEYS)) and (wkb := _wkb(item)) is not None:
             (gone if is_gone else rising).append(wkb)
+    _add_outer_dates(path, started)
     for item, _, _ in _tagged(path, osmium.filter.TagFilter(*_CONSTRUCTION)):
         if (wkb := _wkb(item)) is not None:
             rising.append(wkb)
@@ -102,6 +105,18 @@ def _tagged(path: Path, keyed: osmium.BaseFilter) -> Iterator[tuple[Any, bool, i
             yield item, not item.from_way(), item.orig_id()
         elif not item.is_closed():
             yield item, False, item.id
+
+
+def _add_outer_dates(path: Path, started: dict[ObjectKey, Span]) -> None:
+    """Date multipolygons of the old style by their outer ways, which hold their tags."""
+    keys, typed = kind_keys(load_taxonomy().keys), osmium.filter.KeyFilter("type")
+    relations = osmium.FileProcessor(str(path), osmium.osm.RELATION).with_filter(typed)
+    for item in elements(relations) if started else ():
+        relation = area_relation(item, lambda _: (), keys)
+        ways = [ObjectKey("way", ref) for ref in (() if relation is None else relation.outer)]
+        spans = [started[way] for way in ways if way in started]
+        if spans:
+            started.setdefault(ObjectKey("relation", item.id), spans[0])
 
 
 def _wkb(item: Any) -> bytes | None:  # noqa: ANN401

@@ -169,7 +169,7 @@ def roles_by_place(relation: Relation, area: shapely.Geometry, lines: Mapping[in
     holes = shapely.difference(shapely.boundary(area), shapely.union_all(shapely.get_exterior_ring(parts)))
     inner = {ref for ref in relation.unsure if ref in lines and shapely.covers(holes, lines[ref])}
     outer = tuple(ref for ref in relation.outer if ref not in inner)
-    return replace(relation, outer=outer, inner=(*relation.inner, *sorted(inner)), unsure=frozenset())
+    return replace(relation, outer=outer, inner=(*relation.inner, *sorted(inner)), unsure=relation.unsure - inner)
 
 
 def mended_ring(line: shapely.Geometry) -> shapely.Geometry:
@@ -177,7 +177,7 @@ def mended_ring(line: shapely.Geometry) -> shapely.Geometry:
     coordinates = shapely.get_coordinates(line)
     if len(np.unique(coordinates, axis=0)) < MIN_RING_POINTS:
         return shapely.Polygon()
-    return _polygons_of(shapely.make_valid(shapely.polygons(shapely.linearrings(coordinates))))
+    return polygons_of(shapely.make_valid(shapely.polygons(shapely.linearrings(coordinates))))
 
 
 def mended_area(relation: Relation, lines: Mapping[int, shapely.Geometry]) -> shapely.Geometry:
@@ -186,9 +186,10 @@ def mended_area(relation: Relation, lines: Mapping[int, shapely.Geometry]) -> sh
         shapely.union_all(shapely.get_parts(shapely.polygonize([lines[ref] for ref in refs if ref in lines])))
         for refs in (relation.outer, relation.inner)
     )
-    return _polygons_of(shapely.make_valid(shapely.difference(outer, inner)))
+    return polygons_of(shapely.make_valid(shapely.difference(outer, inner)))
 
 
-def _polygons_of(geometry: shapely.Geometry) -> shapely.Geometry:
+def polygons_of(geometry: shapely.Geometry) -> shapely.Geometry:
+    """Return the polygons among the parts of a geometry, as one multipolygon."""
     parts = shapely.get_parts(shapely.get_parts(geometry))
     return shapely.MultiPolygon([part for part in parts if part.geom_type == "Polygon"])

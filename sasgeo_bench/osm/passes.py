@@ -20,6 +20,7 @@ from sasgeo_bench.osm.multipolygons import (
     area_relation,
     mended_area,
     mended_ring,
+    polygons_of,
     roles_by_place,
 )
 from sasgeo_bench.osm.scan import (
@@ -206,40 +207,57 @@ class _LostPass:
         """Read the file once, and add what can be mended or takes its tags from outer ways."""
         relations = self.lost.relations
         bare = {identifier for identifier, relation in relations.items() if not relation.labels}
-        needed = self.lost.ways | {ref for key in relations.keys() - bare for ref in relations[key].ways}
-        everything = needed | {ref for key in bare for ref in relations[key].ways}
+        cut = {ref for key in relations.keys() - bare for ref in relations[key].ways}
+        everything = self.lost.ways | cut | {ref for key in bare for ref in relations[key].ways}
         for item in _ways_and_relations(path, everything, bare):
             if not item.is_area():
-                self._read_way(item, is_needed=item.id in needed)
+                self._read_way(item, is_cut=item.id in cut)
             else:
                 self.areas[item.orig_id()] = area_wkb(item)
+        relations.update({identifier: self._adopt(relations[identifier], identifier) for identifier in bare})
+        self._join(sorted(bare))
         for identifier, relation in sorted(relations.items()):
-            if identifier in bare:
-                relations[identifier] = self._adopt(relation, self.areas.get(identifier))
-            self._add(identifier, relations[identifier])
+            self._add(identifier, relation)
 
-    def _read_way(self, way: Any, *, is_needed: bool) -> None:  # noqa: ANN401
-        scan, get = self.scan, way.tags.get
-        wkb = line_wkb(way, scan.tally if is_needed else Tally())
+    def _read_way(self, way: Any, *, is_cut: bool) -> None:  # noqa: ANN401
+        scan, get, is_lost = self.scan, way.tags.get, way.id in self.lost.ways
+        wkb = line_wkb(way, scan.tally if is_cut or is_lost else Tally())
         labels = self.classifier.area_labels(get, is_relation=False)
         self.members[way.id] = Member(tags=dict(way.tags), is_closed=way.is_closed())
         if wkb is None or wkb[1] == SEVERAL_LINES:
-            marks = scan.gaps if is_needed and (labels or way.id not in self.lost.ways) else self.gaps
+            marks = scan.gaps if is_cut or (is_lost and labels) else self.gaps
             marks[way.id] = find_gaps(way)
         if wkb is None:
             return
         line = self.lines[way.id] = shapely.from_wkb(wkb)
-        if way.id in self.lost.ways and get("area") == "no":
+        if is_lost and get("area") == "no":
             scan.tally.drops["area=no on an area class"] += 1
-        elif way.id in self.lost.ways and labels:
+        elif is_lost and labels:
             kind = self.classifier.kind(get, labels, is_area=True)
             _add_mended(scan, way, mended_ring(line), kind, what="closed way", identifier=way.id)
 
-    def _adopt(self, relation: Relation, wkb: bytes | None) -> Relation:
+    def _adopt(self, relation: Relation, identifier: int) -> Relation:
         """Return a relation of the old style with the tags of its outer ways; without labels if they do not agree."""
+        wkb = self.areas.get(identifier)
         if wkb is not None:
             relation = roles_by_place(relation, shapely.from_wkb(wkb), self.lines)
         return adopt_tags(relation, self.members, self.classifier.as_outer_way, self.classifier.kind_keys)
+
+    def _join(self, bare: list[int]) -> None:
+        """Make one area of relations of the old style that cut different holes out of the same outer ways."""
+        firsts: dict[frozenset[int], int] = {}
+        for identifier in bare:
+            relation, wkb = self.lost.relations[identifier], self.areas.get(identifier)
+            first = firsts.setdefault(frozenset(relation.outer), identifier) if relation.labels else identifier
+            whole = self.areas.get(first)
+            if first == identifier or wkb is None or whole is None:
+                continue
+            self.areas[first] = bytes(
+                shapely.to_wkb(polygons_of(shapely.intersection(*shapely.from_wkb([whole, wkb]))))
+            )
+            joined = self.lost.relations[first]
+            self.lost.relations[first] = replace(joined, taken=(*joined.taken, *relation.taken))
+            self.lost.relations[identifier] = replace(relation, labels=())
 
     def _add(self, identifier: int, relation: Relation) -> None:
         scan, wkb = self.scan, self.areas.get(identifier)

@@ -330,11 +330,9 @@ def _count_once(scan: Scan, relations: dict[int, Relation]) -> frozenset[int]:
     kinds: dict[tuple[int, tuple[Label, ...]], int] = {}
     for index in [index for index, row in enumerate(scan.rows) if row.osm_id in areas and not row.is_relation]:
         row, traits = scan.rows[index], scan.traits[scan.rows[index].kind]
-        if not traits.is_area:
+        labels = _not_given(row, areas[row.osm_id], relations, scan.traits)
+        if labels == traits.labels:
             continue
-        given = [area for area in areas[row.osm_id] if _shares_ground(row, area, relations[area.osm_id])]
-        drawn = {key for area in given for key in _drawn(scan.traits[area.kind])}
-        labels = tuple(label for label, key in zip(traits.labels, _drawn(traits), strict=True) if key not in drawn)
         kind = kinds.get((row.kind, labels))
         if kind is None:
             kind = kinds[row.kind, labels] = len(scan.traits)
@@ -344,6 +342,23 @@ def _count_once(scan: Scan, relations: dict[int, Relation]) -> frozenset[int]:
             scan.tally.hidden[traits.hidden_by] -= 1
     scan.rows = [row for row in scan.rows if scan.traits[row.kind].labels]
     return frozenset(areas)
+
+
+def _not_given(
+    way: ScanRow, areas: list[ScanRow], relations: dict[int, Relation], traits: list[Traits]
+) -> tuple[Label, ...]:
+    """Return the labels of a way less those of areas that it is an outer ring of, or runs along the edge of."""
+    own = traits[way.kind]
+    if own.is_area:
+        given = [traits[area.kind] for area in areas if _shares_ground(way, area, relations[area.osm_id])]
+        drawn = {key for item in given for key in _drawn(item)}
+        return tuple(label for label, key in zip(own.labels, _drawn(own), strict=True) if key not in drawn)
+    outlines = {replace(label, is_outline=True) for label in own.labels}
+    edges = [area for area in areas if not outlines.isdisjoint(traits[area.kind].labels)]
+    line = shapely.from_wkb(way.wkb)
+    given = [traits[area.kind] for area in edges if shapely.covers(shapely.boundary(shapely.from_wkb(area.wkb)), line)]
+    along = {label for item in given for label in item.labels}
+    return tuple(label for label in own.labels if replace(label, is_outline=True) not in along)
 
 
 def _shares_ground(way: ScanRow, area: ScanRow, relation: Relation) -> bool:

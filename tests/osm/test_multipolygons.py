@@ -181,6 +181,17 @@ def test_the_fence_of_an_outer_way_stays_a_line_around_it_alone(tmp_path):
     assert fence.geometry.length.tolist() == [pytest.approx(400, rel=0.01)]
 
 
+def test_a_wall_on_a_relation_and_its_outer_ways_is_drawn_once(tmp_path):
+    wall, members = {"barrier": "city_wall"}, ((1, "outer"), (2, "outer"), (3, "inner"))
+    ways = [(SOUTH, wall), (NORTH, {"barrier": "hedge"}), (YARD, {})]
+    reading = read_extract(write(tmp_path / "a.osm", ways, (members, BARE | wall)), GRID)
+    assert sorted(reading.features.geometry.length) == pytest.approx([200, 560], rel=0.01)
+    cut = (*members, (77, "outer"))
+    ways = [*ways[:1], (BESIDE[:3], {}), *ways[2:]]
+    reading = read_extract(write(tmp_path / "b.osm", ways, (cut, BARE | wall)), GRID)
+    assert reading.features.geometry.length.tolist() == pytest.approx([200], rel=0.01)
+
+
 def test_what_lies_under_ground_on_the_outer_way_is_not_seen(tmp_path):
     ways = [(SQUARE, HOUSE | {"location": "underground"}), (YARD, {}), (BESIDE, HOUSE)]
     reading = read_extract(write(tmp_path / "a.osm", ways, (((1, "outer"), (2, "inner")), BARE)), GRID)

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The area that an extract maps, and the ground of ways that it cut: there, nothing is known to be absent."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any, Final
 
@@ -18,7 +19,7 @@ CLOSE_M: Final = 600.0  # villages, woods and pastures of one mapped country lie
 OPEN_M: Final = 150.0  # half the width of what is cut off: a road or stream kept whole beyond the edge
 MIN_SHARE: Final = 0.02  # of the largest piece: smaller ones are leftovers of relations that cross the edge
 FULL_SHARE: Final = 0.85  # data that fills this much of the header's box was cut by that box
-_M_PER_DEG: Final = 111_320.0  # of latitude; a coverage cell is 100 m, so the sphere is near enough
+M_PER_DEG: Final = 111_320.0  # of latitude; a coverage cell is 100 m, so the sphere is near enough
 
 
 def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
@@ -36,7 +37,7 @@ def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
         return shapely.Polygon()
     west, south = np.percentile(lonlat, 0.1, axis=0)
     east, north = np.percentile(lonlat, 99.9, axis=0)
-    step = np.array([CELL_M / (_M_PER_DEG * np.cos(np.radians((south + north) / 2))), CELL_M / _M_PER_DEG])
+    step = np.array([CELL_M / (M_PER_DEG * np.cos(np.radians((south + north) / 2))), CELL_M / M_PER_DEG])
     pad = int(CLOSE_M / CELL_M) + 2
     origin = np.array([west, south]) - pad * step
     size = np.ceil((np.array([east, north]) - origin) / step).astype(int) + pad
@@ -80,23 +81,23 @@ def choose_coverage(
     lonlat: NDArray[np.float64],
     *,
     stated: shapely.Geometry | None,
-    header_box: tuple[float, float, float, float] | None,
+    header: shapely.Geometry | None,
+    is_cut_by_box: Callable[[shapely.Geometry, shapely.Geometry], bool] = lambda _found, _header: False,
 ) -> tuple[shapely.Geometry, CoverageSource]:
     """Choose the mapped area of an extract, in degrees, and name its source.
 
-    The region file's polygon (`stated`) comes first. The box of the file's header (west, south, east, north) is taken
-    if the data fill it: the extract was cut by a box. Otherwise the extract was cut along a border, and the estimate
-    within the box is taken.
+    The region file's polygon (`stated`) comes first. The box of the file's header, or its boxes as one geometry, is
+    taken if the data fill it, or else if `is_cut_by_box` says so of the estimate and the box (`box_cut.cuts_by_box`).
+    Otherwise the extract was cut along a border, and the estimate within the box is taken.
     """
     if stated is not None:
         return stated, "region file"
     found = estimate_coverage(lonlat)
-    if header_box is None:
+    if header is None:
         return found, "estimated"
-    box = shapely.box(*header_box)
-    within = shapely.intersection(found, box)
-    if shapely.area(within) >= FULL_SHARE * shapely.area(box):
-        return box, "header box"
+    within = shapely.intersection(found, header)
+    if shapely.area(within) >= FULL_SHARE * shapely.area(header) or is_cut_by_box(found, header):
+        return header, "header box"
     return within, "estimated"
 
 

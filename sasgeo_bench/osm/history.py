@@ -27,7 +27,7 @@ from sasgeo_bench.osm.mapped import box_text, project
 from sasgeo_bench.osm.multipolygons import area_relation, kind_keys
 from sasgeo_bench.osm.read import Reading, read_extract
 from sasgeo_bench.osm.scan import Box, Tally, line_wkb
-from sasgeo_bench.osm.snapshot import OBJECTS, elements, is_history, open_snapshot, read_header
+from sasgeo_bench.osm.snapshot import OBJECTS, elements, is_history, open_snapshot, own_id, read_header
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 # Prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix for what is gone, on the keys of our classes.
@@ -85,7 +85,7 @@ def read_lifecycle(path: Path, *, epsg: int) -> Lifecycle:
         tags = item.tags
         span = next((span for key in _START_KEYS if (span := parse_start(tags.get(key))) is not None), None)
         if span is not None:
-            started[ObjectKey("relation" if is_relation else "way", identifier)] = span
+            started[ObjectKey("relation" if is_relation else "way", own_id(identifier))] = span
         is_gone = any(key in tags for key in _GONE_KEYS)
         if (is_gone or any(key in tags for key in _CONSTRUCTION_KEYS)) and (wkb := _wkb(item)) is not None:
             (gone if is_gone else rising).append(wkb)
@@ -229,15 +229,16 @@ class History:
 def date_extracts(paths: Sequence[Path], *, at: Sequence[dt.date] = ()) -> tuple[DatedExtract, ...]:
     """Date every extract, and sort them by date.
 
-    Full histories (`.osh.*`) are cut at every date of `at`. Without a full history, `at` dates the files in their
-    order; if it is empty, a file is dated by its header, else by the last YYYY-MM-DD in its name, else by its newest
-    element.
+    Full histories are cut at every date of `at`. Without a full history, `at` dates the files in their order; if it is
+    empty, a file is dated by its header, else by the last YYYY-MM-DD in its name, else by its newest element.
 
     Raise `ConfigError` if the dates do not fit the files, two states have one date, or there are fewer than two states,
     and `ExtractError` if a file is missing, damaged or has no date.
 
-    >>> [str(item.on) for item in date_extracts([Path("a.osh.pbf")], at=[dt.date(2016, 1, 1), dt.date(2014, 1, 1)])]
-    ['2014-01-01', '2016-01-01']
+    >>> date_extracts([Path("nowhere.osm.pbf")])
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
     """
     histories = [path for path in paths if is_history(path)]
     if histories:
@@ -245,7 +246,7 @@ def date_extracts(paths: Sequence[Path], *, at: Sequence[dt.date] = ()) -> tuple
             message = f"{histories[0].name} is a full history: give the dates to cut it at with --at"
             raise ConfigError(message)
         dated = [DatedExtract(path=path, on=day) for path in histories for day in at]
-        dated += [DatedExtract(path=path, on=_own_date(path)) for path in paths if not is_history(path)]
+        dated += [DatedExtract(path=path, on=_own_date(path)) for path in paths if path not in histories]
     elif at:
         if len(at) != len(paths):
             message = f"--at dates the extracts in their order: got {len(at)} for {len(paths)} extracts, give one each"
@@ -357,9 +358,10 @@ def _one_state(item: DatedExtract) -> Iterator[Path]:
 
 def _frame(path: Path) -> Box:
     """Return the box of a file's header, else of its nodes, degrees."""
-    box = read_header(path).box_lonlat
-    if box is not None:
-        return box
+    boxes = read_header(path).boxes_lonlat
+    if boxes:
+        west, south, east, north = shapely.total_bounds([shapely.box(*box) for box in boxes]).tolist()
+        return (west, south, east, north)
     with open_snapshot(path, at=dt.date.max if is_history(path) else None) as snapshot:
         nodes = elements(osmium.FileProcessor(str(snapshot.path), osmium.osm.NODE))
         places = np.array([(node.lon, node.lat) for node in nodes if node.location.valid()]).reshape(-1, 2)

@@ -2,6 +2,7 @@
 """Prepare an OSM file for reading: readable, sorted, and with one state of the world."""
 
 import datetime as dt
+from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -13,36 +14,40 @@ import numpy as np
 import osmium
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.errors import ExtractError, counted
+from sasgeo_bench.osm.xml_text import NEW_IDS, Box, clean, needs_cleaning, read_boxes
 
 SUFFIXES: Final = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")
 _HISTORY_SUFFIXES: Final = tuple(suffix for suffix in SUFFIXES if suffix.startswith(".osh"))
+_CHANGE_SUFFIXES: Final = (".osc", ".osc.gz", ".osc.bz2", ".o5c")
+_OTHER_SUFFIXES: Final = (".o5m", ".opl", ".opl.gz", ".opl.bz2")
 _PBF_MARK: Final = b"\n\tOSMHeader"  # after four bytes of length
 _MOST_QUOTED: Final = 200  # characters of an error of osmium, which quotes a value of any length
 _GZIP_MARK: Final = b"\x1f\x8b"
 _BZIP2_MARK: Final = b"BZh"
 OBJECTS: Final = osmium.osm.NODE | osmium.osm.WAY | osmium.osm.RELATION  # changesets have no versions
-_RANK: Final = {"n": 0, "w": 1, "r": 2, "c": 3}  # nodes, ways, relations, changesets
+_TYPES: Final = ("n", "w", "r")  # in osmium's order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snapshot:
     """A readable OSM file that is sorted and holds one state of the world.
 
-    `box_lonlat` is the box of the file's header (west, south, east, north) or None; `replicated_at` its date or None.
+    `boxes_lonlat` are the boxes of the file's header (west, south, east, north), most often one or none;
+    `replicated_at` is its date or None.
     """
 
     path: Path
-    box_lonlat: tuple[float, float, float, float] | None
+    boxes_lonlat: tuple[Box, ...]
     replicated_at: dt.datetime | None
     warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Header:
-    """Box (west, south, east, north, degrees) and date of a file's header; each may be None."""
+    """Boxes (west, south, east, north, degrees) and date of a file's header; there may be none."""
 
-    box_lonlat: tuple[float, float, float, float] | None
+    boxes_lonlat: tuple[Box, ...]
     replicated_at: dt.datetime | None
 
 
@@ -51,13 +56,17 @@ def read_header(path: Path) -> Header:
     _check_file(path)
     with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
         content = _as_its_content(path, Path(scratch))
-        header = _header_of(content)
-        return Header(box_lonlat=_header_box(header), replicated_at=_header_time(header))
+        return _header(content)
 
 
 @contextmanager
 def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot]:
-    """Yield one extract ready to read: sort it if it is out of order, cut a full history at the end of a day (UTC).
+    """Yield one extract ready to read: sorted, each object once, with its nodes, and as of one day.
+
+    A full history is cut at the end of the day `at` (UTC); of a file that is none, `at` is not used. Objects that an
+    editor or the server has deleted are left out; of several versions of an object the newest is taken; ids that are
+    negative, since an object was not uploaded yet, lie above `NEW_IDS`. Where ways carry the places of their nodes,
+    these become nodes.
 
     The yielded path may lie in a temporary folder that is removed when the context ends. Raise `ExtractError` if the
     file is missing, empty, damaged, of a format not in `SUFFIXES`, or a history without a date.
@@ -71,33 +80,61 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
     _check_file(path)
     with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
         content = _as_its_content(path, Path(scratch))
-        header = _header_of(content)
-        box, replicated_at = _header_box(header), _header_time(header)
-        is_sorted = header.get("sorting") == "Type_then_ID"
-        warnings: list[str] = []
-        current = content
-        if is_history(path) or header.has_multiple_object_versions:
-            if at is None:
-                message = f"{path.name} is a full history: give the date to cut it at"
-                raise ExtractError(message)
+        stated = _header(content)
+        survey = _survey(content)
+        is_past, is_named = survey.is_history(path), path.name.endswith(_HISTORY_SUFFIXES)
+        if is_past and at is None and (survey.is_flagged or is_named):
+            message = f"{path.name} is a full history: give the date to cut it at"
+            raise ExtractError(message)
+        current, warnings = content, []
+        if survey.repeated and not is_named:
+            taken = "the newest was taken" if at is None else f"that of {at} was taken"
+            warnings.append(f"{counted(survey.repeated, 'object')} stood there in more than one version: {taken}")
+        elif is_named and not is_past:
+            warnings.append("it is named like a full history, and holds one version of each object: read as it stands")
+        if is_past or survey.repeated or survey.deleted:
             current = Path(scratch) / "at-date.osm.pbf"
-            _cut_history(content, current, at=at)
-            replicated_at = None
-        elif not is_sorted and not _in_order(content):
+            _cut_history(content, current, at=at if is_past else None)
+            survey = _survey(current)
+        if survey.has_negative or survey.has_places:
+            source, current = current, Path(scratch) / "plain.osm.pbf"
+            _write_plain(source, current)
+        if not survey.is_sorted:
             warnings.append("elements were out of order and have been sorted ('osmium sort' does it for good)")
-            current = Path(scratch) / "sorted.osm.pbf"
-            _sort(content, current)
-        yield Snapshot(path=current, box_lonlat=box, replicated_at=replicated_at, warnings=tuple(warnings))
+        if not survey.is_sorted or current.name == "plain.osm.pbf":
+            source, current = current, Path(scratch) / "sorted.osm.pbf"
+            _sort(source, current)
+        yield Snapshot(
+            path=current,
+            boxes_lonlat=stated.boxes_lonlat,
+            replicated_at=None if is_past else stated.replicated_at,
+            warnings=tuple(warnings),
+        )
 
 
 def is_history(path: Path) -> bool:
-    """Return whether a file name is that of a full history, with all versions of its objects."""
-    return path.name.endswith(_HISTORY_SUFFIXES)
+    """Return whether a file is a full history, with all versions of its objects; its name does not count.
+
+    A PBF file says so in its header. XML does not: it is one if it holds several versions of an object, or is named
+    as one and holds deleted objects. Raise `ExtractError` as `open_snapshot` does.
+    """
+    _check_file(path)
+    with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
+        content = _as_its_content(path, Path(scratch))
+        return (
+            _survey(content).is_history(path) if _is_xml(content) else _header_of(content).has_multiple_object_versions
+        )
 
 
 def _check_file(path: Path) -> None:
     if not path.is_file():
         message = f"no extract at {path}: check the path"
+        raise ExtractError(message)
+    if path.name.endswith(_CHANGE_SUFFIXES):
+        message = f"{path.name} is a change file: give the extract, with the changes applied (osmium apply-changes)"
+        raise ExtractError(message)
+    if path.name.endswith(_OTHER_SUFFIXES):
+        message = f"{path.name} is not read in its format: convert it (osmium cat {path.name} -o NAME.osm.pbf)"
         raise ExtractError(message)
     if not path.name.endswith(SUFFIXES):
         message = f"{path.name} is of no known format: name it {', '.join(SUFFIXES[:6])}"
@@ -108,26 +145,32 @@ def _check_file(path: Path) -> None:
 
 
 def _as_its_content(path: Path, scratch: Path) -> Path:
-    """Return the path, or a link to it with the suffix of its content: osmium goes by the name alone."""
-    kind = "osh" if is_history(path) else "osm"
+    """Return the path, a link to it with the suffix of its content (osmium goes by the name alone), or clean XML."""
     with path.open("rb") as source:
         start = source.read(16)
     if start[4 : 4 + len(_PBF_MARK)] == _PBF_MARK:
-        suffix = f".{kind}.pbf"
+        suffix = ".osm.pbf"
     elif start.startswith(_GZIP_MARK):
-        suffix = f".{kind}.gz"
+        suffix = ".osm.gz"
     elif start.startswith(_BZIP2_MARK):
-        suffix = f".{kind}.bz2"
+        suffix = ".osm.bz2"
     elif start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
-        suffix = f".{kind}"
+        suffix = ".osm"
     else:
         message = f"{path} holds no OSM data: it begins with {start!r}; get the extract again"
         raise ExtractError(message)
+    if suffix != ".osm.pbf" and needs_cleaning(path):
+        clean(path, scratch / "clean.osm")
+        return scratch / "clean.osm"
     if path.name.endswith(suffix):
         return path
     link = scratch / f"extract{suffix}"
     link.symlink_to(path.resolve())
     return link
+
+
+def _is_xml(content: Path) -> bool:
+    return not content.name.endswith(".pbf")
 
 
 def elements(source: Iterable[Any]) -> Iterator[Any]:
@@ -165,12 +208,22 @@ def _header_of(path: Path) -> osmium.io.Header:
         return reader.header()
 
 
-def _header_box(header: osmium.io.Header) -> tuple[float, float, float, float] | None:
+def _header(content: Path) -> Header:
+    header = _header_of(content)
+    if _is_xml(content) and header.has_multiple_object_versions:
+        message = "it holds changes, no objects: give the extract with the changes applied, by osmium apply-changes"
+        raise RuntimeError(message)
+    return Header(boxes_lonlat=_header_boxes(content, header), replicated_at=_header_time(header))
+
+
+def _header_boxes(content: Path, header: osmium.io.Header) -> tuple[Box, ...]:
+    if _is_xml(content):
+        return read_boxes(content)  # osmium gives the first of several alone
     box = header.box()
     if not box.valid():
-        return None
+        return ()
     low, high = box.bottom_left, box.top_right
-    return (low.lon, low.lat, high.lon, high.lat)
+    return ((low.lon, low.lat, high.lon, high.lat),)
 
 
 def _header_time(header: osmium.io.Header) -> dt.datetime | None:
@@ -181,16 +234,58 @@ def _header_time(header: osmium.io.Header) -> dt.datetime | None:
         return None
 
 
-def _in_order(path: Path) -> bool:
-    """Return whether elements come in osmium's order: nodes, ways, relations, each by id (negative first, by size)."""
-    last = (-1, 0, 0)
-    for item in elements(osmium.FileProcessor(str(path))):
-        identifier = item.id
-        key = (_RANK[item.type_str()], int(identifier > 0), abs(identifier))
-        if key < last:
-            return False
-        last = key
-    return True
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Survey:
+    """What the objects of a file are like.
+
+    `repeated` counts objects that stand there again, `deleted` those that are not visible; `has_places`: ways carry
+    the places of their nodes. A file flagged as a history is not looked at before it is cut.
+    """
+
+    is_flagged: bool
+    is_sorted: bool = True
+    has_versions: bool = False
+    has_negative: bool = False
+    has_places: bool = False
+    repeated: int = 0
+    deleted: int = 0
+
+    def is_history(self, path: Path) -> bool:
+        """Return whether the file holds the past of its objects, and not only two copies of some."""
+        is_named = path.name.endswith(_HISTORY_SUFFIXES)
+        return self.is_flagged or self.has_versions or (is_named and self.deleted > 0)
+
+
+def _survey(path: Path) -> _Survey:
+    """Look at all objects once; at no nodes of a file that is sorted by its header: they are many."""
+    header = _header_of(path)
+    if header.has_multiple_object_versions:
+        return _Survey(is_flagged=True)
+    is_sorted = header.get("sorting") == "Type_then_ID"
+    kinds, ids, versions = array("q"), array("q"), array("q")
+    deleted, has_places = 0, False
+    wanted = osmium.osm.WAY | osmium.osm.RELATION if is_sorted else OBJECTS
+    for item in elements(osmium.FileProcessor(str(path), wanted)):
+        kinds.append(_TYPES.index(item.type_str()))
+        ids.append(item.id)
+        versions.append(item.version)
+        deleted += not item.visible
+        has_places = has_places or (item.is_way() and any(node.location.valid() for node in item.nodes))
+    number = np.array(ids, dtype=np.int64)
+    # osmium's order: by type, negative ids first, then by the size of the id.
+    keys = np.column_stack((np.array(kinds, dtype=np.int64), number > 0, np.abs(number)))
+    order = np.lexsort(keys.T[::-1])
+    is_again = (keys[order][1:] == keys[order][:-1]).all(axis=1)
+    version = np.array(versions, dtype=np.int64)[order]
+    return _Survey(
+        is_flagged=False,
+        is_sorted=is_sorted or bool((order == np.arange(len(order))).all()),
+        has_versions=bool((is_again & (version[1:] != version[:-1])).any()),
+        has_negative=bool((number < 0).any()),
+        has_places=has_places,
+        repeated=int(is_again.sum()),
+        deleted=deleted,
+    )
 
 
 def _sort(path: Path, target: Path) -> None:
@@ -201,16 +296,61 @@ def _sort(path: Path, target: Path) -> None:
         merger.apply(writer, simplify=True)
 
 
-def _cut_history(path: Path, target: Path, *, at: dt.date) -> None:
-    """Write the state at the end of a day: the last version of each object by then, unless that one is deleted."""
-    until = dt.datetime.combine(at, dt.time.max, tzinfo=dt.UTC)
+def _cut_history(path: Path, target: Path, *, at: dt.date | None) -> None:
+    """Write the last version of each object by the end of a day, or of all times, unless that one is deleted."""
+    until = dt.datetime.combine(at or dt.date.max, dt.time.max, tzinfo=dt.UTC)
     kept = _versions_at(path, until=until)
-    with osmium.SimpleWriter(str(target), overwrite=True) as writer:
+    with osmium.SimpleWriter(_with_places(target), overwrite=True) as writer:
         position = 0
         for number, item in enumerate(elements(osmium.FileProcessor(str(path), OBJECTS))):
             if position < len(kept) and kept[position] == number:
                 writer.add(item)
                 position += 1
+
+
+def _with_places(target: Path) -> osmium.io.File:
+    """Return a file to write to that keeps the places of nodes on ways, where there are any."""
+    return osmium.io.File(str(target), "pbf,locations_on_ways=true")
+
+
+def _write_plain(path: Path, target: Path) -> None:
+    """Write objects with positive ids, and a node for each place that a way carries and no node of the file has."""
+    refs, places = array("q"), array("d")
+    there = array("q")
+    with osmium.SimpleWriter(str(target), overwrite=True) as writer:
+        for item in elements(osmium.FileProcessor(str(path), OBJECTS)):
+            if item.is_node():
+                there.append(item.id)
+                writer.add(item.replace(id=_positive(item.id)))
+            elif item.is_way():
+                for node in item.nodes:
+                    if node.location.valid():
+                        refs.append(node.ref)
+                        places.extend((node.lon, node.lat))
+                nodes = [_positive(node.ref) for node in item.nodes]
+                writer.add(item.replace(id=_positive(item.id), nodes=nodes))
+            else:
+                members = [(member.type, _positive(member.ref), member.role) for member in item.members]
+                writer.add(item.replace(id=_positive(item.id), members=members))
+        lonlat = np.array(places, dtype=np.float64).reshape(-1, 2)
+        found, first = np.unique(np.array(refs, dtype=np.int64), return_index=True)
+        is_lost = ~np.isin(found, np.array(there, dtype=np.int64))
+        for ref, place in zip(found[is_lost].tolist(), lonlat[first[is_lost]].tolist(), strict=True):
+            writer.add_node(osmium.osm.mutable.Node(id=_positive(ref), location=tuple(place)))
+
+
+def own_id(identifier: int) -> int:
+    """Return the id of an object as its file has it: negative if it has none of OpenStreetMap yet.
+
+    >>> own_id(42), own_id(NEW_IDS + 42)
+    (42, -42)
+    """
+    return NEW_IDS - identifier if identifier > NEW_IDS else identifier
+
+
+def _positive(identifier: int) -> int:
+    """Return the id, or the number above `NEW_IDS` of an object that has none yet."""
+    return identifier if identifier >= 0 else NEW_IDS - identifier
 
 
 def _versions_at(path: Path, *, until: dt.datetime) -> NDArray[np.int64]:

@@ -25,7 +25,6 @@ from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.locate import Extract, find_extract, find_parts
 from sasgeo_bench.osm.mapped import lonlat_box
 from sasgeo_bench.osm.read import Reading, read_extract, read_geojson
-from sasgeo_bench.osm.snapshot import is_history
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.progress import Tell
@@ -225,8 +224,7 @@ def _read(plan: BuildPlan, source: Path) -> Reading:
             stated_coverage=stated,
             classes=plan.spec.class_names,
         )
-    at = plan.extract.date if is_history(source) else None
-    return read_extract(source, plan.grid, at=at, stated_coverage=stated, classes=plan.spec.classes)
+    return read_extract(source, plan.grid, at=plan.extract.date, stated_coverage=stated, classes=plan.spec.classes)
 
 
 def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading, tell: Tell) -> OrthoRecord:

@@ -54,7 +54,7 @@ def test_an_extract_cut_by_a_box_has_the_box_of_its_header():
     square = shapely.box(-4000, -4000, 4000, 4000)
     west, south = lonlat_of([(-4000, -4000)])[0]
     east, north = lonlat_of([(4000, 4000)])[0]
-    area, source = choose_coverage(scattered(square), stated=None, header_box=(west, south, east, north))
+    area, source = choose_coverage(scattered(square), stated=None, header=shapely.box(west, south, east, north))
     assert source == "header box"
     assert area.bounds == pytest.approx((west, south, east, north))
 
@@ -63,7 +63,7 @@ def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():
     triangle = shapely.Polygon([(-4000, -4000), (4000, -4000), (4000, 4000)])
     west, south = lonlat_of([(-4000, -4000)])[0]
     east, north = lonlat_of([(4000, 4000)])[0]
-    area, source = choose_coverage(scattered(triangle), stated=None, header_box=(west, south, east, north))
+    area, source = choose_coverage(scattered(triangle), stated=None, header=shapely.box(west, south, east, north))
     assert source == "estimated"
     assert not shapely.contains_xy(metres_of(area), -2500, 2500)
     assert shapely.contains(shapely.box(west, south, east, north), area)
@@ -71,7 +71,11 @@ def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():
 
 def test_what_the_region_file_states_overrules_all():
     stated = shapely.box(9, 47, 9.01, 47.01)
-    assert choose_coverage(scattered(COUNTRY), stated=stated, header_box=(8, 46, 10, 48)) == (stated, "region file")
+    header = shapely.box(8, 46, 10, 48)
+    assert choose_coverage(scattered(COUNTRY), stated=stated, header=header) == (
+        stated,
+        "region file",
+    )
 
 
 def test_no_data_covers_nothing():

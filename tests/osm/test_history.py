@@ -97,6 +97,10 @@ def test_a_full_history_is_cut_at_each_date(tmp_path):
     text = path.read_text().replace('version="1"', 'version="1" visible="true" timestamp="2010-01-01T00:00:00Z"')
     gone = '<way id="2" version="2" visible="false" timestamp="2016-01-01T00:00:00Z"/>'
     path.write_text(text.replace("</osm>", f"{gone}</osm>"))
+    with pytest.raises(ConfigError, match="is a full history: give the dates"):
+        date_extracts([path])
+    with pytest.raises(ConfigError, match="two states have the date 2014-01-01"):
+        date_extracts([path], at=[DAYS[0], DAYS[0]])
     dated = date_extracts([path], at=[dt.date(2018, 1, 1), dt.date(2014, 1, 1)])
     assert [item.on.year for item in dated] == [2014, 2018]
     row = found(read_history(dated))
@@ -112,8 +116,7 @@ def test_a_full_history_is_cut_at_each_date(tmp_path):
         (["a-2014-01-01.osm", "b-2015-01-01.osm"], [DAYS[0]], "got 1 for 2 extracts"),
         (["a-2014-01-01.osm", "b.osm"], [], "b.osm does not say what day it is of"),
         (["a-2014-01-01.osm", "b-2014-13-45.osm"], [], "does not say what day it is of"),
-        (["a.osh.pbf"], [], "is a full history: give the dates"),
-        (["a.osh.pbf"], [DAYS[0], DAYS[0]], "two states have the date 2014-01-01"),
+        (["a-2014-01-01.osh"], [], "at least 2 dated states, got 1"),  # named like a history, and none
         (["none-2014-01-01.osm.pbf", "a-2014-01-01.osm"], [], "no extract at"),
         (["a.txt", "b-2014-01-01.osm"], [], "of no known format"),
     ],

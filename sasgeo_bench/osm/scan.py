@@ -19,8 +19,11 @@ LANE_WIDTH_M: Final = 3.25  # between the 2.75 m and 3.75 m lanes of the German 
 DEFAULT_BRIDGE_WIDTH_M: Final = 4.0
 WIDTH_RANGE_M: Final = (0.3, 80.0)
 _NO: Final = (None, "no", "false", "0")
-_AREA_MODIFIERS: Final = ("tunnel", "layer", "location", "parking", "width")
-_LINE_MODIFIERS: Final = ("tunnel", "layer", "location", "width", "lanes")
+_HIDING: Final = ("tunnel", "layer", "location", "covered", "indoor", "cutting")
+_AREA_MODIFIERS: Final = (*_HIDING, "parking", "width")
+_LINE_MODIFIERS: Final = (*_HIDING, "width", "lanes")
+_ROOFED: Final = ("building", "bridge")
+_OPEN: Final = ("water", "waterway", "coastline")  # with layer=-1 they lie below bridges, in the open
 
 # Where the first point lies in the WKB of a line and of a multipolygon's first ring, and readers of N points.
 _FIRST_POINT: Final = {2: 9, 6: 22}
@@ -157,18 +160,29 @@ def _traits(tags: dict[str, str], labels: tuple[Label, ...], *, is_area: bool) -
         level=level,
         is_bridge=any(label.class_name == "bridge" for label in labels),
         is_tunnel=is_tunnel,
-        hidden_by=_hidden_by(tags, level=level, is_tunnel=is_tunnel),
+        hidden_by=_hidden_by(tags, {label.class_name for label in labels}, level=level),
         width_m=tagged_width_m(tags.get("width"), tags.get("lanes")),
     )
 
 
-def _hidden_by(tags: dict[str, str], *, level: int, is_tunnel: bool) -> str | None:
-    """Return the reason why an object is not visible from above, or None."""
-    if is_tunnel:
+def _hidden_by(tags: dict[str, str], classes: set[str], *, level: int) -> str | None:
+    """Return the reason why an object is not visible from above, or None.
+
+    Water below the level of the ground is open to the sky, and so is what lies in a cutting. A building or a
+    bridge is not hidden by its own roof.
+    """
+    if tags.get("tunnel") not in _NO:
         return f"tunnel={tags['tunnel']}"
-    if level < 0:
-        return "layer < 0"
-    return next((f"{key}=underground" for key in ("location", "parking") if tags.get(key) == "underground"), None)
+    for key in ("location", "parking"):
+        if tags.get(key) == "underground":
+            return f"{key}=underground"
+    for key in ("covered", "indoor"):
+        if tags.get(key) not in _NO and classes.isdisjoint(_ROOFED):
+            return f"{key}={tags[key]}"
+    if tags.get("location") == "indoor":
+        return "location=indoor"
+    is_open = not classes.isdisjoint(_OPEN) or tags.get("cutting") not in _NO
+    return "layer < 0" if level < 0 and not is_open else None
 
 
 def _integer(text: str | None) -> int:

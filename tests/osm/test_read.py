@@ -21,7 +21,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.mapped import project
 from sasgeo_bench.osm.read import read_extract
-from sasgeo_bench.osm.scan import reaches
+from sasgeo_bench.osm.scan import Classifier, Scan, reaches
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 
@@ -84,6 +84,40 @@ def test_what_lies_below_ground_is_kept_but_not_visible(reading):
     }
     assert row(reading, 104, "road_minor")["is_tunnel"]
     assert not row(reading, 140, "path_track")["is_tunnel"]
+
+
+@pytest.mark.parametrize(
+    ("tags", "class_name", "hidden_by"),
+    [
+        ({"natural": "water", "layer": "-1"}, "water", None),
+        ({"leisure": "swimming_pool", "layer": "-1"}, "water", None),
+        ({"waterway": "river", "layer": "-2"}, "waterway", None),
+        ({"highway": "primary", "layer": "-1", "cutting": "yes"}, "road_major", None),
+        ({"railway": "subway", "layer": "-1", "cutting": "both", "tunnel": "no"}, "railway", None),
+        ({"building": "yes", "covered": "yes"}, "building", None),
+        ({"highway": "footway", "bridge": "yes", "covered": "yes"}, "bridge", None),
+        ({"highway": "footway", "covered": "no", "indoor": "no"}, "path_track", None),
+        ({"highway": "primary", "layer": "-1"}, "road_major", "layer < 0"),
+        ({"highway": "primary", "layer": "-1", "cutting": "no"}, "road_major", "layer < 0"),
+        ({"railway": "subway", "layer": "-3"}, "railway", "layer < 0"),
+        ({"amenity": "parking", "layer": "-1"}, "parking", "layer < 0"),
+        ({"building": "yes", "layer": "-1"}, "building", "layer < 0"),
+        ({"waterway": "stream", "layer": "-1", "tunnel": "culvert"}, "waterway", "tunnel=culvert"),
+        ({"natural": "water", "layer": "-1", "covered": "yes"}, "water", "covered=yes"),
+        ({"natural": "water", "location": "underground"}, "water", "location=underground"),
+        ({"leisure": "swimming_pool", "location": "indoor"}, "water", "location=indoor"),
+        ({"leisure": "swimming_pool", "indoor": "yes"}, "water", "indoor=yes"),
+        ({"highway": "footway", "covered": "arcade"}, "path_track", "covered=arcade"),
+        ({"highway": "footway", "indoor": "yes"}, "path_track", "indoor=yes"),
+    ],
+)
+def test_open_water_and_cuttings_are_seen_from_above_and_what_has_a_roof_is_not(tags, class_name, hidden_by):
+    scan = Scan()
+    classifier = Classifier(load_taxonomy(), scan)
+    found = classifier.as_area(tags.get).area or classifier.as_line(tags.get).line
+    assert class_name in {label.class_name for label in found}
+    index = classifier.kind(tags.get, found, is_area=bool(classifier.as_area(tags.get).area))
+    assert scan.traits[index].hidden_by == hidden_by
 
 
 def test_widths_come_from_tags_where_they_say_something(reading):

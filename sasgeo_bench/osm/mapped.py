@@ -163,6 +163,7 @@ def _segments(lines: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats
 CUT: Final = "within reach of ways cut at the edge of the extract"
 OFFSHORE_M: Final = 1000.0  # sea mapped around whole islands: no view is wider, no strait much narrower
 _WGS84: Final = 4326
+_ANTIMERIDIAN_DEG: Final = 180.0
 _EDGE_POINTS: Final = 21  # along each edge of a box: its sides bend when projected
 _DECIMALS: Final = 3  # OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
 _AROUND_DEG: Final = 0.5  # coast further away has no effect, and a projection holds this far
@@ -252,11 +253,18 @@ def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
 
 
 def lonlat_box(grid: Grid) -> Box:
-    """Return west, south, east, north of a grid, degrees: the box around its bent edges."""
+    """Return west, south, east, north of a grid, degrees: the box around its bent edges.
+
+    Of a grid with an edge at the antimeridian, a bent corner may lie beyond: the box ends there.
+    """
     to_lonlat = pyproj.Transformer.from_crs(grid.epsg, _WGS84, always_xy=True)
-    west, south, east, north = grid.bounds_m
-    bounds = to_lonlat.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS)
-    return (float(bounds[0]), float(bounds[1]), float(bounds[2]), float(bounds[3]))
+    bounds = to_lonlat.transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
+    west, south, east, north = map(float, bounds)
+    if west > east:
+        left, low, right, high = grid.bounds_m
+        is_eastern = to_lonlat.transform((left + right) / 2, (low + high) / 2)[0] > 0
+        west, east = (west, _ANTIMERIDIAN_DEG) if is_eastern else (-_ANTIMERIDIAN_DEG, east)
+    return (west, south, east, north)
 
 
 def box_text(box: Box | NDArray[np.float64]) -> str:

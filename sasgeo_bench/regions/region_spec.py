@@ -26,9 +26,11 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.imagery_files import ImageryEntry
 
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
+MAX_LONGITUDE_DEG: Final = 180.0
 MAX_AREA_KM2: Final = 100_000.0
 MAX_CELLS: Final = 4e9
 _EDGE_POINTS: Final = 21
+_M_PER_DEG: Final = 111_320.0
 _NEWER: Final = ("coverage_parts_lonlat", "classes", "largest_view_m", "imagery")  # keys since the first edition
 
 Scene = Literal["urban", "suburban", "industrial", "riverside", "agricultural", "alpine", "coastal", "forest"]
@@ -149,7 +151,28 @@ class RegionFile(NamedDocument):
             message = f"size_m must be two positive lengths, got {list(self.size_m)!r}"
             raise ValueError(message)
         _check_size(*self._size_estimate_m(), self.cell_size_m)
+        self._check_antimeridian()
         return self
+
+    def _check_antimeridian(self) -> None:
+        """Refuse a region across 180 degrees of longitude, before anything is read: ways and boxes end there."""
+        west, south, east, north = self.lonlat_box()
+        width_m, _ = self._size_estimate_m()
+        reach_deg = width_m / _M_PER_DEG / math.cos(math.radians(max(abs(south), abs(north))))
+        if max(abs(west), abs(east)) + reach_deg < MAX_LONGITUDE_DEG or self.size_m is None:
+            return  # far from it, or a box, whose edge may lie on it
+        try:
+            grid = self.grid()
+        except ConfigError:
+            return  # said when the region is built
+        to_lonlat = pyproj.Transformer.from_crs(grid.epsg, 4326, always_xy=True)
+        grid_west, _, grid_east, _ = to_lonlat.transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
+        if grid_west > grid_east:
+            message = (
+                f"the region around {[west, south]!r} reaches over the antimeridian, from {grid_west:.4f} to "
+                f"{grid_east:.4f} degrees: a box over the antimeridian must be split in two"
+            )
+            raise ValueError(message)
 
     @model_validator(mode="after")
     def _dates_differ(self) -> Self:
@@ -184,9 +207,8 @@ class RegionFile(NamedDocument):
         if self.size_m is not None:
             return self.size_m
         west, south, east, north = self.lonlat_box()
-        metres_per_degree = 111_320.0
-        width = (east - west) * metres_per_degree * math.cos(math.radians((south + north) / 2))
-        return (width, (north - south) * metres_per_degree)
+        width = (east - west) * _M_PER_DEG * math.cos(math.radians((south + north) / 2))
+        return (width, (north - south) * _M_PER_DEG)
 
     def grid(self) -> Grid:
         """Return the region's lattice; raise `ConfigError` if the place cannot be projected into the CRS.
@@ -230,7 +252,7 @@ def _checked_ring(ring: list[Corner], key: str) -> list[Corner]:
 def _check_lonlat(box: tuple[float, float, float, float]) -> None:
     west, south, east, north = box
     written = list(box)
-    if not all(math.isfinite(value) for value in box) or max(abs(west), abs(east)) > 180:  # noqa: PLR2004 - degrees
+    if not all(math.isfinite(value) for value in box) or max(abs(west), abs(east)) > MAX_LONGITUDE_DEG:
         message = f"longitudes lie within -180..180 and latitudes within -90..90, got {written!r}"
         raise ValueError(message)
     if max(abs(south), abs(north)) > MAX_LATITUDE_DEG:

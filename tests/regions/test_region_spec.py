@@ -51,6 +51,10 @@ def test_southern_places_get_a_southern_zone():
     [
         ("bounds_lonlat = [9.1, 47.0, 9.0, 47.1]", "west 9.1 > east 9.0"),
         ("bounds_lonlat = [179.9, 47.0, -179.9, 47.1]", "antimeridian"),
+        ("center_lonlat = [180.0, -16.83]\nsize_m = [1024, 1024]", "over the antimeridian must be split in two"),
+        ("center_lonlat = [-180.0, 70.0]\nsize_m = [64, 64]", "over the antimeridian must be split in two"),
+        ("center_lonlat = [-179.99, 66.0]\nsize_m = [2000, 64]", "over the antimeridian must be split in two"),
+        ("center_lonlat = [179.999, 0.0]\nsize_m = [512, 64]\nepsg = 32601", "must be split in two"),
         ("bounds_lonlat = [9.0, 47.1, 9.1, 47.0]", "swap"),
         ("bounds_lonlat = [9.0, 84.5, 9.1, 84.6]", "84"),
         ("bounds_lonlat = [9.0, 47.0, 9.0, 47.1]", "positive size"),

@@ -3,20 +3,31 @@
 
 import datetime as dt
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import shapely
 
-from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.errors import ExtractError, counted
 from sasgeo_bench.files.json import MOST_BYTES, parse_json
-from sasgeo_bench.osm.scan import Box, Classifier, Scan, ScanRow, Tally
+from sasgeo_bench.osm.scan import Box, Classifier, Scan, ScanRow
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy
+from sasgeo_bench.osm.xml_text import NEW_IDS
 
 _NO_TIME: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _WGS84: Final = ("CRS84", "EPSG::4326", "EPSG:4326")  # ends of the names of longitude and latitude in old files
-_IDENTITY: Final = ("osm_id", "osm_type", "version", "timestamp")
+_MORE_TAGS: Final = ("all_tags", "other_tags", "tags")
+_NO_TAGS: Final = (*_MORE_TAGS, "osm_id", "osm_way_id", "osm_type", "version", "timestamp", "type", "id", "@id")
+_NUMBERS: Final = ("layer", "level", "width", "lanes", "height")  # of which 0 and 1 are values
+_SWITCHES: Final = {"true": "yes", "1": "yes", "false": "no", "0": "no"}
+_NOTHING: Final = ("", "none", "null", "<null>", "nan")  # how tables write that there is no value
+_HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"\s*=>\s*"((?:[^"\\]|\\.)*)"')
+_NAMED_ID: Final = re.compile(r"(n|w|r|node|way|relation)/?([0-9]{1,12})")
+_EXACT: Final = 2**53  # whole numbers below it are exact as floats
+_CLASSLESS: Final = " without a class"
+_LEAST_CLASSED: Final = 0.05
 _AREAS: Final = ("Polygon", "MultiPolygon")
 _LINES: Final = ("LineString", "MultiLineString")
 _MOST_LATITUDE_DEG: Final = 90.0
@@ -26,9 +37,10 @@ _MOST_LONGITUDE_DEG: Final = 180.0
 def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str, str], box: Box) -> Scan:
     """Read the features of GeoJSON files as `scan_file` reads an OSM file.
 
-    Properties are tags; `tags` are added where a feature lacks them. `osm_id` and `osm_type` say which object of
-    OpenStreetMap a feature is; without them it gets a negative id, and an object that two files hold is taken once.
-    `box` is west, south, east, north, degrees; features outside it are neither classified nor counted.
+    Properties are tags (`tags_of`); `tags` are added where a feature lacks them. Properties or the id of a feature say
+    which object of OpenStreetMap it is (`identity_of`); without them it gets a negative id. Features of one object are
+    its parts, and one that stands there twice is taken once. `box` is west, south, east, north, degrees; features
+    outside it are neither classified nor counted.
 
     Raise `ExtractError`, which names the file and the feature, if a file is no GeoJSON in longitude and latitude, or a
     geometry is broken.
@@ -36,7 +48,7 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
     scan = Scan()
     classifier = Classifier(taxonomy, scan)
     frame = shapely.box(*box)
-    seen: set[tuple[bool, int]] = set()
+    parts: dict[tuple[Identity, int], int] = {}
     for path in files:
         for number, feature in enumerate(_features(path)):
             shape = _shape(feature, path, number)
@@ -45,8 +57,23 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
             elif not shapely.intersects(shape, frame):
                 scan.far.append(bytes(shapely.to_wkb(shape)))
             else:
-                _take(feature, shape, scan, classifier, tags, seen)
+                _take({**tags, **tags_of(feature)}, identity_of(feature), shape, scan, classifier, parts)
     return scan
+
+
+def classless(scan: Scan) -> str:
+    """Return a warning if fewer than 5 % of the features have a class, else an empty text.
+
+    Then the tags most likely stand where they were not looked for.
+    """
+    without = sum(count for reason, count in scan.tally.drops.items() if reason.endswith(_CLASSLESS))
+    features = without + len(scan.rows)
+    if len(scan.rows) >= _LEAST_CLASSED * features:
+        return ""
+    return (
+        f"{len(scan.rows)} of {counted(features, 'feature')} have a class: are their properties tags of OpenStreetMap, "
+        "and does `tags` say what all of them have?"
+    )
 
 
 def _features(path: Path) -> Iterator[Any]:
@@ -55,7 +82,7 @@ def _features(path: Path) -> Iterator[Any]:
         message = f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region"
         raise ExtractError(message)
     try:
-        content = parse_json(path.read_bytes())
+        content = parse_json(path.read_bytes().removeprefix(b"\xef\xbb\xbf"))
     except (OSError, ValueError) as error:
         message = f"{path} cannot be read as GeoJSON ({str(error)[:200]}): get it again"
         raise ExtractError(message) from error
@@ -75,6 +102,9 @@ def _features(path: Path) -> Iterator[Any]:
 def _shape(feature: Any, path: Path, number: int) -> shapely.Geometry | None:  # noqa: ANN401 - what a file holds
     """Return the geometry of a feature, mended where its rings cross; None if it has none."""
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
+    if isinstance(feature, dict) and not isinstance(feature.get("properties") or {}, dict):
+        message = f"{path}: feature {number} has properties that are no object: export it again"
+        raise ExtractError(message)
     if geometry is None and isinstance(feature, dict):
         return None
     try:
@@ -100,41 +130,139 @@ def _fault(shape: shapely.Geometry) -> str:
     return "" if is_across and is_up else f"its bounds {shape.bounds} are no longitudes and latitudes"
 
 
+def tags_of(feature: Mapping[str, Any]) -> dict[str, str]:
+    """Return the tags of a feature, from properties, and from what they hold of further tags.
+
+    osmtogeojson has an object `tags`, ogr2ogr a text `other_tags` ("key"=>"value" or JSON); own properties come first.
+    No value and an empty text are no tag. True, false and numbers become what a mapper writes: yes, no, and whole
+    numbers without a fraction; 1 and 0 mean yes and no, save of a layer, a width and lanes.
+
+    >>> tags_of({"properties": {"bridge": False, "layer": -1.0, "name": "", "other_tags": '"highway"=>"path"'}})
+    {'highway': 'path', 'bridge': 'no', 'layer': '-1'}
+    """
+    properties = feature.get("properties") or {}
+    found: dict[str, str] = {}
+    for name in _MORE_TAGS:
+        found |= _texts(_parsed(properties.get(name)))
+    return found | _texts({key: value for key, value in properties.items() if key not in _NO_TAGS})
+
+
+def _parsed(value: Any) -> Mapping[str, Any]:  # noqa: ANN401 - any JSON
+    """Return tags from an object, or a text of JSON or of PostgreSQL's hstore."""
+    if isinstance(value, str) and value.lstrip().startswith("{"):
+        try:
+            value = parse_json(value)
+        except ValueError:
+            return {}
+    if isinstance(value, str):
+        return {_unescaped(key): _unescaped(text) for key, text in _HSTORE.findall(value)}
+    return value if isinstance(value, dict) else {}
+
+
+def _unescaped(text: str) -> str:
+    return re.sub(r"\\(.)", r"\1", text)
+
+
+def _texts(values: Mapping[str, Any]) -> dict[str, str]:
+    return {key: text for key, value in values.items() if (text := _text(key, value))}
+
+
+def _text(key: str, value: Any) -> str:  # noqa: ANN401 - any JSON
+    """Return a value as a mapper writes it; empty for none."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if not isinstance(value, str | int | float):
+        return ""
+    text = str(value).strip()
+    if text.lower() in _NOTHING:
+        return ""
+    return text if key in _NUMBERS else _SWITCHES.get(text.lower(), text)
+
+
+class Identity(NamedTuple):
+    """An object of OpenStreetMap; the type of one that is not known to be a relation counts as way."""
+
+    is_relation: bool
+    osm_id: int
+
+
+def identity_of(feature: Mapping[str, Any]) -> Identity | None:
+    """Return which object of OpenStreetMap a feature is, or None if it does not say so.
+
+    Read are `osm_id` with `osm_type`, `osm_way_id` (ogr2ogr), `id` with `type`, and "way/7" in `@id`, `id` or the id of
+    the feature. A negative `osm_id` is that of a relation, as osm2pgsql writes it.
+
+    >>> identity_of({"id": "relation/7", "properties": {}})
+    Identity(is_relation=True, osm_id=7)
+    >>> identity_of({"properties": {"osm_id": "13", "osm_type": "way"}})
+    Identity(is_relation=False, osm_id=13)
+    """
+    properties = feature.get("properties") or {}
+    kind = str(properties.get("osm_type") or properties.get("type") or "").lower()
+    for value in (properties.get("@id"), properties.get("id"), feature.get("id")):
+        named = _NAMED_ID.fullmatch(value) if isinstance(value, str) else None
+        if named is not None:
+            return Identity(named[1].startswith("r"), int(named[2]))
+    is_object = kind in ("way", "relation", "node")
+    for name in ("osm_id", "osm_way_id", *(("id",) if is_object else ())):
+        number = _whole(properties.get(name))
+        if number:
+            return Identity(kind.startswith("r") or number < 0, abs(number))
+    return None
+
+
+def _whole(value: Any) -> int | None:  # noqa: ANN401 - any JSON
+    """Return an id of at most 62 bits, also of a text or a float; None if it is none."""
+    if isinstance(value, bool) or not isinstance(value, int | float | str):
+        return None
+    if isinstance(value, float):
+        return int(value) if value.is_integer() and abs(value) < _EXACT else None
+    text = str(value).strip()
+    is_number = re.fullmatch(r"-?[0-9]{1,19}(\.0+)?", text) is not None
+    number = int(text.split(".")[0]) if is_number else 0
+    return number if abs(number) < NEW_IDS else None
+
+
 def _take(
-    feature: Mapping[str, Any],
+    tags: Mapping[str, str],
+    identity: Identity | None,
     shape: shapely.Geometry,
     scan: Scan,
     classifier: Classifier,
-    tags: Mapping[str, str],
-    seen: set[tuple[bool, int]],
+    parts: dict[tuple[Identity, int], int],
 ) -> None:
-    """Classify one feature by its tags, and keep it under its id."""
-    properties = feature.get("properties") or {}
-    own = {str(key): str(value) for key, value in properties.items() if value is not None and key not in _IDENTITY}
-    get, is_relation = ({**tags, **own}).get, properties.get("osm_type") == "relation"
-    is_area = shape.geom_type in _AREAS
+    """Classify one feature by its tags, and keep it under its id; a further part joins those before it."""
+    get, is_area = tags.get, shape.geom_type in _AREAS
     labels: tuple[Label, ...] = ()
     if is_area:
         labels = classifier.area_labels(get, is_relation=True)
     elif shape.geom_type in _LINES:
         labels = classifier.as_line(get).line
+    wkb = bytes(shapely.to_wkb(shape))
     if not labels:
-        scan.tally.drops[f"{shape.geom_type} without a class"] += 1
-        scan.far.append(bytes(shapely.to_wkb(shape)))
+        scan.tally.drops[f"{shape.geom_type}{_CLASSLESS}"] += 1
+        scan.far.append(wkb)
         return
-    identifier = _identifier(properties, scan.tally, count=len(scan.rows))
-    if (is_relation, identifier) in seen:
+    kind = classifier.kind(get, labels, is_area=is_area)
+    if identity is None:
+        scan.tally.notes["feature without the id of an object"] += 1
+        scan.rows.append(ScanRow(wkb, kind, -1 - len(scan.rows), False, 0, _NO_TIME))  # noqa: FBT003
+        return
+    place = parts.setdefault((identity, kind), len(scan.rows))
+    if place == len(scan.rows):
+        scan.rows.append(ScanRow(wkb, kind, identity.osm_id, identity.is_relation, 0, _NO_TIME))
+        return
+    before = shapely.from_wkb(scan.rows[place].wkb)
+    if shapely.covers(before, shape):
         scan.tally.notes["object that stands there twice, taken once"] += 1
         return
-    seen.add((is_relation, identifier))
-    kind = classifier.kind(get, labels, is_area=is_area)
-    scan.rows.append(ScanRow(bytes(shapely.to_wkb(shape)), kind, identifier, is_relation, 0, _NO_TIME))
+    scan.tally.notes["further part of an object, joined to it"] += 1
+    scan.rows[place] = scan.rows[place]._replace(wkb=bytes(shapely.to_wkb(_joined(before, shape))))
 
 
-def _identifier(properties: Mapping[str, Any], tally: Tally, *, count: int) -> int:
-    """Return the id of an object of OpenStreetMap, or a negative one of our own."""
-    found = properties.get("osm_id")
-    if isinstance(found, int) and not isinstance(found, bool) and 0 < found < 2**62:
-        return found
-    tally.notes["feature without the id of an object"] += 1
-    return -1 - count
+def _joined(before: shapely.Geometry, part: shapely.Geometry) -> shapely.Geometry:
+    if part.geom_type in _AREAS:
+        return shapely.union(before, part)
+    return shapely.multilinestrings(shapely.get_parts([before, part]))

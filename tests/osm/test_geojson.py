@@ -10,6 +10,7 @@ from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.geojson import identity_of, tags_of
 from sasgeo_bench.osm.locate import ExtractPart, find_parts
 from sasgeo_bench.osm.read import read_geojson
 from sasgeo_bench.regions.region_spec import RegionFile
@@ -76,11 +77,92 @@ def test_a_crossing_ring_is_mended_and_a_feature_without_geometry_counted(tmp_pa
     assert reading.drops == {"feature without a geometry": 1}
 
 
+@pytest.mark.parametrize(
+    ("properties", "tags"),
+    [
+        ({"building": "", "landuse": "grass", "name": None, "note": "  "}, {"landuse": "grass"}),
+        ({"highway": "path", "bridge": False, "tunnel": True}, {"highway": "path", "bridge": "no", "tunnel": "yes"}),
+        (
+            {"bridge": 0, "tunnel": 1, "layer": 1, "lanes": 0},
+            {"bridge": "no", "tunnel": "yes", "layer": "1", "lanes": "0"},
+        ),
+        ({"bridge": "False", "tunnel": "0", "area": "TRUE"}, {"bridge": "no", "tunnel": "no", "area": "yes"}),
+        ({"layer": -1.0, "width": 3.5, "lanes": 2.0}, {"layer": "-1", "width": "3.5", "lanes": "2"}),
+        ({"building": "None", "landuse": "nan", "natural": "<Null>"}, {}),
+        ({"type": "way", "id": 5, "tags": {"building": "yes"}, "meta": {}}, {"building": "yes"}),
+        ({"tags": '{"building": true}', "relations": []}, {"building": "yes"}),
+        ({"other_tags": r'"building"=>"yes","name"=>"a \"b\", c"'}, {"building": "yes", "name": 'a "b", c'}),
+        ({"building": "house", "other_tags": '"building"=>"yes"'}, {"building": "house"}),
+        ({"other_tags": "a text of no form"}, {}),
+        (None, {}),
+    ],
+)
+def test_values_are_tags_as_a_mapper_writes_them(properties, tags):
+    assert tags_of({"properties": properties}) == tags
+
+
+@pytest.mark.parametrize(
+    ("feature", "identity"),
+    [
+        ({"properties": {"osm_id": 7, "osm_type": "way"}}, (False, 7)),
+        ({"properties": {"osm_id": 7.0}}, (False, 7)),
+        ({"properties": {"osm_id": "7", "osm_type": "relation"}}, (True, 7)),
+        ({"properties": {"osm_id": -7}}, (True, 7)),
+        ({"properties": {"osm_id": None, "osm_way_id": "8"}}, (False, 8)),
+        ({"properties": {"@id": "relation/9"}}, (True, 9)),
+        ({"id": "way/9", "properties": None}, (False, 9)),
+        ({"id": "w9", "properties": {}}, (False, 9)),
+        ({"properties": {"type": "way", "id": 5}}, (False, 5)),
+        ({"id": 3, "properties": {"id": 4}}, None),
+        ({"properties": {"osm_id": True}}, None),
+        ({"properties": {"osm_id": 2**62}}, None),
+        ({"properties": {"osm_id": "7a"}}, None),
+    ],
+)
+def test_an_object_is_named_in_many_ways(feature, identity):
+    assert identity_of(feature) == identity
+
+
+def test_features_of_one_object_are_its_parts(tmp_path):
+    parts = [feature(shape, osm_id=7, osm_type="relation", building="yes") for shape in (HOUSE, SHED, HOUSE)]
+    line = [shapely.LineString([(WEST, SOUTH + y), (WEST + 90, SOUTH + y)]) for y in (40, 60)]
+    roads = [feature(shape, osm_id=8, highway="primary") for shape in line]
+    reading = read(written(tmp_path / "a.geojson", *parts, *roads), tags={}, classes=("road_major", "building"))
+    assert reading.features["osm_id"].tolist() == [8, 7]
+    road, house = reading.features.geometry
+    assert house.area == pytest.approx(HOUSE.area + SHED.area, rel=1e-3)
+    assert road.length == pytest.approx(180, rel=1e-3)
+    assert reading.notes == {
+        "further part of an object, joined to it": 2,
+        "object that stands there twice, taken once": 1,
+    }
+
+
+def test_an_object_of_two_classes_in_two_features_keeps_both(tmp_path):
+    both = [feature(HOUSE, osm_id=7, building="yes"), feature(HOUSE, osm_id=7, landuse="grass")]
+    reading = read(written(tmp_path / "a.geojson", *both), tags={}, classes=("building", "green"))
+    assert reading.features["class"].tolist() == ["building", "green"]
+
+
+def test_a_byte_order_mark_is_passed_over(tmp_path):
+    path = written(tmp_path / "a.geojson", feature(HOUSE))
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert len(read(path).features) == 1
+
+
+def test_a_file_with_hardly_a_tag_says_so(tmp_path):
+    few = [feature(HOUSE, building="yes"), *(feature(SHED, kind="building") for _ in range(20))]
+    reading = read(written(tmp_path / "a.geojson", *few), tags={})
+    assert reading.warnings[0].startswith("1 of 21 features have a class: are their properties tags")
+    assert read(written(tmp_path / "b.geojson", *few[:20]), tags={}).warnings == ()
+
+
 BAD = {
     "": "cannot be read as GeoJSON",
     "{": "cannot be read as GeoJSON",
     "null": "no GeoJSON FeatureCollection",
     '{"type": "Feature"}': "no GeoJSON FeatureCollection",
+    '{"type": "FeatureCollection", "features": [{"properties": "a", "geometry": null}]}': "that are no object",
     '{"type": "FeatureCollection", "features": [7]}': "feature 0 has a broken geometry",
     '{"type": "FeatureCollection", "features": [{"geometry": {"type": "Circle"}}]}': "feature 0 has a broken geometry",
     '{"type": "FeatureCollection", "features": [{"geometry": {"type": "Polygon", "coordinates": [[[1]]]}}]}': "broken",

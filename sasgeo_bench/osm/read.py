@@ -17,8 +17,9 @@ from sasgeo_bench.errors import CoverageError, ExtractError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.box_cut import cuts_by_box
 from sasgeo_bench.osm.coverage import choose_coverage
+from sasgeo_bench.osm.families import missing_families
 from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features
-from sasgeo_bench.osm.geojson import scan_geojson
+from sasgeo_bench.osm.geojson import classless, scan_geojson
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.osm.mapped import Mapped, box_text, lonlat_box, map_ground, project
 from sasgeo_bench.osm.passes import scan_file
@@ -53,7 +54,9 @@ class Reading:
 
     def dated(self, snapshot: Snapshot) -> Self:
         """Return the content with the date and the warnings of the file that it was read from."""
-        return replace(self, osm_timestamp=snapshot.replicated_at or self.osm_timestamp, warnings=snapshot.warnings)
+        return replace(
+            self, osm_timestamp=snapshot.replicated_at or self.osm_timestamp, warnings=snapshot.warnings + self.warnings
+        )
 
 
 def read_extract(
@@ -105,7 +108,8 @@ def read_geojson(
     name, scan = files[0].name, scan_geojson(files, load_taxonomy(), tags=tags, box=lonlat_box(grid))
     objects = _objects(scan)
     mapped = _mapped(name, scan, grid, area=stated_coverage, source="region file", frame=_frame(objects))
-    return _reading(name, scan, grid, mapped, objects=objects, classes=classes)
+    warning = classless(scan)
+    return _reading(name, scan, grid, mapped, objects=objects, classes=classes, warnings=(warning,) if warning else ())
 
 
 def _objects(scan: Scan) -> NDArray[np.object_]:
@@ -114,7 +118,7 @@ def _objects(scan: Scan) -> NDArray[np.object_]:
 
 
 def _frame(objects: NDArray[np.object_]) -> shapely.Geometry:
-    return shapely.box(*shapely.total_bounds(objects))
+    return shapely.box(*shapely.total_bounds(objects)) if len(objects) else shapely.Polygon()
 
 
 def _mapped(
@@ -149,6 +153,7 @@ def _reading(
     *,
     objects: NDArray[np.object_],
     classes: Sequence[str] | None,
+    warnings: tuple[str, ...] = (),
 ) -> Reading:
     """Turn what one pass found into features."""
     taxonomy, grid_lonlat = load_taxonomy(), lonlat_box(grid)
@@ -162,6 +167,8 @@ def _reading(
         of_class = "any class" if classes is None else f"class {', '.join(classes)}"
         message = f"{name} holds no element of {of_class} within {box_text(grid_lonlat)}: move or enlarge the bounds"
         raise CoverageError(message)
+    kept = taxonomy.names if classes is None else classes
+    warnings = (*warnings, missing_families(features, mapped.coverage, classes=kept))
     newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
     return Reading(
         features=features,
@@ -171,7 +178,7 @@ def _reading(
         drops=dict(scan.tally.drops.most_common()),
         hidden=dict(scan.tally.hidden.most_common()),
         notes=dict(scan.tally.notes.most_common()),
-        warnings=(),
+        warnings=tuple(filter(None, warnings)),
         unknown_m2=mapped.unknown_m2,
         cuts=_cuts(scan),
     )

@@ -56,7 +56,7 @@ def read_header(path: Path) -> Header:
     _check_file(path)
     with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
         content = _as_its_content(path, Path(scratch))
-        return _header(content)
+        return _header(path, content)
 
 
 @contextmanager
@@ -80,7 +80,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
     _check_file(path)
     with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
         content = _as_its_content(path, Path(scratch))
-        stated = _header(content)
+        stated = _header(path, content)
         survey = _survey(content)
         is_past, is_named = survey.is_history(path), path.name.endswith(_HISTORY_SUFFIXES)
         if is_past and at is None and (survey.is_flagged or is_named):
@@ -208,11 +208,11 @@ def _header_of(path: Path) -> osmium.io.Header:
         return reader.header()
 
 
-def _header(content: Path) -> Header:
+def _header(path: Path, content: Path) -> Header:
     header = _header_of(content)
     if _is_xml(content) and header.has_multiple_object_versions:
-        message = "it holds changes, no objects: give the extract with the changes applied, by osmium apply-changes"
-        raise RuntimeError(message)
+        message = f"{path.name} holds changes: give the extract, with the changes applied (osmium apply-changes)"
+        raise ExtractError(message)
     return Header(boxes_lonlat=_header_boxes(content, header), replicated_at=_header_time(header))
 
 

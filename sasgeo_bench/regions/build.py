@@ -196,6 +196,8 @@ def _build_into(scratch: Path, plan: BuildPlan, tell: Tell) -> Manifest:
     with _source(plan) as source:
         tell(f"{name}: reading {source.name}")
         reading = _read(plan, source)
+        for warning in reading.warnings:
+            tell(f"{name}: warning: {warning}")
         record = file_record(source)
         extract = ExtractRecord(
             file=plan.extract.file,

@@ -1,0 +1,302 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OSM files as editors, servers and filters write them: one town is read from each, or a line says what is wrong."""
+
+import bz2
+import datetime as dt
+import gzip
+
+import osmium
+import pytest
+import shapely
+from osmium.osm.mutable import Node, Way
+
+from sasgeo_bench.errors import CoverageError, ExtractError
+from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.osm.snapshot import is_history, open_snapshot, read_header
+
+GRID = Grid(epsg=32632, west_m=499_700.0, north_m=5_205_500.0, cell_size_m=5.0, rows=130, cols=130)
+DAY = dt.datetime(2015, 6, 1, tzinfo=dt.UTC)
+
+
+def place(x, y):
+    """Longitude and latitude of metres from 9 E, 47 N."""
+    return 9 + x / 76_030, 47 + y / 111_175
+
+
+class Town:
+    """A grid of streets with the elements that a test adds, each as the text of an XML file."""
+
+    def __init__(self):
+        self.number, self.nodes, self.ways, self.relations = 1, [], [], []
+        for y in range(-300, 301, 75):
+            self.way([(x, y) for x in range(-300, 301, 75)], highway="service")
+
+    def take(self):
+        self.number += 1
+        return self.number - 1
+
+    def way(self, corners, more="", *, sign=1, of=None, **tags):
+        of = [None] * len(corners) if of is None else of
+        refs = [self.node(*corner, sign=sign) for corner in corners[: len(set(corners))]]
+        refs += refs[: len(corners) - len(refs)]
+        identifier = sign * self.take()
+        nds = "".join(f'<nd ref="{ref}"/>' for ref in refs)
+        text = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+        self.ways.append(f'<way id="{identifier}" version="1" {more}>{nds}{text}</way>')
+        return identifier
+
+    def node(self, x, y, *, sign=1):
+        lon, lat = place(x, y)
+        identifier = sign * self.take()
+        self.nodes.append(f'<node id="{identifier}" version="1" lat="{lat:.7f}" lon="{lon:.7f}"/>')
+        return identifier
+
+    def text(self, head=""):
+        body = "\n".join((*self.nodes, *self.ways, *self.relations))
+        return f'<?xml version="1.0"?>\n<osm version="0.6">{head}\n{body}</osm>\n'
+
+    def write(self, path, head=""):
+        path.write_text(self.text(head), encoding="utf-8")
+        return path
+
+
+def square(x, y, side=40.0):
+    half = side / 2
+    corners = [(x - half, y - half), (x + half, y - half), (x + half, y + half), (x - half, y + half)]
+    return [*corners, corners[0]]
+
+
+def houses(path, **more):
+    """Total area of the buildings, to fifty square metres (UTM is 0.1 % smaller), and their ids."""
+    found = read_extract(path, GRID, **more).features
+    found = found[found["class"] == "building"]
+    return 50 * round(float(found.geometry.area.sum()) / 50), sorted(found["osm_id"])
+
+
+# Editors
+
+
+@pytest.mark.parametrize("mark", ["action='delete'", 'action="delete"', "visible='false'"])
+def test_what_an_editor_or_the_server_has_deleted_is_left_out(mark, tmp_path):
+    town = Town()
+    kept = town.way(square(0, 0), "action='modify' visible='true'", building="yes")
+    town.way(square(100, 0), mark, building="yes")
+    assert houses(town.write(tmp_path / "a.osm")) == (1600, [kept])
+    (tmp_path / "a.osm.gz").write_bytes(gzip.compress(town.text().encode()))
+    (tmp_path / "a.osm.bz2").write_bytes(bz2.compress(town.text().encode()))
+    for name in ("a.osm.gz", "a.osm.bz2"):
+        assert houses(tmp_path / name) == (1600, [kept])
+
+
+def test_a_tag_that_speaks_of_deletion_deletes_nothing(tmp_path):
+    town = Town()
+    kept = town.way(square(0, 0), building="yes", note="action=&apos;delete&apos; &amp; &quot;visible&quot; &lt;b&gt;")
+    town.way(square(100, 0), "action='delete'", building="yes")
+    assert houses(town.write(tmp_path / "a.osm")) == (1600, [kept])
+
+
+def test_a_relation_that_was_deleted_is_no_area_and_its_ways_stay(tmp_path):
+    town = Town()
+    ring = town.way(square(0, 0), building="yes")
+    member = f'<member type="way" ref="{ring}" role="outer"/><tag k="type" v="multipolygon"/>'
+    town.relations.append(f'<relation id="900" action="delete">{member}<tag k="landuse" v="forest"/></relation>')
+    found = read_extract(town.write(tmp_path / "a.osm"), GRID).features
+    assert "green" not in set(found["class"])
+    assert houses(tmp_path / "a.osm") == (1600, [ring])
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_what_was_drawn_and_not_uploaded_yet_is_read_and_keeps_its_negative_id(order, tmp_path):
+    town = Town()
+    old = town.way(square(0, 0), building="yes")
+    new = town.way(square(100, 0), sign=-1, building="yes")
+    road = town.way([(-200, 37), (100, 37), (200, 37)], sign=-1, highway="primary")
+    town.nodes, town.ways = town.nodes[::order], town.ways[::order]
+    found = read_extract(town.write(tmp_path / "a.osm"), GRID).features
+    assert houses(tmp_path / "a.osm") == (3200, sorted((old, new)))
+    major = found[found["class"] == "road_major"]
+    assert major["osm_id"].tolist() == [road]
+    assert major.geometry.length.iloc[0] == pytest.approx(400, abs=1)
+
+
+def test_a_relation_of_new_ways_has_its_hole(tmp_path):
+    town = Town()
+    outer, inner = town.way(square(0, 0, 100), sign=-1), town.way(square(0, 0), sign=-1)
+    members = "".join(f'<member type="way" ref="{r}" role="{s}"/>' for r, s in ((outer, "outer"), (inner, "inner")))
+    tags = '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
+    town.relations.append(f'<relation id="-5">{members}{tags}</relation>')
+    assert houses(town.write(tmp_path / "a.osm")) == (8400, [-5])
+
+
+def bounds(west, south, east, north):
+    (west, south), (east, north) = place(west, south), place(east, north)
+    return f"<bounds minlat='{south:.7f}' minlon='{west:.7f}' maxlat='{north:.7f}' maxlon='{east:.7f}' origin='x'/>"
+
+
+def test_the_boxes_of_several_downloads_are_one_mapped_area(tmp_path):
+    two = bounds(-320, -320, 0, 320) + bounds(0, -320, 320, 320)
+    reading = read_extract(Town().write(tmp_path / "a.osm", two), GRID)
+    assert len(read_header(tmp_path / "a.osm").boxes_lonlat) == 2
+    assert reading.coverage_source == "header box"
+    assert shapely.area(reading.coverage) == pytest.approx(640 * 620, rel=0.05)
+
+
+def test_a_box_in_the_older_form_is_a_box(tmp_path):
+    (west, south), (east, north) = place(-320, -320), place(320, 320)
+    old = f'<bound box="{south},{west},{north},{east}" origin="Osmosis"/>'
+    assert read_header(Town().write(tmp_path / "a.osm", old)).boxes_lonlat == (
+        pytest.approx((west, south, east, north)),
+    )
+
+
+# Servers
+
+
+def geom(corners):
+    places = [place(*corner) for corner in corners]
+    return "".join(f'<nd lat="{lat:.7f}" lon="{lon:.7f}"/>' for lon, lat in places)
+
+
+@pytest.mark.parametrize("with_ways", [True, False])
+def test_places_inside_members_are_read(with_ways, tmp_path):
+    town = Town()
+    rings = {"outer": square(0, 0, 100), "inner": square(0, 0)}
+    members = ""
+    for number, (role, corners) in enumerate(rings.items(), start=800):
+        ref = town.way(corners) if with_ways else number
+        members += f'<member type="way" ref="{ref}" role="{role}">{geom(corners)}</member>'
+        role_again = f'<member type="way" ref="{ref}" role="">{geom(corners)}</member>'
+        town.relations.append(f'<relation id="{number + 100}">{role_again}<tag k="type" v="route"/></relation>')
+    tags = '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
+    town.relations.append(f'<relation id="999"><bounds minlat="0" maxlat="1"/>{members}{tags}</relation>')
+    assert houses(town.write(tmp_path / "a.osm")) == (8400, [999])
+
+
+def test_ways_that_carry_the_places_of_their_nodes_need_no_nodes(tmp_path):
+    town = Town()
+    corners = square(0, 0)
+    texts = geom(corners).split("<nd ")[1:]
+    nds = "".join(f'<nd ref="{900 + at % 4}" {text}' for at, text in enumerate(texts))
+    town.ways.append(f'<way id="800"><center lat="47" lon="9"/>{nds}<tag k="building" v="yes"/></way>')
+    assert houses(town.write(tmp_path / "a.osm")) == (1600, [800])
+
+
+def on_ways(source, target, *, keep_nodes=False):
+    """Write what `osmium add-locations-to-ways` writes."""
+    with osmium.SimpleWriter(osmium.io.File(str(target), "pbf,locations_on_ways=true")) as writer:
+        for item in osmium.FileProcessor(str(source)).with_locations():
+            if not item.is_node() or keep_nodes:
+                writer.add(item)
+    return target
+
+
+@pytest.mark.parametrize("keep_nodes", [True, False])
+def test_node_places_on_ways_give_the_same_town(keep_nodes, tmp_path):
+    town = Town()
+    house = town.way(square(0, 0), building="yes")
+    plain = town.write(tmp_path / "a.osm")
+    path = on_ways(plain, tmp_path / "b.osm.pbf", keep_nodes=keep_nodes)
+    assert houses(path) == houses(plain) == (1600, [house])
+    assert len(read_extract(path, GRID).features) == len(read_extract(plain, GRID).features)
+
+
+# Histories, repetitions, and what is no extract
+
+
+def write_states(path, options):
+    """A house of 2015 that is deleted in 2018, and a street that stays."""
+    with osmium.SimpleWriter(osmium.io.File(str(path), options)) as writer:
+        for number, corner in enumerate([*square(0, 0)[:4], (-200, 60), (200, 60)], start=1):
+            writer.add_node(Node(id=number, version=1, visible=True, timestamp=DAY, location=place(*corner)))
+        made = {"id": 1, "timestamp": DAY, "visible": True}
+        writer.add_way(Way(**made, version=1, nodes=[1, 2, 3, 4, 1], tags={"building": "yes"}))
+        if "history" in options:
+            writer.add_way(Way(id=1, version=2, visible=False, timestamp=DAY.replace(year=2018), nodes=[], tags={}))
+        writer.add_way(Way(**made | {"id": 2}, version=1, nodes=[5, 6], tags={"highway": "residential"}))
+    return path
+
+
+def test_a_history_is_told_by_its_header_whatever_its_name(tmp_path):
+    path = write_states(tmp_path / "history-latest.osm.pbf", "pbf,history=true")
+    assert is_history(path)
+    assert houses(path, at=dt.date(2016, 1, 1)) == (1600, [1])
+    assert houses(path, at=dt.date(2019, 1, 1)) == (0, [])
+    with pytest.raises(ExtractError, match="give the date"):
+        read_extract(path, GRID)
+
+
+def test_what_is_only_named_like_a_history_is_read_as_it_stands(tmp_path):
+    path = write_states(tmp_path / "town.osh.pbf", "pbf")
+    assert not is_history(path)
+    reading = read_extract(path, GRID, at=dt.date(2000, 1, 1))
+    assert (reading.features["class"] == "building").sum() == 1
+    assert "named like a full history" in reading.warnings[0]
+
+
+def test_a_history_in_xml_is_told_by_its_versions(tmp_path):
+    town = Town()
+    house = town.way(square(0, 0), 'timestamp="2015-06-01T00:00:00Z"', building="yes")
+    town.ways.append(f'<way id="{house}" version="2" visible="false" timestamp="2018-01-01T00:00:00Z"/>')
+    for name in ("history-latest.osm", "a.osh"):
+        path = town.write(tmp_path / name)
+        assert is_history(path)
+        assert houses(path, at=dt.date(2016, 1, 1)) == (1600, [house])
+        assert houses(path, at=dt.date(2019, 1, 1)) == (0, [])
+
+
+@pytest.mark.parametrize("versions", [(1, 1), (1, 2), (2, 1)])
+def test_of_merged_files_each_object_is_taken_once_and_newest(versions, tmp_path):
+    town = Town()
+    refs = [town.node(*corner) for corner in square(0, 0)[:4]]
+    nds = "".join(f'<nd ref="{ref}"/>' for ref in [*refs, refs[0]])
+    newest = max(versions)
+    for version in versions:
+        kind = "yes" if version == newest else "no"
+        town.ways.append(f'<way id="800" version="{version}">{nds}<tag k="building" v="{kind}"/></way>')
+    reading = read_extract(town.write(tmp_path / "a.osm"), GRID)
+    assert houses(tmp_path / "a.osm") == (1600, [800])
+    assert reading.warnings[0].startswith("1 object stood there in more than one version")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.osc", "", "is a change file"),
+        ("a.osc.gz", "", "is a change file"),
+        ("a.o5c", "", "is a change file"),
+        ("a.osm", '<osmChange version="0.6"><create><node id="1" version="1" lat="47" lon="9"/></create></osmChange>',
+         "holds changes: give the extract"),
+        ("a.osm", "<osm version='0.6'></osm>", "holds no element of any class"),
+        ("a.osm", "<osm version='0.6'><node id='1' lat='47' lon='9'/></osm>", "holds no element of any class"),
+        ("a.o5m", "x", r"convert it \(osmium cat a.o5m"),
+        ("a.opl", "n1 x9 y47", r"convert it \(osmium cat a.opl"),
+        ("a.osm", "<osm version='0.6'><way id='1' action='delete'></osm>", "cannot be read as OSM data"),
+        ("a.osm", "<!DOCTYPE x [<!ENTITY a 'b'>]><osm version='0.6'><node id='1' action='delete'/></osm>", "entities"),
+    ],
+)  # fmt: skip
+def test_what_is_no_extract_is_refused_with_what_to_do(name, text, words, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises((CoverageError, ExtractError), match=words) as caught:
+        read_extract(tmp_path / name, GRID)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("keep", [0, 3, 4])
+def test_ways_without_their_nodes_are_refused_in_one_line(keep, tmp_path):
+    town = Town()
+    town.nodes = [node for at, node in enumerate(town.nodes) if keep and at % keep == 0]
+    with pytest.raises(ExtractError, match=r"lacks the nodes of 9 of its 9 ways: .* without -R"):
+        read_extract(town.write(tmp_path / "a.osm"), GRID)
+
+
+def test_a_plain_file_is_read_where_it_lies(tmp_path):
+    plain = on_ways(Town().write(tmp_path / "a.osm"), tmp_path / "b.osm.pbf", keep_nodes=True)
+    with osmium.SimpleWriter(str(tmp_path / "c.osm.pbf")) as writer:
+        for item in osmium.FileProcessor(str(tmp_path / "a.osm")):
+            writer.add(item)
+    with open_snapshot(tmp_path / "c.osm.pbf") as snapshot:
+        assert snapshot.path == tmp_path / "c.osm.pbf"
+        assert snapshot.warnings == ()
+    with open_snapshot(plain) as snapshot:
+        assert snapshot.path != plain

@@ -19,6 +19,7 @@ CLOSE_M: Final = 600.0  # villages, woods and pastures of one mapped country lie
 OPEN_M: Final = 150.0  # half the width of what is cut off: a road or stream kept whole beyond the edge
 MIN_SHARE: Final = 0.02  # of the largest piece: smaller ones are leftovers of relations that cross the edge
 FULL_SHARE: Final = 0.85  # data that fills this much of the header's box was cut by that box
+_HALF_ROUND_DEG: Final = 180.0
 M_PER_DEG: Final = 111_320.0  # of latitude; a coverage cell is 100 m, so the sphere is near enough
 
 
@@ -37,6 +38,9 @@ def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
         return shapely.Polygon()
     west, south = np.percentile(lonlat, 0.1, axis=0)
     east, north = np.percentile(lonlat, 99.9, axis=0)
+    if east - west > _HALF_ROUND_DEG:  # on both sides of the antimeridian: cells all around the globe are too many
+        is_west = lonlat[:, 0] < 0
+        return shapely.union(estimate_coverage(lonlat[is_west]), estimate_coverage(lonlat[~is_west]))
     step = np.array([CELL_M / (M_PER_DEG * np.cos(np.radians((south + north) / 2))), CELL_M / M_PER_DEG])
     pad = int(CLOSE_M / CELL_M) + 2
     origin = np.array([west, south]) - pad * step

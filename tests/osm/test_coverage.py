@@ -80,3 +80,13 @@ def test_what_the_region_file_states_overrules_all():
 
 def test_no_data_covers_nothing():
     assert estimate_coverage(np.zeros((0, 2))).is_empty
+
+
+def test_a_place_on_both_sides_of_the_antimeridian_is_estimated_side_by_side():
+    rng = np.random.default_rng(2)
+    lonlat = rng.uniform((-0.05, -17.05), (0.05, -16.95), (20_000, 2))
+    lonlat[:, 0] = np.where(lonlat[:, 0] < 0, lonlat[:, 0] + 180, lonlat[:, 0] - 180)
+    west, _, east, _ = estimate_coverage(lonlat).bounds
+    assert west < -179.94
+    assert east > 179.94
+    assert 0.007 < estimate_coverage(lonlat).area < 0.013

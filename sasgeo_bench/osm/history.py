@@ -113,10 +113,10 @@ def _add_outer_dates(path: Path, started: dict[ObjectKey, Span]) -> None:
     relations = osmium.FileProcessor(str(path), osmium.osm.RELATION).with_filter(typed)
     for item in elements(relations) if started else ():
         relation = area_relation(item, lambda _: (), keys)
-        ways = [ObjectKey("way", ref) for ref in (() if relation is None else relation.outer)]
+        ways = [ObjectKey("way", own_id(ref)) for ref in (() if relation is None else relation.outer)]
         spans = [started[way] for way in ways if way in started]
         if spans:
-            started.setdefault(ObjectKey("relation", item.id), spans[0])
+            started.setdefault(ObjectKey("relation", own_id(item.id)), spans[0])
 
 
 def _wkb(item: Any) -> bytes | None:  # noqa: ANN401

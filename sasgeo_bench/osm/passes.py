@@ -287,16 +287,7 @@ def _ways_and_relations(path: Path, ways: set[int], relations: set[int]) -> Iter
     return elements(processor.with_filter(kinds).with_filter(_of_ids("way", ways)).with_filter(_of_ids("area", areas)))
 
 
-class _NegativeIds:
-    """Filter one kind of object by id in Python: osmium's filter refuses the negative ids of JOSM's new objects."""
-
-    def __init__(self, kind: str, ids: set[int]) -> None:
-        setattr(self, kind, lambda item: item.id not in ids)
-
-
 def _of_ids(kind: str, ids: set[int]) -> Any:  # noqa: ANN401
-    if min(ids, default=0) < 0:
-        return _NegativeIds(kind, ids)
     of_ids = osmium.filter.IdFilter(ids)
     of_ids.enable_for(getattr(osmium.osm, kind.upper()))
     return of_ids

@@ -19,6 +19,7 @@ from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import NoisePool, dilated, shifted
 from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects, thin_classes
+from sasgeo_bench.tasks.perturbations.streams import Streams
 
 _BLOCKED_BY: Final = ("building", "water", "railway", "road_major", "road_minor")
 _TRIES: Final = 12  # to find a free place for a new object
@@ -101,24 +102,25 @@ class Ageing:
         """Remove and shift objects of all classes first, then add new ones on free ground."""
         if self.years == 0:
             return evidence
-        pool = NoisePool(evidence.shape)
+        streams = Streams(rng)
+        pool = NoisePool(evidence.shape, streams)
         layers = dict(zip(evidence.classes, evidence.cells == PRESENT, strict=True))
         sea = _sea(layers)
         if sea is not None:
             layers["water"] &= ~sea
         objects = {
-            name: _objects_of(name, mask, pool, evidence.cell_size_m, rng)
+            name: _objects_of(name, mask, pool, evidence.cell_size_m, streams.of(name))
             for name, mask in layers.items()
             if name in self.rates and mask.any()
         }
         before = dict(layers)
         for name, found in objects.items():
-            layers[name] = self._older(name, layers[name], found, evidence.cell_size_m, rng)
+            layers[name] = self._older(name, layers[name], found, evidence.cell_size_m, streams.of(name))
         growth = {name: self._growth(name, found, before[name], layers[name]) for name, found in objects.items()}
         if sea is not None:
             layers["water"] |= sea
         for name, item in growth.items():
-            self._appear(name, layers, item, evidence.cell_size_m, rng)
+            self._appear(name, layers, item, evidence.cell_size_m, streams.of(name))
         return with_cells(evidence, np.stack(list(layers.values())).view(np.uint8))
 
     def _older(self, name: str, mask: Mask, found: Objects, cell_size_m: float, rng: np.random.Generator) -> Mask:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import rotation
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.tasks.perturbations.streams import Streams
 
 Field = NDArray[np.float32]
 Mask = NDArray[np.bool_]
@@ -39,11 +40,15 @@ def smooth_noise(shape: tuple[int, int], scale_cells: float, rng: np.random.Gene
 
 
 class NoisePool:
-    """Draw smooth fields for many layers of a view as windows of a larger one, which is faster."""
+    """Draw smooth fields for many layers of a view as windows of a larger one, which is faster.
 
-    def __init__(self, shape: tuple[int, int]) -> None:
+    The larger ones come from streams of their own, so that it does not matter which layer asks first.
+    """
+
+    def __init__(self, shape: tuple[int, int], streams: Streams) -> None:
         """Draw nothing yet."""
         self._shape = shape
+        self._streams = streams
         self._fields: dict[float, Field] = {}
 
     def take(self, scale_cells: float, rng: np.random.Generator) -> Field:
@@ -52,7 +57,8 @@ class NoisePool:
         spare_rows, spare_cols = rows // 3 + 1, cols // 3 + 1
         whole = self._fields.get(scale_cells)
         if whole is None:
-            whole = smooth_noise((rows + spare_rows, cols + spare_cols), scale_cells, rng)
+            stream = self._streams.of(f"noise {scale_cells:g}")
+            whole = smooth_noise((rows + spare_rows, cols + spare_cols), scale_cells, stream)
             self._fields[scale_cells] = whole
         down, right, mirrored = rng.random(3).tolist()
         top, left = int(down * (spare_rows + 1)), int(right * (spare_cols + 1))

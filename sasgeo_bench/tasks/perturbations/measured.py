@@ -7,7 +7,7 @@ bad view is bad for all classes.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
@@ -19,6 +19,7 @@ from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import SIGMA, Field, NoisePool, dilated, disc, highest_within
 from sasgeo_bench.tasks.perturbations.objects import find_objects, thin_classes
+from sasgeo_bench.tasks.perturbations.streams import Streams
 
 Where = Literal["ground", "roads"]
 
@@ -139,23 +140,25 @@ class MeasuredPerception:
         """Lose cells of each class, then gain: a class first gains what another one is called."""
         if self.error_factor == 0:
             return evidence
-        view = _View.of(evidence, self.errors)
-        factors = self.error_factor * _spread(len(evidence.classes), rng)
+        streams = Streams(rng)
+        view = _View.of(evidence, self.errors, streams)
+        factors = self.error_factor * _spread(evidence.classes, streams)
         seen: dict[str, Mask] = {}
         called: dict[str, list[Mask]] = {}
         for name, mask, factor in zip(evidence.classes, view.masks, factors, strict=True):
-            seen[name] = view.lose(name, mask, float(factor), called, rng)
+            seen[name] = view.lose(name, mask, float(factor), called, streams.of(name))
         for name, mask, factor in zip(evidence.classes, view.masks, factors, strict=True):
-            view.gain(name, mask, seen[name], float(factor), rng)
+            view.gain(name, mask, seen[name], float(factor), streams.of(name))
             for taken in called.get(name, ()):
                 np.logical_or(seen[name], taken & ~view.unknown[view.at[name]], out=seen[name])
         return with_cells(evidence, np.stack(list(seen.values())).view(np.uint8))
 
 
-def _spread(count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+def _spread(classes: Sequence[str], streams: Streams) -> NDArray[np.float64]:
     """Draw factors of the errors with mean 1: one of the view, common to all classes, times one of each class."""
-    whole = rng.lognormal(-(QUALITY**2) / 2, QUALITY)
-    return np.asarray(whole * rng.lognormal(-(CLASS_SPREAD**2) / 2, CLASS_SPREAD, size=count))
+    whole = streams.view.lognormal(-(QUALITY**2) / 2, QUALITY)
+    own = [streams.of(name).lognormal(-(CLASS_SPREAD**2) / 2, CLASS_SPREAD) for name in classes]
+    return whole * np.array(own)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,7 +176,7 @@ class _View:
     outlines: dict[str, Field] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, evidence: Evidence, errors: Mapping[str, MeasuredErrors]) -> "_View":
+    def of(cls, evidence: Evidence, errors: Mapping[str, MeasuredErrors], streams: Streams) -> "_View":
         """Split a view into masks."""
         masks, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
         ground = ~(masks | unknown).any(axis=0)
@@ -186,7 +189,7 @@ class _View:
             at={name: index for index, name in enumerate(evidence.classes)},
             ground=ground,
             yards=ground & beside,
-            pool=NoisePool(evidence.shape),
+            pool=NoisePool(evidence.shape, streams),
             errors=errors,
         )
 

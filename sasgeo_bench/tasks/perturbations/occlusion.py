@@ -21,6 +21,7 @@ from sasgeo_bench.tasks.perturbations.fields import (
     smooth_noise,
     top_share,
 )
+from sasgeo_bench.tasks.perturbations.streams import Streams
 
 _DRAWS: Final = 256  # rectangles drawn at a time
 _SIDES: Final = (0.08, 0.35)  # smallest and largest side of a rectangle, as fractions of the view's side
@@ -173,32 +174,27 @@ def shadow(building: Mask, sun_deg: float, length_cells: float) -> Mask:
 
 _RADIUS_M: Final = 20.0
 _WATER_BONUS: Final = 1.5  # added to the strength of glare where all is water; the strength has a deviation of 0.575
-_RIM: Final = 0.3  # relative difference from the mean size of the largest and smallest blobs, those of two classes
+_RIM: Final = 0.15  # weight of a class's own noise: a tenth of what is hidden for one class is seen for another
 
 
 class Glare(Occlusion):
-    """Hide soft blobs; `share` is that of the cells over all classes.
+    """Hide soft blobs; `share` is that of the cells of each class.
 
-    A soft edge in three states: a blob reaches less far for some classes than for others, at random in each view. If
-    the share exceeds 1 / 1.3, the sizes of blobs differ less, so that the mean stays.
+    A soft edge in three states: here and there a blob reaches less far for some classes than for others, at random in
+    each view.
     """
 
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
         """Return the blobs, shape (C, rows, cols)."""
-        radius_cells = _RADIUS_M / evidence.cell_size_m
-        strength = smooth_noise(evidence.shape, 2 * radius_cells, rng)
+        streams, radius_cells = Streams(rng), _RADIUS_M / evidence.cell_size_m
+        strength = smooth_noise(evidence.shape, 2 * radius_cells, streams.view)
         if "water" in evidence.classes:
             water = (evidence.layer("water") == PRESENT).astype(np.float32)
             reach = max(1, round(radius_cells / 2))
             strength += np.float32(_WATER_BONUS) * cv2.blur(water, (reach, reach))
-        rim = min(_RIM, (1 - self.share) / self.share)
-        reaches = self.share * (1 + rim * np.linspace(-1, 1, len(evidence.classes)))
-        if len(evidence.classes) == 1:
-            reaches[:] = self.share
-        ordered = np.sort(strength, axis=None)[::-1]
-        counts = (rng.permutation(reaches) * ordered.size).round().astype(int)
-        limits = ordered[np.clip(counts - 1, 0, None)]
-        return np.asarray(strength >= limits[:, None, None])
+        pool = NoisePool(evidence.shape, streams)
+        rims = (pool.take(2 * radius_cells, streams.of(name)) for name in evidence.classes)
+        return np.stack([top_share(strength + np.float32(_RIM) * rim, self.share) for rim in rims])
 
 
 _SPREAD: Final = 0.4  # weight of the sides against the far end: 0 cuts straight across, 1 cuts a corner of 90 degrees
@@ -254,9 +250,11 @@ class FalseUnknown(Occlusion):
 
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
         """Return the patches of each class, shape (C, rows, cols)."""
-        pool, patches = NoisePool(evidence.shape), []
-        for layer in evidence.cells:
-            noise, known = pool.take(_FALSE_PATCH_M / evidence.cell_size_m, rng), layer != UNKNOWN
+        streams = Streams(rng)
+        pool, patches = NoisePool(evidence.shape, streams), []
+        for name, layer in zip(evidence.classes, evidence.cells, strict=True):
+            own, known = streams.of(name), layer != UNKNOWN
+            noise = pool.take(_FALSE_PATCH_M / evidence.cell_size_m, own)
             count = np.count_nonzero(known)
-            patches.append(known & (noise >= highest_within(noise, known, self.share * count, rng)))
+            patches.append(known & (noise >= highest_within(noise, known, self.share * count, own)))
         return np.stack(patches)

@@ -26,6 +26,7 @@ from sasgeo_bench.tasks.perturbations.fields import (
     smooth_noise,
 )
 from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to, thin_classes
+from sasgeo_bench.tasks.perturbations.streams import Streams
 
 TOLERANCE_CELLS: Final = 1.5  # the eight neighbours
 EDGE_M: Final = 4.0  # width of ragged edges
@@ -102,7 +103,8 @@ class Perception:
     """See a clean view with a detector's errors.
 
     The detector "published". `error_factor` multiplies the errors of every class: 0 is a perfect detector, 1 one in its
-    own domain, 1.5 to 2 one in another domain. At most 0.95 of a class goes wrong.
+    own domain, 1.5 to 2 one in another domain. At most 0.95 of a class goes wrong. Each class has a stream of its own:
+    a class more or less changes no other one, but what it is taken for.
 
     Notes
     -----
@@ -123,29 +125,30 @@ class Perception:
         """Lose cells, then gain: a class first gains what another one lost to it."""
         if self.error_factor == 0:
             return evidence
-        looks = self._looks(evidence, rng)
+        streams = Streams(rng)
+        looks = self._looks(evidence, streams)
         lost_to: dict[str | None, list[Mask]] = {}
         seen = []
         for look in looks:
-            kept, taken = look.lose(rng)
+            kept, taken = look.lose(streams.of(look.name))
             seen.append(kept)
             if taken is not None:
                 lost_to.setdefault(look.errors.confused_with, []).append(taken)
         for look, kept in zip(looks, seen, strict=True):
-            look.gain(kept, lost_to.get(look.name, ()), rng)
+            look.gain(kept, lost_to.get(look.name, ()), streams.of(look.name))
         return with_cells(evidence, np.stack(seen).view(np.uint8))
 
-    def _looks(self, evidence: Evidence, rng: np.random.Generator) -> list["_Look"]:
+    def _looks(self, evidence: Evidence, streams: Streams) -> list["_Look"]:
         """Return each class with the fraction of it that goes wrong."""
-        pool = NoisePool(evidence.shape)
+        pool = NoisePool(evidence.shape, streams)
         errors = [ERRORS.get(name, _FLAWLESS) for name in evidence.classes]
         shares = self.error_factor * np.array([(item.lost, item.gained) for item in errors])
         if SPREAD > 0:
-            shares *= rng.gamma(SPREAD**-2, SPREAD**2, size=(len(errors), 1))
+            shares *= [[streams.of(name).gamma(SPREAD**-2, SPREAD**2)] for name in evidence.classes]
         lost, gained = np.minimum(shares, _MOST_ERROR).T
         present, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
         # Noise wider than the patches: most objects are confused as a whole or not at all.
-        mixed_up = smooth_noise(evidence.shape, 3 * PATCH_M / evidence.cell_size_m, rng)
+        mixed_up = smooth_noise(evidence.shape, 3 * PATCH_M / evidence.cell_size_m, streams.view)
         return [
             _Look(
                 name=name,

@@ -13,6 +13,7 @@ from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import Field, dilated, highest, smooth_noise, top_share
 from sasgeo_bench.tasks.perturbations.objects import find_objects
+from sasgeo_bench.tasks.perturbations.streams import Streams
 
 Kind = Literal["leaf_on", "snow", "low_water", "harvest"]
 Layers = dict[str, NDArray[np.uint8]]
@@ -72,7 +73,7 @@ class Season:
         elif self.kind == "low_water":
             self._dry(layers, noise, evidence.cell_size_m)
         else:
-            self._harvest(layers, noise, rng)
+            self._harvest(layers, noise, Streams(rng))
         return with_cells(evidence, cells)
 
     def _dry(self, layers: Layers, noise: Field, cell_size_m: float) -> None:
@@ -86,13 +87,14 @@ class Season:
         # A line within a lake or broad river does not fall dry before the water around it.
         _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
 
-    def _harvest(self, layers: Layers, noise: Field, rng: np.random.Generator) -> None:
+    def _harvest(self, layers: Layers, noise: Field, streams: Streams) -> None:
         """Exchange fields and green, each parcel as a whole, and remove the boundaries between them."""
         boundary = _of(layers, "field_boundary")
         farmland, green = _of(layers, "farmland"), _of(layers, "green")
-        mown = _some_parcels(farmland, boundary, self.strength, rng)
+        mown = _some_parcels(farmland, boundary, self.strength, streams.of("farmland"))
         # Green that fills the view is a wood or a mountain side, not a field.
-        grown = _some_parcels(green & ~farmland, boundary, self.strength * _REGROWN, rng, most=_LARGEST_MEADOW)
+        meadows = green & ~farmland
+        grown = _some_parcels(meadows, boundary, self.strength * _REGROWN, streams.of("green"), most=_LARGEST_MEADOW)
         for name, gained, lost in (("green", mown, grown), ("farmland", grown, mown)):
             if name in layers:
                 layers[name][lost] = ABSENT

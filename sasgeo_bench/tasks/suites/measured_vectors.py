@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import footprint
+from sasgeo_bench.tasks.perturbations.streams import Streams
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.vectors import VECTOR_CLASSES, vector_table
 
@@ -39,10 +40,11 @@ class MeasuredVectorNoise:
     """Errors of perceived vectors; all numbers are guesses, but for the bridges (recall 0.85, measured).
 
     `small_m2` and `short_m` are the area of a building and the length of a line that are missed half of the time.
-    `hidden_share` of the length of lines is hidden where a smooth field, `canopy_m` wide, is highest; below mapped
-    green the field is higher by `under_green` deviations. Curves are simplified by `coarse_m`, outlines by half of it.
-    Buildings within `merged_m` become one with probability `merged_share`. `false_share` new lines and buildings appear
-    for each true one. Each building is moved by `lean_m` by itself (relief), lines by a smooth shift of `shift_m` rms.
+    `hidden_share` of the length of the lines of each class is hidden where a smooth field, `canopy_m` wide, is highest;
+    below mapped green the field is higher by `under_green` deviations. Curves are simplified by `coarse_m`, outlines by
+    half of it. Buildings within `merged_m` become one with probability `merged_share`. `false_share` new lines and
+    buildings appear for each true one. Each building is moved by `lean_m` by itself (relief), lines by a smooth shift
+    of `shift_m` rms. Each class draws from a stream of its own.
     """
 
     small_m2: float = 12.0
@@ -88,33 +90,46 @@ def perceive_coarsely(
         for part in shapely.get_parts(shapely.get_parts(shape))
         if part.geom_type in ("LineString", "Polygon") and part.length >= _LEAST_M
     ]
-    lines = _lines([item for item in things if item.shape.geom_type == "LineString"], green, noise, rng)
-    areas = _buildings([item for item in things if item.shape.geom_type == "Polygon"], noise, rng)
-    made = [*lines, *areas, *_false(lines, areas, side_m, noise, rng)]
+    streams = Streams(rng)
+    lines = _lines([item for item in things if item.shape.geom_type == "LineString"], green, noise, streams)
+    areas = [item for item in things if item.shape.geom_type == "Polygon"]
+    areas = [area for name in VECTOR_CLASSES for area in _outlines(_of(name, areas), noise, streams.of(name))]
+    drives = [drive for name in VECTOR_CLASSES for drive in _drives(_of(name, lines), side_m, noise, streams.of(name))]
+    made = [*lines, *areas, *drives, *_sheds(_of("building", areas), side_m, noise, streams.of("building"))]
     kept = [item for item in made if not item.shape.is_empty and item.shape.length >= _LEAST_M]
     return vector_table([(item.name, item.level, item.is_bridge, item.shape) for item in kept])
 
 
+def _of(name: str, things: Sequence[_Thing]) -> list[_Thing]:
+    return [item for item in things if item.name == name]
+
+
 def _lines(
-    things: Sequence[_Thing], green: shapely.Geometry, noise: MeasuredVectorNoise, rng: np.random.Generator
+    things: Sequence[_Thing], green: shapely.Geometry, noise: MeasuredVectorNoise, streams: Streams
 ) -> list[_Thing]:
     """Simplify between junctions, miss short lines and bridges, hide stretches, shift what is left."""
     shapes = _simplified([item.shape for item in things], noise.coarse_m)
     lengths = np.array([shape.length for shape in shapes])
-    seen = rng.random(len(things)) >= _missed(lengths, noise.short_m)
-    is_missed = rng.random(len(things)) < noise.bridge_missed
-    canopy, shift = _field(noise.canopy_m, 1, rng), _field(noise.shift_wave_m, 2, rng)
+    names = np.array([item.name for item in things], dtype=object)
+    missed, under = streams.chances(names, 2)
+    seen, is_missed = missed >= _missed(lengths, noise.short_m), under < noise.bridge_missed
+    canopy, shift = _field(noise.canopy_m, 1, streams.view), _field(noise.shift_wave_m, 2, streams.view)
     points = [shapely.get_coordinates(shapely.segmentize(shape, _STEP_M)) for shape in shapes]
     heights = _heights(points, canopy, green, noise.under_green)
-    limit = np.quantile(np.concatenate(heights), 1 - noise.hidden_share) if heights else 0.0
+    limits = {name: _limit(list(compress(heights, names == name)), noise) for name in set(names.tolist())}
     found = []
     for at, item in enumerate(things):
         plain = replace(item, is_bridge=False, level=0) if item.is_bridge and is_missed[at] else item
         corners = set(map(tuple, shapely.get_coordinates(shapes[at]).tolist()))
-        pieces = _visible(points[at], heights[at] <= limit, corners) if seen[at] else ()
+        pieces = _visible(points[at], heights[at] <= limits[item.name], corners) if seen[at] else ()
         found += [replace(plain, shape=piece) for piece in pieces]
     moved = [shapely.transform(item.shape, lambda xy: xy + noise.shift_m * shift(xy)) for item in found]
     return [replace(item, shape=shape) for item, shape in zip(found, moved, strict=True)]
+
+
+def _limit(heights: Sequence[NDArray[np.float64]], noise: MeasuredVectorNoise) -> float:
+    """Return the height of the canopy above which lines are hidden: of each class the same share."""
+    return float(np.quantile(np.concatenate(heights), 1 - noise.hidden_share))
 
 
 def _missed(sizes: NDArray[np.float64], half: float) -> NDArray[np.float64]:
@@ -161,8 +176,8 @@ def _simplified(shapes: Sequence[shapely.LineString], coarse_m: float) -> list[s
     return found
 
 
-def _buildings(things: Sequence[_Thing], noise: MeasuredVectorNoise, rng: np.random.Generator) -> list[_Thing]:
-    """Miss small buildings, merge some neighbours, simplify outlines, move each by itself."""
+def _outlines(things: Sequence[_Thing], noise: MeasuredVectorNoise, rng: np.random.Generator) -> list[_Thing]:
+    """Miss small buildings, merge some neighbours, simplify outlines, move each by itself; squares of a road too."""
     areas = np.array([item.shape.area for item in things])
     left = list(compress(things, rng.random(len(things)) >= _missed(areas, noise.small_m2)))
     merged = _merged([item.shape for item in left], noise, rng)
@@ -199,14 +214,10 @@ def _merged(
     return found
 
 
-def _false(
-    lines: Sequence[_Thing],
-    areas: Sequence[_Thing],
-    side_m: float,
-    noise: MeasuredVectorNoise,
-    rng: np.random.Generator,
+def _drives(
+    lines: Sequence[_Thing], side_m: float, noise: MeasuredVectorNoise, rng: np.random.Generator
 ) -> list[_Thing]:
-    """Return drives that branch off lines, and sheds beside buildings, that are not there."""
+    """Return drives that branch off lines of one class and are not there."""
     found = []
     for _ in range(rng.poisson(noise.false_share * len(lines))):
         line = lines[int(rng.integers(len(lines)))].shape
@@ -215,6 +226,14 @@ def _false(
         end = begin + length_m * np.array((np.cos(turn), np.sin(turn)))
         shape = shapely.LineString((begin, np.clip(end, -side_m / 2, side_m / 2)))
         found.append(_Thing(name="road_minor", level=0, is_bridge=False, shape=shape))
+    return found
+
+
+def _sheds(
+    areas: Sequence[_Thing], side_m: float, noise: MeasuredVectorNoise, rng: np.random.Generator
+) -> list[_Thing]:
+    """Return sheds beside buildings that are not there."""
+    found = []
     for _ in range(rng.poisson(noise.false_share * len(areas))):
         near = shapely.get_coordinates(areas[int(rng.integers(len(areas)))].shape.centroid)[0]
         middle, sides = near + rng.normal(0, 15, size=2), rng.uniform(3, 9, size=2) / 2

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import footprint
+from sasgeo_bench.tasks.perturbations.streams import Streams
 from sasgeo_bench.tasks.query import PUBLISHED
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import Shot
@@ -55,10 +56,10 @@ def perceive_vectors(
     clipped = shapely.intersection(shapely.make_valid(table.geometry.to_numpy()), outline)
     back = inverse(pose)
     local = shapely.transform(clipped, back.to_map)
-    seen = rng.random(len(local)) >= noise.missed_share
-    local = shapely.transform(local, smooth_shift(noise.shift_m, rng))
-    gaps = rng.random(len(local)) < noise.gap_share
-    places = rng.random(len(local))
+    streams = Streams(rng)
+    local = shapely.transform(local, smooth_shift(noise.shift_m, streams.view))
+    missed, gap, places = streams.chances(table["class"].to_numpy(dtype=object), 3)
+    seen, gaps = missed >= noise.missed_share, gap < noise.gap_share
     rows = []
     for at, (shape, (_, row)) in enumerate(zip(local, table.iterrows(), strict=True)):
         if seen[at]:

@@ -12,7 +12,7 @@ from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.tasks.query import PUBLISHED
 from sasgeo_bench.tasks.suites.base import Shot
 from sasgeo_bench.tasks.suites.measured_vectors import MeasuredVectorNoise, perceive_coarsely
-from sasgeo_bench.tasks.suites.vectors import site_vectors
+from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors, site_vectors
 from sasgeo_bench.tasks.vectors import VECTOR_CLASSES, as_features
 from tests.tasks.suites.test_vectors import EAST, NORTH, row, table
 
@@ -128,3 +128,23 @@ def test_a_site_is_drawn_by_the_detector_of_the_variant_and_alike_each_time(carr
     cells = [shot.perceived().cells for shot in shots]
     assert (cells[1] == cells[2]).all()
     assert (cells[0] != cells[1]).any()
+
+
+@pytest.mark.parametrize("perceive", [perceive_vectors, perceive_coarsely])
+def test_a_class_more_or_less_changes_the_vectors_of_no_other_one(world, perceive):
+    noise = MeasuredVectorNoise(false_share=0.5) if perceive is perceive_coarsely else VectorNoise()
+    lines = [row(name, shapely.LineString([(-90, y), (90, y + 9)])) for name, y in (("road_minor", 0), ("railway", 40))]
+    square = row("road_minor", shapely.box(-60, -60, -20, -30))
+    most = (*houses(9.0, 3.0, count=6), *lines, square, row("waterway", shapely.LineString([(-90, -70), (90, -80)])))
+
+    def vectors(*left_out):
+        state = world(*(item for item in most if item["class"] not in left_out))
+        pose, rng = Pose(easting_m=EAST, northing_m=NORTH, yaw_deg=0.0), np.random.default_rng(3)
+        found = perceive(state, pose, side_m=192.0, noise=noise, rng=rng)
+        return {name: sorted(shape.wkt for shape in part.geometry) for name, part in found.groupby("class")}
+
+    whole = vectors()
+    for left_out in whole:
+        found = vectors(left_out)
+        same = [name for name in whole if name not in (left_out, "road_minor")]  # false drives branch off any line
+        assert {name: found[name] for name in same} == {name: whole[name] for name in same}

@@ -59,7 +59,7 @@ class Outline(Document):
 
 
 class SemanticClass(Document):
-    """One semantic class: identity, tag rules, colour and persistence."""
+    """One semantic class: identity, tag rules, colour and persistence; `covered_by` hides its cells."""
 
     id: Annotated[int, Field(ge=0)]
     name: Name
@@ -69,6 +69,7 @@ class SemanticClass(Document):
     persistence: Persistence
     rules: list[Rule]
     outline_of: Outline | None = None
+    covered_by: Name | None = None
 
 
 class Taxonomy(Document):
@@ -85,6 +86,9 @@ class Taxonomy(Document):
         if len(set(self.names)) != len(ids):
             message = f"class names must be unique, got {self.names!r}"
             raise ValueError(message)
+        if strange := [item.covered_by for item in self.classes if item.covered_by not in (None, *self.names)]:
+            message = f"covered_by names a class, got {strange!r}"
+            raise ValueError(message)
         return self
 
     @cached_property
@@ -95,6 +99,11 @@ class Taxonomy(Document):
     def __getitem__(self, name: str) -> SemanticClass:
         """Return the class of that name; `KeyError` if there is none."""
         return {item.name: item for item in self.classes}[name]
+
+    @cached_property
+    def covers(self) -> dict[str, str]:
+        """Return the classes whose cells another class covers, each with that other one."""
+        return {item.name: item.covered_by for item in self.classes if item.covered_by is not None}
 
     @cached_property
     def keys(self) -> tuple[str, ...]:

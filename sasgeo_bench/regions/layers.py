@@ -4,9 +4,9 @@
 import itertools
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
@@ -23,6 +23,7 @@ from tifffile import TiffFile, TiffPage, TiffWriter
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 
@@ -32,21 +33,30 @@ if TYPE_CHECKING:
 PRESENT: Final = 1
 OUTSIDE: Final = 255  # unknown: beyond the mapped area
 
+_NO_AREAS: Final = np.array([], dtype=object)
 _ARC_SEGMENTS: Final = 2  # per quarter circle at line ends and bends: 3 % of the radius, a few centimetres on a road
 
 
 @dataclass(frozen=True, kw_only=True)
 class Paint:
-    """The polygons to burn: for each class, in band order, with the outer ring counter-clockwise."""
+    """The polygons to burn: for each class, in band order, with the outer ring counter-clockwise.
+
+    `above` holds those of a class that nothing covers, because they are on a bridge; they are among `areas` too.
+    """
 
     classes: tuple[str, ...]
     areas: tuple[NDArray[np.object_], ...]
     coverage: NDArray[np.object_]
+    above: Mapping[str, NDArray[np.object_]] = field(default_factory=dict)
 
     @cached_property
     def bounds(self) -> tuple[NDArray[np.float64], ...]:
         """Return west, south, east, north of every polygon, shape (N, 4) for each class."""
         return tuple(shapely.bounds(areas).reshape(-1, 4) for areas in self.areas)
+
+    def near(self, index: int, grid: Grid) -> NDArray[np.object_]:
+        """Return the polygons of a class that may reach into a window."""
+        return self.areas[index][_meets(self.bounds[index], grid)]
 
     @cached_property
     def ground(self) -> NDArray[np.object_]:
@@ -71,11 +81,12 @@ def make_paint(
     is_coarse = least_width_m > 0
     lines = shapely.simplify(shape[is_line], least_width_m / 8) if is_coarse else shape[is_line]
     shape[is_line] = shapely.buffer(lines, half_m, quad_segs=1 if is_coarse else _ARC_SEGMENTS)
-    names = seen["class"].to_numpy()
+    names, on_bridge = seen["class"].to_numpy(), seen["is_bridge"].to_numpy()
     return Paint(
         classes=classes,
         areas=tuple(_oriented(shape[names == name]) for name in classes),
         coverage=_oriented(np.array([coverage], dtype=object)),
+        above={name: _oriented(shape[on_bridge & (names == name)]) for name in load_taxonomy().covers},
     )
 
 
@@ -88,7 +99,8 @@ def _oriented(areas: NDArray[np.object_]) -> NDArray[np.object_]:
 def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
     """Burn every class on a grid in the CRS of the polygons: PRESENT, ABSENT, or OUTSIDE beyond the mapped area.
 
-    The result is uint8 of shape (C, rows, cols). A window of the region's grid gives exactly that window of the whole.
+    The result is uint8 of shape (C, rows, cols); a class is absent where another one covers it (`burn_class`). A window
+    of the region's grid gives exactly that window of the whole.
 
     >>> grid = Grid(epsg=32632, west_m=0.0, north_m=4.0, cell_size_m=1.0, rows=4, cols=4)
     >>> house = np.array([shapely.box(1, 1, 3, 3)])
@@ -103,13 +115,36 @@ def burn_layers(paint: Paint, grid: Grid) -> NDArray[np.uint8]:
     outside = None
     if not shapely.covers(paint.ground, shapely.box(*grid.bounds_m)).any():
         outside = np.where(burn(paint.coverage, grid), np.uint8(0), np.uint8(OUTSIDE))
-    for band, areas, bounds in zip(layers, paint.areas, paint.bounds, strict=True):
-        near = areas[_meets(bounds, grid)]
-        if len(near):
-            band[...] = burn(near, grid)
+    for index, band in enumerate(layers):
+        seen = burn_class(paint, index, grid)
+        if seen is not None:
+            band[...] = seen
         if outside is not None:
             np.maximum(band, outside, out=band)
     return layers
+
+
+def burn_class(paint: Paint, index: int, grid: Grid) -> NDArray[np.bool_] | None:
+    """Burn one class as it is seen from above, mapped or not; None where none of it is near.
+
+    What another class covers is left out (`covered_by` in the taxonomy), if that one is among the classes: a stream is
+    seen up to the lake that it enters, and an aqueduct over it.
+
+    >>> grid = Grid(epsg=32632, west_m=0.0, north_m=1.0, cell_size_m=1.0, rows=1, cols=5)
+    >>> stream, lake = np.array([shapely.box(0, 0, 5, 1)]), np.array([shapely.box(2, 0, 5, 1)])
+    >>> paint = Paint(classes=("water", "waterway"), areas=(lake, stream), coverage=stream)
+    >>> burn_class(paint, 1, grid).astype(int)
+    array([[1, 1, 0, 0, 0]])
+    """
+    near = paint.near(index, grid)
+    if not len(near):
+        return None
+    name = paint.classes[index]
+    seen, cover = burn(near, grid), load_taxonomy().covers.get(name)
+    if cover in paint.classes:
+        above = paint.above.get(name, _NO_AREAS)
+        seen &= ~burn(paint.near(paint.classes.index(cover), grid), grid) | burn(above, grid)
+    return seen
 
 
 def burn_mapped(paint: Paint, grid: Grid) -> NDArray[np.uint8] | None:

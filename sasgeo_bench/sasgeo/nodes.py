@@ -238,7 +238,20 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
         relation=np.array([code[name] for name in graph.edges["relation"]], dtype=np.int64),
         feature=table["osm_id"].to_numpy(dtype=np.int64),
     ).taken(kind >= 0)
-    return _blurred(found) if drawing == "mask" else found
+    if drawing == "vectors":
+        return found
+    on_river = np.isin(found.kind, [INDEX["mask water crossing"], INDEX["mask river_bend"]])
+    return _blurred(found.taken(~(on_river & _in_water(features, found.places_m))))
+
+
+def _in_water(features: gpd.GeoDataFrame, places_m: Floats) -> Bools:
+    """Return which places lie in visible water, where no river is drawn as a line."""
+    shapes = np.asarray(features.geometry.array)
+    is_water = (features["class"] == "water").to_numpy() & features["is_visible"].to_numpy(dtype=bool)
+    water = shapes[is_water & (shapely.get_dimensions(shapes) == 2)]  # noqa: PLR2004 - areas
+    found = np.zeros(len(places_m), dtype=bool)
+    found[shapely.STRtree(water).query(shapely.points(places_m), predicate="intersects")[0]] = True
+    return found
 
 
 def _blurred(nodes: Nodes) -> Nodes:

@@ -174,8 +174,8 @@ def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
     """Burn perceived vectors on the cells of a view, in the classes that both have; None where they share none.
 
     Lines have the width of their class (`line_width_m`), areas are areas, and a cell holds what covers its centre, as
-    on a map. Cells that are unknown in the view stay unknown, but for bridges: where a line runs, it says whether it is
-    on one.
+    on a map: a river is no line where the view shows water. Cells that are unknown in the view stay unknown, but for
+    bridges: where a line runs, it says whether it is on one.
 
     Examples
     --------
@@ -199,6 +199,9 @@ def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
     on_bridges = features[is_line & features["is_bridge"].to_numpy(bool)].assign(**{"class": BRIDGE})
     paint = make_paint(pd.concat([features, on_bridges], ignore_index=True), names, shapely.box(*grid.bounds_m))
     cells = burn_layers(paint, grid)
+    for name, cover in load_taxonomy().covers.items():
+        if name in names and cover in evidence.classes:
+            cells[names.index(name), evidence.layer(cover) == PRESENT] = ABSENT
     unknown = np.stack([evidence.layer(name) == UNKNOWN for name in names])
     if BRIDGE in names:
         lines = [at for at, name in enumerate(names) if name in THIN and name != BRIDGE]

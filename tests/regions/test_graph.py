@@ -200,6 +200,14 @@ def test_the_river_bends_twice_towards_the_inside(graph: MapGraph) -> None:
     np.testing.assert_allclose(bends["bearing_deg"], [315, 135], atol=0.1)
 
 
+def test_water_over_a_river_changes_nothing_along_it(graph: MapGraph) -> None:
+    water = table(area(99, "water", 280, 0, 1000, 300))
+    wet = build_graph(pd.concat([village(), water], ignore_index=True), bounds_m=BOUNDS_M)
+    for kind in ("river_bend", "road_water_crossing"):
+        assert places(wet, kind) == places(graph, kind)
+        assert places(graph, kind)
+
+
 def test_edges_have_the_distance_and_bearing_from_source_to_target(graph: MapGraph) -> None:
     edge = graph.edges[(graph.edges["relation"] == "connectivity") & (graph.edges["length_m"] == 450)].iloc[0]
     points = graph.nodes.geometry

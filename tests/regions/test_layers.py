@@ -102,6 +102,67 @@ def test_several_classes_may_hold_in_one_cell():
     assert ((water == 1) & (bridge == 1)).sum() == 6 * 50
 
 
+RIVER = ("waterway", shapely.LineString([(0, 20), (50, 20)]), 6.0)
+LAKE = ("water", shapely.box(20, 0, 40, 40), np.nan)
+POND = ("water", shapely.box(0, 0, 8, 8), np.nan)
+ROAD = ("road_minor", shapely.LineString([(30, 0), (30, 40)]), 4.0)
+BEYOND_THE_LAKE = [*range(20), *range(40, 50)]
+
+
+def river_cols(*rows, classes=("water", "waterway"), **columns):
+    """Columns of the map in which the river is a cell."""
+    layers = burn_layers(make_paint(table(*rows, **columns), classes, EVERYWHERE), GRID)
+    return np.flatnonzero((layers[classes.index("waterway")] == 1).any(axis=0)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("columns", "cols"),
+    [
+        ({}, BEYOND_THE_LAKE),
+        ({"is_visible": [True, False], "is_tunnel": [False, True]}, [*range(50)]),  # water in a pipe covers nothing
+        ({"is_bridge": [True, False], "level": [1, 0]}, [*range(50)]),  # an aqueduct over the lake
+        ({"is_bridge": [False, True], "level": [0, 1]}, BEYOND_THE_LAKE),  # a basin on a bridge is water all the same
+        ({"is_visible": [False, True]}, []),
+        ({"osm_type": ["way", "coastline"]}, BEYOND_THE_LAKE),  # the sea is water
+    ],
+)
+def test_the_middle_of_a_river_is_no_line_in_its_own_water(columns, cols):
+    assert river_cols(RIVER, LAKE, **columns) == cols
+    assert river_cols(LAKE, RIVER, **{name: values[::-1] for name, values in columns.items()}) == cols
+
+
+def test_nothing_but_a_river_is_covered_and_what_covers_it_stays():
+    names = ("road_minor", "water", "waterway", "bridge", "coastline")
+    rows = (RIVER, LAKE, POND, ROAD, ("bridge", *ROAD[1:]), ("coastline", *ROAD[1:]))
+    layers = burn_layers(make_paint(table(*rows), names, EVERYWHERE), GRID)
+    alone = [burn_layers(make_paint(table(*rows), (name,), EVERYWHERE), GRID)[0] for name in names]
+    np.testing.assert_array_equal(np.delete(layers, 2, axis=0), np.delete(alone, 2, axis=0))
+    np.testing.assert_array_equal(layers[2], np.where(alone[1] == 1, 0, alone[2]))
+
+
+def test_a_map_without_water_shows_the_whole_river():
+    assert river_cols(RIVER, LAKE, classes=("waterway",)) == [*range(50)]
+    assert river_cols(RIVER, POND) == [*range(50)]
+
+
+def test_beyond_the_mapped_area_a_covered_river_is_unknown_too():
+    classes = ("water", "waterway")
+    water, river = burn_layers(make_paint(table(RIVER, LAKE), classes, shapely.box(0, 0, 30, 40)), GRID)
+    assert (river[:, 30:] == OUTSIDE).all()
+    assert (river[:, 20:30] == 0).all()
+    assert (water[:, 20:30] == 1).all()
+
+
+@given(shapes=st.lists(stars(), min_size=1, max_size=3), row=st.integers(0, 30), col=st.integers(0, 40))
+def test_a_window_of_a_covered_river_is_that_of_the_whole(shapes, row, col):
+    rows = [("water", shape, np.nan) for shape in shapes]
+    paint = make_paint(table(RIVER, *rows), ("waterway", "water"), EVERYWHERE)
+    river, water = burn_layers(paint, GRID)
+    part = burn_layers(paint, GRID.window(row, col, 10, 10))
+    assert (part == np.stack((river, water))[:, row : row + 10, col : col + 10]).all()
+    assert not (river & water).any()
+
+
 def test_what_is_not_visible_is_not_burnt():
     tunnel = table(("road_major", shapely.LineString([(0, 20), (50, 20)]), 6.0), is_visible=[False])
     assert not burn_layers(make_paint(tunnel, ("road_major",), EVERYWHERE), GRID).any()

@@ -4,6 +4,7 @@
 from dataclasses import asdict, replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 
@@ -15,6 +16,7 @@ from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
 from sasgeo_bench.sasgeo.graph_rules import GraphRules, by_area, by_arms, by_degree
 from sasgeo_bench.sasgeo.mapped import MappedGraph
+from sasgeo_bench.sasgeo.nodes import NODE_KINDS, nodes_of
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, warped
 from sasgeo_bench.tasks.state import State
@@ -229,6 +231,23 @@ def test_learnt_rules_hold_for_vectors_and_starting_values_for_masks(town):
     drawn, masked = ObservedGraph.make(view, vectors), ObservedGraph.make(view)
     assert verify(masked, mapped, poses, strict) == verify(masked, mapped, poses)
     assert verify(drawn, mapped, [here], strict)[0].score > verify(drawn, mapped, [here])[0].score
+
+
+@pytest.mark.parametrize("is_visible", [True, False])
+def test_masks_show_no_river_below_water_and_vectors_do(is_visible):
+    river = shapely.LineString([(-90, -20), (0, -20), (0, 40), (90, 40)])
+    street = shapely.LineString([(-60, -90), (-60, -20), (-60, 90)])
+    lines = as_features(vector_table([("waterway", 0, False, river), ("road_minor", 0, False, street)]))
+    lake = as_features(vector_table([("water", 0, False, shapely.box(-95, -95, 95, 95))]))
+    features = pd.concat([lines, lake.assign(is_visible=is_visible)], ignore_index=True)
+    shown = {
+        drawing: {NODE_KINDS[kind].name for kind in nodes_of(build_graph(features), features, drawing).kind}
+        for drawing in ("vectors", "mask")
+    }
+    assert {"river_bend", "road_water_crossing"} <= shown["vectors"]
+    assert {"mask river_bend", "mask water crossing"} & shown["mask"] == (
+        set() if is_visible else {"mask river_bend", "mask water crossing"}
+    )
 
 
 def test_ratios_favour_what_is_alike_and_say_nothing_of_what_is_unknown():

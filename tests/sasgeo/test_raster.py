@@ -197,6 +197,15 @@ def test_burnt_vectors_say_nothing_where_the_view_is_unknown_or_lacks_their_clas
     assert burnt(vector_table([]), BLANK) is None
 
 
+def test_a_perceived_river_is_no_line_where_the_view_shows_water():
+    cells = np.zeros((2, 20, 20), dtype=np.uint8)
+    cells[0, :, 12:] = PRESENT
+    view = Evidence(classes=("water", "waterway"), cells=cells, cell_size_m=1.0)
+    river = burnt(vector_table([("waterway", 0, False, shapely.LineString([(-10, 0), (10, 0)]))]), view)
+    assert river.classes == ("waterway",)
+    assert np.flatnonzero((river.cells[0] == PRESENT).any(axis=0)).tolist() == [*range(12)]
+
+
 def test_lines_say_whether_they_are_on_a_bridge_where_the_view_does_not():
     lines = [shapely.LineString([(-9, 0), (9, 0)]), shapely.LineString([(0, -9), (0, 9)])]
     cells = np.stack([np.zeros((20, 20), dtype=np.uint8), np.full((20, 20), UNKNOWN, dtype=np.uint8)])

@@ -265,6 +265,15 @@ def test_one_generator_state_gives_one_picture_and_another_changes_its_noise_alo
     assert 0 < difference.mean() < 8
 
 
+def test_labels_are_those_of_the_map_where_water_covers_a_river(monkeypatch):
+    monkeypatch.setattr(f"{__name__}.CLASSES", ("water", "waterway"))
+    river = ("waterway", shapely.LineString([(EAST - 45, NORTH), (EAST + 45, NORTH)]), 6.0)
+    lake = ("water", shapely.box(EAST, NORTH - 30, EAST + 30, NORTH + 30), np.nan)
+    water, line = labels(scene_of((river, lake)), camera())
+    assert (line == PRESENT).sum() > 100
+    assert not ((line == PRESENT) & (water == PRESENT)).any()
+
+
 def test_a_picture_made_with_its_labels_is_the_one_made_without():
     scene, view, evening = village(), camera(tilt_deg=30.0), replace(CLEAR, season="autumn", noise=0.01)
     picture, found = render_labelled(scene, view, evening, np.random.default_rng(1))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.regions.layers import burn, make_paint
+from sasgeo_bench.regions.layers import burn, burn_class, make_paint
 from sasgeo_bench.sensing.rendering.buildings import Buildings, style_buildings
 from sasgeo_bench.sensing.rendering.cars import paint_cars
 from sasgeo_bench.sensing.rendering.conditions import Sun
@@ -154,9 +154,10 @@ def make_scene(
     )
     paint_areas = make_paint(features[shapely.intersects(features.geometry.to_numpy(), box)], classes, coverage)
     bits = np.zeros(grid.shape, dtype=np.uint32)
-    for number, areas in enumerate(paint_areas.areas):
-        if len(areas):
-            bits[burn(areas, grid)] |= np.uint32(1 << number)
+    for number in range(len(classes)):
+        seen = burn_class(paint_areas, number, grid)
+        if seen is not None:
+            bits[seen] |= np.uint32(1 << number)
     return Scene(
         plan=plan,
         buildings=style_buildings(plan, relief),

@@ -217,7 +217,11 @@ def _table(
     geometry = project(geometry, grid.epsg)
     touches = shapely.intersects(geometry, shapely.box(*grid.bounds_m))
     rows, geometry = [scan.rows[index] for index in picked[touches]], geometry[touches]
-    pairs = [(index, label) for index, row in enumerate(rows) for label in scan.traits[row.kind].labels]
+    pairs = [
+        (index, _drawn(label, geometry[index]))
+        for index, row in enumerate(rows)
+        for label in scan.traits[row.kind].labels
+    ]
     source = np.array([index for index, _ in pairs], dtype=np.int64)
     labels = [label for _, label in pairs]
     traits = [scan.traits[rows[index].kind] for index, _ in pairs]
@@ -239,6 +243,14 @@ def _table(
         "geometry": _shapes(geometry[source], labels)[order],
     }
     return make_features(columns, epsg=grid.epsg)
+
+
+def _drawn(label: Label, shape: shapely.Geometry) -> Label:
+    """Return how an object in metres is drawn: an area that is too wide to be what it says is an outline."""
+    if label.fills_to_m is None or shapely.get_dimensions(shape) < 2:  # noqa: PLR2004 - a line stays one
+        return label
+    is_wide = not shapely.is_empty(shapely.buffer(shape, -label.fills_to_m / 2))
+    return replace(label, is_outline=label.is_outline or is_wide)
 
 
 def _with_sea(features: gpd.GeoDataFrame, sea: NDArray[np.object_], taxonomy: Taxonomy) -> gpd.GeoDataFrame:

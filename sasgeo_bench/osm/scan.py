@@ -18,6 +18,7 @@ from sasgeo_bench.osm.taxonomy import Classification, Label, Taxonomy, classify
 LANE_WIDTH_M: Final = 3.25  # between the 2.75 m and 3.75 m lanes of the German RAS-Q 96 cross sections
 DEFAULT_BRIDGE_WIDTH_M: Final = 4.0
 WIDTH_RANGE_M: Final = (0.3, 80.0)
+_OF_YARDS: Final = ("landuse", "amenity", "leisure", "name")  # a barrier that has one of these goes around something
 _NO: Final = (None, "no", "false", "0")
 _HIDING: Final = ("tunnel", "layer", "location", "covered", "indoor", "cutting")
 _AREA_MODIFIERS: Final = (*_HIDING, "parking", "width")
@@ -118,7 +119,9 @@ class Classifier:
         """Return the labels of an area by area rules and by line rules, filled if the rule says so, else outlines."""
         labels = self.as_area(get).area
         if not labels and get("area") == "yes":
-            return self.as_line(get).line
+            is_yard = any(get(key) for key in _OF_YARDS)
+            line = self.as_line(get).line
+            return tuple(replace(label, is_outline=is_yard and label.fills_to_m is not None) for label in line)
         if not is_relation and not any(label.is_outline for label in labels):
             return labels
         line = self.as_line(get).line

@@ -37,6 +37,7 @@ class Rule(Document):
     widths: dict[str, WidthM] = {}
     multipolygon: Literal["outline", "filled"] = "outline"
     keeps_width: list[str] = [ANY]
+    fills_to: Annotated[float, Field(gt=0)] | None = None
 
     @model_validator(mode="after")
     def _has_values(self) -> Self:
@@ -121,7 +122,7 @@ class Label:
     """One class of an object; `width_m` is None for areas and where the width of the carrying way counts.
 
     `is_outline`: the edge of an area is drawn, not the area; `is_filled`: a multipolygon of a line rule is an area;
-    `keeps_width`: a tagged width overrides `width_m`.
+    `keeps_width`: a tagged width overrides `width_m`; `fills_to_m`: an area that is wider anywhere is an outline.
     """
 
     class_name: str
@@ -129,6 +130,7 @@ class Label:
     is_outline: bool = False
     is_filled: bool = False
     keeps_width: bool = False
+    fills_to_m: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -161,11 +163,12 @@ def classify(tags: Mapping[str, str], taxonomy: Taxonomy) -> Classification:
             if value is None or not rule.takes(value):
                 continue
             known.add(rule.key)
-            target = line if rule.geometry == "line" else area
+            target, width_m = line if rule.geometry == "line" else area, rule.widths.get(value)
             target.append(
                 Label(
                     class_name=item.name,
-                    width_m=rule.widths.get(value),
+                    width_m=width_m,
+                    fills_to_m=None if rule.fills_to is None or width_m is None else rule.fills_to * width_m,
                     is_filled=rule.multipolygon == "filled",
                     keeps_width=not {ANY, value}.isdisjoint(rule.keeps_width),
                 )

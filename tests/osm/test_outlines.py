@@ -1,11 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Lines that close: walls, hedges, railways and waterways around something are outlines of it, not areas."""
 
+import json
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import shapely
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.osm.read import read_extract, read_geojson
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import PRESENT, burn_layers, make_paint
 
@@ -61,7 +65,81 @@ def test_a_line_that_closes_is_filled_where_it_says_so_and_squares_are(
         assert line.geometry.length == pytest.approx(ring_m, rel=0.01)
         assert line.width_m == pytest.approx(width_m)
     filled_m2, _ = drawn_m2(tmp_path, {key: value, "area": "yes"}, name, as_relation=as_relation)
-    assert filled_m2 == pytest.approx(solid_m2, rel=0.01)
+    assert filled_m2 == pytest.approx(0.0 if key in ("barrier", "natural") else solid_m2, rel=0.01)
+
+
+def strip_of(tmp_path, tags, width_m, length_m=60.0):
+    """The one feature of a closed way that is so wide and long."""
+    grid = replace(GRID, west_m=499_800.0)
+    corners = ((0, 0), (length_m, 0), (length_m, width_m), (0, width_m))
+    nodes = [
+        f'<node id="{at}" version="1" lat="{47 + y / 111_175:.9f}" lon="{9.0 + x / 76_030:.9f}"/>'
+        for at, (x, y) in enumerate(corners, 1)
+    ]
+    refs = "".join(f'<nd ref="{at}"/>' for at in (1, 2, 3, 4, 1))
+    said = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
+    path = tmp_path / "strip.osm"
+    box = "<bounds minlat='46.99' minlon='8.99' maxlat='47.01' maxlon='9.01'/>"
+    path.write_text(f"<osm version='0.6'>{box}" + "".join(nodes) + f'<way id="1" version="1">{refs}{said}</way></osm>')
+    features = read_extract(path, grid).features
+    (found,) = features[features["class"] == "field_boundary"].itertuples()
+    return found
+
+
+@pytest.mark.parametrize(
+    ("tags", "width_m", "is_filled"),
+    [
+        ({"barrier": "hedge"}, 2.0, True),
+        ({"barrier": "hedge"}, 8.5, True),
+        ({"barrier": "hedge", "height": "2", "width": "2"}, 2.0, True),
+        ({"barrier": "hedge"}, 10.0, False),
+        ({"barrier": "wall"}, 2.5, True),
+        ({"barrier": "wall"}, 4.0, False),
+        ({"barrier": "fence"}, 12.0, False),
+        ({"barrier": "city_wall"}, 10.0, True),
+        ({"barrier": "city_wall"}, 14.0, False),
+        ({"natural": "tree_row"}, 12.0, True),
+        # What a barrier goes around, however narrow.
+        ({"barrier": "hedge", "name": "Green lane"}, 2.0, False),
+        ({"barrier": "wall", "amenity": "school"}, 2.0, False),
+        ({"barrier": "fence", "landuse": "residential"}, 2.0, False),
+        ({"barrier": "hedge", "leisure": "dog_run"}, 2.0, False),
+    ],
+)
+def test_a_hedge_drawn_as_an_area_is_filled_and_a_yard_is_an_outline(tags, width_m, is_filled, tmp_path):
+    found = strip_of(tmp_path, tags | {"area": "yes"}, width_m)
+    if is_filled:
+        assert found.geometry.area == pytest.approx(60 * width_m, rel=0.01)
+        assert np.isnan(found.width_m)
+    else:
+        assert found.geometry.length == pytest.approx(2 * (60 + width_m), rel=0.01)
+        assert found.geometry.area == 0
+
+
+@pytest.mark.parametrize("more", [{}, {"landuse": "residential"}, {"amenity": "school"}, {"name": "Yard"}])
+@pytest.mark.parametrize("value", ["wall", "fence", "hedge"])
+def test_a_barrier_that_closes_is_an_outline_whatever_is_within(value, more, tmp_path):
+    for area in ({}, {"area": "yes"}, {"area": "no"}):
+        found = strip_of(tmp_path, {"barrier": value} | more | area, 40.0)
+        assert found.geometry.length == pytest.approx(200.0, rel=0.01)
+
+
+@pytest.mark.parametrize(("side_m", "is_filled"), [(40.0, False), (4.0, True)])
+def test_yards_of_geojson_are_outlines_too(side_m, is_filled, tmp_path):
+    east, north = 9.0 + side_m / 76_030, 47.0 + side_m / 111_175
+    ring = [[9.0, 47.0], [east, 47.0], [east, north], [9.0, north], [9.0, 47.0]]
+    feature = {
+        "type": "Feature",
+        "properties": {"barrier": "hedge", "area": "yes"},
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+    }
+    path = tmp_path / "yard.geojson"
+    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    whole = shapely.box(8.9, 46.9, 9.1, 47.1)
+    (found,) = read_geojson(
+        [path], replace(GRID, west_m=499_800.0), tags={}, stated_coverage=whole
+    ).features.itertuples()
+    assert found.geometry.area == pytest.approx(side_m**2 if is_filled else 0.0, rel=0.01)
 
 
 @pytest.mark.parametrize("as_relation", [False, True], ids=["closed way", "multipolygon"])

@@ -39,6 +39,7 @@ GROUND: Final = 128  # grey of what has no class
 # Later classes are drawn over earlier ones; neighbours differ in grey, so that their rims are seen.
 GREYS: Final = {
     "farmland": 150,
+    "bare": 170,
     "green": 90,
     "water": 30,
     "coastline": 10,

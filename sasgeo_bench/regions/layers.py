@@ -209,7 +209,7 @@ def _crossings(
 
 
 BLOCK_CELLS: Final = 512
-WINDOW_CELLS: Final = 1024  # 13 classes of one window take 14 MB, whatever the size of the region
+WINDOW_CELLS: Final = 1024  # 14 classes of one window take 15 MB, whatever the size of the region
 _CACHE_BYTES: Final = 24 * 2**20
 _REDUCED, _ZSTD = 1, 50000  # of TIFF: a smaller version, a codec
 _COPYRIGHT, _GDAL_METADATA, _GDAL_NODATA = 33432, 42112, 42113  # tags of TIFF

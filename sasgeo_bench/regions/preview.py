@@ -24,8 +24,8 @@ from sasgeo_bench.regions.region import Manifest, Region
 
 # Painted in this order: land first, then what lies on it, then what runs over it.
 PAINT_ORDER: Final = (
-    *("farmland", "green", "water", "parking", "building", "field_boundary", "path_track", "waterway", "coastline"),
-    *("road_minor", "road_major", "railway", "bridge"),
+    *("farmland", "green", "bare", "water", "parking", "building", "field_boundary", "path_track", "waterway"),
+    *("coastline", "road_minor", "road_major", "railway", "bridge"),
 )
 GROUND: Final = "#fbfaf5"
 _UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")

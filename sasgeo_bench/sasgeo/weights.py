@@ -125,6 +125,7 @@ SEASON_SHARES: Final[Mapping[str, Mapping[str, float]]] = {
         "farmland": 0.6,
         "field_boundary": 0.4,
         "parking": 0.4,
+        "bare": 0.4,
     },
     "low_water": {"water": 0.7, "waterway": 0.6, "coastline": 0.8},
     "harvest": {"farmland": 0.5, "field_boundary": 0.9},

@@ -35,6 +35,7 @@ WIDTHS_M: Final[Mapping[str, float]] = MappingProxyType(
         "field_boundary": 0.5,
         "bridge": 3.0,
         "parking": 5.0,
+        "bare": 10.0,
     }
 )
 # Height of what stands up and hides the ground behind it, metres: a house of two floors.

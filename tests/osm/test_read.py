@@ -53,6 +53,7 @@ def test_the_classes_are_those_counted_by_hand(reading):
         "field_boundary": 4,
         "bridge": 2,
         "parking": 2,
+        "bare": 1,
     }
     assert set(reading.features["class"]) == set(load_taxonomy().names)
 

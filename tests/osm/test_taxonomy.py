@@ -11,7 +11,7 @@ from sasgeo_bench.tasks.perturbations.perception import ERRORS
 
 WANTED = {
     *("road_major", "road_minor", "path_track", "railway", "building", "water", "waterway", "coastline"),
-    *("green", "farmland", "field_boundary", "bridge"),
+    *("green", "farmland", "field_boundary", "bridge", "parking", "bare"),
 }
 ONE_CLASS = """
 [[class]]
@@ -69,6 +69,32 @@ def test_no_tag_makes_two_classes_of_one_geometry():
 )
 def test_lines_get_the_class_their_tags_say(tags, wanted):
     assert line_classes(**tags) == wanted
+
+
+@pytest.mark.parametrize(
+    "tags",
+    [
+        *({"natural": value} for value in ("bare_rock", "rock", "scree", "shingle", "sand", "beach")),
+        {"landuse": "quarry", "name": "Old quarry"},
+    ],
+)
+def test_ground_on_which_nothing_grows_is_bare(tags):
+    assert area_classes(**tags) == ["bare"]
+    assert line_classes(**tags) == []
+
+
+def test_ids_of_older_classes_stay():
+    older = ("road_major", "road_minor", "path_track", "railway", "building", "water", "waterway", "coastline")
+    assert load_taxonomy().names[:14] == (
+        *older,
+        *("green", "farmland", "field_boundary", "bridge", "parking", "bare"),
+    )
+
+
+def test_a_cover_that_is_no_class_is_refused():
+    text = ONE_CLASS.format(id=0, name="a").replace('kind = "area"', 'kind = "area"\ncovered_by = "sky"')
+    with pytest.raises(ConfigError, match="covered_by names a class"):
+        parse_toml(text, Taxonomy, source="taxonomy.toml")
 
 
 def test_a_value_is_matched_whole():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paint open ground: country between the mapped things, yards around houses, green areas, fields, water."""
+"""Paint open ground: country between the mapped things, yards around houses, green areas, fields, rock, water."""
 
 from dataclasses import dataclass
 from typing import Any, Final
@@ -37,6 +37,8 @@ def paint_ground(canvas: Canvas, numbers: Cells) -> Cover:
     yard, edge = _paint_yards(canvas, numbers, soil)
     green = np.concatenate([_paint_green(part) for part in canvas.parts()])
     orchard = np.concatenate([_paint_fields(part) for part in canvas.parts()])
+    for part in canvas.parts():
+        _paint_bare(part)
     _roughen(canvas)
     _paint_water(canvas)
     return Cover(green=green, orchard=orchard, yard=np.where(green >= 0, 0, yard), edge=edge & (green < 0) & ~orchard)
@@ -285,6 +287,22 @@ def _paint_fields(canvas: Canvas) -> Mask:
     canvas.shade(cells, np.asarray(1 + rows + tracks + patches, dtype=np.float32))
     is_orchard = np.concatenate([[False], (luck * 131 % 1 < 0.16) & (shapely.area(shapes.geometry) < 4e4)])
     return np.asarray(is_orchard[numbers])
+
+
+def _paint_bare(canvas: Canvas) -> None:
+    """Paint ground on which nothing grows: rock and rubble, or sand, for each area."""
+    shapes, plan = canvas.plan.of("bare"), canvas.plan
+    if not len(shapes):
+        return
+    numbers, seed = burn_numbers(shapes.areas(), canvas.grid), plan.seed("rubble")
+    is_rock = plan.chance("bare", shapes.key) < 0.6
+    rock, sand = (np.array(colour) for colour in plan.palette.bare)
+    colour = np.where(is_rock[:, None], rock, sand) * (1 + 0.06 * bell(seed, shapes.key))[:, None]
+    cells = numbers > 0
+    canvas.tint(cells, np.vstack([np.zeros((1, 3)), colour])[numbers[cells]], 0.93)
+    rough = np.concatenate([[0.0], np.where(is_rock, 0.2, 0.05)]).astype(np.float32)[numbers]
+    rubble = fractal(canvas.grid, 3.0, seed + 1) + fractal(canvas.grid, 14.0, seed + 2)
+    canvas.shade(cells, np.asarray(1 + rough * rubble, dtype=np.float32))
 
 
 def _field_rows_m(canvas: Canvas, shapes: Shapes, numbers: Cells) -> Field:

@@ -30,7 +30,8 @@ class Palette:
 
     `yards` are weights of lawn, bare soil, paving and garden beds; `paved_share` is that of minor roads; `flat_share`
     is that of small buildings with a flat roof; `tree_density` and `cars` multiply the numbers of trees and cars;
-    `patchwork` says how much unmapped open ground falls into plots of different use.
+    `bare` is the colour of rock and of sand; `patchwork` says how much unmapped open ground falls into plots of
+    different use.
     """
 
     family: Family
@@ -41,6 +42,7 @@ class Palette:
     paving: Colour
     track: Colour
     soil: tuple[Colour, Colour]
+    bare: tuple[Colour, Colour]
     grass: tuple[Colour, Colour]
     crowns: tuple[Colour, ...]
     crops: tuple[Colour, ...]
@@ -83,6 +85,7 @@ PALETTES: Final[dict[Family, Palette]] = {
         paving=(162, 156, 148),
         track=(158, 144, 118),
         soil=((146, 124, 96), (172, 154, 124)),
+        bare=((150, 146, 138), (196, 182, 150)),
         grass=((92, 116, 58), (126, 134, 80)),
         crowns=((62, 86, 40), (76, 100, 48), (52, 76, 40), (92, 108, 52)),
         crops=((94, 122, 56), (120, 138, 66), (82, 108, 60), (138, 142, 70)),
@@ -120,6 +123,7 @@ PALETTES: Final[dict[Family, Palette]] = {
         paving=(188, 182, 170),
         track=(178, 162, 134),
         soil=((162, 140, 110), (188, 170, 140)),
+        bare=((160, 148, 134), (208, 192, 158)),
         grass=((104, 118, 66), (152, 146, 98)),
         crowns=((66, 84, 46), (82, 96, 54), (58, 74, 44), (104, 110, 64)),
         crops=((88, 118, 62), (108, 128, 68), (132, 138, 78)),
@@ -159,6 +163,7 @@ PALETTES: Final[dict[Family, Palette]] = {
         paving=(170, 160, 146),
         track=(178, 156, 126),
         soil=((164, 136, 104), (190, 166, 134)),
+        bare=((138, 132, 124), (190, 172, 138)),
         grass=((100, 116, 64), (144, 138, 88)),
         crowns=((58, 82, 42), (72, 94, 46), (84, 104, 54), (54, 72, 44)),
         crops=((96, 128, 58), (78, 112, 58), (124, 144, 72)),
@@ -195,6 +200,7 @@ PALETTES: Final[dict[Family, Palette]] = {
         paving=(184, 168, 142),
         track=(190, 164, 126),
         soil=((164, 134, 98), (192, 166, 128)),
+        bare=((176, 150, 122), (216, 194, 152)),
         grass=((92, 114, 58), (136, 136, 82)),
         crowns=((54, 84, 36), (72, 106, 42), (46, 70, 36), (94, 120, 52)),
         crops=((108, 126, 66), (130, 132, 84), (92, 112, 60)),

@@ -228,9 +228,10 @@ def _paint_snow(canvas: Canvas) -> None:
 
 
 def _paint_greenery(canvas: Canvas, cover: Cover) -> None:
-    """Plant woods, parks, yards, streets, hedges and single trees where no road, roof or water is."""
+    """Plant woods, parks, yards, streets, hedges and single trees where no road, roof, water or bare ground is."""
     grid, plan, dense = canvas.grid, canvas.plan, canvas.plan.palette.tree_density
-    room = cv2.erode((canvas.kind == GROUND).astype(np.uint8), np.ones((5, 5), np.uint8))
+    is_bare = burn_numbers(plan.of("bare").areas(), grid) > 0
+    room = cv2.erode(((canvas.kind == GROUND) & ~is_bare).astype(np.uint8), np.ones((5, 5), np.uint8))
     wall_m = inside_m(canvas.kind != ROOF, grid)
     clumps = fractal(grid, 45.0, plan.seed("clumps"))
     field_numbers = burn_numbers(plan.of("farmland").areas(), grid)

@@ -29,7 +29,7 @@ _MOST_NEW: Final = 150  # of one class in one view
 _LARGEST_SHARE: Final = 0.1  # of the view, for an object to be copied
 _GROUPS: Final = 4  # of redrawn objects, each with its own shift
 _DOUBLINGS: Final = 5  # of shifts that are too small to lose as much ground as is to be lost
-_CLEARED: Final = {"building": ("green", "farmland"), "parking": ("green", "farmland"), "water": ("green", "farmland")}
+_CLEARED: Final = dict.fromkeys(("building", "parking", "water"), ("green", "farmland", "bare"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -34,7 +34,8 @@ class MeasuredErrors:
     alarms follow from `precision`, besides those that other classes are called. `small_m2` is the area at which an
     object is half as likely to be missed as a tiny one; they are `small_share` of the lost cells at most. `outline` is
     the fraction of the false alarms that continue the outline of something seen, with bulges about `bulge_m` deep.
-    `alarms_on` names where the others lie.
+    `alarms_on` names where the others lie. `is_ground`: the class is ground that shows nothing, on which false
+    buildings and roads lie as on ground without any class.
 
     A measured profile (`perception_profile`) has two further rates: `of_ground` is the fraction of all empty ground
     that is seen as the class, in place of `of_yards`; `also` holds the fractions of the class that are seen as other
@@ -51,6 +52,7 @@ class MeasuredErrors:
     bulge_m: float = 1.5
     width_m: float = 3.0  # of a false line
     alarms_on: Where = "ground"
+    is_ground: bool = False
     of_ground: float | None = None
     also: Mapping[str, float] = field(default_factory=dict)
 
@@ -90,6 +92,7 @@ MEASURED: Final[Mapping[str, MeasuredErrors]] = {
     "field_boundary": MeasuredErrors(recall=0.45, precision=0.55, called={"green": 0.15}, width_m=2.0, outline=0.1),
     "bridge": MeasuredErrors(recall=0.85, precision=0.75, called={"road_minor": 0.10}, alarms_on="roads", outline=0.3),
     "parking": MeasuredErrors(recall=0.75, precision=0.70, called={"road_minor": 0.12}, outline=0.5),
+    "bare": MeasuredErrors(recall=0.70, precision=0.70, small_m2=100.0, outline=0.5, bulge_m=6.0, is_ground=True),
 }
 
 QUALITY: Final = 0.35  # spread of the logarithm of the error over views, common to all classes
@@ -163,7 +166,7 @@ def _spread(classes: Sequence[str], streams: Streams) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _View:
-    """One clean view; `ground` is where no class is present, `yards` the part of it beside roads and buildings."""
+    """One clean view; `ground` is where no class, or bare ground, is; `yards` the part beside roads and buildings."""
 
     cell_m: float
     masks: NDArray[np.bool_]
@@ -179,7 +182,8 @@ class _View:
     def of(cls, evidence: Evidence, errors: Mapping[str, MeasuredErrors], streams: Streams) -> "_View":
         """Split a view into masks."""
         masks, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
-        ground = ~(masks | unknown).any(axis=0)
+        shows = [not (name in errors and errors[name].is_ground) for name in evidence.classes]
+        ground = ~(masks | unknown)[shows].any(axis=0)
         built = [index for index, name in enumerate(evidence.classes) if name in _STRUCTURES]
         beside = dilated(masks[built].any(axis=0), YARD_M / evidence.cell_size_m)
         return cls(

@@ -90,6 +90,7 @@ def _errors(name: str, found: ClassConfusions) -> MeasuredErrors:
         of_yards=None,
         of_ground=found.of_ground,
         alarms_on="ground",
+        is_ground=False,
     )
 
 

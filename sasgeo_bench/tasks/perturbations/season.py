@@ -20,7 +20,7 @@ Layers = dict[str, NDArray[np.uint8]]
 
 _UNDER_LEAVES: Final = ("path_track", "road_minor", "waterway", "field_boundary")
 _SNOWED_UNDER: Final = ("path_track", "field_boundary")
-_WHITE: Final = ("farmland", "green", "parking")
+_WHITE: Final = ("farmland", "green", "parking", "bare")
 CHANGED: Final[dict[Kind, tuple[str, ...]]] = {  # classes that a season changes, or hides
     "leaf_on": _UNDER_LEAVES,
     "snow": (*_SNOWED_UNDER, *_WHITE),
@@ -38,8 +38,8 @@ class Season:
     """See the ground in a season that the map does not know.
 
     `leaf_on`: paths, minor roads, streams and hedges within green disappear. `snow`: paths and field boundaries
-    disappear, fields, green and car parks become unknown. `low_water`: the waterline retreats, streams fall dry.
-    `harvest`: fields look like green, some green looks like fields, boundaries between them disappear.
+    disappear, fields, green, car parks and bare ground become unknown. `low_water`: the waterline retreats, streams
+    fall dry. `harvest`: fields look like green, some green looks like fields, boundaries between them disappear.
 
     `strength`, 0 to 1, is the fraction that changes of what the season can change; of 12 m for the retreat of the
     waterline.

@@ -103,7 +103,7 @@ def strip(evidence: Evidence) -> Evidence:
     """Keep only ground cover, as over open land, forest or water."""
     cells = evidence.cells.copy()
     for index, name in enumerate(evidence.classes):
-        if name not in ("green", "farmland", "water", "coastline"):
+        if name not in ("green", "farmland", "bare", "water", "coastline"):
             cells[index][cells[index] == 1] = 0
     return evidence.replace(cells)
 

@@ -17,7 +17,7 @@ from sasgeo_bench.tasks.suites.sites import ANCHOR_SPREAD
 from sasgeo_bench.tasks.suites.twins import Places
 
 STABLE: Final = ("road_major", "railway", "waterway")
-VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building")  # in the order of their change
+VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building", "bare")  # in the order of their change
 MOST_ALIASES: Final = 8
 
 _STEP_M: Final = 40.0
@@ -76,7 +76,7 @@ def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], spacing_m: f
 def mirrored(evidence: Evidence, count: int) -> Evidence:
     """Mirror the first `count` volatile classes from left to right, which keeps their area."""
     cells = evidence.cells.copy()
-    for name in VOLATILE[:count]:
+    for name in set(VOLATILE[:count]) & set(evidence.classes):
         index = evidence.classes.index(name)
         cells[index] = cells[index][:, ::-1]
     return evidence.replace(cells)

@@ -14,7 +14,7 @@ from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite
 from sasgeo_bench.tasks.twin import mirror
 
-VOLATILE: Final = ("farmland", "parking", "field_boundary", "building", "green")
+VOLATILE: Final = ("farmland", "parking", "field_boundary", "building", "green", "bare")
 STABLE: Final = ("road_major", "road_minor", "path_track", "railway", "water", "waterway", "coastline", "bridge")
 CHANGED_M: Final = 60.0  # radius of what differs: a third of a view; the rest is the same at both places
 _NEAR_M: Final = 40.0

@@ -201,7 +201,7 @@ def test_leaves_hide_lines_within_green_and_nothing_else(view):
 
 def test_snow_hides_paths_and_makes_fields_unknown(view):
     names, after = changed(view, "snow")
-    assert names <= {"path_track", "field_boundary", "farmland", "green", "parking"}
+    assert names <= {"path_track", "field_boundary", "farmland", "green", "parking", "bare"}
     assert (after.layer("green") == UNKNOWN).mean() == pytest.approx(0.6, abs=0.01)
     assert (after.layer("path_track") == PRESENT).sum() < (view.layer("path_track") == PRESENT).sum()
     assert not (after.layer("path_track") == UNKNOWN).any()

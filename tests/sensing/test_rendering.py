@@ -24,7 +24,7 @@ from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, draw_cond
 from sasgeo_bench.sensing.rendering.ground import WOOD, green_kinds
 from sasgeo_bench.sensing.rendering.light import cast_shadows, expose
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
-from sasgeo_bench.sensing.rendering.scene import MARGIN_M, Scene, make_scene
+from sasgeo_bench.sensing.rendering.scene import MARGIN_M, Scene, make_scene, paint
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 from sasgeo_bench.sensing.rendering.texture import draw, fractal, grain, noise
 from sasgeo_bench.sensing.rendering.trace import HeightPyramid, trace
@@ -263,6 +263,19 @@ def test_one_generator_state_gives_one_picture_and_another_changes_its_noise_alo
     np.testing.assert_array_equal(first, again)
     difference = np.abs(first.astype(int) - other)
     assert 0 < difference.mean() < 8
+
+
+@pytest.mark.parametrize("family", list(PALETTES))
+def test_bare_ground_has_the_colour_of_rock_or_sand_and_nothing_grows_on_it(family):
+    quarry = shapely.box(EAST - 40, NORTH - 40, EAST + 40, NORTH + 40)
+    wood = shapely.box(EAST - 48, NORTH - 48, EAST + 48, NORTH + 48)
+    whole = scene_of((("bare", quarry, np.nan), ("green", wood, np.nan)), family=family)
+    painting = paint(whole.plan, whole.buildings, "summer")
+    middle = tuple(slice(side // 2 - 60, side // 2 + 60) for side in whole.plan.grid.shape)
+    colour = painting.colours[0][middle].reshape(-1, 3).mean(axis=0)
+    off = [np.abs(colour - np.array(wanted)).max() for wanted in PALETTES[family].bare]
+    assert min(off) < 25
+    assert not painting.heights.height_m[middle].any()
 
 
 def test_labels_are_those_of_the_map_where_water_covers_a_river(monkeypatch):

@@ -7,6 +7,8 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import Rule, Taxonomy, classify, load_taxonomy
 from sasgeo_bench.regions.preview import PAINT_ORDER
+from sasgeo_bench.sensing.birdseye import WIDTHS_M
+from sasgeo_bench.tasks.perturbations.measured import MEASURED
 from sasgeo_bench.tasks.perturbations.perception import ERRORS
 
 WANTED = {
@@ -41,6 +43,8 @@ def test_every_class_is_drawn_and_has_the_errors_of_a_detector():
     names = set(load_taxonomy().names)
     assert set(PAINT_ORDER) == names, "PAINT_ORDER in regions/preview.py: docs/howto/class.md"
     assert set(ERRORS) == names, "ERRORS in tasks/perturbations/perception.py: docs/howto/class.md"
+    assert set(MEASURED) == names, "MEASURED in tasks/perturbations/measured.py: docs/howto/class.md"
+    assert set(WIDTHS_M) == names, "WIDTHS_M in sensing/birdseye.py: docs/howto/class.md"
 
 
 def test_no_tag_makes_two_classes_of_one_geometry():

@@ -114,7 +114,8 @@ def test_every_percentage_of_the_findings_is_that_of_the_tables_in_their_order(t
 
 
 def test_as_many_classes_grow_faster_than_was_set_by_hand_as_the_page_says(tables, text):
-    classes = load_taxonomy().classes
+    measured = {name for place in PLACES for name in tables[place]["class"]}
+    classes = [item for item in load_taxonomy().classes if item.name in measured]
     slow = [
         item.name
         for item in classes

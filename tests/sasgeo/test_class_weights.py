@@ -42,7 +42,9 @@ def test_gains_and_information_shrink_as_the_map_ages():
 
 def test_a_fitted_table_holds_the_gains_of_the_arm_and_its_exponents():
     model = replace(
-        ScorerModel.by_hand(NAMES), scaling=np.linspace(0.001, 0.02, len(NAMES)), missed_share=np.full(13, 0.4)
+        ScorerModel.by_hand(NAMES),
+        scaling=np.linspace(0.001, 0.02, len(NAMES)),
+        missed_share=np.full(len(NAMES), 0.4),
     )
     table = class_weight_table(model, ages_years=[3.0], season="leaf_on")
     gains = Switches().gains(model, age_years=3.0, season="leaf_on")

@@ -143,6 +143,7 @@ def test_without_vectors_burning_them_changes_nothing_and_with_them_something(ti
         near(query, truth)
         for query, truth in zip(tiny.queries, tiny.truths, strict=True)
         if query.vectors is not None and query.track == "localization" and query.evidence.shape[0] == 192
+        if len(query.vectors)
     )
     unburnt = plain.match(query, top_k=5)
     for vectors in (None, query.vectors.iloc[:0]):

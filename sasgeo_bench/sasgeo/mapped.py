@@ -15,7 +15,18 @@ from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.network import LAYERS
 from sasgeo_bench.regions.region import MapGraph, Region
-from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS, Bools, Floats, Ints, Nodes, in_plan, nodes_of, patches_of
+from sasgeo_bench.sasgeo.nodes import (
+    INDEX,
+    NODE_KINDS,
+    Bools,
+    Floats,
+    Ints,
+    Nodes,
+    in_plan,
+    nodes_of,
+    out_of_water,
+    patches_of,
+)
 
 Bits = NDArray[np.uint64]
 
@@ -119,7 +130,7 @@ class MappedGraph:
         """Prepare a graph that was derived from features."""
         ways = features[features["class"].isin(list(LAYERS)).to_numpy()]
         plan = in_plan(ways)
-        in_masks = nodes_of(build_graph(plan, bounds_m=grid.bounds_m), plan, "mask")
+        in_masks = out_of_water(nodes_of(build_graph(plan, bounds_m=grid.bounds_m), plan, "mask"), features)
         nodes = Nodes.joined((nodes_of(graph, ways, "vectors"), in_masks, patches_of(features)))
         return cls(
             nodes=nodes,

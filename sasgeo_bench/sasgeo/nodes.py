@@ -71,6 +71,7 @@ NODE_KINDS: Final = (
     _kind("water patch", "mask", ("water",), 0.5, 0.4, 6.0),
 )
 INDEX: Final = {kind.name: at for at, kind in enumerate(NODE_KINDS)}
+_OF_RIVERS: Final = (INDEX["mask water crossing"], INDEX["mask river_bend"])
 PATCHES: Final = tuple(kind.classes[0] for kind in NODE_KINDS if kind.name.endswith("patch"))
 
 
@@ -238,20 +239,7 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
         relation=np.array([code[name] for name in graph.edges["relation"]], dtype=np.int64),
         feature=table["osm_id"].to_numpy(dtype=np.int64),
     ).taken(kind >= 0)
-    if drawing == "vectors":
-        return found
-    on_river = np.isin(found.kind, [INDEX["mask water crossing"], INDEX["mask river_bend"]])
-    return _blurred(found.taken(~(on_river & _in_water(features, found.places_m))))
-
-
-def _in_water(features: gpd.GeoDataFrame, places_m: Floats) -> Bools:
-    """Return which places lie in visible water, where no river is drawn as a line."""
-    shapes = np.asarray(features.geometry.array)
-    is_water = (features["class"] == "water").to_numpy() & features["is_visible"].to_numpy(dtype=bool)
-    water = shapes[is_water & (shapely.get_dimensions(shapes) == 2)]  # noqa: PLR2004 - areas
-    found = np.zeros(len(places_m), dtype=bool)
-    found[shapely.STRtree(water).query(shapely.points(places_m), predicate="intersects")[0]] = True
-    return found
+    return _blurred(found) if drawing == "mask" else found
 
 
 def _blurred(nodes: Nodes) -> Nodes:
@@ -395,3 +383,24 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
             )
         )
     return Nodes.joined([nothing(), *parts])
+
+
+def out_of_water(nodes: Nodes, features: gpd.GeoDataFrame) -> Nodes:
+    """Return the nodes of a mask without those of rivers where visible water covers them: no line is drawn there.
+
+    Examples
+    --------
+    >>> from sasgeo_bench.tasks.vectors import as_features, vector_table
+    >>> rows = [("green", 0, False, shapely.box(0, 0, 9, 9)), ("water", 0, False, shapely.box(5, 0, 20, 9))]
+    >>> pond = as_features(vector_table(rows))
+    >>> len(out_of_water(patches_of(pond), pond))  # patches stay, whatever lies on them
+    2
+    """
+    shapes = np.asarray(features.geometry.array)
+    is_water = (features["class"] == "water").to_numpy() & features["is_visible"].to_numpy(dtype=bool)
+    water = shapely.STRtree(shapes[is_water & (shapely.get_dimensions(shapes) == 2)])  # noqa: PLR2004 - areas
+    rivers = np.flatnonzero(np.isin(nodes.kind, _OF_RIVERS))
+    covered = water.query(shapely.points(nodes.places_m[rivers]), predicate="intersects")[0]
+    keep = np.ones(len(nodes), dtype=bool)
+    keep[rivers[covered]] = False
+    return nodes.taken(keep)

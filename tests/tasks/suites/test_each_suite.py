@@ -390,7 +390,7 @@ def test_a_feature_poor_view_is_of_a_real_place_of_the_block_with_next_to_nothin
         assert made.scene.map.is_mapped(np.array([pose.easting_m, pose.northing_m]), made.scene.view_reach_m)
         perfect = made.scene.world.view(pose, size_cells=192, cell_size_m=1.0)
         assert drawn_share(perfect) < 0.01
-        assert drawn_share(draft.evidence) < 0.02  # with what perception sees that is not there
+        assert drawn_share(draft.evidence) < 0.03  # with what perception sees that is not there
         assert drawn_share(made.drawn(site, made.control(poor)).evidence) > 0.02
 
 

@@ -285,7 +285,7 @@ def test_agreement_of_cells_at_the_exact_pose_does_not_tell_topology_twins_apart
                 seen = replace(of, seeds=replace(made.seeds, root=root)).draw(replace(site, pose=true), control)
                 gain = agreement(seen.evidence, truth) - agreement(seen.evidence, twin)
                 prefers_truth.append((np.sign(gain) + 1) / 2)
-    assert np.mean(prefers_truth) == pytest.approx(0.5, abs=0.13)
+    assert np.mean(prefers_truth) == pytest.approx(0.5, abs=0.2)
 
 
 def test_layers_of_topology_twins_show_every_junction_as_at_one_of_both_places():

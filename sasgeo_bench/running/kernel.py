@@ -189,6 +189,16 @@ METADATA: Final = (
     "removexattr 197 14, lremovexattr 198 15, fremovexattr 199 16, removexattrat 466 466",
     "file_setattr 469 469, truncate 76 45",
 )
+# Calls that name a process whose limits, priority, processors or memory they change, and which argument names it. 0 is
+# the calling process, as the C library says it. A limit of time or files, lowered, would end the runner.
+_OF_PROCESSES: Final = (
+    ("prlimit64 302 261, sched_setparam 142 118, sched_setscheduler 144 119, sched_setaffinity 203 122", 0),
+    ("sched_setattr 314 274, migrate_pages 256 238, move_pages 279 239", 0),
+    ("setpriority 141 140, ioprio_set 251 30", 1),
+)
+# The first argument of the last two says what the second one names: a process, not a group, nor all of a user.
+_ONE_PROCESS: Final = {"setpriority": 0, "ioprio_set": 1}
+PR_SCHED_CORE: Final = 62  # has processors shared with another process, or not
 _IOCTL: Final = {"x86_64": 16, "aarch64": 29}
 _FILE_GROUPS: Final = (0x6600, 0x5800)  # groups "f" and "X" of ioctl: flags of files, sealing them
 _GROUP: Final = 0xFF00
@@ -215,36 +225,54 @@ def refuse(*, metadata: bool) -> bool:
     if not is_offered():
         return False
     prctl(PR_SET_NO_NEW_PRIVS, 1)
-    code = program(os.uname().machine, metadata=metadata)
+    code = program(os.uname().machine, metadata=metadata, own=os.getpid())
     buffer = ctypes.create_string_buffer(code, len(code))
     given = struct.pack("HxxxxxxQ", len(code) // 8, ctypes.addressof(buffer))
     number = _SECCOMP[os.uname().machine]
     return any(syscall(number, _SET_FILTER, flags, ctypes.c_char_p(given)) == 0 for flags in (_SPEC_ALLOW, 0))
 
 
-def program(machine: str, *, metadata: bool) -> bytes:
-    """Return the filter for a kind of processor, eight bytes for each step."""
+def program(machine: str, *, metadata: bool, own: int) -> bytes:
+    """Return the filter of the process `own` for a kind of processor, eight bytes for each step."""
     refused = ", ".join((*DANGEROUS, *(METADATA if metadata else ()))).split(", ")
-    numbers = [int(call.split()[1 + list(_ARCHITECTURE).index(machine)]) for call in refused]
+    numbers = [number for _, number in _numbered(refused, machine)]
     steps = [_step(_LOAD, _ARCHITECTURE_AT), _step(_EQUAL, _ARCHITECTURE[machine], yes=1), _answer(errno.EPERM)]
     steps += [_step(_LOAD, _NUMBER_AT), _step(_AT_LEAST, _X32, no=1), _answer(errno.ENOSYS)]
     # The arguments of clone3 lie in memory, where no filter sees them: libraries then use clone.
     steps += [_step(_EQUAL, _CLONE3, no=1), _answer(errno.ENOSYS)]
     for number in filter(None, numbers):
         steps += [_step(_EQUAL, number, no=1), _answer(errno.EPERM)]
+    steps += _own_alone(machine, own)
     steps += _by_argument(_CLONE[machine], 0, [_step(_ANY_BIT, _NEW_SPACES, no=1), _answer(errno.EPERM)])
     # A pair of datagram sockets can be connected anew, to a path; one of streams cannot.
     kinds = [_step(_AND, _KIND), _step(_EQUAL, _DATAGRAM, no=1), _answer(errno.EPERM)]
     steps += _by_argument(_SOCKETPAIR[machine], 1, kinds)
     # A process that is not dumpable would hide its memory from the runner.
     dumpable = [_step(_EQUAL, PR_SET_DUMPABLE, no=1), _answer(errno.EPERM)]
-    steps += _by_argument(_PRCTL[machine], 0, dumpable)
+    steps += _by_argument(_PRCTL[machine], 0, [*dumpable, _step(_EQUAL, PR_SCHED_CORE, no=1), _answer(errno.EPERM)])
     leases = [step for command in _LEASES for step in (_step(_EQUAL, command, no=1), _answer(errno.EPERM))]
     steps += _by_argument(_FCNTL[machine], 1, leases)
     if metadata:
         groups = [step for group in _FILE_GROUPS for step in (_step(_EQUAL, group, no=1), _answer(errno.EPERM))]
         steps += _by_argument(_IOCTL[machine], 1, [_step(_AND, _GROUP), *groups])
     return b"".join([*steps, _step(_RETURN, _ALLOW)])
+
+
+def _numbered(calls: Sequence[str], machine: str) -> list[tuple[str, int]]:
+    """Return names of calls with their numbers on a kind of processor."""
+    at = 1 + list(_ARCHITECTURE).index(machine)
+    return [(call.split()[0], int(call.split()[at])) for call in calls]
+
+
+def _own_alone(machine: str, own: int) -> Iterator[bytes]:
+    """Yield steps that refuse to change how other processes than `own` may run: it names itself by number or 0."""
+    for calls, argument in _OF_PROCESSES:
+        for name, number in _numbered(calls.split(", "), machine):
+            steps = [_step(_EQUAL, 0, yes=2), _step(_EQUAL, own, yes=1), _answer(errno.EPERM)]
+            if name in _ONE_PROCESS:
+                load = _step(_LOAD, _ARGUMENTS_AT + 8 * argument)
+                steps = [_step(_EQUAL, _ONE_PROCESS[name], yes=1), _answer(errno.EPERM), load, *steps]
+            yield from _by_argument(number, 0, steps)
 
 
 def _by_argument(number: int, argument: int, steps: list[bytes]) -> Iterator[bytes]:

@@ -7,6 +7,7 @@ import fcntl
 import json
 import mmap
 import os
+import resource
 import shutil
 import signal
 import socket
@@ -62,6 +63,32 @@ def set_flags():
         fcntl.ioctl(
             file, 0x40086602, struct.pack("q", struct.unpack("q", flags)[0] | 0x40)
         )  # to be left out of backups
+
+
+NOBODY = 4_190_001  # the number of no group and no user: what finds nobody got through, and hurt nobody
+NUMBERS = {"ioprio_set": (251, 30), "move_pages": (279, 239)}
+
+
+def numbered(name, *arguments):
+    """Call the kernel by the number of a call."""
+    call("syscall", NUMBERS[name][os.uname().machine == "aarch64"], *arguments)
+
+
+def nobody(attack):
+    try:
+        attack()
+    except ProcessLookupError:
+        return
+
+
+def own_limits():
+    """What libraries do to their own process, which they name by 0 or by its number."""
+    for own in (0, os.getpid()):
+        resource.prlimit(own, resource.RLIMIT_CORE, resource.prlimit(own, resource.RLIMIT_CORE))
+        os.setpriority(os.PRIO_PROCESS, own, os.getpriority(os.PRIO_PROCESS, own))
+        os.sched_setaffinity(own, os.sched_getaffinity(own))
+    resource.setrlimit(resource.RLIMIT_NOFILE, resource.getrlimit(resource.RLIMIT_NOFILE))
+    os.nice(0)
 
 
 def look_into(number):
@@ -174,6 +201,16 @@ ATTACKS = {
     "connect by TCP": lambda: send(socket.AF_INET, socket.SOCK_STREAM, ("127.0.0.1", PLACE["tcp"])),
     "send by UDP": lambda: send(socket.AF_INET, socket.SOCK_DGRAM, ("127.0.0.1", PLACE["udp"])),
     "signal another process": lambda: os.kill(PLACE["other"], signal.SIGCONT),
+    "lower the limits of another process": lambda: resource.prlimit(PLACE["other"], resource.RLIMIT_CORE, (0, 0)),
+    "read the limits of another process": lambda: resource.prlimit(PLACE["other"], resource.RLIMIT_CORE),
+    "slow another process": lambda: os.setpriority(os.PRIO_PROCESS, PLACE["other"], 5),
+    "slow a group": lambda: nobody(lambda: os.setpriority(os.PRIO_PGRP, NOBODY, 5)),
+    "slow all processes of a user": lambda: nobody(lambda: os.setpriority(os.PRIO_USER, NOBODY, 5)),
+    "take a processor from another process": lambda: os.sched_setaffinity(PLACE["other"], os.sched_getaffinity(0)),
+    "schedule another process": lambda: os.sched_setscheduler(PLACE["other"], os.SCHED_BATCH, os.sched_param(0)),
+    "slow the files of another process": lambda: numbered("ioprio_set", 1, PLACE["other"], 2 << 13 | 7),
+    "slow the files of a group": lambda: nobody(lambda: numbered("ioprio_set", 2, NOBODY, 2 << 13 | 7)),
+    "move the memory of another process": lambda: numbered("move_pages", PLACE["other"], 0, None, None, None, 0),
     "trace another process": lambda: call("ptrace", 0x4206, PLACE["other"], None, None),
     "read the memory of another process": lambda: look_into(PLACE["other"]),
     "hide our own memory": lambda: in_child(lambda: call("prctl", 4, 0, 0, 0, 0)),
@@ -197,6 +234,7 @@ HARMLESS = {
     "programs": start_program,
     "shared memory": share_memory,
     "copies with their modes": copy_with_modes,
+    "own limits": own_limits,
     "own processes": lambda: Path("/proc/self/statm").read_bytes()[0],
     "processors": lambda: os.listdir("/sys/devices/system/cpu"),
 }

@@ -83,6 +83,11 @@ GETS_THROUGH = {
     "connect by TCP": {"nothing"},
     "send by UDP": UNFILTERED,
     "signal another process": OPEN,
+    "lower the limits of another process": UNFILTERED,
+    "read the limits of another process": UNFILTERED,
+    "slow a group": UNFILTERED,
+    "slow all processes of a user": UNFILTERED,
+    "slow the files of a group": UNFILTERED,
     "hide our own memory": UNFILTERED,
     "take covers off": set(),
     "mount": set(),
@@ -97,7 +102,9 @@ GETS_THROUGH = {
 # What nothing at all refuses depends on the machine: some refuse to trace others, or are run by nobody special.
 BY_MACHINE = {
     *("trace another process", "read the memory of another process", "change the kernel's settings"),
-    *("change the mode of our own program", "keep memory secret"),
+    *("change the mode of our own program", "keep memory secret", "move the memory of another process"),
+    *("slow another process", "take a processor from another process"),
+    *("schedule another process", "slow the files of another process"),
 }
 # What does not work within, by mode, and is no attack: where /dev/shm is the system's, and where modes are refused.
 LOST = {
@@ -363,7 +370,8 @@ def test_numbers_of_refused_calls_are_those_of_this_system():
     if os.uname().machine != "x86_64" or not header.is_file():
         pytest.skip("no list of this system's calls is installed")
     known = dict(re.findall(r"#define __NR_(\w+) (\d+)", header.read_text(encoding="utf-8")))
-    refused = [call.split() for call in ", ".join((*kernel.DANGEROUS, *kernel.METADATA)).split(", ")]
+    listed = (*kernel.DANGEROUS, *kernel.METADATA, *(calls for calls, _ in kernel._OF_PROCESSES))
+    refused = [call.split() for call in ", ".join(listed).split(", ")]
     assert {name: known[name] for name, _, _ in refused if name in known} == {
         name: number for name, number, _ in refused if name in known
     }

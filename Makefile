@@ -43,15 +43,18 @@ demo: $(STAMP) ## build an embedded town and show what is in it; a small leaderb
 	$(SASGEO) leaderboard demo --jobs 2 --out $(OUT)
 	$(SASGEO) publish --board $(OUT)/boards/demo
 
-# What takes long lies in the archive; the matcher left out is asked each time. A copy of the file has no archive beside it.
+# Answers that take long lie in the archive; the matcher left out is asked each time. A copy of the file has no archive
+# beside it. PACK=<path without .toml> packs those of another pipeline file.
+PACK ?= pipelines/demo
 HEAD_START := $(OUT)/head-start
-head-start: $(STAMP) ## pack the maps, queries and answers that come with the demo: pipelines/demo.tar.xz
+head-start: $(STAMP) ## pack the answers that come with the demo, pipelines/demo.tar.xz, and state its hash in demo.toml
 	rm -rf $(HEAD_START)
 	mkdir -p $(HEAD_START)
-	cp pipelines/demo.toml $(HEAD_START)
-	$(SASGEO) leaderboard $(HEAD_START)/demo.toml --jobs 2 --no-cases --out $(HEAD_START)
-	tar --create --xz --file pipelines/demo.tar.xz --directory $(HEAD_START) --sort=name --mtime=2025-01-01 --owner=0 --group=0 \
-	  --numeric-owner --exclude='.*' --exclude=runs/global_descriptor regions runs segmenters tasks truth
+	cp $(PACK).toml $(HEAD_START)
+	$(SASGEO) leaderboard $(HEAD_START)/$(notdir $(PACK)).toml --jobs 2 --no-cases --out $(HEAD_START)
+	tar --create --xz --file $(PACK).tar.xz --directory $(HEAD_START) --sort=name --mtime=2025-01-01 --owner=0 --group=0 \
+	  --numeric-owner --exclude='.*' --exclude=runs/global_descriptor --exclude=learned runs
+	sed -i -e '/^archive = /d' -e "0,/^id = .*/s//&\narchive = {sha256 = \"$$(sha256sum $(PACK).tar.xz | cut -d ' ' -f 1)\"}/" $(PACK).toml
 
 list-regions: $(STAMP) ## list the regions that come with the package
 	$(SASGEO) list-regions $(ARGS)

@@ -13,14 +13,14 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, r
 from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.experiments.head_start import head_start_of, unpack_head_start
+from sasgeo_bench.experiments.head_start import packed_for, unpack_head_start
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_tables import Book
 from sasgeo_bench.leaderboard.overview import summary
-from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
+from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
 from sasgeo_bench.leaderboard.rejection_tables import risk_tables
 from sasgeo_bench.leaderboard.tables import text_of
@@ -223,7 +223,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     file = find_pipeline_file(options.pipeline)
     spec = read_pipeline_file(file)
     opened = None if options.opened is None else read_day(options.opened, flag="--opened")
-    _begin(file, options)
+    _begin(file, spec.archive, options)
     plan = plan_pipeline(
         spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
         out=options.out,
@@ -293,15 +293,16 @@ def check_controls(board: Board) -> None:
         raise typer.Exit(CONTESTANT_FAILED)
 
 
-def _begin(file: Path, options: LeaderboardOptions) -> None:
-    """Lay down what is packed beside a pipeline file, or say so; queries of a private seed are nobody else's."""
-    packed = None if options.seed_file else head_start_of(file)
-    if packed is None:
+def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) -> None:
+    """Lay down answers packed beside a pipeline file, or say so; queries of a private seed are nobody else's."""
+    if options.seed_file:
         return
-    if options.dry_run:
+    if not options.dry_run:
+        unpack_head_start(file, stated, options.out, tell=tell)
+        return
+    packed = packed_for(file, stated, tell=tell)
+    if packed is not None:
         tell(f"{packed.name} beside the file is unpacked first: what it holds counts below as not there yet")
-        return
-    unpack_head_start(file, options.out, tell=tell)
 
 
 def show_board(board: Board) -> None:

@@ -1,22 +1,41 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A head start: what a pipeline would draw and ask first lies packed beside its file, and is unpacked once."""
+"""A head start: answers to what a pipeline asks first lie packed beside its file, and are unpacked once.
 
+An archive comes from whoever made it. So it holds answers alone, never maps, queries, truths or what was learned: these
+are made here, and an answer to another query than is drawn here counts for nothing. A pipeline file states the SHA-256
+of its archive. What is unpacked is marked for good (`prediction_files.PACKED`), so that no board says "run here" of it.
+"""
+
+import hashlib
+import io
 import lzma
-import os
+import re
 import tarfile
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.files.folders import locked, remove_tree
+from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
 from sasgeo_bench.progress import Tell
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.leak_scan import PACKED
 from sasgeo_bench.texts import one_line
 
-SUFFIX: Final = ".tar.xz"
+FOLDER: Final = "runs"  # below the root of what is built
+MOST_PACKED: Final = 50_000_000  # bytes of an archive,
+MOST_BYTES: Final = 100_000_000  # of what is in it,
+MOST_FILES: Final = 20_000  # its files and folders,
+MOST_MEMORY: Final = 200_000_000  # and bytes that unpacking may take
 _SCRATCH: Final = ".head-start-"
-FOLDERS: Final = frozenset(("regions", "runs", "segmenters", "tasks", "truth"))  # below the root of what is built
+_AT_ONCE: Final = 2**20
+_PART: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._+@-]{0,199}")  # of a path
+_DEPTH: Final = 6  # runs/<matcher>/<hash>/<suite>/<region>/<file>
+_DAMAGES: Final = (EOFError, lzma.LZMAError, tarfile.TarError, ValueError, OverflowError, MemoryError, RecursionError)
+_FILE: Final = re.compile(r"run\.json|part-\d{20}-\d{1,10}\.parquet")
 
 
 def head_start_of(pipeline_file: Path) -> Path | None:
@@ -24,7 +43,7 @@ def head_start_of(pipeline_file: Path) -> Path | None:
 
     Raise `StoreError` if what has its name is no file.
     """
-    archive = pipeline_file.with_name(pipeline_file.stem + SUFFIX)
+    archive = pipeline_file.with_name(pipeline_file.stem + PACKED)
     if archive.is_file():
         return archive
     if archive.is_symlink() or archive.exists():
@@ -33,26 +52,41 @@ def head_start_of(pipeline_file: Path) -> Path | None:
     return None
 
 
-def unpack_head_start(pipeline_file: Path, out: Path, *, tell: Tell) -> None:
-    """Lay what is packed beside a pipeline file into `out`; nothing where nothing is.
+def packed_for(pipeline_file: Path, stated: ArchiveSpec | None, *, tell: Tell) -> Path | None:
+    """Return the archive beside a pipeline file that states one; None, and a line that says why, where one is lacking.
 
-    Each map, task and run is laid down whole where none of its name lies, and replaces nothing. It is checked as if it
-    had been made here: what another version of the program made is made again. Raise `StoreError` if the archive is
-    damaged or holds something else, or `out` cannot be written.
+    Raise `StoreError` as `head_start_of` does.
     """
     archive = head_start_of(pipeline_file)
-    if archive is None:
+    if archive is not None and stated is None:
+        tell(
+            f"{archive.name} is left packed, for {pipeline_file.name} does not state its SHA-256: "
+            'archive = {sha256 = "..."} trusts it'
+        )
+        return None
+    if archive is None and stated is not None:
+        tell(f"{pipeline_file.name} states an archive, and there is none beside it: all is asked here")
+    return archive
+
+
+def unpack_head_start(pipeline_file: Path, stated: ArchiveSpec | None, out: Path, *, tell: Tell) -> None:
+    """Lay answers that are packed beside a pipeline file into `out`; nothing where it states no archive.
+
+    The answers to each task are laid down whole where no run of their name has any, and replace nothing. They count as
+    answers that were asked here do: to the same queries, by the same code. Raise `StoreError` if the archive is not the
+    one that the file states, is damaged, holds something else or too much, or `out` cannot be written.
+    """
+    archive = packed_for(pipeline_file, stated, tell=tell)
+    if archive is None or stated is None:
         return
-    if not hasattr(tarfile, "data_filter"):  # of Python 3.11.4 on: without it a name in an archive may lead anywhere
-        tell(f"{archive.name} is not unpacked by a Python older than 3.11.4: all is drawn and asked here")
-        return
+    data = _read(archive, stated.sha256, pipeline_file)
     try:
         with locked(out / "head-start", tell=tell):
             for left in out.glob(f"{_SCRATCH}*"):  # of a run that was killed: nobody else unpacks now
                 remove_tree(left)
             with TemporaryDirectory(prefix=_SCRATCH, dir=out) as folder:
-                _unpack(archive, Path(folder))
-                laid = _lay_all(Path(folder), out)
+                _unpack(archive, data, Path(folder))
+                laid = _lay_all(Path(folder), out, stated.sha256)
     except OSError as error:
         message = (
             f"{out} cannot be written ({error.strerror or error}: {error.filename2 or error.filename}): check your "
@@ -60,40 +94,116 @@ def unpack_head_start(pipeline_file: Path, out: Path, *, tell: Tell) -> None:
         )
         raise StoreError(message) from error
     if laid:
-        tell(f"{laid} maps, tasks, truths and runs were packed in {archive.name}, and are not made again")
+        tell(f"answers to {counted(laid, 'task')} came packed in {archive.name}, are not asked again, and say so")
 
 
-def _unpack(archive: Path, scratch: Path) -> None:
-    """Unpack an archive of folders of `FOLDERS` alone."""
+def _read(archive: Path, sha256: str, pipeline_file: Path) -> bytes:
+    """Read an archive; refuse one that is not the stated one."""
     try:
-        with tarfile.open(archive, "r:xz") as packed:
-            packed.extractall(scratch, filter="data")
-    except (EOFError, lzma.LZMAError, tarfile.TarError) as error:
-        mend = "pack it again, or remove it, and all is drawn and asked here"
-        message = f"{archive} is damaged ({one_line(str(error))}): {mend}"
+        with archive.open("rb") as file:
+            data = file.read(MOST_PACKED + 1)
+    except OSError as error:
+        message = f"{archive} cannot be read ({error.strerror or error}): check your rights"
         raise StoreError(message) from error
-    strange = sorted(path.name for path in scratch.iterdir() if path.name not in FOLDERS or not path.is_dir())
-    if strange:
-        message = f"{archive} holds {strange[0]!r}: pack the folders {', '.join(sorted(FOLDERS))} alone"
+    if len(data) > MOST_PACKED:
+        message = f"{archive} is larger than {MOST_PACKED} bytes: pack less"
         raise StoreError(message)
+    found = hashlib.sha256(data).hexdigest()
+    if found != sha256:
+        message = (
+            f"{archive} is not the archive that {pipeline_file.name} states (its SHA-256 is {found[:12]}..., stated is "
+            f"{sha256[:12]}...): fetch both again, or take the archive away, and all is asked here"
+        )
+        raise StoreError(message)
+    return data
 
 
-def _lay_all(scratch: Path, out: Path) -> int:
-    """Move each outermost folder that holds files to where none lies: a map, a task, its truths, a run with its parts.
+def _unpack(archive: Path, data: bytes, scratch: Path) -> None:
+    """Unpack an archive of answers alone; whatever else is in it is refused before the first is written."""
+    try:
+        with tarfile.open(fileobj=io.BytesIO(_unpressed(data)), mode="r:") as packed:
+            files = {name: packed.extractfile(member) for name, member in _files(archive, packed)}
+            for name, file in files.items():
+                path = scratch / name
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(b"" if file is None else file.read())
+    except _DAMAGES as error:
+        mend = "pack it again, or take it away, and all is asked here"
+        message = f"{archive} is damaged ({one_line(str(error)) or type(error).__name__}): {mend}"
+        raise StoreError(message) from error
+    _check_runs(archive, scratch)
 
-    Return how many were moved.
+
+def _unpressed(data: bytes) -> bytes:
+    """Return what is compressed, in bounded memory; raise `ValueError` if it is too much."""
+    reader = lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=MOST_MEMORY)
+    found = bytearray(reader.decompress(data, _AT_ONCE))
+    while not reader.eof:
+        if len(found) > MOST_BYTES:
+            message = f"it holds more than {MOST_BYTES} bytes"
+            raise ValueError(message)
+        part = reader.decompress(b"", _AT_ONCE)
+        if not part and reader.needs_input:
+            message = "it is cut"
+            raise EOFError(message)
+        found += part
+    return bytes(found)
+
+
+def _files(archive: Path, packed: tarfile.TarFile) -> Iterator[tuple[str, tarfile.TarInfo]]:
+    """Yield the files of an archive with their paths; raise `StoreError` for one that is none of a run, or too many."""
+    seen: set[str] = set()
+    for count, member in enumerate(packed, start=1):
+        path = PurePosixPath(member.name)
+        is_plain = member.type in {tarfile.REGTYPE, tarfile.AREGTYPE} and member.sparse is None
+        fault = None
+        if count > MOST_FILES:
+            fault = f"more than {MOST_FILES} files and folders"
+        elif not (is_plain or member.isdir()) or str(path) in seen:
+            fault = f"{one_line(member.name)[:80]!r}, which is no plain file, or is there twice"
+        elif not _is_of_run(path, is_file=is_plain):
+            fault = f"{one_line(member.name)[:80]!r}"
+        if fault is not None:
+            message = f"{archive} holds {fault}: pack answers alone, the folder {FOLDER} as it lies below OUT"
+            raise StoreError(message)
+        if is_plain:
+            seen.add(str(path))
+            yield str(path), member
+
+
+def _is_of_run(path: PurePosixPath, *, is_file: bool) -> bool:
+    """Return whether a member is the record of a run or a part of its answers, or a folder on the way there.
+
+    >>> [_is_of_run(PurePosixPath(name), is_file=True) for name in ("runs/a/b/clean/vaduz/run.json", "runs/../a")]
+    [True, False]
     """
-    units = {unit: out / unit.relative_to(scratch) for unit in _units(scratch)}
-    for target in units.values():  # before the first is moved: where one cannot be, none is
+    parts = path.parts
+    is_within = bool(parts) and parts[0] == FOLDER and all(map(_PART.fullmatch, parts))
+    if not is_file:
+        return is_within and len(parts) < _DEPTH
+    return is_within and len(parts) == _DEPTH and _FILE.fullmatch(parts[-1]) is not None
+
+
+def _check_runs(archive: Path, scratch: Path) -> None:
+    """Refuse answers without a sound record of their run: it is what tells who gave them."""
+    for folder in sorted({path.parent for path in scratch.rglob("*") if path.is_file()}):
+        try:
+            about = parse_json((folder / prediction_files.RUN).read_bytes())
+        except (OSError, ValueError, RecursionError):
+            about = None
+        if not isinstance(about, dict):
+            where = folder.relative_to(scratch)
+            message = f"{archive} holds no sound {prediction_files.RUN} in {where}: pack each run with its record"
+            raise StoreError(message)
+
+
+def _lay_all(scratch: Path, out: Path, sha256: str) -> int:
+    """Move the answers to each task to where none lie, marked; return how many were moved."""
+    units = {run.parent: out / run.parent.relative_to(scratch) for run in scratch.rglob(prediction_files.RUN)}
+    for unit, target in units.items():  # before the first is moved: where one cannot be, none is
+        prediction_files.mark_packed(unit, sha256)
         target.parent.mkdir(parents=True, exist_ok=True)
     new = {unit: target for unit, target in units.items() if not target.exists()}
     for unit, target in new.items():
         unit.rename(target)
     return len(new)
-
-
-def _units(folder: Path) -> Iterator[Path]:
-    for parent, folders, files in os.walk(folder):
-        if files:
-            folders.clear()  # they belong to it
-            yield Path(parent)

@@ -7,7 +7,7 @@ from typing import Any, Final
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.tables import DAGGER, Column, Mark
 from sasgeo_bench.scoring.metrics import METRICS
-from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, REPRODUCED, RUN_HERE
+from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE
 from sasgeo_bench.scoring.verdicts import LEAST_PLACES
 from sasgeo_bench.tasks.query import BY, PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
@@ -125,6 +125,7 @@ MARKS: Final[dict[str, str]] = {  # words next to names and ranks
     REPRODUCED: "it was run on a private seed of 128 bits too, and no figure is shown to be worse there",
     NOT_REPRODUCED: "it was run on a private seed too, and is shown to be worse there: do not trust the row",
     AS_SUBMITTED: "a file of answers; nobody here has run its code",
+    PACKED: "answers of an archive that lay beside the pipeline file; what is not in it was asked here",
     "trained on": "the places that its parameters come from",
     "set apart": "in a table of its own and in no rank, for the reason stated there",
     FAILED_CONTROL: "it fails a control of the board, whose right score is known beforehand: do not trust the row",
@@ -136,7 +137,7 @@ FEW: Final = Mark(
     meaning=f"fewer than {LEAST_PLACES} places: nobody is ranked, and other places of the kind may well differ",
     tone="warn",
 )
-_TONES: Final = {RUN_HERE: "plain", REPRODUCED: "good", NOT_REPRODUCED: "warn", AS_SUBMITTED: "warn"}
+_TONES: Final = {RUN_HERE: "plain", REPRODUCED: "good", NOT_REPRODUCED: "warn", AS_SUBMITTED: "warn", PACKED: "warn"}
 
 
 def column(term: str, *, is_number: bool = True, order: str = "none", title: str = "") -> Column:
@@ -194,11 +195,11 @@ def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:
     >>> [mark.text for mark in marks_of({"how": "as submitted", "trained_on": ["porto"]}, is_control=False)]
     ['as submitted', 'trained on 1 place']
     """
-    if is_control:
-        return (CONTROL,)
     how = str(entry.get("how") or "")
     how = RUN_HERE if how == REPRODUCED and not entry.get("private") else how  # older boards had no private seed
     marks = [Mark(text=how, meaning=MARKS.get(how, "as the board says"), tone=_TONES.get(how, "plain"))] if how else []
+    if is_control:
+        return (CONTROL, *(mark for mark in marks if how == PACKED))
     places = [str(place) for place in entry.get("trained_on") or ()]
     if places:
         meaning = f"its parameters come from {', '.join(places)}"

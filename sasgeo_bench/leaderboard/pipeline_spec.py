@@ -249,6 +249,16 @@ class ReferenceImagerySpec(Document):
         return min(sorted(dates), key=lambda date: abs((newest - date).days / DAYS_PER_YEAR - self.age_years))
 
 
+class ArchiveSpec(Document):
+    """The archive of answers beside the file (`experiments.head_start`), by its SHA-256: another one is not unpacked.
+
+    >>> ArchiveSpec(sha256="0" * 64).sha256[:4]
+    '0000'
+    """
+
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
 class PipelineFile(NamedDocument):
     """A pipeline file: suites on regions of a split, the paper's experiment, or both.
 
@@ -272,11 +282,12 @@ class PipelineFile(NamedDocument):
     top_k: Annotated[int, Field(ge=1, le=1000)] = 25
     match_s: Annotated[float, Field(gt=0, le=3600)] = 30.0
     draws: Annotated[int, Field(ge=100, le=100_000)] = 10_000
+    archive: ArchiveSpec | None = None
 
     @property
     def sha256(self) -> str:
-        """Hash of all that it says, defaults among it, as `board.json` names it."""
-        unsaid = {name for name in ("learning", "reference_imagery") if getattr(self, name) is None}
+        """Hash of all that it says of the experiment, defaults among it, as `board.json` names it."""
+        unsaid = {"archive"} | {name for name in ("learning", "reference_imagery") if getattr(self, name) is None}
         fields = self.model_dump(mode="json", exclude=unsaid)
         pilots = [item["pilot"] for item in fields["contrast"] if item["pilot"] is not None]
         named = {**fields, "pilot": pilots}

@@ -28,7 +28,7 @@ from sasgeo_bench.scoring.intervals import (
 )
 from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metrics import FALSE_ABSENT, primary_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, REPRODUCED, RUN_HERE, name_alone
+from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, name_alone
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP
 from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
@@ -251,7 +251,9 @@ class OnPrivate:
     rows: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     def how(self, entry: Entry) -> str:
-        """Return how an entry's answers were made, and how they fared on the private seed."""
+        """Return how an entry's answers were made, and how they fared on the private seed, but of packed ones."""
+        if entry.how == PACKED:
+            return PACKED
         return str(self.rows[entry.name]["verdict"]) if entry.name in self.rows else entry.how
 
 
@@ -311,7 +313,7 @@ def hold_private(
     known = {_whose(entry["name"], entry): entry for entry in about["entries"]}
     rows = {}
     for entry in entries:
-        if not entry.runs:
+        if not entry.runs or entry.how == PACKED:
             continue
         other = known.get(_whose(entry.name, {"version": entry.version, "hash": entry.hash}))
         why = _lack(other, about[task_files.PRIVATE])

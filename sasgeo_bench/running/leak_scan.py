@@ -51,7 +51,8 @@ _TELLING: Final = frozenset(
     }
 )
 _OUT: Final = frozenset({"tasks", "truth"})
-_OF_OUT: Final = ("tasks", "truth", "runs", "boards", "release", "results", "sheets")
+_OF_OUT: Final = ("tasks", "truth", "runs", "boards", "release", "results", "sheets", "segmenters")
+PACKED: Final = ".tar.xz"  # beside a pipeline file: answers (`experiments.head_start`)
 _HISTORY: Final = frozenset({".git", ".hg"})  # they hold all results that were ever committed
 _SKIPPED: Final = frozenset({"site-packages", "dist-packages", "node_modules", "__pycache__"})
 _INTERPRETER: Final = frozenset({"pyvenv.cfg", "conda-meta"})
@@ -153,6 +154,7 @@ def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]
         return [], []
     base = folder.rstrip("/")
     telling = {name for name in names if name in _HISTORY or name.endswith(SEED)}  # truths are drawn by the seed
+    telling |= {name for name in names if name.endswith(PACKED) and f"{name.removesuffix(PACKED)}.toml" in names}
     found = [Telling(folder=f"{base}/{name}") for name in sorted(telling)]
     skipped = {*_HISTORY, *_SKIPPED}
     if names >= _OUT:

@@ -32,7 +32,11 @@ MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once
 _MOST_S: Final = 7 * 86_400.0
 _BYTES_PER_MB = 10**6
-_HIDDEN: Final = ("tasks", "truth", "runs", "boards", "release", "sheets", "sealed")  # below a root: they reveal truths
+# Folders below a root that reveal truths, answers, or what pictures of later queries show.
+_HIDDEN: Final = (
+    *("tasks", "truth", "runs", "boards", "release", "results", "sheets", "sealed"),
+    *("segmenters", "private", "datasets", "head-start"),
+)
 _LATER_LIMITS: Final = ("scratch_bytes", "processes")  # hashed only where they differ from the default
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 

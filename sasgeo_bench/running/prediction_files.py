@@ -34,6 +34,7 @@ from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
 from sasgeo_bench.texts import MOST_MESSAGE, json_text, one_line
 
 RUN: Final = "run.json"
+PACKED: Final = "packed.json"  # beside it where answers came packed: they were not asked here, whatever `run.json` says
 ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is asked again
 _MEND: Final = "write it again, or remove it where it is a part of a run"
 _MEND_ROUND: Final = "remove it and enter with --again"
@@ -437,7 +438,10 @@ def write_run(folder: Path, about: Mapping[str, Any]) -> None:
 
 
 def read_run(folder: Path) -> dict[str, Any] | None:
-    """Read `run.json`; return None if there is none, raise `StoreError` if it is damaged."""
+    """Read `run.json`, marked as `packed` where answers came in an archive; None if there is no run.
+
+    Raise `StoreError` if it is damaged.
+    """
     path = folder / RUN
     if not path.is_file():
         return None
@@ -445,4 +449,15 @@ def read_run(folder: Path) -> dict[str, Any] | None:
     if not isinstance(content, dict):
         message = f"{path} is damaged (it holds {str(content)[:40]!r}): {_MEND_RUN}"
         raise StoreError(message)
+    mark = folder / PACKED
+    if mark.exists():
+        content["packed"] = True
     return content
+
+
+def mark_packed(folder: Path, sha256: str) -> None:
+    """Mark the answers of a run for good as such that came in an archive of this hash.
+
+    The mark has a file of its own: `run.json` is written anew when more is asked, and may be removed.
+    """
+    (folder / PACKED).write_text(json_text({"archive_sha256": sha256}), encoding="utf-8")

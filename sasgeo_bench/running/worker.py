@@ -23,12 +23,13 @@ from typing import IO, Any, ClassVar, Final, Generic, Self, TypeVar
 import psutil
 
 import sasgeo_bench.running.child
+from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.folders import remove_tree
 from sasgeo_bench.matching.results import Status
 from sasgeo_bench.running import wire
 from sasgeo_bench.running.launch import PROGRAM
-from sasgeo_bench.running.leak_scan import walk_code
+from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
 from sasgeo_bench.running.replies import PluginReply, Reply, read_reply
 from sasgeo_bench.sensing.packing import LABELLED
@@ -239,7 +240,8 @@ class PluginProcess(ABC, Generic[AnyReply]):
         code = _code()
         scan = walk_code(code)
         found = scan.hidden([*code, *self.reach.readable])
-        hidden = [*map(str, self.reach.hidden), *(path for path in found if not self._is_lesson(path))]
+        packed = sorted(shipped_dir("pipelines").glob(f"*{PACKED}"))  # answers; nobody walks what is installed
+        hidden = [*map(str, (*self.reach.hidden, *packed)), *(path for path in found if not self._is_lesson(path))]
         return {
             "readable": [str(path) for path in (*code, *self.reach.readable)],
             "scratch": scratch,

@@ -21,7 +21,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.controls import Verdict, knows_too_much
 from sasgeo_bench.scoring.cost import run_cost
-from sasgeo_bench.scoring.rows import AS_SUBMITTED, RUN_HERE, is_unranked
+from sasgeo_bench.scoring.rows import AS_SUBMITTED, PACKED, RUN_HERE, is_unranked
 from sasgeo_bench.scoring.submission_files import predictions_name, read_submission
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.split import Split
@@ -187,7 +187,7 @@ def _entries_of_runs(by_run: _ByRun) -> list[Entry]:
                 name=shown,
                 version=number,
                 hash=digest,
-                how=RUN_HERE,
+                how=PACKED if any(about.get("packed") for _, about in found) else RUN_HERE,
                 sources=tuple(folder for folder, _ in found),
                 runs=tuple(about for _, about in found),
             )

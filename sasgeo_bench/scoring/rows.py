@@ -18,6 +18,7 @@ from sasgeo_bench.scoring.score import MISSING
 ALL_SUITES: Final = "all suites"
 AS_SUBMITTED: Final = "as submitted"  # source of the answers: their author,
 RUN_HERE: Final = "run here"  # our run of the code, on queries of a public seed only,
+PACKED: Final = "answers came packed"  # in an archive beside a pipeline file: nobody here has asked for them,
 REPRODUCED: Final = "reproduced"  # or of a private seed too, where it is not shown to be worse,
 NOT_REPRODUCED: Final = "not reproduced"  # or is shown to be worse
 UNRANKED: Final = frozenset(  # controls: not ranked

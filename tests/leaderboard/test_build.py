@@ -31,6 +31,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.prediction_files import mark_packed
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.scoring import contestants, tables
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -147,6 +148,17 @@ def test_progress_counts_every_group_of_queries_and_every_entry(out):
     board = make_board(request, tell=lambda _: None, progress=Counts())
     groups = board.scores["oracle_pose"][["suite", "track", "prior_group"]].drop_duplicates()
     assert begun == done == {tables.INTERVALS: len(groups), JUDGED: 1}
+
+
+def test_an_entry_of_which_some_answers_came_packed_says_so_on_every_board(out, tmp_path):
+    shutil.copytree(out / "runs", tmp_path / "runs")
+    (run, *_) = sorted((tmp_path / "runs").rglob("run.json"))
+    assert {entry.how for entry in find_entries([tmp_path / "runs"])} == {"run here"}
+    mark_packed(run.parent, "ab" * 32)
+    name = json.loads(run.read_text())["matcher"]["name"]
+    said = {entry.name: entry.how for entry in find_entries([tmp_path / "runs"])}
+    assert said.pop(name) == "answers came packed"
+    assert "answers came packed" not in said.values()
 
 
 def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_path):

@@ -18,7 +18,8 @@ from sasgeo_bench.leaderboard.board_files import read_board
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.leaderboard.private_board import compare_seeds, seed_lines, verdict_of
+from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, seed_lines, verdict_of
+from sasgeo_bench.leaderboard.tables import Cell, text_of
 from sasgeo_bench.leaderboard.validity_tables import seed_table
 from sasgeo_bench.publishing.archive import pack_board, request_of, score_all
 from sasgeo_bench.publishing.build import publish
@@ -26,6 +27,8 @@ from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.running import sandbox
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
+from sasgeo_bench.scoring.entries import Entry
+from sasgeo_bench.scoring.rows import PACKED
 from sasgeo_bench.tasks.build import ensure_tasks
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -299,3 +302,13 @@ def test_boards_of_older_programs_do_not_pass_for_reproduced():
         assert [mark.text for mark in marks_of(entry, is_control=False)] == [shown]
     entry = {"how": "reproduced", "private": {"verdict": "reproduced", "why": "", "figures": []}}
     assert [mark.text for mark in marks_of(entry, is_control=False)] == ["reproduced"]
+
+
+def test_rows_of_answers_that_came_packed_say_so_whatever_a_private_seed_shows():
+    packed = Entry(name="mine", version="1", hash="ab", how=PACKED, sources=())
+    for verdict in ("run here", "reproduced"):
+        assert OnPrivate(rows={"mine": {"verdict": verdict}}).how(packed) == "answers came packed"
+    for is_control in (True, False):
+        assert "answers came packed" in [mark.text for mark in marks_of({"how": PACKED}, is_control=is_control)]
+        shown = Cell(text="random", marks=marks_of({"how": PACKED}, is_control=is_control))
+        assert "(answers came packed)" in text_of(shown)

@@ -9,7 +9,9 @@ import pytest
 
 from sasgeo_bench.leaderboard import board_files
 from sasgeo_bench.publishing import archive_file, release_files, site_files
-from sasgeo_bench.running import leak_scan
+from sasgeo_bench.running import leak_scan, worker
+from sasgeo_bench.running.segmenter_process import SegmenterProcess
+from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.scoring import submission_files
 from sasgeo_bench.tasks import task_files
 
@@ -62,9 +64,8 @@ def test_what_stored_results_are_called_is_what_is_looked_for():
 def test_a_root_of_the_program_hides_all_of_it(tmp_path):
     lay(tmp_path, "out/tasks/clean/a/task.json", "out/truth/clean/a/truth.parquet", "out/runs/x/run.json", "out/x.txt")
     lay(tmp_path, "out/regions/a/region.json", "out/regions/a/layers.tif")
-    everything = [
-        *sorted(f"out/{name}" for name in ("boards", "release", "results", "runs", "sheets", "tasks", "truth"))
-    ]
+    names = ("boards", "release", "results", "runs", "segmenters", "sheets", "tasks", "truth")
+    everything = [f"out/{name}" for name in names]
     assert hidden(tmp_path)[0] == sorted([*everything, "out/regions/a"])
     assert hidden(tmp_path, tmp_path / "out/regions/a")[0] == everything
 
@@ -127,3 +128,19 @@ def test_many_processes_of_a_run_share_a_walk(tmp_path, monkeypatch):
     leak_scan.walk_code([tmp_path])
     assert len(walks) == 2
     leak_scan._walked.cache_clear()
+
+
+def test_answers_packed_beside_a_pipeline_file_are_hidden_and_other_archives_are_not(tmp_path):
+    lay(tmp_path, "a/mine.toml", "a/mine.tar.xz", "a/weights.tar.xz", "b/other.toml")
+    assert hidden(tmp_path)[0] == ["a/mine.tar.xz"]
+
+
+@pytest.mark.parametrize("process", [Worker, SegmenterProcess])
+def test_the_archives_that_ship_are_hidden_from_every_plugin_although_nobody_walks_what_is_installed(
+    tmp_path, monkeypatch, process
+):
+    lay(tmp_path, "pipelines/demo.tar.xz")
+    monkeypatch.setattr(worker, "shipped_dir", lambda kind: tmp_path / kind)
+    reach = Reach(readable=[], hidden=[])
+    policy = process(spec="random", reach=reach, limits=Limits())._policy(str(tmp_path))
+    assert str(tmp_path / "pipelines/demo.tar.xz") in policy["hidden"]

@@ -82,6 +82,8 @@ def test_every_run_hides_the_files_of_seeds_beside_the_code(made):
 def test_the_file_of_a_pipelines_seed_is_hidden_wherever_it_lies(tmp_path):
     request = RunRequest(spec="random", tasks=[], out=tmp_path, hidden=[tmp_path / "far" / "my.seed"])
     assert tmp_path / "far" / "my.seed" in reach_of(request, ()).hidden
+    others = {"truth", "segmenters", "private", "results", "datasets"}
+    assert {request.out.resolve() / name for name in others} <= set(reach_of(request, ()).hidden)
 
 
 def test_a_matcher_that_bears_a_shipped_name_is_refused_before_it_is_asked_or_tried(made, monkeypatch):

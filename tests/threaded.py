@@ -5,14 +5,13 @@ import socket
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib import import_module
 from types import SimpleNamespace
 
 import pytest
 
 from sasgeo_bench.running import answers, plan, profiling, segmenter_testing, segmenting, testing, training
 from sasgeo_bench.running.segmenter_process import SegmenterProcess
-from sasgeo_bench.running.serve import TOOLS, PluginServer, Server
+from sasgeo_bench.running.serve import PluginServer, Server
 from sasgeo_bench.running.serve_segmenter import SegmenterServer
 from sasgeo_bench.running.worker import PluginProcess, Worker
 
@@ -54,8 +53,6 @@ class ThreadedSegmenter(_Threaded, SegmenterProcess):
 @contextmanager
 def threaded() -> Iterator[None]:
     """Serve every matcher and segmenter by a thread."""
-    for tool in TOOLS:  # the hash of a matcher's code covers those that are imported: all of them, from the beginning
-        import_module(f"sasgeo_bench.{tool}")
     with pytest.MonkeyPatch.context() as patch:
         for module in (answers, plan, profiling, training, testing):
             patch.setattr(module, "Worker", Threaded)

@@ -7,10 +7,17 @@ import sys
 import warnings
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from importlib.metadata import Distribution, EntryPoint, entry_points
+from importlib.metadata import Distribution, EntryPoint
 from typing import TYPE_CHECKING, Any, Final
 
 from sasgeo_bench.errors import MatchError, SasgeoError
+from sasgeo_bench.matching.plugin_files import (
+    import_paths,
+    is_ours,
+    is_shipped,
+    read_entry_points,
+    strange_file,
+)
 from sasgeo_bench.texts import message_of, one_line
 
 if TYPE_CHECKING:
@@ -22,8 +29,6 @@ MATCHERS: Final = "sasgeo_bench.matchers"
 TRACKERS: Final = "sasgeo_bench.trackers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 SEGMENTERS: Final = "sasgeo_bench.segmenters"
-SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
-_MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
 YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are never ranked
 # The runner's own controls, which are given the truth: no plugin can have their names.
 ORACLE: Final = "oracle_pose"
@@ -62,19 +67,19 @@ def _installed(group: str) -> list[EntryPoint]:
             f"an installed package has entry points that cannot be read ({message_of(error)}): reinstall or remove it"
         )
         raise MatchError(message) from error
-    return sorted(installed, key=lambda point: (_home(point) not in SHIPPED, _home(point), point.value))
+    return sorted(installed, key=lambda point: (not is_ours(point), _home(point), point.value))
 
 
 @lru_cache(maxsize=8)
 def _read(group: str, _: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Read the entry points of a group once for each list of places that packages are imported from."""
-    return tuple(entry_points(group=group))
+    return tuple(read_entry_points(group))
 
 
 def _clash(first: EntryPoint, other: EntryPoint) -> str:
     """Name two plugins with the same name, and say which is used: ours, otherwise neither."""
     lost = f"{_home(other)} ({other.value})"
-    if _home(first) in SHIPPED:
+    if is_ours(first):
         return f"two plugins are named {first.name!r}: {_home(first)} is used, {lost} is not"
     return (
         f"two plugins are named {first.name!r}: {_home(first)} ({first.value}) and {lost}, so neither is used: "
@@ -84,7 +89,7 @@ def _clash(first: EntryPoint, other: EntryPoint) -> str:
 
 def shipped_names(group: str = MATCHERS) -> frozenset[str]:
     """Return the names of shipped plugins of a group, which no other plugin may use."""
-    shipped = {point.name for point in _installed(group) if _home(point) in SHIPPED}
+    shipped = {point.name for point in _installed(group) if is_ours(point)}
     return frozenset(shipped | {_RESERVED[group]} if group in _RESERVED else shipped)
 
 
@@ -99,11 +104,12 @@ def check_card_name(spec: str, name: str, *, is_oracle: bool = False, group: str
     sasgeo_bench.errors.MatchError: mine:Matcher: its card is named 'oracle_pose', as a matcher that ships: rename it
     """
     shipped = shipped_names(group)
-    is_ours = spec.partition(":")[0].partition(".")[0] in _MODULES if ":" in spec else spec in shipped
-    if not is_ours and name in shipped:
+    module, is_class, _ = spec.partition(":")
+    ships = is_shipped(module, import_paths(spec)) if is_class else spec in shipped
+    if not ships and name in shipped:
         message = f"{one_line(spec)}: its card is named {name!r}, as a {KINDS[group]} that ships: rename it"
         raise MatchError(message)
-    if name.startswith(YARDSTICK) and not (is_ours or is_oracle):
+    if name.startswith(YARDSTICK) and not (ships or is_oracle):
         message = (
             f"{one_line(spec)}: its card is named {name!r}, and names that begin with {YARDSTICK} are of oracles, "
             "which use the truth: rename it"
@@ -265,9 +271,39 @@ def _known(name: str, group: str) -> EntryPoint:
         raise _unknown(name, group)
     others = {point.value: point for point in _installed(group) if point.name == name and point != points[name]}
     rival = next((point for value, point in others.items() if value != points[name].value), None)
-    if rival is not None and _home(points[name]) not in SHIPPED:
+    if rival is not None and not is_ours(points[name]):
         raise MatchError(_clash(points[name], rival))
+    _check_place(points[name])
     return points[name]
+
+
+def _check_place(point: EntryPoint) -> None:
+    """Refuse a plugin that ships where other code of its name would be imported: its rows would not be its own."""
+    strange = strange_file(point.module, import_paths(point.name)) if is_ours(point) else None
+    if strange is not None:
+        message = (
+            f"{point.name}: {point.module} would be imported from {one_line(str(strange))}, and not from where "
+            f"{_home(point)} is installed: take that folder off PYTHONPATH"
+        )
+        raise MatchError(message)
+
+
+def code_of(spec: str, *groups: str) -> tuple[str, str]:
+    """Return module and name of the class behind a name of one of the groups, or behind module:Class.
+
+    Nothing is imported. Raise `MatchError` if there is none of that name.
+
+    >>> code_of("random", MATCHERS, TRACKERS)
+    ('sasgeo_bench.matching.controls.blind', 'RandomPlaces')
+    """
+    if ":" in spec:
+        module, _, name = spec.partition(":")
+        return module, name
+    group = next((one for one in groups if spec in list_entry_points(one)), None)
+    if group is None:
+        raise _unknown(spec, *groups)
+    point = _known(spec, group)
+    return point.module, point.attr
 
 
 def _unknown(name: str, *groups: str) -> MatchError:

@@ -19,6 +19,7 @@ from sasgeo_bench.matching.results import SOUND, STATUSES, Status, matcher_hash
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.code_hash import matcher_code
 from sasgeo_bench.running.oracle import CARD
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, map_of, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
@@ -311,7 +312,7 @@ def _check_sizes(limits: Limits) -> None:
 
 
 def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
-    """Return a plugin's card, the hash of its code, and whether it learns, as its own process reports them."""
+    """Return a plugin's card and whether it learns, as its own process reports them, and the hash of its code."""
     if request.spec == ORACLE:
         return CARD, "", False
     with Worker(spec=request.spec, reach=reach_of(request, ()), limits=request.limits) as worker:
@@ -320,7 +321,7 @@ def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
         cause = reply.message or "the plugin has no card"
         raise MatchError(cause if request.spec in cause else f"{request.spec}: cannot be made ({cause})")
     check_card_name(request.spec, reply.card.name, is_oracle=request.is_oracle)
-    return reply.card, reply.code, reply.learns
+    return reply.card, matcher_code(request.spec), reply.learns
 
 
 def reach_of(request: RunRequest, regions: Sequence[Path]) -> Reach:

@@ -34,8 +34,8 @@ _SHOWN: Final = 60  # characters of where a fault is
 class PluginReply:
     """Reply of any plugin to a question, with its status, and its cause in one line.
 
-    `seconds` is by the runner's clock, `own_s` and `cpu_s` are those that the process reports. Loading returns the hash
-    `code` and whether the plugin `learns`; training, the `learned` text.
+    `seconds` is by the runner's clock, `own_s` and `cpu_s` are those that the process reports. Loading returns whether
+    the plugin `learns`; training, the `learned` text.
     """
 
     status: Status
@@ -43,7 +43,6 @@ class PluginReply:
     seconds: float | None = None
     own_s: float | None = None
     cpu_s: float = 0.0
-    code: str = ""
     learns: bool = False
     learned: str | None = None
 
@@ -136,13 +135,12 @@ class _Card(Strictly):
 class _Loaded(Strictly):
     status: Literal["ok"]
     card: _Card
-    code: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     learns: bool
 
     def reply(self) -> Reply:
         """Return the reply for the runner."""
         fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
-        return Reply(status="ok", card=MatcherCard(**fields), code=self.code, learns=self.learns)
+        return Reply(status="ok", card=MatcherCard(**fields), learns=self.learns)
 
 
 class _Trained(Strictly):

@@ -52,14 +52,13 @@ class _Card(Strictly):
 class _Loaded(Strictly):
     status: Literal["ok"]
     card: _Card
-    code: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
     learns: bool
 
     def reply(self, data: bytes) -> SegmenterReply:
         """Return the reply for the runner."""
         del data
         fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
-        return SegmenterReply(status="ok", card=SegmenterCard(**fields), code=self.code, learns=self.learns)
+        return SegmenterReply(status="ok", card=SegmenterCard(**fields), learns=self.learns)
 
 
 class _Trained(Strictly):

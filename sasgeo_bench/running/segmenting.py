@@ -13,6 +13,7 @@ from typing import Self
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER, SEGMENTERS, check_card_name
 from sasgeo_bench.matching.segmenter import SegmenterCard
+from sasgeo_bench.running.code_hash import segmenter_code
 from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.oracle_segmenter import CARD, ISOLATION, oracle_reply
 from sasgeo_bench.running.plan import TrainingResult, hidden_below
@@ -61,7 +62,7 @@ def _without(hidden: Path, shown: Sequence[Path]) -> list[Path]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadedSegmenter:
-    """Card of a segmenter, hash of its code, and whether it learns; as its own process reports them."""
+    """Card of a segmenter and whether it learns, as its own process reports them, and the hash of its code."""
 
     card: SegmenterCard
     code: str
@@ -78,7 +79,7 @@ def load_card(request: SegmentRequest) -> LoadedSegmenter:
         cause = reply.message or "the plugin has no card"
         raise MatchError(cause if request.spec in cause else f"{request.spec}: cannot be made ({cause})")
     check_card_name(request.spec, reply.card.name, group=SEGMENTERS)
-    return LoadedSegmenter(card=reply.card, code=reply.code, learns=reply.learns)
+    return LoadedSegmenter(card=reply.card, code=segmenter_code(request.spec), learns=reply.learns)
 
 
 def train_segmenter(request: SegmentRequest, images: Iterable[LabelledImage]) -> TrainingResult:

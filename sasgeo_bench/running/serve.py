@@ -2,15 +2,13 @@
 """Serve a runner inside the sandbox: load, learn, prepare, match or step; every failure becomes a message."""
 
 import errno
-import hashlib
 import os
 import socket
-import sys
 import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Self
@@ -19,6 +17,7 @@ import numpy as np
 import psutil
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching.follower import Follower
 from sasgeo_bench.matching.matcher import (
     Learner,
     Match,
@@ -41,11 +40,6 @@ if TYPE_CHECKING:
     from sasgeo_bench.geometry.grid import Grid
 
 MOST_MAPS: Final = 2  # cached while a matcher trains
-# Modules of this package that answers depend on: after a change there, queries are asked anew.
-TOOLS: Final = (
-    *("matching.controls", "matching.follower", "regions.evidence", "regions.graph", "regions.network", "search"),
-    "tasks.vectors",
-)
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
 
@@ -98,8 +92,8 @@ class Server(PluginServer):
     def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
         if message["kind"] == "load":
             self.matcher = load_method(self.spec)
-            about = {"card": asdict(self.matcher.card), "code": code_hash(self.matcher)}
-            return {"status": "ok", **about, "learns": isinstance(self.matcher, Learner)}, b""
+            card, learns = asdict(self.matcher.card), isinstance(self.matcher, Learner)
+            return {"status": "ok", "card": card, "learns": learns}, b""
         if self.matcher is None:
             self.matcher = load_method(self.spec)
         if message["kind"] == "learn":
@@ -128,8 +122,6 @@ class Server(PluginServer):
     def _following(self, matcher: Matcher) -> Tracker:
         """Return the tracker that asks a matcher of single views about flights."""
         if self._follower is None:
-            from sasgeo_bench.matching.follower import Follower  # noqa: PLC0415 - else it would be code of all matchers
-
             self._follower = Follower(matcher, grid=self._grid)
         return self._follower
 
@@ -244,39 +236,6 @@ class Maps(Mapping[str, Region]):
     def __len__(self) -> int:
         """Number of maps."""
         return len(self._folders)
-
-
-def code_hash(plugin: object, tools: Sequence[str] | None = None) -> str:
-    """Return the SHA-256 of the code that makes answers: the plugin's own, and the tools, `TOOLS`, that it has loaded.
-
-    Its own is the file of its class or, in a package, all Python files next to and below it, by name; of a tracker that
-    asks a `matcher`, also that one's.
-    """
-    digest = hashlib.sha256()
-    named = _own_files(plugin)
-    if not named:
-        return digest.hexdigest()
-    asked = getattr(plugin, "matcher", None)
-    named |= {f"matcher:{name}": path for name, path in (() if asked is None else _own_files(asked).items())}
-    loaded = [sys.modules.get(f"sasgeo_bench.{tool}") for tool in (TOOLS if tools is None else tools)]
-    for path in (Path(tool.__file__) for tool in loaded if tool is not None and tool.__file__):
-        for part in sorted(path.parent.glob("*.py")) if path.name == "__init__.py" else [path]:
-            named[f"sasgeo_bench:{part.relative_to(path.parent.parent).as_posix()}"] = part
-    for shown, path in named.items():
-        digest.update(shown.encode() + b"\0" + path.read_bytes() + b"\0")
-    return digest.hexdigest()
-
-
-def _own_files(plugin: object) -> dict[str, Path]:
-    """Return the files of a plugin's own code by name; none if its class is of no file."""
-    module = sys.modules.get(type(plugin).__module__)
-    name = getattr(module, "__file__", None)
-    if name is None:
-        return {}
-    own = Path(name)
-    is_package = "." in type(plugin).__module__ or own.name == "__init__.py"
-    files = sorted(own.parent.rglob("*.py")) if is_package else [own]
-    return {path.relative_to(own.parent).as_posix(): path for path in files}
 
 
 def _resident_bytes() -> int:

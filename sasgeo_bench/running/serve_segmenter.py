@@ -6,7 +6,7 @@ import time
 import zlib
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.plugins import load_segmenter
@@ -17,11 +17,8 @@ from sasgeo_bench.matching.segmenter import (
     check_segmentation,
     check_text,
 )
-from sasgeo_bench.running.serve import PluginServer, code_hash, package_of
+from sasgeo_bench.running.serve import PluginServer, package_of
 from sasgeo_bench.sensing.image_bytes import LabelledFiles, image_from
-
-# Modules of this package that segmentations depend on, as `serve.TOOLS` are those of a matcher's answers.
-SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera", "sensing.intrinsics")
 
 
 class SegmenterServer(PluginServer):
@@ -39,8 +36,8 @@ class SegmenterServer(PluginServer):
         if self.segmenter is None:
             self.segmenter = load_segmenter(self.spec)
         if message["kind"] == "load":
-            about = {"card": asdict(self.segmenter.card), "code": code_hash(self.segmenter, SEGMENTER_TOOLS)}
-            return {"status": "ok", **about, "learns": isinstance(self.segmenter, LearningSegmenter)}, b""
+            card, learns = asdict(self.segmenter.card), isinstance(self.segmenter, LearningSegmenter)
+            return {"status": "ok", "card": card, "learns": learns}, b""
         if message["kind"] == "learn":
             return _learn(self.segmenter, message)
         return _segment(self.segmenter, blob, self.learned)

@@ -26,6 +26,7 @@ import sasgeo_bench.running.child
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.folders import remove_tree
+from sasgeo_bench.matching.plugin_files import import_paths
 from sasgeo_bench.matching.results import Status
 from sasgeo_bench.running import wire
 from sasgeo_bench.running.launch import PROGRAM
@@ -188,9 +189,8 @@ class PluginProcess(ABC, Generic[AnyReply]):
             started = self._heard_of_start(ours)
             self.isolation = {str(name): one_line(str(text)) for name, text in dict(started["isolation"]).items()}
         self.isolation["memory"] = _memory_words(self.limits, self._group)
-        paths = [os.getcwd(), *filter(None, sys.path)]  # noqa: PTH109
         luggage = self._luggage()
-        start = {"door": self.door, "spec": self.spec, "scratch": str(self._scratch), "paths": paths}
+        start = {"door": self.door, "spec": self.spec, "scratch": str(self._scratch), "paths": import_paths(self.spec)}
         wire.send(ours, start | {"has_luggage": luggage is not None}, luggage or b"")
         return ours
 

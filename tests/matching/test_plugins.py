@@ -9,10 +9,11 @@ from importlib.metadata import distribution
 import pytest
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching import plugin_files
 from sasgeo_bench.matching.matcher import MatcherCard
+from sasgeo_bench.matching.plugin_files import SHIPPED, find_module, home_of
 from sasgeo_bench.matching.plugins import (
     MATCHERS,
-    SHIPPED,
     check_card_name,
     check_names,
     list_entry_points,
@@ -100,11 +101,16 @@ a_number = 3
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Put a distribution with entry points and modules on the import path, in front of all others."""
-    modules = set(sys.modules)
+    """Put a distribution with entry points and modules on the import path, in front of all others.
 
-    def put(name: str, points: dict[str, str], **sources: str) -> None:
+    With a name of ours it is installed as they are, unless it is but called so (`is_installed`).
+    """
+    modules, bases = set(sys.modules), plugin_files._bases()
+
+    def put(name: str, points: dict[str, str], *, is_installed: bool = True, **sources: str) -> None:
         folder = tmp_path / name
+        if name in SHIPPED and is_installed:
+            monkeypatch.setattr(plugin_files, "_bases", lambda: (*bases, folder))
         about = folder / f"{name.replace('-', '_')}-1.0.dist-info"
         about.mkdir(parents=True)
         (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
@@ -185,6 +191,50 @@ def test_of_two_with_one_name_the_built_in_one_wins_and_both_are_named(install, 
     assert f"{ours} is used, an-outsider (outside:Sound) is not" in said
     with pytest.warns(UserWarning, match="two plugins"):
         assert type(load_matcher("sound")).__module__ == "built_in"
+
+
+@pytest.mark.parametrize("ours", [*SHIPPED, "Sasgeo_Bench"])
+def test_who_only_calls_himself_as_we_are_called_takes_no_name_of_ours(install, ours) -> None:
+    install(ours, {"random": "built_in:Sound", "mine": "built_in:Sound"}, is_installed=False, built_in=SOUND)
+    with pytest.warns(UserWarning, match="two plugins are named 'random'"):
+        points = list_entry_points()
+    assert points["random"].value == "sasgeo_bench.matching.controls.blind:RandomPlaces"
+    assert points["raster_uniform"].module == "sasgeo_baselines.raster"
+    with pytest.raises(MatchError, match="as a matcher that ships: rename it"):
+        check_card_name("mine", "random")
+
+
+def test_a_folder_named_as_our_package_takes_no_name_of_ours(tmp_path, monkeypatch) -> None:
+    fake = tmp_path / "sasgeo_baselines"
+    fake.mkdir()
+    (fake / "__init__.py").write_text("")
+    (fake / "raster.py").write_text(SOUND.replace("Sound", "RasterUniform"))
+    monkeypatch.chdir(tmp_path)  # for a registered name the working folder comes last
+    check_names(matchers=["raster_uniform"])
+    with pytest.raises(
+        MatchError, match=r"^sasgeo_baselines\.raster:RasterUniform: its card is named 'raster_uniform'"
+    ):
+        check_card_name("sasgeo_baselines.raster:RasterUniform", "raster_uniform")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    words = (
+        r"^raster_uniform: sasgeo_baselines\.raster would be imported from .*, and not from where sasgeo-baselines is"
+    )
+    with pytest.raises(MatchError, match=words) as refused:
+        check_names(matchers=["raster_uniform"])
+    assert str(refused.value).endswith("take that folder off PYTHONPATH")
+    check_names(matchers=["random"])
+
+
+def test_modules_are_found_as_python_would_and_nothing_of_them_runs(tmp_path) -> None:
+    for name in ("whole/__init__.py", "whole/deep/__init__.py", "whole/deep/code.py", "bare/inner/code.py", "one.py"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text("raise SystemExit")
+    paths = [str(tmp_path)]
+    places = {"whole.deep.code": "whole", "bare.inner.code": "bare/inner/code.py", "one": "one.py"}
+    for name, place in places.items():
+        assert home_of(name, paths).path == tmp_path / place
+    for name in ("one.inner", "whole.none", "none", "", ".", "..a", "whole..deep", "a/b", "one\0"):
+        assert find_module(name, paths) is None, name
 
 
 @pytest.mark.parametrize("order", [("b-second", "a-first"), ("a-first", "b-second")])

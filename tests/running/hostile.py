@@ -349,7 +349,7 @@ class FarAway(Plain):
 
 class CardOfAList(Plain):
     def __init__(self):
-        write_past_the_server('{"nonce": "NONCE", "status": "ok", "code": "", "learns": false, "card": [[]]}')
+        write_past_the_server('{"nonce": "NONCE", "status": "ok", "learns": false, "card": [[]]}')
         time.sleep(1000)
 
 

@@ -1,69 +1,183 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What makes a run another run: the plugin's own code, and that of the rooms it answers with."""
+"""What makes a run another run: the files of a plugin's own code, and those of the tools that it imports."""
 
 import sys
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-from sasgeo_bench.matching.matcher import Matcher
-from sasgeo_bench.running import serve
-from sasgeo_bench.running.serve import TOOLS, code_hash
+from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching.plugins import MATCHERS
+from sasgeo_bench.running import code_hash
+from sasgeo_bench.running.code_hash import SEGMENTER_TOOLS, TOOLS, digest_of, matcher_code, segmenter_code
 
-PLUGIN = "class Mine:\n    pass\n"
+MODULE = '''
+"""What it is."""
+import numpy as np
+
+
+class Mine:
+    """A matcher."""
+
+    def match(self, query, *, top_k):
+        """Answer."""
+        return [top_k, f"{query!r:>10}", 1.5, None, b"x"]
+'''
+SAME_TREE = '''
+# Other words, and other lines.
+
+
+import numpy as np
+
+class Mine:
+    def match(self, query, *, top_k):
+
+        """In other words,
+
+        and more of them."""
+        return [
+            top_k, f"{query!r:>10}", 1.5, None, b"x",
+        ]  # all of them
+'''
 
 
 @pytest.fixture
-def matcher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Matcher:
-    """A plugin of one file."""
-    (tmp_path / "mine_of_the_test.py").write_text(PLUGIN)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    monkeypatch.setattr(serve, "TOOLS", ())
-    module = __import__("mine_of_the_test")
-    monkeypatch.setitem(sys.modules, "mine_of_the_test", module)
-    made: Matcher = module.Mine()
-    return made
+def lay(tmp_path, monkeypatch):
+    """Write files into the working folder; the function returns the hash of `plugin:Mine`, or of another class."""
+    monkeypatch.chdir(tmp_path)
+
+    def write(files: dict[str, str | bytes], spec: str = "plugin:Mine") -> str:
+        for name, text in files.items():
+            path = tmp_path / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        sys.path_importer_cache.clear()  # files that are newer than the clock of folders tells
+        return matcher_code(spec)
+
+    return write
 
 
-def fake_tool(folder: Path, monkeypatch: pytest.MonkeyPatch, name: str = "search") -> Path:
-    """A room `sasgeo_bench.<name>` of two files, loaded; -> its second file."""
-    room = folder / name
-    room.mkdir()
-    (room / "__init__.py").write_text("")
-    (room / "find.py").write_text("beam = 1\n")
-    module = ModuleType(f"sasgeo_bench.{name}")
-    module.__file__ = str(room / "__init__.py")
-    monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.setattr(serve, "TOOLS", (name,))
-    return room / "find.py"
+def test_words_and_lines_change_no_hash_and_code_does(lay):
+    before = lay({"plugin.py": MODULE})
+    assert lay({"plugin.py": SAME_TREE}) == before
+    assert lay({"plugin.py": "\ufeff" + SAME_TREE.replace("\n", "\r\n")}) == before
+    for old, new in (("1.5", "1.25"), ("None", "0"), (":>10", ":>11"), ('b"x"', '"x"'), ("top_k,", "top_k + 0,")):
+        assert lay({"plugin.py": SAME_TREE.replace(old, new)}) != before, new
+    assert lay({"plugin.py": SAME_TREE}) == before
 
 
-def test_a_change_of_the_plugin_changes_its_hash(tmp_path: Path, matcher: Matcher) -> None:
-    before = code_hash(matcher)
-    assert before == code_hash(matcher)
-    (tmp_path / "mine_of_the_test.py").write_text(PLUGIN + "# changed\n")
-    assert code_hash(matcher) != before
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("x = None", "x = ..."),
+        ("x = 1", "x = 1.0"),
+        ("x = 1", "x = True"),
+        ("x = 0.0", "x = -0.0"),
+        ("x = [None]", "x = []"),
+        ("x = {**y}", "x = {None: y}"),
+        ("def f(a, *, b): pass", "def f(a, b): pass"),
+        ("def f(a=None): pass", "def f(a): pass"),
+        ("x: int", "x: int = None"),
+        ("class A(B): pass", "class A(metaclass=B): pass"),
+        ("return_ = 'doc'; 'doc'", "return_ = 'doc'"),
+        ("from . import a", "from .. import a"),
+        ("def f():\n  'doc'\n  'not'", "def f():\n  'doc'"),
+        ("not = python", "not  = python"),
+    ],
+)
+def test_what_differs_as_code_differs_as_hash(lay, one, other):
+    assert lay({"plugin.py": one}) != lay({"plugin.py": other})
 
 
-def test_a_change_of_the_search_it_has_loaded_changes_its_hash(
-    tmp_path: Path, matcher: Matcher, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    alone = code_hash(matcher)
-    find = fake_tool(tmp_path, monkeypatch)
-    before = code_hash(matcher)
-    assert before != alone
-    find.write_text("beam = 2\n")
-    assert code_hash(matcher) != before
+def test_all_of_a_package_counts_and_what_is_no_python_by_its_bytes(lay):
+    package = {"plugin/__init__.py": "from plugin.inner.code import Mine\n", "plugin/inner/code.py": MODULE}
+    before = lay(package)
+    for name in ("plugin/data/weights.npz", "plugin/settings.toml", "plugin/util.py", "plugin/fast.so"):
+        after = lay({name: b"x = 1"})
+        assert after != before, name
+        before = after
+    assert lay({"plugin/util.py": b"x = 1  # one"}) == before
+    assert lay({"plugin/settings.toml": b"x = 1 # one"}) != before
 
 
-def test_a_search_it_has_not_loaded_does_not_count(matcher: Matcher, monkeypatch: pytest.MonkeyPatch) -> None:
-    alone = code_hash(matcher)
-    monkeypatch.setattr(serve, "TOOLS", ("search",))
-    monkeypatch.delitem(sys.modules, "sasgeo_bench.search", raising=False)
-    assert code_hash(matcher) == alone
+def test_what_nobody_runs_does_not_count(lay):
+    before = lay({"plugin/__init__.py": MODULE})
+    others = (
+        "plugin/__pycache__/a.cpython-311.pyc",
+        "plugin/.cache/b.py",
+        "plugin/.c.swp",
+        "other.py",
+        "data.bin",
+        "plugin/card.toml",
+    )
+    assert lay(dict.fromkeys(others, b"?")) == before
 
 
-def test_the_rooms_that_count_are_there() -> None:
-    assert all(find_spec(f"sasgeo_bench.{tool}") for tool in TOOLS), "a file that moved would drop out of the hash"
+def test_a_module_beside_it_that_it_imports_counts_and_another_does_not(lay):
+    before = lay({"plugin.py": "import helper\n" + MODULE, "helper.py": "from deeper import x", "deeper/x.py": ""})
+    assert lay({"idle.py": "x = 1"}) == before
+    assert lay({"helper.py": "from deeper import x, y"}) != before
+    before = lay({"deeper/__init__.py": "x = 1"})
+    assert lay({"deeper/far.txt": "x"}) != before
+
+
+def test_a_class_that_is_handed_on_counts_where_it_is(lay, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path / "elsewhere"))
+    files = {"elsewhere/vendor/__init__.py": "from .deep import Mine as Mine", "elsewhere/vendor/deep.py": MODULE}
+    before = lay({"plugin.py": "from vendor import Mine", **files})
+    assert lay({"elsewhere/vendor/deep.py": MODULE.replace("1.5", "2.5")}) != before
+    ours = lay({"plugin.py": "from sasgeo_bench.matching.controls.blind import RandomPlaces as Mine"})
+    assert ours != lay({"plugin.py": "from sasgeo_bench.matching.controls.fft_vote import FftVote as Other"})
+
+
+def test_the_tools_that_it_imports_count_by_whatever_name(lay, monkeypatch):
+    texts = (
+        "from sasgeo_bench.search.find import score_at",
+        "import sasgeo_bench.search",
+        "import sasgeo_bench as sgb\ny = sgb.Chart",
+        "def later():\n    from sasgeo_bench import VotePlan",
+    )
+    alone = code_hash._rooms([])
+    for text in texts:
+        lay({"plugin.py": text})
+        assert code_hash._rooms([Path("plugin.py")]) >= {"search"}, text
+    lay({"plugin.py": "import sasgeo_bench as sgb\ny = sgb.Grid"})
+    assert code_hash._rooms([Path("plugin.py")]) == alone
+    before = lay({"plugin.py": texts[0], "changed.py": "beam = 1"})
+    files = code_hash._room_files
+    monkeypatch.setattr(code_hash, "_room_files", lambda room: [*files(room)][: -1 if room == "search" else None])
+    assert lay({}) != before
+
+
+def test_the_plugin_has_no_say_in_its_hash(lay, tmp_path):
+    """It runs nothing: what a plugin does when it is imported cannot change what is hashed."""
+    before = lay({"plugin.py": "raise SystemExit\n", "mark.txt": "x"})
+    liar = "import pathlib, sys\npathlib.Path('ran').touch()\nsys.modules.clear()\n__file__ = 'mark.txt'\n"
+    assert lay({"plugin.py": liar}) != before
+    assert not (tmp_path / "ran").exists()
+
+
+def test_what_is_nowhere_on_the_disk_is_refused_in_one_line(lay):
+    with pytest.raises(MatchError, match="no file of nowhere_to_be can be found"):
+        lay({}, "nowhere_to_be:Mine")
+    with pytest.raises(MatchError, match=f"there is no .* 'nobody' .*|{MATCHERS}"):
+        matcher_code("nobody")
+
+
+def test_names_are_part_of_a_hash_and_their_order_is_not(tmp_path):
+    one, two = tmp_path / "one.py", tmp_path / "two.py"
+    one.write_text("x = 1")
+    two.write_text("x = 2")
+    assert digest_of({"a": one, "b": two}) == digest_of({"b": two, "a": one}) != digest_of({"a": two, "b": one})
+
+
+def test_what_ships_has_a_hash_by_its_folder():
+    assert matcher_code("random") == matcher_code("prior_centre") != matcher_code("sasgeo")
+    assert segmenter_code("colour_thresholds") != matcher_code("raster_uniform")
+
+
+def test_the_rooms_that_count_are_there():
+    rooms = (*TOOLS, *SEGMENTER_TOOLS)
+    assert all(find_spec(f"sasgeo_bench.{tool}") for tool in rooms), "a file that moved would drop out of the hash"
+    assert all(code_hash._room_files(tool) for tool in rooms)

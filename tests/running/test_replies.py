@@ -31,7 +31,7 @@ CARD = {
     "code": "",
 }
 SOUND = {
-    "load": {"status": "ok", "card": CARD, "code": "0" * 64, "learns": False},
+    "load": {"status": "ok", "card": CARD, "learns": False},
     "learn": {"status": "ok", "seconds": 1.0, "learned": "text"},
     "prepare": {"status": "ok", "seconds": 1.0, "grown_bytes": 5},
     "match": {

@@ -1,0 +1,283 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The hash of the code that makes a plugin's answers: taken by the runner from files, and never told by the plugin.
+
+Rows are kept as long as it stays. Words change nothing: Python is hashed as its syntax tree, without comments,
+docstrings and positions, and alike by every version of Python.
+"""
+
+import ast
+import hashlib
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from importlib.util import resolve_name
+from pathlib import Path
+from typing import Any, Final
+
+from sasgeo_bench.errors import MatchError, counted
+from sasgeo_bench.matching.card_file import CARD_FILE
+from sasgeo_bench.matching.plugin_files import Home, file_of, find_module, home_of, import_paths, is_installed_file
+from sasgeo_bench.matching.plugins import MATCHERS, SEGMENTERS, TRACKERS, code_of
+
+_PACKAGE: Final = Path(__file__).resolve().parents[1]
+_OURS: Final = _PACKAGE.name
+# Modules of this package that answers depend on, if a plugin imports them: after a change there, it is asked anew.
+TOOLS: Final = (
+    *("matching.controls", "matching.follower", "regions.evidence", "regions.graph", "regions.network", "search"),
+    *("sasgeo", "tasks.vectors"),
+)
+_ALWAYS: Final = ("regions.evidence",)  # what every query is made of
+# The same of segmentations; whoever segments looks at pictures by all of them.
+SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera", "sensing.intrinsics")
+MOST_FILES: Final = 20_000  # of a plugin
+_MOST_STEPS: Final = 20  # from a name to where its class is
+_CACHES: Final = ("__pycache__",)
+_WORDS: Final = (CARD_FILE,)  # its version and places are told apart by themselves; all else in it is for readers
+_COMPILED: Final = (".pyc", ".pyo")
+_NO_CODE: Final = ("kind", "type_comment")  # fields of a syntax tree that change nothing
+
+
+def matcher_code(spec: str) -> str:
+    """Return the SHA-256 of the code of a matcher or tracker, by name or `module:Class`, and of the tools it imports.
+
+    Its own is all of the outermost package or module that it lies in, and of modules beside it that these import; of
+    one that ships, the files of its folder. Files that are no Python count by their bytes. Raise `MatchError` if there
+    is no such code.
+
+    >>> len(matcher_code("random")), matcher_code("random") == matcher_code("prior_centre")
+    (64, True)
+    """
+    return _code(spec, (MATCHERS, TRACKERS))
+
+
+def segmenter_code(spec: str) -> str:
+    """Return the SHA-256 of the code of a segmenter, as `matcher_code` does.
+
+    >>> len(segmenter_code("colour_thresholds"))
+    64
+    """
+    return _code(spec, (SEGMENTERS,))
+
+
+def _code(spec: str, groups: Sequence[str]) -> str:
+    module, name = code_of(spec, *groups)
+    paths = import_paths(spec)
+    own = _own_files(spec, module, name, paths)
+    rooms = SEGMENTER_TOOLS if groups == (SEGMENTERS,) else sorted({*_ALWAYS, *_rooms(own.values())})
+    tools = {f"{_OURS}:{_shown(path)}": path for room in rooms for path in _room_files(room)}
+    return digest_of(own | tools)
+
+
+def digest_of(files: Mapping[str, Path]) -> str:
+    """Return the SHA-256 of some files and the names they are known by."""
+    digest = hashlib.sha256()
+    for shown, path in sorted(files.items()):
+        digest.update(shown.encode() + b"\0" + file_digest(path))
+    return digest.hexdigest()
+
+
+def file_digest(path: Path) -> bytes:
+    """Return the SHA-256 of a file: of Python as its syntax tree; raise `MatchError` if it cannot be read."""
+    try:
+        about = path.stat()
+        return _file_digest(path, about.st_size, about.st_mtime_ns)
+    except OSError as error:
+        message = f"{path}, which is code of a plugin, cannot be read ({error.strerror}): check your rights"
+        raise MatchError(message) from error
+
+
+@lru_cache(maxsize=4096)
+def _file_digest(path: Path, size: int, changed_ns: int) -> bytes:
+    del size, changed_ns
+    if path.suffix != ".py":
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").digest()
+    data = path.read_bytes()
+    tree = _tree(data)
+    return hashlib.sha256(data if tree is None else "".join(_shape(tree)).encode(errors="replace")).digest()
+
+
+def _tree(data: bytes) -> ast.Module | None:
+    """Parse a file; None if it is no Python of this version."""
+    try:
+        return ast.parse(data)
+    except (SyntaxError, ValueError, RecursionError, MemoryError):
+        return None
+
+
+def _shape(node: object) -> Iterator[str]:
+    """Yield what a syntax tree says: types, fields and values, without docstrings, and what is empty or no code.
+
+    >>> one, two = (ast.parse(text) for text in ("def f(): 'Say.'; return 1", "def f(): return (1)  # one"))
+    >>> "".join(_shape(one)) == "".join(_shape(two))
+    True
+    """
+    if isinstance(node, ast.AST):
+        yield f"{type(node).__name__}("
+        for name, value in ast.iter_fields(node):
+            if name in _NO_CODE or value == [] or (value is None and not isinstance(node, ast.Constant)):
+                continue
+            yield f"{name}="
+            yield from _shape(value[1:] if name == "body" and _has_docstring(node) else value)
+        yield ")"
+    elif isinstance(node, list):
+        yield "["
+        for item in node:
+            yield from _shape(item)
+        yield "]"
+    else:
+        yield f"{node!r};"
+
+
+def _has_docstring(node: ast.AST) -> bool:
+    if not isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+        return False
+    first = node.body[0] if node.body else None
+    return isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant) and isinstance(first.value.value, str)
+
+
+def _own_files(spec: str, module: str, name: str, paths: Sequence[str]) -> dict[str, Path]:
+    """Return the files of a plugin's own code by name."""
+    found: dict[str, Path] = {}
+    for one in _ways(module, name, paths):
+        if one.partition(".")[0] == _OURS:
+            path = file_of(find_module(one, paths))
+            found |= {} if path is None else _named(_OURS, path.parent)
+            continue
+        home = home_of(one, paths)
+        if home is not None:
+            found |= _named(home.name, home.path) | _beside(home, paths)
+    if not found:
+        message = f"{spec}: no file of {module} can be found: rows are kept by its code, so it must lie on the disk"
+        raise MatchError(message)
+    if len(found) > MOST_FILES:
+        message = f"{spec}: the package of {module} holds {counted(len(found), 'file')}, {MOST_FILES} at most"
+        raise MatchError(message)
+    return found
+
+
+def _ways(module: str, name: str, paths: Sequence[str]) -> list[str]:
+    """Return the module of a class, and those that it is handed on from by `from ... import`."""
+    ways, wanted = [module], name.partition(".")[0]
+    for _ in range(_MOST_STEPS):
+        path = file_of(find_module(ways[-1], paths))
+        tree = None if path is None or path.suffix != ".py" else _tree(path.read_bytes())
+        found = next(
+            (
+                (_absolute(node, ways[-1], is_package=path is not None and path.name == "__init__.py"), alias.name)
+                for node in ast.walk(tree or ast.Module([], []))
+                if isinstance(node, ast.ImportFrom)
+                for alias in node.names
+                if (alias.asname or alias.name) == wanted
+            ),
+            None,
+        )
+        if found is None or found[0] in ways:
+            break
+        source, wanted = found
+        ways.append(_public().get(wanted, source) if source == _OURS else source)
+    return ways
+
+
+def _named(label: str, path: Path) -> dict[str, Path]:
+    """Return a file, or the files of a folder, by name, without what Python itself has compiled, and hidden ones."""
+    if path.is_file():
+        return {f"{label}{path.suffix}": path}
+    found: dict[str, Path] = {}
+    for parent, folders, files in os.walk(path):
+        folders[:] = [one for one in folders if one not in _CACHES and not one.startswith(".")]
+        for one in files:
+            inner = Path(parent, one)
+            if not one.startswith(".") and not one.endswith(_COMPILED) and one not in _WORDS and inner.is_file():
+                found[f"{label}/{inner.relative_to(path).as_posix()}"] = inner
+        if len(found) > MOST_FILES:
+            break
+    return found
+
+
+def _beside(home: Home, paths: Sequence[str]) -> dict[str, Path]:
+    """Return the files of modules beside one of somebody's own, and that it imports; none of what is installed."""
+    if is_installed_file(home.path):
+        return {}
+    found: dict[str, Path] = {}
+    seen, left = {home.path}, [home]
+    while left:
+        here = left.pop()
+        own = _named(here.name, here.path).values()
+        names = {name for path in own if path.suffix == ".py" for name in _imported(path)}
+        package = here.name.rpartition(".")[0]
+        for other in (home_of(f"{package}{name}" if name[0] == "." else name, paths) for name in names):
+            if other is not None and other.path.parent == home.path.parent and other.path not in seen:
+                seen.add(other.path)
+                found |= _named(other.name, other.path)
+                left.append(other)
+    return found
+
+
+def _rooms(files: Iterable[Path]) -> set[str]:
+    """Return the tools that some files import, and those that these import."""
+    rooms: set[str] = set()
+    left = [path for path in files if path.suffix == ".py"]
+    while left:
+        for name in _imported(left.pop()):
+            module = _public().get(name.removeprefix(f"{_OURS}."), name).removeprefix(f"{_OURS}.")
+            room = next((tool for tool in TOOLS if f"{module}.".startswith(f"{tool}.")), None)
+            if room is not None and room not in rooms:
+                rooms.add(room)
+                left += _room_files(room)
+    return rooms
+
+
+def _imported(path: Path) -> frozenset[str]:
+    about = path.stat()
+    return _imports_of(path, about.st_size, about.st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _imports_of(path: Path, size: int, changed_ns: int) -> frozenset[str]:
+    """Return the modules that a file imports anywhere, and names that it takes out of this package as a whole."""
+    del size, changed_ns
+    tree = _tree(path.read_bytes())
+    nodes = [] if tree is None else list(ast.walk(tree))
+    found: set[str] = set()
+    known_as = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+            known_as |= {alias.asname or _OURS for alias in node.names if alias.name == _OURS}
+        elif isinstance(node, ast.ImportFrom) and node.level <= 1:  # what lies farther up is in the package anyway
+            source = f"{'.' * node.level}{node.module or ''}"
+            found |= {source, *(f"{source.rstrip('.')}.{alias.name}" for alias in node.names)} - {"."}
+    for node in nodes:
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known_as:
+            found.add(f"{_OURS}.{node.attr}")
+    return frozenset(found)
+
+
+def _absolute(node: ast.ImportFrom, module: str, *, is_package: bool) -> str:
+    """Return the module that `from ... import` names, seen from another one."""
+    if not node.level:
+        return str(node.module)
+    package = module if is_package else module.rpartition(".")[0]
+    try:
+        return resolve_name("." * node.level + (node.module or ""), package)
+    except ImportError:
+        return ""
+
+
+@lru_cache(maxsize=1)
+def _public() -> Mapping[str, str]:
+    """Return the module that each public name of this package comes from, as its stub says."""
+    tree = ast.parse((_PACKAGE / "__init__.pyi").read_bytes())
+    froms = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
+    return {alias.name: f"{_OURS}.{node.module}" for node in froms for alias in node.names}
+
+
+def _room_files(room: str) -> list[Path]:
+    """Return the files of a module or folder of this package."""
+    place: Any = _PACKAGE.joinpath(*room.split("."))
+    return sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+
+
+def _shown(path: Path) -> str:
+    return path.relative_to(_PACKAGE).as_posix()

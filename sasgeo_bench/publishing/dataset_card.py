@@ -197,7 +197,7 @@ import geopandas as gpd
 import pandas as pd
 import rasterio
 
-with rasterio.open("regions/{name}/layers.tif") as source:
+with rasterio.open("regions/{name}/layers.tif", driver="GTiff") as source:
     layers = source.read()  # 0 absent, 1 present, 255 outside the mapped area
     print(source.descriptions, source.crs, source.tags()["attribution"])
 features = gpd.read_parquet("regions/{name}/features.parquet")

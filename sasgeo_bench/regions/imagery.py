@@ -228,11 +228,11 @@ def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
     from rasterio.vrt import WarpedVRT  # noqa: PLC0415
 
     try:
-        with rasterio.open(path) as whole:
+        with rasterio.open(path, driver="GTiff") as whole:
             fitting = [factor for factor in whole.overviews(1) if factor * whole.res[0] <= grid.cell_size_m]
         level = {"overview_level": len(fitting) - 1} if fitting else {}
         with (
-            rasterio.open(path, **level) as source,
+            rasterio.open(path, driver="GTiff", **level) as source,
             WarpedVRT(
                 source,
                 crs=source.crs,

@@ -354,14 +354,22 @@ def _in_turn(pool: ThreadPoolExecutor, work: Callable[[In], Out], items: Iterabl
 
 
 def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
-    """Read the finest level whose longer side has at most `longest_cells`; shape (C, rows, cols)."""
-    with rasterio.open(path) as source:
-        longest, factors = max(source.height, source.width), source.overviews(1)
-    fitting = [level for level, factor in enumerate(factors) if longest / factor <= longest_cells]
-    if longest <= longest_cells or not factors:
-        return read_layers(path)
-    with rasterio.open(path, overview_level=fitting[0] if fitting else len(factors) - 1) as source:
-        return np.asarray(source.read(), dtype=np.uint8)
+    """Read the finest level whose longer side has at most `longest_cells`; shape (C, rows, cols).
+
+    Raise `StoreError` if the file cannot be read.
+    """
+    try:
+        with rasterio.open(path, driver="GTiff") as source:
+            longest, factors = max(source.height, source.width), source.overviews(1)
+        fitting = [level for level, factor in enumerate(factors) if longest / factor <= longest_cells]
+        if longest <= longest_cells or not factors:
+            return read_layers(path)
+        level = fitting[0] if fitting else len(factors) - 1
+        with rasterio.open(path, driver="GTiff", overview_level=level) as source:
+            return np.asarray(source.read(), dtype=np.uint8)
+    except (RasterioError, RasterioIOError) as error:
+        message = f"{path} cannot be read ({error}): build the region again"
+        raise StoreError(message) from error
 
 
 def read_layers(
@@ -372,7 +380,7 @@ def read_layers(
     Raise `StoreError` if the file cannot be read.
     """
     try:
-        with rasterio.open(path) as source:
+        with rasterio.open(path, driver="GTiff") as source:
             part = Window(window[1], window[0], window[3], window[2]) if window else None
             chosen = None if bands is None else [band + 1 for band in bands]
             layers = np.asarray(source.read(chosen, window=part), dtype=np.uint8)
@@ -389,7 +397,10 @@ def read_bits(path: Path) -> LayerBits:
     Raise `StoreError` if the file cannot be read.
     """
     try:
-        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES), rasterio.open(path) as source:  # no block is read twice
+        with (
+            rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES),
+            rasterio.open(path, driver="GTiff") as source,
+        ):  # no block is read twice
             bits = np.empty(source.shape, dtype=np.uint32)
             for top in range(0, source.height, BLOCK_CELLS):
                 stripe = Window(0, top, source.width, min(BLOCK_CELLS, source.height - top))
@@ -410,6 +421,8 @@ def cog_faults(path: Path) -> list[str]:
     from rio_cogeo.cogeo import cog_validate  # noqa: PLC0415 - an extra, needed only to write a release
 
     try:
+        with rasterio.open(path, driver="GTiff"):  # the validator would open whatever a file of another format names
+            pass
         is_valid, faults, _ = cog_validate(path, quiet=True)
         found = [] if is_valid else list(faults) or ["not valid"]
         return [fault for fault in found if "not tiled" not in fault or not _is_tiled(path)]
@@ -420,10 +433,10 @@ def cog_faults(path: Path) -> list[str]:
 
 def _is_tiled(path: Path) -> bool:
     """Return whether all levels of a raster have square blocks."""
-    with rasterio.open(path) as source:
+    with rasterio.open(path, driver="GTiff") as source:
         levels = range(len(source.overviews(1)))
         shapes = {*source.block_shapes}
     for level in levels:
-        with rasterio.open(path, overview_level=level) as source:
+        with rasterio.open(path, driver="GTiff", overview_level=level) as source:
             shapes |= {*source.block_shapes}
     return all(rows == cols for rows, cols in shapes)

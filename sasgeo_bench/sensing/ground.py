@@ -179,7 +179,7 @@ def read_dem(path: Path, grid: Grid) -> Dem:
         message = f"a ground of {grid.rows} x {grid.cols} cells is too large: cut a smaller lattice, or larger cells"
         raise CameraError(message)
     try:
-        with rasterio.open(path) as source:
+        with rasterio.open(path, driver="GTiff") as source:
             _check_source(path, source, grid.epsg)
             unit_m, scale, offset = _unit_m(path, source), source.scales[0], source.offsets[0]
             with WarpedVRT(

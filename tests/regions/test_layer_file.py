@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """The layer file: what was burnt is what is read, in a cloud-optimized layout."""
 
+import ast
 import struct
 from dataclasses import replace
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,20 +13,26 @@ import rasterio
 import shapely
 from tifffile import TiffFile
 
-from sasgeo_bench.errors import StoreError
+import sasgeo_bench
+from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions import layers
+from sasgeo_bench.regions.imagery import read_window
 from sasgeo_bench.regions.layers import (
     OUTSIDE,
     Paint,
     burn_layers,
     burn_mapped,
+    cog_faults,
     overview_factors,
+    read_bits,
     read_layers,
     read_overview,
     write_layers,
 )
+from sasgeo_bench.sensing.ground import read_dem
 
+LATTICE = Grid(epsg=32632, west_m=8.0, north_m=-8.0, cell_size_m=2.0, rows=16, cols=16)
 CLASSES = ("building", "water", "bridge")
 GRID = Grid(epsg=32632, west_m=500_000.0, north_m=5_200_000.0, cell_size_m=2.0, rows=2300, cols=4700)
 
@@ -179,3 +188,46 @@ def test_a_file_that_cannot_be_written_or_read_is_told(tmp_path):
 def test_memory_of_a_window_does_not_grow_with_the_raster():
     largest = max(window.rows * window.cols for _, _, window in GRID.windows(layers.WINDOW_CELLS))
     assert largest <= layers.WINDOW_CELLS**2
+
+
+VIRTUAL = """<VRTDataset rasterXSize="{size}" rasterYSize="{size}"><SRS>EPSG:32632</SRS>
+<GeoTransform>0, 1, 0, 0, 0, -1</GeoTransform><VRTRasterBand dataType="Byte" band="1"><SimpleSource>
+<SourceFilename>{path}</SourceFilename><SourceBand>1</SourceBand></SimpleSource></VRTRasterBand></VRTDataset>"""
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        read_layers,
+        read_bits,
+        partial(read_overview, longest_cells=8),
+        cog_faults,
+        lambda path: read_window(path, LATTICE, is_coarser=False),
+        lambda path: read_window(path, LATTICE, is_coarser=True),
+        lambda path: read_dem(path, LATTICE),
+    ],
+)
+def test_a_raster_that_only_names_another_file_is_not_opened(tmp_path, read):
+    secret, path = tmp_path / "secret.tif", tmp_path / "layers.tif"
+    profile = {"driver": "GTiff", "width": 64, "height": 64, "count": 1, "dtype": "uint8", "crs": "EPSG:32632"}
+    with rasterio.open(secret, "w", **profile, transform=rasterio.Affine(1, 0, 0, 0, -1, 64)) as target:
+        target.write(np.full((1, 64, 64), 7, dtype=np.uint8))
+    path.write_text(VIRTUAL.format(path=secret, size=64))
+    with rasterio.open(path) as source:
+        assert source.read().max() == 7  # GDAL itself follows it
+    with pytest.raises(SasgeoError, match=r"layers\.tif"):
+        read(path)
+
+
+def test_every_reader_of_rasters_and_pictures_names_the_formats_that_it_takes():
+    root = Path(sasgeo_bench.__file__).parent
+    loose = []
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_bytes())):
+            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "open"):
+                continue
+            wanted = {"rasterio": "driver", "Image": "formats"}.get(ast.unparse(node.func.value))
+            is_written = any(isinstance(one, ast.Constant) and one.value == "w" for one in node.args)
+            if wanted and not is_written and wanted not in {one.arg for one in node.keywords}:
+                loose.append(f"{path.relative_to(root)}:{node.lineno}")
+    assert not loose

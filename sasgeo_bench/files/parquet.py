@@ -9,12 +9,13 @@ structure is checked.
 import json
 import os
 import zlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
@@ -27,6 +28,8 @@ VERIFIED: Final[Mapping[str, Any]] = {"page_checksum_verification": True}
 MOST_ROWS: Final = 1_000_000  # of a table that is converted to rows
 MOST_VALUES: Final = 100_000_000  # of all columns together, with the items of lists
 _MOST_UNPACKED: Final = 2_000_000_000  # bytes
+MOST_TEXT_BYTES: Final = 32_000_000  # of one text
+_TEXTS_AT_ONCE: Final = 65_536
 _LEAST_BYTES: Final = 1_000_000  # that a column of texts may have, with the headers of its pages
 _ATTRS: Final = b"PANDAS_ATTRS"  # where pandas itself looks for them
 _SEAL: Final = b"sasgeo_footer_crc32"
@@ -89,14 +92,17 @@ def open_table(
 ) -> Iterator[pq.ParquetFile]:
     """Open a table of unknown origin: check its footer and bound its size before anything is read.
 
-    A table that is not read whole (`is_whole`) is bounded by row group; `options` are those of
-    `pyarrow.parquet.ParquetFile`. Pages that carry a checksum are verified as they are read. Raise `StoreError`, with
-    the advice `mend`, if the file is missing, damaged, no table, or too large, or if reading fails while it is open.
+    A table that is not read whole (`is_whole`) is bounded by row group; a text that stands once in the file and in a
+    million rows counts a million times. `options` are those of `pyarrow.parquet.ParquetFile`. Pages that carry a
+    checksum are verified as they are read. Raise `StoreError`, with the advice `mend`, if the file is missing, damaged,
+    no table, or too large, or if reading fails while it is open.
     """
     try:
         _check_footer(path)
         with pq.ParquetFile(path, **{**VERIFIED, **options}) as source:
             fault = size_fault(source.metadata, most_rows=most_rows, is_whole=is_whole)
+            if fault is None and not options.get("read_dictionary"):  # who reads so has bounds of its own
+                fault = _unpacked_fault(path, source.metadata, is_whole=is_whole)
             if fault is not None:
                 message = f"{path} holds {fault}: {mend}"
                 raise StoreError(message)
@@ -181,16 +187,85 @@ def _texts_fault(about: pq.FileMetaData, texts: Collection[str], text_bytes: int
     return None
 
 
+def _unpacked_fault(path: Path, about: pq.FileMetaData, *, is_whole: bool) -> str | None:
+    """Describe texts that become too large when each of their rows gets its own, or return None.
+
+    The footer does not tell. Columns that could are read as dictionaries first, which hold each distinct text once.
+    """
+    groups = range(about.num_row_groups)
+    for together in (groups,) if is_whole else ((at,) for at in groups):
+        total = 0
+        for at, names in _doubtful(about, together):
+            for size, longest in _texts_of(path, at, names):
+                total += size
+                if longest > MOST_TEXT_BYTES:
+                    return f"a text of {longest} bytes, {MOST_TEXT_BYTES} at most"
+                if total > _MOST_UNPACKED:
+                    return f"texts of more than {_MOST_UNPACKED} bytes unpacked"
+    return None
+
+
+def _doubtful(about: pq.FileMetaData, groups: Iterable[int]) -> Iterator[tuple[int, list[str]]]:
+    """Yield row groups, and their columns of texts that may be too large, together or one text of them."""
+    chunks = [(at, about.row_group(at).column(column)) for at in groups for column in range(about.num_columns)]
+    texts = [(at, chunk) for at, chunk in chunks if chunk.physical_type == "BYTE_ARRAY"]
+    most: dict[tuple[int, str], int] = {
+        (at, chunk.path_in_schema): chunk.num_values * chunk.total_uncompressed_size for at, chunk in texts
+    }
+    sure = 0
+    for key in sorted(most, key=most.__getitem__):
+        sure += most[key]
+        if sure > _MOST_UNPACKED // 2:
+            break
+        most[key] = 0
+    long = {(at, chunk.path_in_schema) for at, chunk in texts if chunk.total_uncompressed_size > MOST_TEXT_BYTES}
+    for at in groups:
+        names = [name for (group, name), size in most.items() if group == at and (size or (group, name) in long)]
+        if names:
+            yield at, names
+
+
+def _texts_of(path: Path, group: int, columns: Sequence[str]) -> Iterator[tuple[int, int]]:
+    """Yield the bytes of some texts of a row group, all of them and the longest one, without unpacking them."""
+    if not columns:
+        return
+    with pq.ParquetFile(path, **VERIFIED, read_dictionary=list(columns)) as source:
+        for name in columns:
+            for batch in source.iter_batches(_TEXTS_AT_ONCE, row_groups=[group], columns=[name]):
+                for texts in (found for column in batch.columns for found in _dictionaries(column)):
+                    lengths = pc.binary_length(texts.dictionary)
+                    if len(lengths) and len(texts):
+                        yield pc.sum(lengths.take(texts.indices)).as_py() or 0, pc.max(lengths).as_py() or 0
+
+
+def _dictionaries(array: pa.Array) -> Iterator[pa.DictionaryArray]:
+    """Yield the dictionaries in a column, however deep in lists and records they lie."""
+    if isinstance(array, pa.DictionaryArray):
+        yield array
+    elif isinstance(array, pa.MapArray):
+        yield from (found for part in (array.keys, array.items) for found in _dictionaries(part))
+    elif isinstance(array, pa.StructArray):
+        yield from (found for part in array.flatten() for found in _dictionaries(part))
+    elif isinstance(array, pa.ListArray | pa.LargeListArray | pa.FixedSizeListArray):
+        yield from _dictionaries(array.flatten())
+
+
 def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True) -> str | None:
     """Describe what is too large about a table, by its footer, or return None."""
     groups = [about.row_group(at) for at in range(about.num_row_groups)]
     chunks = [[group.column(at) for at in range(about.num_columns)] for group in groups]
     rows = max(about.num_rows, sum(group.num_rows for group in groups))
     values = sum(chunk.num_values for columns in chunks for chunk in columns)
-    sizes = [sum(chunk.total_uncompressed_size for chunk in columns) for columns in chunks]
+    sizes = [sum(map(_size_of, columns, map(about.schema.column, range(about.num_columns)))) for columns in chunks]
     unpacked = sum(sizes) if is_whole else max(sizes, default=0)
     found = {"rows": (rows, most_rows), "values": (values, MOST_VALUES), "bytes unpacked": (unpacked, _MOST_UNPACKED)}
     return next((f"{count} {what}, {most} at most" for what, (count, most) in found.items() if count > most), None)
+
+
+def _size_of(chunk: pq.ColumnChunkMetaData, leaf: pq.ColumnSchema) -> int:
+    """Return the bytes of a part of a column, also where a value of fixed length stands in the file but once."""
+    fixed = chunk.num_values * leaf.length if chunk.physical_type == "FIXED_LEN_BYTE_ARRAY" else 0
+    return max(int(chunk.total_uncompressed_size), int(fixed))
 
 
 def _seal(path: Path) -> None:

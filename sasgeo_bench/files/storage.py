@@ -148,8 +148,10 @@ def fetch(url: str, folder: str | Path) -> Moved:
                     "again"
                 )
                 raise StoreError(message)
-        (scratch / LIST).unlink()
-        replace_folder(scratch, target)
+        whole = _whole(target)
+        scratch.rename(whole)  # first, so that a folder without its list still tells by its name what it is
+        (whole / LIST).unlink()
+        replace_folder(whole, target)
     return Moved(files=len(records), bytes=_bytes_of(records), moved=moved)
 
 
@@ -211,7 +213,14 @@ def _begun(target: Path, sent: "_Sent") -> Path:
     """Return the folder beside another one that its files are fetched into: one that was begun, or a new one."""
     scratch = target.with_name(f".{target.name}.fetched")
     data = _list_bytes(sent)
-    mark = scratch / LIST
+    mark, whole = scratch / LIST, _whole(target)
+    if whole.is_dir() and not whole.is_symlink():
+        if scratch.exists() or not set(list_files(whole)) - {LIST} <= sent.files.keys():
+            remove_tree(whole)
+        else:
+            whole.rename(scratch)
+            if not mark.is_file():
+                mark.write_bytes(data)
     if scratch.is_dir() and not scratch.is_symlink() and mark.is_file():
         if mark.read_bytes() == data:
             return scratch
@@ -223,6 +232,11 @@ def _begun(target: Path, sent: "_Sent") -> Path:
         raise StoreError(message) from error
     mark.write_bytes(data)
     return scratch
+
+
+def _whole(target: Path) -> Path:
+    """Return the name of a folder that is fetched to its end, until it gets its own."""
+    return target.with_name(f".{target.name}.whole")
 
 
 def _is_there(path: Path, record: FileRecord) -> bool:

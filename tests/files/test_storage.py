@@ -2,12 +2,14 @@
 """Folders in object storage come back as they were sent, whatever is cut, damaged or forged on the way."""
 
 import json
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 import sasgeo_bench as sgb
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files import storage
 from sasgeo_bench.files.storage import LIST, fetch, send
 
 fsspec = pytest.importorskip("fsspec", reason="fsspec is not installed (make install brings it)")
@@ -95,6 +97,50 @@ def test_what_was_cut_goes_on_where_it_was_and_is_nothing_until_then(url, folder
     monkeypatch.setattr(type(system), "get_file", get)
     assert fetch(url, tmp_path / "here").moved == 1
     assert contents(tmp_path / "here") == seen(folder)
+
+
+@pytest.mark.parametrize("is_there", [False, True])
+@pytest.mark.parametrize("at", ["Path.unlink", "replace_folder", "Path.rename 1", "Path.rename 2", "Path.rename 3"])
+def test_a_fetch_that_is_killed_late_goes_on(url, folder, tmp_path, monkeypatch, at, is_there):
+    """Killed: nothing of it runs any more, and no block is left as it should be."""
+    send(folder, url)
+    if is_there:
+        fetch(url, tmp_path / "here")
+        (folder / "layers" / "b.tif").write_text("B", encoding="utf-8")
+        send(folder, url)
+    name, _, number = at.partition(" ")
+    calls = []
+
+    class Killed(BaseException):
+        pass
+
+    def killing(really):
+        def call(*given, **more):
+            calls.append(given)
+            if len(calls) == int(number or 1):
+                raise Killed
+            return really(*given, **more)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        owner, attribute = (Path, name[5:]) if name.startswith("Path.") else (storage, name)
+        patch.setattr(owner, attribute, killing(getattr(owner, attribute)))
+        with suppress(Killed):
+            fetch(url, tmp_path / "here")
+    assert fetch(url, tmp_path / "here").moved == 0 or not calls
+    assert contents(tmp_path / "here") == seen(folder)
+    assert [path.name for path in tmp_path.iterdir() if path.name.startswith(".") and "lock" not in path.name] == []
+
+
+def test_what_a_fetch_left_of_a_folder_that_was_sent_anew_since_does_not_stay(url, folder, tmp_path):
+    send(folder, url)
+    left = tmp_path / ".here.whole"
+    left.mkdir()
+    (left / "older.txt").write_text("older", encoding="utf-8")
+    fetch(url, tmp_path / "here")
+    assert contents(tmp_path / "here") == seen(folder)
+    assert not left.exists()
 
 
 def test_a_file_that_is_not_what_was_sent_is_refused_and_the_folder_stays(url, folder, tmp_path):

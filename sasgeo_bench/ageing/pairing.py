@@ -12,6 +12,8 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.regions.shapes import overlapping
+
 MATCH_IOU: Final = 0.3  # of two areas that are one thing
 NEAR_M: Final = 5.0  # roads in OSM lie within about 6 m of the truth, and so do re-drawn ones
 REDRAWN_M: Final = 1.0  # below this a shift is rounding or a tidied corner
@@ -229,7 +231,7 @@ class _Intersections(NamedTuple):
 
 
 def _intersections(these: Geometries, others: Geometries) -> _Intersections:
-    left, right = shapely.STRtree(others).query(these, predicate="intersects")
+    left, right = overlapping(these, others, predicate="intersects")
     order = np.lexsort((right, left))
     left, right = left[order], right[order]
     shared = shapely.intersection(these[left], others[right])

@@ -9,6 +9,8 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.regions.shapes import overlapping
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
@@ -214,7 +216,7 @@ def find_crossings(network: Network) -> Crossings:
     """
     seen = np.flatnonzero(network.is_visible)
     lines = np.asarray(shapely.linestrings(network.vertices[network.ends[seen]]))
-    left, right = seen[shapely.STRtree(lines).query(lines)]
+    left, right = seen[overlapping(lines, lines)]
     pairs = np.stack([left, right], axis=1)[left < right]
     pairs = pairs[np.arange(len(pairs))[:, None], np.argsort(network.layer[pairs], axis=1, kind="stable")]
     ends = network.ends[pairs]

@@ -14,6 +14,7 @@ import shapely.affinity
 from numpy.typing import NDArray
 
 from sasgeo_bench.osm.features import check_features
+from sasgeo_bench.regions.shapes import overlapping
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -299,8 +300,7 @@ def level_crossings(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     shapes = table.geometry.to_numpy().copy()
     is_road = table["class"].isin(ROADS).to_numpy()
     roads = np.flatnonzero(is_road & (shapely.get_dimensions(shapes) == 1))  # a square is a road too, and no line
-    tree = shapely.STRtree(shapes[roads])
-    first, second = tree.query(shapes[roads], predicate="crosses")
+    first, second = overlapping(shapes[roads], shapes[roads], predicate="crosses")
     meeting: dict[int, list[shapely.Geometry]] = {}
     for one, two in zip(roads[first].tolist(), roads[second].tolist(), strict=True):
         if one < two:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-import rasterio
 from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 from sasgeo_bench.errors import DatasetError
+from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.importers.items import Box, Item, Position
 
 TILE_PX: Final = 256
@@ -34,7 +34,7 @@ def read_size_px(path: Path, *, shown: str) -> tuple[int, int]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
-            with rasterio.open(path, driver="GTiff") as source:  # no other driver: some open what a file only names
+            with open_geotiff(path, has_more=True) as source:
                 width, height = int(source.width), int(source.height)
     except RasterioError as error:
         message = f"{shown} is no TIFF that can be read: copy it again"

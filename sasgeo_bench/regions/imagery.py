@@ -13,6 +13,7 @@ from pydantic import ConfigDict, Field, SerializerFunctionWrapHandler, model_ser
 from sasgeo_bench.config import Document
 from sasgeo_bench.errors import ImageryError, StoreError
 from sasgeo_bench.files.folders import FileRecord, file_record
+from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 
 ORTHO: Final = "ortho.tif"
@@ -221,18 +222,17 @@ class Imagery:
 
 def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
     """Read a window of an ortho image on a lattice in its CRS; raise `StoreError` if the file cannot be read."""
-    import rasterio  # noqa: PLC0415 - GDAL is slow to import, and few regions have imagery
     from affine import Affine  # noqa: PLC0415
     from rasterio.enums import Resampling  # noqa: PLC0415
     from rasterio.errors import RasterioError  # noqa: PLC0415
     from rasterio.vrt import WarpedVRT  # noqa: PLC0415
 
     try:
-        with rasterio.open(path, driver="GTiff") as whole:
+        with open_geotiff(path) as whole:
             fitting = [factor for factor in whole.overviews(1) if factor * whole.res[0] <= grid.cell_size_m]
-        level = {"overview_level": len(fitting) - 1} if fitting else {}
+        level: dict[str, Any] = {"overview_level": len(fitting) - 1} if fitting else {}
         with (
-            rasterio.open(path, driver="GTiff", **level) as source,
+            open_geotiff(path, **level) as source,
             WarpedVRT(
                 source,
                 crs=source.crs,

@@ -22,6 +22,7 @@ from rasterio.windows import Window
 from tifffile import TiffFile, TiffPage, TiffWriter
 
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import LayerBits
@@ -359,13 +360,13 @@ def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
     Raise `StoreError` if the file cannot be read.
     """
     try:
-        with rasterio.open(path, driver="GTiff") as source:
+        with open_geotiff(path) as source:
             longest, factors = max(source.height, source.width), source.overviews(1)
         fitting = [level for level, factor in enumerate(factors) if longest / factor <= longest_cells]
         if longest <= longest_cells or not factors:
             return read_layers(path)
         level = fitting[0] if fitting else len(factors) - 1
-        with rasterio.open(path, driver="GTiff", overview_level=level) as source:
+        with open_geotiff(path, overview_level=level) as source:
             return np.asarray(source.read(), dtype=np.uint8)
     except (RasterioError, RasterioIOError) as error:
         message = f"{path} cannot be read ({error}): build the region again"
@@ -380,7 +381,7 @@ def read_layers(
     Raise `StoreError` if the file cannot be read.
     """
     try:
-        with rasterio.open(path, driver="GTiff") as source:
+        with open_geotiff(path) as source:
             part = Window(window[1], window[0], window[3], window[2]) if window else None
             chosen = None if bands is None else [band + 1 for band in bands]
             layers = np.asarray(source.read(chosen, window=part), dtype=np.uint8)
@@ -399,7 +400,7 @@ def read_bits(path: Path) -> LayerBits:
     try:
         with (
             rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES),
-            rasterio.open(path, driver="GTiff") as source,
+            open_geotiff(path) as source,
         ):  # no block is read twice
             bits = np.empty(source.shape, dtype=np.uint32)
             for top in range(0, source.height, BLOCK_CELLS):
@@ -421,7 +422,7 @@ def cog_faults(path: Path) -> list[str]:
     from rio_cogeo.cogeo import cog_validate  # noqa: PLC0415 - an extra, needed only to write a release
 
     try:
-        with rasterio.open(path, driver="GTiff"):  # the validator would open whatever a file of another format names
+        with open_geotiff(path):  # the validator would open whatever a file of another format names
             pass
         is_valid, faults, _ = cog_validate(path, quiet=True)
         found = [] if is_valid else list(faults) or ["not valid"]
@@ -433,10 +434,10 @@ def cog_faults(path: Path) -> list[str]:
 
 def _is_tiled(path: Path) -> bool:
     """Return whether all levels of a raster have square blocks."""
-    with rasterio.open(path, driver="GTiff") as source:
+    with open_geotiff(path) as source:
         levels = range(len(source.overviews(1)))
         shapes = {*source.block_shapes}
     for level in levels:
-        with rasterio.open(path, driver="GTiff", overview_level=level) as source:
+        with open_geotiff(path, overview_level=level) as source:
             shapes |= {*source.block_shapes}
     return all(rows == cols for rows, cols in shapes)

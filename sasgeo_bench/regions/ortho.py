@@ -22,6 +22,7 @@ from rasterio.windows import Window
 
 from sasgeo_bench.errors import GridError, ImageryError
 from sasgeo_bench.files.folders import file_record
+from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.bands import RGB, Bands, find_bands, selected
 from sasgeo_bench.regions.imagery import BANDS, PictureRecord
@@ -103,7 +104,7 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
 def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
     """Open a GeoTIFF, and no other format; turn what GDAL says of it into one line."""
     try:
-        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES), rasterio.open(path, driver="GTiff") as source:
+        with rasterio.Env(GDAL_CACHEMAX=_CACHE_BYTES), open_geotiff(path, has_more=True) as source:
             yield source
     except (RasterioError, OSError) as error:
         if isinstance(error, ImageryError | CRSError):

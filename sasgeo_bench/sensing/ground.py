@@ -16,6 +16,7 @@ from rasterio.vrt import WarpedVRT
 from scipy.ndimage import map_coordinates
 
 from sasgeo_bench.errors import CameraError
+from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.texts import one_line
 
@@ -179,7 +180,7 @@ def read_dem(path: Path, grid: Grid) -> Dem:
         message = f"a ground of {grid.rows} x {grid.cols} cells is too large: cut a smaller lattice, or larger cells"
         raise CameraError(message)
     try:
-        with rasterio.open(path, driver="GTiff") as source:
+        with open_geotiff(path, has_more=True) as source:
             _check_source(path, source, grid.epsg)
             unit_m, scale, offset = _unit_m(path, source), source.scales[0], source.offsets[0]
             with WarpedVRT(

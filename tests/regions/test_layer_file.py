@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 import rasterio
 import shapely
+from rasterio.errors import RasterioIOError
 from tifffile import TiffFile
 
 import sasgeo_bench
 from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions import layers
 from sasgeo_bench.regions.imagery import read_window
@@ -219,15 +221,48 @@ def test_a_raster_that_only_names_another_file_is_not_opened(tmp_path, read):
         read(path)
 
 
+@pytest.mark.parametrize("beside", ["layers.tif.ovr", "layers.tif.msk", "layers.tif.aux.xml"])
+def test_what_lies_beside_a_raster_reads_no_other_file(tmp_path, beside):
+    profile = {"driver": "GTiff", "width": 64, "height": 64, "count": 1, "dtype": "uint8", "crs": "EPSG:32632"}
+    path, secret = tmp_path / "layers.tif", tmp_path / "elsewhere" / "secret.tif"
+    secret.parent.mkdir()
+    for name, size, value in ((path, 64, 1), (secret, 32, 7)):
+        with rasterio.open(name, "w", **profile | {"width": size, "height": size}) as target:
+            target.write(np.full((1, size, size), value, dtype=np.uint8))
+    text = f'<PAMDataset><Metadata domain="OVERVIEWS"><MDI key="OVERVIEW_FILE">{secret}</MDI></Metadata></PAMDataset>'
+    virtual = VIRTUAL.format(path=secret, size=32 if beside.endswith("ovr") else 64)
+    (tmp_path / beside).write_text(text if beside.endswith("xml") else virtual)
+    with rasterio.open(path, driver="GTiff") as source:
+        assert str(secret) in source.files  # GDAL itself follows it
+    with open_geotiff(path) as source:
+        assert (source.files, source.overviews(1), source.dataset_mask().min()) == ([str(path)], [], 255)
+    with (
+        pytest.raises(RasterioIOError, match=r"reads secret\.tif, which is none of its own"),
+        open_geotiff(path, has_more=True),
+    ):
+        pass
+
+
+def test_what_belongs_to_a_raster_may_lie_beside_it(tmp_path):
+    path = tmp_path / "a.tif"
+    with rasterio.open(path, "w", driver="GTiff", width=64, height=64, count=1, dtype="uint8") as target:
+        target.write(np.full((1, 64, 64), 1, dtype=np.uint8))
+    (tmp_path / "a.tfw").write_text("2\n0\n0\n-2\n100\n200\n")
+    with open_geotiff(path, has_more=True) as source:
+        assert source.transform[:6] == (2, 0, 99, 0, -2, 201)
+
+
 def test_every_reader_of_rasters_and_pictures_names_the_formats_that_it_takes():
+    """Rasters by `open_geotiff` alone."""
     root = Path(sasgeo_bench.__file__).parent
     loose = []
     for path in root.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_bytes())):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "open"):
                 continue
-            wanted = {"rasterio": "driver", "Image": "formats"}.get(ast.unparse(node.func.value))
+            is_raster = ast.unparse(node.func.value) == "rasterio" and path.name != "geotiff.py"
             is_written = any(isinstance(one, ast.Constant) and one.value == "w" for one in node.args)
-            if wanted and not is_written and wanted not in {one.arg for one in node.keywords}:
+            is_picture = ast.unparse(node.func.value) == "Image"
+            if (is_raster and not is_written) or (is_picture and "formats" not in {one.arg for one in node.keywords}):
                 loose.append(f"{path.relative_to(root)}:{node.lineno}")
     assert not loose

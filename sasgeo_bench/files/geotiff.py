@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open GeoTIFF files of anybody, and no other file by them.
+
+GDAL takes a file for what it holds, not for what it is called: one of a few lines can name any other file of this
+machine as its pixels. So can files beside a GeoTIFF: its overviews, its mask, its metadata.
+"""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rasterio.io import DatasetReader
+
+
+@contextmanager
+def open_geotiff(path: Path, *, has_more: bool = False, **options: Any) -> Iterator["DatasetReader"]:  # noqa: ANN401
+    """Open a GeoTIFF to read; `options` are those of `rasterio.open`.
+
+    Files beside it are passed over, unless it `has_more` of its own: a world file, overviews, a mask. Raise
+    `RasterioIOError` if it is no GeoTIFF, or one of these names a file that is none of its own.
+    """
+    import rasterio  # noqa: PLC0415 - GDAL is slow to import
+    from rasterio.errors import RasterioIOError  # noqa: PLC0415
+
+    beside = {} if has_more else {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+    with rasterio.Env(**beside), rasterio.open(path, driver="GTiff", **options) as source:
+        stray = next((name for name in source.files if not _is_own(Path(name), path)), None) if has_more else None
+        if stray is not None:
+            message = f"a file beside it reads {Path(stray).name}, which is none of its own"
+            raise RasterioIOError(message)
+        yield source
+
+
+def _is_own(name: Path, path: Path) -> bool:
+    """Return whether a file lies beside another one and begins with its name.
+
+    >>> [_is_own(Path(name), Path("maps/a.tif")) for name in ("maps/a.tif.ovr", "maps/a.tfw", "/etc/a.tif", "maps/b")]
+    [True, True, False, False]
+    """
+    return name.resolve().parent == path.resolve().parent and name.name.startswith(path.stem)

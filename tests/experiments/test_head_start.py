@@ -13,7 +13,7 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.experiments import head_start
 from sasgeo_bench.experiments.head_start import unpack_head_start
-from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
+from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, PipelineFile
 from sasgeo_bench.running import prediction_files
 
 RUN = "runs/random/abc/clean/one"
@@ -206,3 +206,14 @@ def test_what_a_killed_run_left_is_removed_and_a_folder_of_that_name_is_named(tm
     (tmp_path / "mine.tar.xz").mkdir()
     with pytest.raises(StoreError, match=r"mine\.tar\.xz is no file"):
         unpack_head_start(tmp_path / "mine.toml", None, tmp_path / "out", tell=lambda _: None)
+
+
+def test_the_hash_of_an_archive_is_no_part_of_the_experiment_and_must_be_one():
+    spec = {"id": "mine", "title": "Mine", "split": "crossfit", "matchers": ["random"]}
+    spec |= {"task": [{"suites": ["clean"], "sites": 2}]}
+    stated = PipelineFile.model_validate(spec | {"archive": {"sha256": "ab" * 32}})
+    assert stated.archive == ArchiveSpec(sha256="ab" * 32)
+    assert stated.sha256 == PipelineFile.model_validate(spec).sha256
+    for wrong in ("AB" * 32, "ab" * 31, ""):
+        with pytest.raises(ValueError, match="sha256"):
+            ArchiveSpec(sha256=wrong)

@@ -535,6 +535,7 @@ def test_a_file_without_learning_has_the_hash_it_had_before_there_was_any():
     newer = {
         "learning": True,
         "reference_imagery": True,
+        "archive": True,
         "contrast": {"__all__": {"pilot", "detectors"}},
         "task": {"__all__": {"views_cells", "kinds", "tracks", "detectors", "segmenters", "regions"}},
     }

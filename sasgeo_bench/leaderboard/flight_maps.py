@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps of a flight, one for each tracker: the true path, the estimates, and which of them were accepted."""
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +14,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import Page, page, panels
 from sasgeo_bench.errors import StoreError, counted
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.score import FIX_M
@@ -82,8 +82,8 @@ def flight_map_pixels(
         panel_inches=(_ONE_INCHES, _ONE_INCHES) if len(names) == 1 else (_INCHES, _INCHES),
         keys=[*flight_keys([panel]), *_keys(list(mine.values()))],
     )
-    with tempfile.TemporaryDirectory() as scratch:
-        path = Path(scratch) / "flight.png"
+    with scratch_folder("flight") as scratch:
+        path = scratch / "flight.png"
         with page(path, sheet) as charts:
             for number, chart in panels(charts, len(names)):
                 draw_flight(chart, panel, ground)

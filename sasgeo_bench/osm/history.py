@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from shutil import copyfile
-from tempfile import TemporaryDirectory
 from typing import Any, Final, NamedTuple
 
 import geopandas as gpd
@@ -20,6 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.osm.coverage import CLOSE_M
 from sasgeo_bench.osm.features import SEA
@@ -349,8 +349,8 @@ def _one_state(item: DatedExtract) -> Iterator[Path]:
     if not is_history(item.path):
         yield item.path
         return
-    with TemporaryDirectory(prefix="sasgeo-") as scratch:
-        cut = Path(scratch) / f"{item.path.name.split('.')[0]}-at-{item.on}.osm.pbf"
+    with scratch_folder("map") as scratch:
+        cut = scratch / f"{item.path.name.split('.')[0]}-at-{item.on}.osm.pbf"
         with open_snapshot(item.path, at=item.on) as snapshot:
             copyfile(snapshot.path, cut)
         yield cut

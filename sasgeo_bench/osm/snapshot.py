@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import numpy as np
@@ -15,6 +14,7 @@ import osmium
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ExtractError, counted
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.osm.xml_text import NEW_IDS, Box, clean, needs_cleaning, read_boxes
 
 SUFFIXES: Final = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")
@@ -54,8 +54,8 @@ class Header:
 def read_header(path: Path) -> Header:
     """Read the header of an extract and no more; raise `ExtractError` as `open_snapshot` does."""
     _check_file(path)
-    with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
-        content = _as_its_content(path, Path(scratch))
+    with _readable(path), scratch_folder("map") as scratch:
+        content = _as_its_content(path, scratch)
         return _header(path, content)
 
 
@@ -78,8 +78,8 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
     sasgeo_bench.errors.ExtractError: no extract at nowhere.osm.pbf: check the path
     """
     _check_file(path)
-    with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
-        content = _as_its_content(path, Path(scratch))
+    with _readable(path), scratch_folder("map") as scratch:
+        content = _as_its_content(path, scratch)
         stated = _header(path, content)
         survey = _survey(content)
         is_past, is_named = survey.is_history(path), path.name.endswith(_HISTORY_SUFFIXES)
@@ -93,16 +93,16 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
         elif is_named and not is_past:
             warnings.append("it is named like a full history, and holds one version of each object: read as it stands")
         if is_past or survey.repeated or survey.deleted:
-            current = Path(scratch) / "at-date.osm.pbf"
+            current = scratch / "at-date.osm.pbf"
             _cut_history(content, current, at=at if is_past else None)
             survey = _survey(current)
         if survey.has_negative or survey.has_places:
-            source, current = current, Path(scratch) / "plain.osm.pbf"
+            source, current = current, scratch / "plain.osm.pbf"
             _write_plain(source, current)
         if not survey.is_sorted:
             warnings.append("elements were out of order and have been sorted ('osmium sort' does it for good)")
         if not survey.is_sorted or current.name == "plain.osm.pbf":
-            source, current = current, Path(scratch) / "sorted.osm.pbf"
+            source, current = current, scratch / "sorted.osm.pbf"
             _sort(source, current)
         yield Snapshot(
             path=current,
@@ -119,8 +119,8 @@ def is_history(path: Path) -> bool:
     as one and holds deleted objects. Raise `ExtractError` as `open_snapshot` does.
     """
     _check_file(path)
-    with _readable(path), TemporaryDirectory(prefix="sasgeo-") as scratch:
-        content = _as_its_content(path, Path(scratch))
+    with _readable(path), scratch_folder("map") as scratch:
+        content = _as_its_content(path, scratch)
         return (
             _survey(content).is_history(path) if _is_xml(content) else _header_of(content).has_multiple_object_versions
         )

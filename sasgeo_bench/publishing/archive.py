@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board with all it was made of -> stored results, and stored results -> what a board is made of."""
 
-import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board
@@ -264,8 +264,8 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
     if request.tasks:
         message = f"{stored} are stored results, which hold their own tasks: leave --tasks away"
         raise ConfigError(message)
-    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
-        found = unpack(stored, Path(folder))
+    with scratch_folder("answers") as folder:
+        found = unpack(stored, folder)
         others = [path for path in request.predictions if path != stored]
         with _attributed(stored, found.root):
             yield replace(
@@ -296,11 +296,11 @@ def laid_tasks(paths: Sequence[Path]) -> Iterator[tuple[Path, ...]]:
 
     Raise `StoreError` if results are damaged.
     """
-    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
+    with scratch_folder("answers") as folder:
         tasks: list[Path] = []
         for number, path in enumerate(paths):
-            tasks += unpack_tasks(path, Path(folder) / str(number)) if is_pack(path) else [path]
-        with _attributed(next(filter(is_pack, paths), Path()), Path(folder)):
+            tasks += unpack_tasks(path, folder / str(number)) if is_pack(path) else [path]
+        with _attributed(next(filter(is_pack, paths), Path()), folder):
             yield tuple(tasks)
 
 

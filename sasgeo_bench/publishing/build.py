@@ -3,7 +3,6 @@
 
 import os
 import shutil
-import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -16,6 +15,7 @@ import pandas as pd
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import SITE, absolute, resolve_link
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.leaderboard.board_files import (
     ANSWERS,
     BOARD_FILES,
@@ -126,8 +126,8 @@ def _with_figures(board: Path, root: Path, jobs: int, tell: Tell, progress: Prog
         yield board
         return
     tell(f"{board}: scoring stored results again, for their figures")
-    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as scratch:
-        folder = Path(scratch) / board.resolve().name
+    with scratch_folder("answers") as scratch:
+        folder = scratch / board.resolve().name
         request = replace(request_of([board], board=folder, root=root), jobs=jobs)
         score_all(request, tell=tell, progress=progress)
         if not read_board(folder)[1].equals(read_board(board)[1]):
@@ -165,8 +165,8 @@ def _source(files: BoardFiles, tell: Tell) -> SiteSource:
     drawing: dict[str, Callable[[Path], None]] = {_RATES: partial(draw_rates, book=book)}
     if places:
         drawing[_MAP] = partial(draw_places, places=places)
-    with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
-        drawn = {file: SiteFigure.of(file, draw_text(draw, Path(folder))) for file, draw in drawing.items()}
+    with scratch_folder("figures") as folder:
+        drawn = {file: SiteFigure.of(file, draw_text(draw, folder)) for file, draw in drawing.items()}
     tables = files.tables
     return SiteSource(
         name=name,

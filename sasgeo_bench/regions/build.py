@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Final
 
 import geopandas as gpd
@@ -20,6 +19,7 @@ import shapely
 
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import file_record, fresh_folder, locked, sha256_of
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.locate import Extract, find_extract, find_parts
@@ -386,8 +386,8 @@ def _source(plan: BuildPlan) -> Iterator[Path]:
     if town is None or plan.spec.center_lonlat is None:
         message = f"{plan.spec.id}: an embedded town needs center_lonlat in its region file"
         raise StoreError(message)
-    with TemporaryDirectory(prefix="sasgeo-town-") as folder:
-        path = Path(folder) / plan.extract.file
+    with scratch_folder("town") as folder:
+        path = folder / plan.extract.file
         longitude_deg, latitude_deg = plan.spec.center_lonlat
         shape = TownPlan(
             morphology=town.morphology, seed=town.seed, size_m=town.size_m, center_lonlat=(longitude_deg, latitude_deg)

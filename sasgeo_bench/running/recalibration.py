@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Recalibrate what a segmenter says by the shares of the classes on the map: no label is needed."""
 
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
@@ -26,8 +26,8 @@ def recalibrated(said: Iterable[Said], region: Region) -> Iterator[Said]:
     Until all are seen, segmentations lie in a temporary folder.
     """
     totals: dict[str, NDArray[np.int64]] = {}
-    with tempfile.TemporaryDirectory(prefix="sasgeo-seen-") as name:
-        folder, queries = Path(name), []
+    with scratch_folder("seen") as folder:
+        queries = []
         for at, (query, seen) in enumerate(said):
             queries.append(query)
             for number, one in enumerate(seen):

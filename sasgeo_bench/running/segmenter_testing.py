@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The conformance kit of segmenters: the rules that each keeps, checked on tiny images under the limits of a run."""
 
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.plugins import SEGMENTERS
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.running.checks import (
@@ -49,7 +49,7 @@ def check_segmenter(
     """
     labelled = tuple(tiny_images() if images is None else images)
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sasgeo-check-"))).resolve()
+        folder = stack.enter_context(scratch_folder("check"))
         paths = write_labelled(folder, labelled)
         before = listing_of(folder)
         reach = Reach(readable=[folder], hidden=[], is_shut_in=is_shut_in)

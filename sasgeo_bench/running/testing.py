@@ -2,7 +2,6 @@
 """The conformance kit: the rules that every matcher keeps, checked on a tiny place under the limits of a run."""
 
 import hashlib
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
@@ -12,6 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match, lacks
 from sasgeo_bench.matching.plugins import MATCHERS
 from sasgeo_bench.regions.build import build_region, plan_build
@@ -99,7 +99,7 @@ def check_matcher(
     """
     with ExitStack() as stack:
         if place is None:
-            place = tiny_place(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sasgeo-check-"))))
+            place = tiny_place(stack.enter_context(scratch_folder("check")))
         readable, hidden = place.map_folder.resolve(), (place.folder / "truth").resolve()
         reach = Reach(readable=[readable], hidden=[hidden], is_shut_in=is_shut_in)
         worker = stack.enter_context(Worker(spec=spec, reach=reach, limits=limits or Limits()))

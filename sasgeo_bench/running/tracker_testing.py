@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The conformance kit of trackers: the rules that each keeps, checked on a short flight under the limits of a run."""
 
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import MatcherCard, is_followed, lacks
 from sasgeo_bench.matching.plugins import MATCHERS, TRACKERS
@@ -110,7 +110,7 @@ def check_tracker(
     """
     with ExitStack() as stack:
         if made is None:
-            made = tiny_flights(Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="sasgeo-check-"))))
+            made = tiny_flights(stack.enter_context(scratch_folder("check")))
         readable, hidden = made.map_folder.resolve(), (made.folder / "truth").resolve()
         reach = Reach(readable=[readable], hidden=[hidden, (made.folder / "tasks").resolve()], is_shut_in=is_shut_in)
         worker = stack.enter_context(Worker(spec=spec, reach=reach, limits=limits or Limits()))

@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import time
 from abc import ABC, abstractmethod
@@ -25,7 +24,7 @@ import psutil
 import sasgeo_bench.running.child
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files.folders import remove_tree
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.plugin_files import import_paths
 from sasgeo_bench.matching.results import Status
 from sasgeo_bench.running import wire
@@ -100,6 +99,7 @@ class PluginProcess(ABC, Generic[AnyReply]):
     _printed: deque[bytes] = field(default_factory=deque)
     _drain: threading.Thread | None = None
     _scratch: Path | None = None
+    _kept: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)  # its scratch folder, until it ends
 
     def __enter__(self) -> Self:
         """Start nothing yet."""
@@ -166,7 +166,7 @@ class PluginProcess(ABC, Generic[AnyReply]):
             return self._channel
         self.end()
         ours, theirs = socket.socketpair()
-        self._scratch = Path(tempfile.mkdtemp(prefix=f"sasgeo-{self.door}-")).resolve()
+        self._scratch = self._kept.enter_context(scratch_folder(self.door))
         command = _command(theirs.fileno(), is_shut_in=self.reach.is_shut_in)
         self._process = subprocess.Popen(  # noqa: S603 - our own module, by our own interpreter
             command,
@@ -280,8 +280,7 @@ class PluginProcess(ABC, Generic[AnyReply]):
         if self._process is not None:
             _kill_family(self._process)
         self._end_watch()
-        if self._scratch is not None:
-            remove_tree(self._scratch)
+        self._kept.close()
         self._process, self._channel, self._scratch = None, None, None
 
 

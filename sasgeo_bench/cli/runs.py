@@ -120,7 +120,7 @@ def run(options: RunOptions) -> RunReport:
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
     options.tell(f"{plan.card.name} {plan.card.version}: {counts}")
     for status, message in sorted(report.messages.items()):
-        options.tell(f"  {status}, the first of {report.counts[status]}: {message}")
+        options.tell(f"  {status}, one of {report.counts[status]}: {message}")
     for folder in report.folders:
         options.say(folder)
     return report

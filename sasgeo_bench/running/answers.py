@@ -19,6 +19,7 @@ from sasgeo_bench.matching.tracker import check_covariance
 from sasgeo_bench.regions.region_files import check_files, read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import Oracle
+from sasgeo_bench.running.patience import GIVEN_UP, Patience
 from sasgeo_bench.running.plan import RunPart, RunPlan, by_map, reach_of
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.sandbox import PROMISES, joined
@@ -176,7 +177,7 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
     counts: dict[str, int] = {}
     messages: dict[str, str] = {}
     for cost in costs:
-        messages = cost.messages | messages
+        messages = _first_messages(messages, cost.messages)
         for status, count in cost.counts.items():
             counts[status] = counts.get(status, 0) + count
     return Cost(
@@ -188,6 +189,12 @@ def pool_costs(costs: Sequence[Cost]) -> Cost:
         isolation=joined(cost.isolation for cost in costs),
         messages=messages,
     )
+
+
+def _first_messages(messages: dict[str, str], later: dict[str, str]) -> dict[str, str]:
+    """Return the first message of each status; that a plugin was given up comes before the first late answer."""
+    ended = {name: text for found in (later, messages) for name, text in found.items() if text.startswith(GIVEN_UP)}
+    return later | messages | ended
 
 
 class Watch:
@@ -210,7 +217,8 @@ def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) 
     written; written ones stay.
     """
     groups = [[_Writer(part, watch=watch) for part in group] for group in by_map(plan.request.spec, parts)]
-    maps = [_Map(plan, group) for group in groups]
+    patience = Patience()
+    maps = [_Map(plan, group, patience) for group in groups]
     writers = [writer for group in groups for writer in group]
     schedule = Schedule([(place.groups(), place.count) for place in maps])
     threads = min(jobs, sum(place.count for place in maps))
@@ -247,9 +255,9 @@ def _write_in_time(writers: Sequence["_Writer"], schedule: Schedule[Question]) -
 class _Map:
     """A map and the tasks that search it."""
 
-    def __init__(self, plan: RunPlan, writers: Sequence["_Writer"]) -> None:
+    def __init__(self, plan: RunPlan, writers: Sequence["_Writer"], patience: Patience) -> None:
         self.count = sum(len(writer.part.left) for writer in writers)
-        self._plan, self._writers = plan, writers
+        self._plan, self._writers, self._patience = plan, writers, patience
         asks = "imagery" in plan.card.needs
         self._is_pictured = asks and read_manifest(writers[0].part.region).imagery is not None
 
@@ -273,7 +281,7 @@ class _Map:
 
         Each flight has a process and a scratch folder of its own: others may fly the same way, or have flown it.
         """
-        ready = self._failed_training()
+        ready = self._failed_training() or self._given_up()
         with self._process() as worker:
             is_warm = False
             for group in schedule.groups(number):
@@ -285,11 +293,14 @@ class _Map:
                     region, text = self._writers[0].part.region, None if result is None else result.text
                     ready = guarded(self._plan, partial(worker.prepare, region, text))
                     self._check_map(ready)
+                    if ready.status != "ok":  # a map that is ready answers nothing yet
+                        self._patience.note(ready.status, ready.message)
                 if schedule.is_stopped:
                     return
                 if self._failed_training() is None:
                     for writer in {id(item[0]): item[0] for item in group}.values():
                         writer.add_process(worker, ready)
+                is_warm = is_warm or self._given_up() is not None
                 if ready.status == "ok" and not is_warm and self._lacks(group[0][1]) is None:
                     guarded(self._plan, partial(worker.match, group[0][2], top_k=self._plan.request.top_k))
                     is_warm = True
@@ -307,13 +318,25 @@ class _Map:
             if reason is not None:
                 writer.add(Prediction(query_id=query.query_id, status="not applicable", message=reason))
                 continue
-            reply = failed or guarded(self._plan, partial(worker.match, blob, top_k=self._plan.request.top_k))
+            reply = failed or self._given_up()
+            reply = reply or self._asked(partial(worker.match, blob, top_k=self._plan.request.top_k))
             row = self._row(query, reply)
             writer.add(row, cpu_s=reply.cpu_s)
             if query.step is not None and failed is None and row.status != "ok":
                 failed = Reply(
                     status=row.status, message=f"since frame {query.step.frame} of the flight: {row.message}"
                 )
+
+    def _asked(self, ask: Callable[[], Reply]) -> Reply:
+        """Return the reply to a question, which tells how long to go on asking."""
+        reply = guarded(self._plan, ask)
+        self._patience.note(reply.status, reply.message)
+        return reply
+
+    def _given_up(self) -> Reply | None:
+        """Return the reply to every query after ten in a row that the matcher hung on; starts no process."""
+        message = self._patience.given_up
+        return None if message is None else Reply(status="timeout", message=message)
 
     def _lacks(self, query: Query) -> str | None:
         """Return why a query is not applicable to the matcher, or None."""
@@ -412,7 +435,7 @@ class _Writer:
             self._cpu_s += cpu_s
             self._counts[prediction.status] = self._counts.get(prediction.status, 0) + 1
             if prediction.message:
-                self._messages.setdefault(prediction.status, prediction.message)
+                self._messages = _first_messages(self._messages, {prediction.status: prediction.message})
             if len(self._rows) >= PART_ROWS:
                 self.flush()
             self._watch.advance(self.part)

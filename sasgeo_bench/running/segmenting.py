@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train a segmenter and ask it about images, in processes of its own; a failure costs one image and is recorded."""
 
-import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -11,11 +10,13 @@ from types import TracebackType
 from typing import Self
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER, SEGMENTERS, check_card_name
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.running.code_hash import segmenter_code
 from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.oracle_segmenter import CARD, ISOLATION, oracle_reply
+from sasgeo_bench.running.patience import Patience
 from sasgeo_bench.running.plan import TrainingResult, hidden_below
 from sasgeo_bench.running.segmenter_process import SegmenterProcess, SegmenterReply
 from sasgeo_bench.running.training import failed_training
@@ -103,8 +104,8 @@ def _paths_of(images: Iterable[LabelledImage]) -> Iterator[tuple[Path, ...]]:
     if isinstance(images, LabelledFiles):
         yield images.paths
         return
-    with tempfile.TemporaryDirectory(prefix="sasgeo-images-") as folder:
-        yield write_labelled(Path(folder), images)
+    with scratch_folder("images") as folder:
+        yield write_labelled(folder, images)
 
 
 class SegmenterRun:
@@ -116,6 +117,7 @@ class SegmenterRun:
 
     def __init__(self, request: SegmentRequest, loaded: LoadedSegmenter, *, learned: str | None = None) -> None:
         self._request, self._loaded, self._learned = request, loaded, learned
+        self._patience = Patience("images")
         self._process = SegmenterProcess(
             spec=request.spec, reach=request.reach(), limits=request.limits, learned=learned
         )
@@ -133,7 +135,8 @@ class SegmenterRun:
     def segment(self, image: AerialImage | LabelledImage) -> SegmenterReply:
         """Ask about an image; a crash, a late or an unsound answer is a status with its cause, and costs no other one.
 
-        Raise `StoreError` if no process can be started for want of space, `MatchError` if the control has no labels.
+        After ten late answers in a row the segmenter is not asked any more. Raise `StoreError` if no process can be
+        started for want of space, `MatchError` if the control has no labels.
         """
         if self._request.spec == ORACLE_SEGMENTER:
             return oracle_reply(image)
@@ -141,8 +144,12 @@ class SegmenterRun:
         if "training" in card.needs and self._learned is None:
             return SegmenterReply(status="not applicable", message="no training")
         picture = image.image if isinstance(image, LabelledImage) else image
+        if self._patience.given_up is not None:
+            return SegmenterReply(status="timeout", message=self._patience.given_up)
         ask = partial(self._process.segment, picture, classes=card.classes)
-        return guard(ask, partial(_failed_by_us, self._request))
+        reply = guard(ask, partial(_failed_by_us, self._request))
+        self._patience.note(reply.status, reply.message)
+        return reply
 
     @property
     def isolation(self) -> dict[str, str]:

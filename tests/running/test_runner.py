@@ -142,6 +142,20 @@ def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     assert not [fault for fault in validate(folder, [task]) if "again" in fault.found]
 
 
+@pytest.mark.usefixtures("in_threads")
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_matcher_that_hangs_on_ten_queries_in_a_row_is_given_up(task, tmp_path, jobs):
+    count = len(task_files.read_ids(task))
+    hanging = Limits(match_s=0.01)  # it never answers, however long one waits
+    report, folder = run_all(request_of(task, tmp_path, name="Hangs", limits=hanging, jobs=jobs))
+    assert report.counts == {"timeout": count}
+    words = "given up after 10 queries in a row without an answer in time (no answer within 0.01 s)"
+    messages = [item.message for item in table(folder)]
+    assert count - 10 - (jobs - 1) <= messages.count(words) <= count - 10
+    assert set(messages) == {words, "no answer within 0.01 s"}
+    assert report.messages == {"timeout": words}
+
+
 def command_of(program, task, out, *words):
     command = [sys.executable, "-c", program, "run", "--matcher", "hostile:Slow", "--tasks", str(task)]
     return [*command, "--out", str(out), "--match-s", "600", *words]

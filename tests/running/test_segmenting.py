@@ -57,6 +57,16 @@ def test_images_are_answered_with_what_the_plugin_itself_would_say(request_of) -
         assert 0 < reply.own_s <= reply.seconds
 
 
+@pytest.mark.usefixtures("in_threads")
+def test_a_segmenter_that_hangs_on_ten_images_in_a_row_is_given_up(request_of) -> None:
+    request = request_of("Hangs", limits=replace(PATIENT, match_s=0.01))
+    replies = told(request, *[tiny_images()[0]] * 12)
+    assert {reply.status for reply in replies} == {"timeout"}
+    assert [reply.message.startswith("given up after 10 images in a row") for reply in replies] == [False] * 10 + [
+        True
+    ] * 2
+
+
 @pytest.mark.parametrize(
     ("name", "status", "words"),
     [

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar, get_origin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.files.paths import plain_file
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -163,7 +164,7 @@ def shipped_dir(kind: Kind) -> Path:
 def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
     """Read a file of a kind that ships; raise `ConfigError`, with all faults on one line, if it is wrong."""
     try:
-        text = path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark
+        text = plain_file(path).read_text(encoding="utf-8-sig")  # some editors write a byte order mark
     except (OSError, UnicodeDecodeError) as error:
         noun = kind.removesuffix("s")
         message = f"{path} cannot be read as a {noun} file ({error}): name a .toml file, or the id of one that ships"

@@ -3,11 +3,13 @@
 
 import logging
 import os
+import re
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import chdir, contextmanager
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, chdir, contextmanager
 from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
@@ -16,6 +18,7 @@ from threading import Thread
 from typing import TYPE_CHECKING, Final, Generic, NamedTuple, Protocol, TypeVar, cast
 
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.texts import message_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -25,6 +28,9 @@ QUIET: Final = "SASGEO_QUIET"  # variable that is set while nothing is to be sho
 _MINUTE_S: Final = 60.0
 _HOUR_S: Final = 3600.0
 _CONNECT_S: Final = 10.0
+MOST_PROCESSES: Final = 1000  # at once, of one command
+_DIGITS: Final = 10
+_ADDRESS: Final = re.compile(r"(?:(?:tcp|tls)://)?[^\s/:]+:\d{1,5}|(?:tcp|tls)://\[[0-9a-fA-F:.%]+\]:\d{1,5}")
 
 Tell = Callable[[str], None]
 
@@ -109,6 +115,13 @@ Item = TypeVar("Item")
 Found = TypeVar("Found")
 
 
+def check_jobs(jobs: int) -> None:
+    """Raise `ConfigError` for a number of processes that no computer starts."""
+    if not 1 <= jobs <= MOST_PROCESSES:
+        message = f"--jobs must lie between 1 and {MOST_PROCESSES}, got {jobs}"
+        raise ConfigError(message)
+
+
 @contextmanager
 def connected(address: str) -> Iterator["Client"]:
     """Yield a client of a dask scheduler at tcp://host:port, or of N processes on this machine for local:N.
@@ -122,26 +135,34 @@ def connected(address: str) -> Iterator["Client"]:
         raise ConfigError(message) from error
     kind, _, count = address.partition(":")
     if kind == "local":
-        if not (count.isascii() and count.isdecimal() and int(count) >= 1):
-            message = f"--dask must be local:N with N >= 1, or a scheduler's address, got {address!r}"
+        if not (count.isascii() and count.isdecimal() and len(count) <= _DIGITS and 1 <= int(count) <= MOST_PROCESSES):
+            message = (
+                f"--dask must be local:N with N from 1 to {MOST_PROCESSES}, or a scheduler's address, got {address!r}"
+            )
             raise ConfigError(message)
-        with (
-            # One thread each: a chunk waits for one matcher's process. The page that dask serves anyway is for this
-            # machine alone, at any port: by default it is for all, and a warning where another cluster has that port.
-            LocalCluster(
-                n_workers=int(count),
-                threads_per_worker=1,
-                processes=True,
-                dashboard_address="127.0.0.1:0",
-                silence_logs=logging.CRITICAL,
-            ) as cluster,
-            Client(cluster) as client,
-        ):
+        with ExitStack() as stack:
+            try:
+                # One thread each: a chunk waits for one matcher's process. The page that dask serves anyway is for this
+                # machine alone, at any port: by default it is for all, with a warning where a cluster has that port.
+                cluster = LocalCluster(
+                    n_workers=int(count),
+                    threads_per_worker=1,
+                    processes=True,
+                    dashboard_address="127.0.0.1:0",
+                    silence_logs=logging.CRITICAL,
+                )
+                client = stack.enter_context(Client(stack.enter_context(cluster)))
+            except (OSError, RuntimeError) as error:  # TimeoutError is among them
+                message = f"{count} dask workers cannot be started here ({message_of(error)}): ask for fewer"
+                raise ConfigError(message) from error
             yield client
         return
+    if not _ADDRESS.fullmatch(address):
+        message = f"--dask must be local:N, or a scheduler's address as tcp://host:port, got {address!r}"
+        raise ConfigError(message)
     try:
         client = Client(address, timeout=_CONNECT_S)
-    except (OSError, TimeoutError, ValueError) as error:
+    except (OSError, TimeoutError, ValueError, TypeError) as error:  # TypeError: of TLS without certificates
         message = f"no dask scheduler answers at {address!r} within {_CONNECT_S:g} s: check the address, or use local:N"
         raise ConfigError(message) from error
     with client:
@@ -166,6 +187,7 @@ def spread(
     or cannot write or read, is given to another one. Raise `ConfigError` if it is not there, or named beside `jobs`;
     `StoreError` if no worker can do an item.
     """
+    check_jobs(jobs)
     if dask is not None and jobs > 1:
         message = f"--jobs {jobs} and --dask {dask} both share out the work: leave one of them out"
         raise ConfigError(message)
@@ -181,8 +203,15 @@ def _found(work: Callable[[Item], Found], items: Sequence[Item], jobs: int) -> I
     if jobs == 1 or len(items) < 2:  # noqa: PLR2004 - one item is no work to share
         yield from map(work, items)
         return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
-        yield from pool.map(work, items)
+    try:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
+            yield from pool.map(work, items)
+    except BrokenProcessPool as error:
+        message = (
+            f"one of {jobs} processes died, by a signal or for want of memory: ask for fewer --jobs, and go on; "
+            "what is written stays"
+        )
+        raise StoreError(message) from error
 
 
 class _Tried(NamedTuple, Generic[Found]):

@@ -2,13 +2,16 @@
 """Work that is spread over processes ends with the program that spreads it."""
 
 import os
+import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import psutil
+import pytest
 
+from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.progress import spread
 
 PROGRAM = """
@@ -26,6 +29,23 @@ def note_and_wait(path: Path) -> None:
     path.with_suffix(".part").write_text(str(os.getpid()), encoding="ascii")
     path.with_suffix(".part").replace(path)
     time.sleep(LONG_S)
+
+
+def die(number):
+    """End the process as the kernel does for want of memory."""
+    os.kill(os.getpid(), signal.SIGKILL)
+    return number
+
+
+def test_a_process_that_dies_is_told_in_one_line() -> None:
+    with pytest.raises(StoreError, match=r"one of 2 processes died.*ask for fewer --jobs"):
+        list(spread(die, [1, 2], jobs=2))
+
+
+@pytest.mark.parametrize("jobs", [0, -1, 10**8])
+def test_more_processes_than_a_computer_starts_are_refused(jobs) -> None:
+    with pytest.raises(ConfigError, match=f"--jobs must lie between 1 and 1000, got {jobs}"):
+        list(spread(abs, [1], jobs=jobs))
 
 
 def test_results_come_in_order_from_several_processes():

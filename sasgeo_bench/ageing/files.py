@@ -15,7 +15,7 @@ from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, Ageing
 from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
 from sasgeo_bench.ageing.plots import draw_ageing
 from sasgeo_bench.ageing.ratebook import VERSION
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError
 from sasgeo_bench.files.parquet import read_frame, write_frame
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -68,6 +68,8 @@ def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         write(scratch)
         scratch.replace(target)
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except OSError as error:
         message = f"{target} cannot be written ({error}): check the free space and the rights of its folder"
         raise StoreError(message) from error

@@ -16,9 +16,10 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import Final
 
-from sasgeo_bench.errors import StoreError, counted
+from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import locked, remove_tree
 from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.running import prediction_files
@@ -87,6 +88,8 @@ def unpack_head_start(pipeline_file: Path, stated: ArchiveSpec | None, out: Path
             with TemporaryDirectory(prefix=_SCRATCH, dir=out) as folder:
                 _unpack(archive, data, Path(folder))
                 laid = _lay_all(Path(folder), out, stated.sha256)
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except OSError as error:
         message = (
             f"{out} cannot be written ({error.strerror or error}: {error.filename2 or error.filename}): check your "
@@ -100,7 +103,7 @@ def unpack_head_start(pipeline_file: Path, stated: ArchiveSpec | None, out: Path
 def _read(archive: Path, sha256: str, pipeline_file: Path) -> bytes:
     """Read an archive; refuse one that is not the stated one."""
     try:
-        with archive.open("rb") as file:
+        with plain_file(archive).open("rb") as file:
             data = file.read(MOST_PACKED + 1)
     except OSError as error:
         message = f"{archive} cannot be read ({error.strerror or error}): check your rights"

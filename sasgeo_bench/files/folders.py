@@ -15,8 +15,9 @@ from filelock import FileLock, Timeout
 from pydantic import ConfigDict, Field
 
 from sasgeo_bench.config import Document
-from sasgeo_bench.errors import StoreError, named
+from sasgeo_bench.errors import SasgeoError, StoreError, named
 from sasgeo_bench.files.json import read_json
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.texts import one_line
 
 
@@ -102,6 +103,8 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
             check_room(folder)  # where no file can be made, nobody holds it
             tell(f"{folder} is being written by another run, waiting for it")
             lock.acquire()
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except OSError as error:
         message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
         raise StoreError(message) from error
@@ -129,6 +132,8 @@ def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
         finally:  # also of an interrupt; once it is renamed there is none
             with suppress(OSError):
                 scratch.unlink()
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except OSError as error:
         message = f"{path} cannot be written ({error.strerror or error}): {mend}"
         raise StoreError(message) from error
@@ -196,7 +201,7 @@ class FileRecord(Document):
 
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file, hexadecimal, read in pieces."""
-    with path.open("rb") as source:
+    with plain_file(path).open("rb") as source:
         return hashlib.file_digest(source, "sha256").hexdigest()
 
 
@@ -346,6 +351,8 @@ def check_room(folder: Path) -> None:
             pass
         if folder.is_dir() and not os.access(folder, os.W_OK):
             raise PermissionError(13, "Permission denied")
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except OSError as error:
         message = f"{folder} cannot be written ({error.strerror or error}): check your rights, or name another folder"
         raise StoreError(message) from error

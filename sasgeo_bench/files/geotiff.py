@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sasgeo_bench.files.paths import plain_file
+
 if TYPE_CHECKING:
     from rasterio.io import DatasetReader
 
@@ -25,7 +27,7 @@ def open_geotiff(path: Path, *, has_more: bool = False, **options: Any) -> Itera
     from rasterio.errors import RasterioIOError  # noqa: PLC0415
 
     beside = {} if has_more else {"GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
-    with rasterio.Env(**beside), rasterio.open(path, driver="GTiff", **options) as source:
+    with rasterio.Env(**beside), rasterio.open(plain_file(path), driver="GTiff", **options) as source:
         stray = next((name for name in source.files if not _is_own(Path(name), path)), None) if has_more else None
         if stray is not None:
             message = f"a file beside it reads {Path(stray).name}, which is none of its own"

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.texts import plain
 
 MOST_BYTES: Final = 50_000_000
@@ -51,7 +52,7 @@ def read_json(path: Path, *, mend: str, most_bytes: int = MOST_BYTES) -> Any:  #
 
 
 def _read(path: Path, most_bytes: int) -> bytes:
-    with path.open("rb") as source:
+    with plain_file(path).open("rb") as source:
         data = source.read(most_bytes + 1)
     if len(data) > most_bytes:
         message = f"it has more than {most_bytes} bytes"

@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.files.paths import plain_file
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -99,7 +100,7 @@ def open_table(
     """
     try:
         _check_footer(path)
-        with pq.ParquetFile(path, **{**VERIFIED, **options}) as source:
+        with pq.ParquetFile(plain_file(path), **{**VERIFIED, **options}) as source:
             fault = size_fault(source.metadata, most_rows=most_rows, is_whole=is_whole)
             if fault is None and not options.get("read_dictionary"):  # who reads so has bounds of its own
                 fault = _unpacked_fault(path, source.metadata, is_whole=is_whole)
@@ -279,7 +280,7 @@ def _seal(path: Path) -> None:
 
 def _check_footer(path: Path) -> None:
     """Refuse a file whose footer contradicts its CRC; one without a CRC passes."""
-    with path.open("rb") as file:
+    with plain_file(path).open("rb") as file:
         footer = _read_footer(file)
     at = footer.find(_MARK) + len(_MARK)
     if at >= len(_MARK) and footer[at : at + _DIGITS] != _crc_of(footer, at):

@@ -1,10 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Paths that a caller gives to a public function."""
+"""Paths that a caller gives to a public function, or names in a file."""
 
+import errno
+import stat
+from contextlib import suppress
 from pathlib import Path
+from typing import Final
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.texts import one_line
+
+_SPECIAL: Final = {
+    stat.S_IFIFO: "a pipe",
+    stat.S_IFSOCK: "a socket",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+}
 
 
 def given_path(value: object) -> Path:
@@ -21,3 +32,22 @@ def given_path(value: object) -> Path:
         message = f"{one_line(repr(value))} is no path: name a folder or a file, as a text or a Path"
         raise StoreError(message)
     return Path(value)
+
+
+def plain_file(path: Path) -> Path:
+    """Return the path of a file that is about to be read; raise `OSError` if it is a pipe, a socket or a device.
+
+    To open a pipe waits until another program writes to it, perhaps for ever. Of a folder, or what is not there, the
+    opening itself speaks. Every reader of this package calls it.
+
+    >>> plain_file(Path("/dev/null"))
+    Traceback (most recent call last):
+        ...
+    OSError: [Errno 22] it is a device, a plain file is needed: '/dev/null'
+    """
+    kind = None
+    with suppress(OSError, ValueError):
+        kind = _SPECIAL.get(stat.S_IFMT(path.stat().st_mode))
+    if kind is not None:
+        raise OSError(errno.EINVAL, f"it is {kind}, a plain file is needed", str(path))
+    return path

@@ -30,7 +30,7 @@ from sasgeo_bench.files.folders import (
     sha256_of,
 )
 from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.files.paths import given_path
+from sasgeo_bench.files.paths import given_path, plain_file
 from sasgeo_bench.texts import json_text, one_line
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def _content_of(folder: Path) -> str:
     """
     for name, keys in _CONTENT.items():
         with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-            about: Any = parse_json((folder / name).read_bytes())
+            about: Any = parse_json(plain_file(folder / name).read_bytes())
             return "/".join(str(about[key]) for key in keys)
     return ""
 
@@ -222,7 +222,7 @@ def _begun(target: Path, sent: "_Sent") -> Path:
             if not mark.is_file():
                 mark.write_bytes(data)
     if scratch.is_dir() and not scratch.is_symlink() and mark.is_file():
-        if mark.read_bytes() == data:
+        if plain_file(mark).read_bytes() == data:
             return scratch
         remove_tree(scratch)  # of another folder, or an older copy
     try:

@@ -12,6 +12,7 @@ from pydantic import Field
 from sasgeo_bench.config import Document, Line, Prose, parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.texts import NAME
 
 _FOLDER: Final = "profiles"
@@ -120,7 +121,7 @@ def read_drift_profile(path: Path) -> DriftProfile:
     """Read a profile of one's own; raise `ConfigError`, in one line, if the file is missing or wrong."""
     mend = "name a .toml file that measure-drift --profile has written"
     try:
-        with path.open("rb") as source:
+        with plain_file(path).open("rb") as source:
             content = source.read(_MOST_BYTES + 1)
         if len(content) > _MOST_BYTES:
             message = f"{path} is no drift profile, it has more than {_MOST_BYTES} bytes: {mend}"

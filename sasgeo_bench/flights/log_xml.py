@@ -15,6 +15,7 @@ from defusedxml import DefusedXmlException  # type: ignore[import-untyped]
 from defusedxml.ElementTree import iterparse  # type: ignore[import-untyped]
 
 from sasgeo_bench.errors import FlightError
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.flights.log_points import FlightLog, LogSource, shown
 from sasgeo_bench.texts import message_of
 
@@ -174,7 +175,7 @@ def _elements(source: LogSource) -> Iterator[tuple[str, Element, str]]:
 def _content(source: LogSource) -> bytes:
     source.check_size()
     try:
-        content = source.path.read_bytes()
+        content = plain_file(source.path).read_bytes()
     except OSError as error:
         message = f"cannot be read ({message_of(error)}): check its rights"
         raise source.fault(message) from error

@@ -13,6 +13,7 @@ import numpy as np
 
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.flights.axes import Axes, in_axes
 from sasgeo_bench.flights.trajectory import Trajectory
 
@@ -95,10 +96,7 @@ def write_tum(trajectory: Trajectory, path: Path) -> None:
 
 def _content_of(path: Path) -> bytes:
     try:
-        if path.is_fifo():
-            message = f"{path} is a pipe, which is not read: name a TUM file, plain or gzipped"
-            raise FlightError(message)
-        with path.open("rb") as file:
+        with plain_file(path).open("rb") as file:
             is_packed = file.read(2) == _GZIP
             file.seek(0)
             content = (gzip.GzipFile(fileobj=file) if is_packed else file).read(MOST_BYTES + 1)

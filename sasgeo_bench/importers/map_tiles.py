@@ -36,7 +36,7 @@ def read_size_px(path: Path, *, shown: str) -> tuple[int, int]:
             warnings.simplefilter("ignore", NotGeoreferencedWarning)
             with open_geotiff(path, has_more=True) as source:
                 width, height = int(source.width), int(source.height)
-    except RasterioError as error:
+    except (RasterioError, OSError) as error:
         message = f"{shown} is no TIFF that can be read: copy it again"
         raise DatasetError(message) from error
     if not (0 < width <= _MOST_PX and 0 < height <= _MOST_PX):

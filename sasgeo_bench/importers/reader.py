@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import DatasetError, counted
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.importers.items import MOST_ITEMS, Item, Role
 
 IMAGES: Final = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
@@ -80,7 +81,7 @@ class FolderReader:
             message = f"{relative} has {path.stat().st_size} bytes, {_MOST_BYTES} at most: it is no table of this set"
             raise DatasetError(message)
         try:
-            text = path.read_text(encoding="utf-8-sig")
+            text = plain_file(path).read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
             message = f"{relative} is no text in UTF-8 (byte {error.start}): copy it again"
             raise DatasetError(message) from error

@@ -19,7 +19,7 @@ from matplotlib.patches import Circle, Patch, Rectangle
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, footprint, observe
@@ -69,6 +69,8 @@ def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         scratch.write_bytes(_encoded(PNG, pixels, [cv2.IMWRITE_PNG_COMPRESSION, 9]))
         scratch.rename(path)
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except OSError as error:
         message = f"{path} cannot be written ({error.strerror or error}): check the free space and your rights"
         raise StoreError(message) from error

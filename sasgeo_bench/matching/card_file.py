@@ -6,7 +6,7 @@ from typing import Any, Final
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.files.paths import given_path
+from sasgeo_bench.files.paths import given_path, plain_file
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.submission import Card
 
@@ -69,7 +69,7 @@ def read_card_file(path: Path) -> Card:
         message = f"{path} is no plain file: {noun}"
         raise StoreError(message)
     try:
-        with path.open("rb") as source:
+        with plain_file(path).open("rb") as source:
             read = source.read(_MOST_BYTES + 1)
         text = read.decode("utf-8-sig")  # some editors write a byte order mark
     except (UnicodeDecodeError, OSError) as error:

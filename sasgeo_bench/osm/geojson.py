@@ -12,6 +12,7 @@ import shapely
 
 from sasgeo_bench.errors import ExtractError, counted
 from sasgeo_bench.files.json import MOST_BYTES, parse_json
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.osm.scan import Box, Classifier, Scan, ScanRow
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy
 from sasgeo_bench.osm.xml_text import NEW_IDS
@@ -82,7 +83,7 @@ def _features(path: Path) -> Iterator[Any]:
         message = f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region"
         raise ExtractError(message)
     try:
-        content = parse_json(path.read_bytes().removeprefix(b"\xef\xbb\xbf"))
+        content = parse_json(plain_file(path).read_bytes().removeprefix(b"\xef\xbb\xbf"))
     except (OSError, ValueError) as error:
         message = f"{path} cannot be read as GeoJSON ({str(error)[:200]}): get it again"
         raise ExtractError(message) from error
@@ -96,7 +97,15 @@ def _features(path: Path) -> Iterator[Any]:
             f"{path} is in {json.dumps(crs)[:100]}, GeoJSON is in longitude and latitude: reproject it to EPSG:4326"
         )
         raise ExtractError(message)
-    yield from features
+    for number, feature in enumerate(features):
+        properties = feature.get("properties") if isinstance(feature, dict) else None
+        if not isinstance(properties, dict | None):
+            message = (
+                f"{path}: the properties of feature {number} are {json.dumps(properties)[:60]}, and no object "
+                "of keys and values: mend or remove it"
+            )
+            raise ExtractError(message)
+        yield feature
 
 
 def _shape(feature: Any, path: Path, number: int) -> shapely.Geometry | None:  # noqa: ANN401 - what a file holds

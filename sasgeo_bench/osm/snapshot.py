@@ -14,6 +14,7 @@ import osmium
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ExtractError, counted
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.osm.xml_text import NEW_IDS, Box, clean, needs_cleaning, read_boxes
 
@@ -146,7 +147,7 @@ def _check_file(path: Path) -> None:
 
 def _as_its_content(path: Path, scratch: Path) -> Path:
     """Return the path, a link to it with the suffix of its content (osmium goes by the name alone), or clean XML."""
-    with path.open("rb") as source:
+    with plain_file(path).open("rb") as source:
         start = source.read(16)
     if start[4 : 4 + len(_PBF_MARK)] == _PBF_MARK:
         suffix = ".osm.pbf"

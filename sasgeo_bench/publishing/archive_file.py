@@ -21,6 +21,7 @@ from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import SITE_FOLDERS, fresh_folder, hashes_of, list_files, locked, resolve_link
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import MOST_VALUES, read_schema, read_table, write_table
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.leaderboard.board_files import ANSWERS, BOARD_FILES
 from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.matching import learned_file
@@ -209,9 +210,9 @@ def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
         region = item.region / MANIFEST
         rows.append(
             {
-                "task_json": (item.task / task_files.TASK).read_text(encoding="utf-8"),
-                "truth_json": (item.truth / task_files.TRUTH_OF).read_text(encoding="utf-8"),
-                "region_json": region.read_text(encoding="utf-8") if region.is_file() else None,
+                "task_json": plain_file(item.task / task_files.TASK).read_text(encoding="utf-8"),
+                "truth_json": plain_file(item.truth / task_files.TRUTH_OF).read_text(encoding="utf-8"),
+                "region_json": plain_file(region).read_text(encoding="utf-8") if region.is_file() else None,
             }
         )
         heads = _heads_of(item.task / task_files.QUERIES)
@@ -245,7 +246,7 @@ def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
             "contestant": name,
             "rows": len(run.predictions),
             "about": json.dumps(dict(run.about)),
-            LEARNED: None if run.learned is None or not run.learned.is_file() else run.learned.read_text("utf-8"),
+            LEARNED: None if run.learned is None else _text_of(run.learned),
         }
         for name, listed in runs.items()
         for run in listed
@@ -389,7 +390,11 @@ def _read_runs(folder: Path) -> pa.Table:
 def _former_learned(folder: Path, about: Mapping[str, Any]) -> str | None:
     training = TrainingRecord.of(about)
     path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(training)
-    return path.read_text("utf-8") if path.is_file() else None
+    return _text_of(path)
+
+
+def _text_of(path: Path) -> str | None:
+    return plain_file(path).read_text("utf-8") if path.is_file() else None
 
 
 def _learned_name(training: TrainingRecord | None) -> str:

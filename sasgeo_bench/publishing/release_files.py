@@ -24,6 +24,7 @@ from sasgeo_bench.files.folders import (
     sha256_of,
 )
 from sasgeo_bench.files.parquet import open_table, read_table, table_writer
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE, Manifest
 from sasgeo_bench.regions.region_files import MANIFEST
@@ -260,7 +261,7 @@ def _is_same(path: Path, sha256: str) -> bool:
 def _sums_of(folder: Path) -> dict[str, str]:
     """Return the SHA-256 of the files of an older release of ours; nothing where there is none."""
     try:
-        lines = (folder / SUMS).read_text(encoding="utf-8").splitlines() if is_ours(folder / INDEX) else []
+        lines = plain_file(folder / SUMS).read_text(encoding="utf-8").splitlines() if is_ours(folder / INDEX) else []
     except (OSError, UnicodeDecodeError):
         lines = []
     return {line[66:]: line[:64] for line in lines}  # two spaces between

@@ -20,6 +20,7 @@ from sasgeo_bench.files.folders import IMAGES, SITE_FOLDERS, check_site, fresh_f
 from sasgeo_bench.files.folders import SITE_MANIFEST as MANIFEST
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.parquet import read_frame
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import (
     ACCEPTANCE,
@@ -179,14 +180,14 @@ def _plain_or_packed(path: Path) -> bytes | None:
     """Return the bytes of a file, or of its .gz unpacked; None where there is neither."""
     packed = path.with_name(f"{path.name}.gz")
     if path.is_file():
-        return path.read_bytes()
+        return plain_file(path).read_bytes()
     return _unpacked(packed) if packed.is_file() else None
 
 
 def _unpacked(path: Path) -> bytes:
     """Unpack a .gz of limited size."""
     try:
-        with gzip.open(path) as source:
+        with gzip.open(plain_file(path)) as source:
             data = source.read(_MOST_UNPACKED + 1)
     except (OSError, EOFError, zlib.error) as error:
         message = f"{path.name} cannot be unpacked: {error}"
@@ -232,7 +233,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
     if not path.is_file():
         return {}
     try:
-        data = path.read_bytes()
+        data = plain_file(path).read_bytes()
         parse_record(data, PicturesRecord)
         content = parse_json(data)
         found = {kind: [dict(item) for item in content.get(kind, [])] for kind in KINDS}
@@ -340,10 +341,12 @@ def write_site(
             for name, data in files.items():
                 _put(scratch / name, data)
             for name, path in pictures.items():
-                _put(scratch / name, path.read_bytes())
+                _put(scratch / name, plain_file(path).read_bytes())
         picture_bytes = sum(
             path.stat().st_size for kind in (PICTURES, MAPS) for path in (target / kind).rglob("*") if path.is_file()
         )
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except OSError as error:
         message = (
             f"{target} cannot be written ({error.strerror or error}): check the free space and your rights, and "

@@ -244,7 +244,7 @@ def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
             ) as view,
         ):
             bands = view.read()  # at once: each call warps anew
-    except RasterioError as error:
+    except (RasterioError, OSError) as error:
         message = f"{path} cannot be read ({error}): build the region again"
         raise StoreError(message) from error
     rgb, is_known = bands[:-1], np.asarray(bands[-1] > 0)

@@ -17,11 +17,11 @@ import rasterio
 import shapely
 from affine import Affine
 from numpy.typing import NDArray
-from rasterio.errors import RasterioError, RasterioIOError
+from rasterio.errors import RasterioError
 from rasterio.windows import Window
 from tifffile import TiffFile, TiffPage, TiffWriter
 
-from sasgeo_bench.errors import StoreError
+from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -246,7 +246,9 @@ def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callab
             painters = _in_turn(painting, paint, (factor for factor, _ in levels))
             for (factor, page), burn_window in zip(levels, painters, strict=True):
                 _fill(page, grid.coarsen(factor), burn_window, packing)
-    except (RasterioError, RasterioIOError, OSError) as error:
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
+    except (RasterioError, OSError) as error:
         message = f"{path} cannot be written ({error}): check the free space and the rights of its folder"
         raise StoreError(message) from error
 
@@ -365,12 +367,29 @@ def read_overview(path: Path, *, longest_cells: int) -> NDArray[np.uint8]:
         fitting = [level for level, factor in enumerate(factors) if longest / factor <= longest_cells]
         if longest <= longest_cells or not factors:
             return read_layers(path)
-        level = fitting[0] if fitting else len(factors) - 1
-        with open_geotiff(path, overview_level=level) as source:
+        chosen = fitting[0] if fitting else len(factors) - 1
+        with open_geotiff(path, overview_level=chosen) as source:
             return np.asarray(source.read(), dtype=np.uint8)
-    except (RasterioError, RasterioIOError) as error:
-        message = f"{path} cannot be read ({error}): build the region again"
-        raise StoreError(message) from error
+    except (RasterioError, OSError) as error:
+        raise _unreadable(path, error) from error
+
+
+def check_shape(path: Path, shape: tuple[int, int, int]) -> None:
+    """Raise `StoreError` if a file has other layers, rows or columns than its region says, or cannot be read."""
+    try:
+        with open_geotiff(path) as source:
+            found = (source.count, source.height, source.width)
+    except (RasterioError, OSError) as error:
+        raise _unreadable(path, error) from error
+    if found != shape:
+        message = f"{path} has layers, rows and columns {found}, its region {shape}: build the region again"
+        raise StoreError(message)
+
+
+def _unreadable(path: Path, error: Exception) -> StoreError:
+    if isinstance(error, StoreError):
+        return error
+    return StoreError(f"{path} cannot be read ({error}): build the region again")
 
 
 def read_layers(
@@ -385,9 +404,8 @@ def read_layers(
             part = Window(window[1], window[0], window[3], window[2]) if window else None
             chosen = None if bands is None else [band + 1 for band in bands]
             layers = np.asarray(source.read(chosen, window=part), dtype=np.uint8)
-    except (RasterioError, RasterioIOError) as error:
-        message = f"{path} cannot be read ({error}): build the region again"
-        raise StoreError(message) from error
+    except (RasterioError, OSError) as error:
+        raise _unreadable(path, error) from error
     layers.flags.writeable = False
     return layers
 
@@ -407,9 +425,8 @@ def read_bits(path: Path) -> LayerBits:
                 stripe = Window(0, top, source.width, min(BLOCK_CELLS, source.height - top))
                 bits[top : top + BLOCK_CELLS] = LayerBits.of(np.asarray(source.read(window=stripe))).bits
             count = source.count
-    except (RasterioError, RasterioIOError) as error:
-        message = f"{path} cannot be read ({error}): build the region again"
-        raise StoreError(message) from error
+    except (RasterioError, OSError) as error:
+        raise _unreadable(path, error) from error
     bits.flags.writeable = False
     return LayerBits(bits=bits, count=count)
 
@@ -427,9 +444,8 @@ def cog_faults(path: Path) -> list[str]:
         is_valid, faults, _ = cog_validate(path, quiet=True)
         found = [] if is_valid else list(faults) or ["not valid"]
         return [fault for fault in found if "not tiled" not in fault or not _is_tiled(path)]
-    except (RasterioError, RasterioIOError) as error:
-        message = f"{path} cannot be read ({error}): build the region again"
-        raise StoreError(message) from error
+    except (RasterioError, OSError) as error:
+        raise _unreadable(path, error) from error
 
 
 def _is_tiled(path: Path) -> bool:

@@ -103,7 +103,8 @@ def read_manifest(folder: Path) -> Manifest:
         raise StoreError(message)
     try:
         manifest = check_document(content, Manifest, source=MANIFEST)
-        _ = manifest.grid, shapely.from_wkt(manifest.coverage.wkt), CRS.from_epsg(manifest.epsg)
+        _ = shapely.from_wkt(manifest.coverage.wkt), CRS.from_epsg(manifest.epsg)
+        _check_bounds(manifest)
     except (ConfigError, GridError, CRSError, shapely.errors.ShapelyError) as error:
         message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
         raise StoreError(message) from error
@@ -112,6 +113,15 @@ def read_manifest(folder: Path) -> Manifest:
         message = f"{path} is damaged (its files lack {lost[0]}): {_MEND}"
         raise StoreError(message)
     return manifest
+
+
+def _check_bounds(manifest: Manifest) -> None:
+    """Refuse rows and columns that are not those of the bounds: arrays are made by them before a file is opened."""
+    grid, (west_m, south_m, east_m, north_m) = manifest.grid, manifest.bounds_m
+    rows, cols = (north_m - south_m) / grid.cell_size_m, (east_m - west_m) / grid.cell_size_m
+    if not (abs(rows - grid.rows) < 0.5 and abs(cols - grid.cols) < 0.5):  # noqa: PLR2004 - of a cell
+        message = f"it has {grid.rows} x {grid.cols} cells, its bounds hold {rows:.0f} x {cols:.0f}"
+        raise GridError(message)
 
 
 def read_region(
@@ -147,12 +157,13 @@ def read_region(
     GridError
         If the bounds are no box, or lie beyond the map.
     """
-    from sasgeo_bench.regions.layers import read_layers  # noqa: PLC0415 - imports GDAL
+    from sasgeo_bench.regions.layers import check_shape, read_layers  # noqa: PLC0415 - imports GDAL
 
     folder = given_path(path)
     manifest = read_manifest(folder)
     for name in (LAYERS, FEATURES, NODES, EDGES):
         _check_file(folder / name, manifest.files[name])
+    check_shape(folder / LAYERS, (len(manifest.classes), manifest.rows, manifest.cols))
     coverage, window, box = shapely.from_wkt(manifest.coverage.wkt), None, None
     if bounds_m is not None:
         window = _window(manifest.grid, bounds_m)

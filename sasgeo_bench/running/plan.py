@@ -16,6 +16,7 @@ from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, rea
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.matching.results import SOUND, STATUSES, Status, matcher_hash
+from sasgeo_bench.progress import check_jobs
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
@@ -277,7 +278,8 @@ def _check(request: RunRequest) -> None:
         message = f"--shard must be i/n with 1 <= i <= n, got {index}/{count}"
         raise ConfigError(message)
     limits = request.limits
-    numbers = (("--jobs", request.jobs), ("--top-k", request.top_k), ("--limit", request.limit))
+    check_jobs(request.jobs)
+    numbers = (("--top-k", request.top_k), ("--limit", request.limit))
     for name, value in numbers:
         if value is not None and value < 1:
             message = f"{name} must be at least 1, got {value}"

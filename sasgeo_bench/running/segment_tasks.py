@@ -13,6 +13,7 @@ import numpy as np
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.files.folders import sha256_of
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.learned_file import write_learned
 from sasgeo_bench.matching.segmenter import check_text
 from sasgeo_bench.progress import Progress, Tell, spread
@@ -242,7 +243,7 @@ def _digest(text: str) -> str:
 def _kept_text(path: Path) -> str:
     """Read what a segmenter learned; raise `StoreError` if it is not what its name says: evidence would be lost."""
     try:
-        text = path.read_bytes().decode()
+        text = plain_file(path).read_bytes().decode()
     except (OSError, UnicodeDecodeError):
         text = ""
     if path.stem.rpartition("-")[2] != _digest(text):

@@ -2,7 +2,7 @@
 """The levels of a map on disk, made window by window and mapped into memory: a country is searched as a town is."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
@@ -13,11 +13,13 @@ import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
-from sasgeo_bench.errors import ShapeError, StoreError
+from sasgeo_bench.errors import SasgeoError, ShapeError, StoreError
 from sasgeo_bench.files.folders import check_known, fresh_folder, is_ours, locked
 from sasgeo_bench.files.json import read_json
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.search.field import Field, Level, is_thin, round_kernel
+from sasgeo_bench.texts import message_of
 
 FACTORS: Final = (1, 2, 4, 8, 16, 32)  # cells of 2 m: views of up to 2 km
 WINDOW_CELLS: Final = 2048  # of the map's own cells: 14 bands of one window take 60 MB
@@ -45,23 +47,23 @@ class StoredField:
         """Open the output of `store_levels`; raise `StoreError` if it is missing or damaged."""
         about = read_json(folder / _ABOUT, mend=_MEND)
         try:
-            thinner = {int(factor): tuple(map(float, shares)) for factor, shares in about["thinner"].items()}
+            thinner = {int(factor): _shares(shares) for factor, shares in about["thinner"].items()}
             found = cls(folder=folder, grid=Grid(**about["grid"]), key=str(about["key"]), thinner=thinner)
-            for factor in thinner:
-                found._cells(factor)
-        except (KeyError, TypeError, ValueError, AttributeError, EOFError, OSError) as error:
-            message = f"{folder} is damaged ({str(error)[:200]}): {_MEND}"
-            raise StoreError(message) from error
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+            raise _damaged(folder, error) from error
+        if 1 not in thinner:
+            raise _damaged(folder, ValueError(f"{_ABOUT} lists no level 1"))
+        for factor in thinner:
+            found._cells(factor)
         return found
 
     def _cells(self, factor: int) -> NDArray[np.uint8]:
-        """Map the cells of a level into memory."""
-        cells = np.load(self.folder / _name(factor), mmap_mode="r", allow_pickle=False)
-        shape = (*self.grid.coarsen(factor).shape, len(self.thinner[factor]))
-        if cells.dtype != np.uint8 or cells.shape != shape:
-            message = f"{_name(factor)} has {cells.dtype} of shape {cells.shape}, expected uint8 of {shape}"
-            raise ValueError(message)
-        return np.asarray(cells)
+        """Map the cells of a level into memory; raise `StoreError` if they are not what the grid says."""
+        path = self.folder / _name(factor)
+        try:
+            return _mapped(path, (*self.grid.coarsen(factor).shape, len(self.thinner[factor])))
+        except Exception as error:  # NumPy parses a header as Python, which fails at damage with errors of many kinds
+            raise _damaged(self.folder, error) from error
 
     def level(self, factor: int) -> Level:
         """Return the map in cells of `factor` of its own a side; raise `StoreError` if that level is not stored."""
@@ -71,6 +73,31 @@ class StoredField:
             raise StoreError(message)
         shares = np.array(self.thinner[factor])
         return Level(factor=factor, grid=self.grid.coarsen(factor), cells=self._cells(factor), thinner=shares)
+
+
+def _shares(values: Iterable[float]) -> tuple[float, ...]:
+    """Return the `thinner` of a level; raise `ValueError` for what is no share."""
+    shares = tuple(map(float, values))
+    if not all(0.0 <= share <= 1.0 for share in shares):
+        message = f"{shares} are no shares"
+        raise ValueError(message)
+    return shares
+
+
+def _mapped(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """Map the cells of a file into memory; raise `ValueError` for other ones."""
+    cells = open_memmap(plain_file(path), mode="r")
+    if cells.dtype != np.uint8 or cells.shape != shape or not cells.flags.c_contiguous:
+        message = f"{path.name} has {cells.dtype} of shape {cells.shape}, expected uint8 of {shape}"
+        raise ValueError(message)
+    if path.stat().st_size != cells.offset + cells.nbytes:
+        message = f"{path.name} is longer than its cells"
+        raise ValueError(message)
+    return np.asarray(cells)
+
+
+def _damaged(folder: Path, error: Exception) -> StoreError:
+    return StoreError(f"{folder} is damaged ({message_of(error)[:200]}): {_MEND}")
 
 
 def store_levels(
@@ -156,6 +183,8 @@ def store_levels(
                     "thinner": {factor: share.tolist() for factor, share in shares.items()},
                 }
                 (scratch / _ABOUT).write_text(json.dumps(about), encoding="utf-8")
+        except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+            raise
         except OSError as error:
             message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
             raise StoreError(message) from error

@@ -10,6 +10,7 @@ import pyproj
 import rasterio
 from numpy.typing import NDArray
 from pyproj.exceptions import ProjError
+from rasterio._err import CPLE_BaseError
 from rasterio.enums import Resampling
 from rasterio.errors import RasterioError
 from rasterio.vrt import WarpedVRT
@@ -194,7 +195,15 @@ def read_dem(path: Path, grid: Grid) -> Dem:
                 nodata=np.nan,
             ) as warped:
                 cells_m = warped.read(1)
-    except RasterioError as error:
+    except CPLE_BaseError as error:  # of GDAL where no operation leads from one CRS to the other: no `RasterioError`
+        message = (
+            f"{path} cannot be transformed to EPSG:{grid.epsg}: no operation leads there from its CRS; name a file in "
+            "a geographic or projected CRS of the Earth"
+        )
+        raise CameraError(message) from error
+    except (RasterioError, OSError, ValueError) as error:
+        if isinstance(error, CameraError):
+            raise
         message = f"{path} cannot be read as a GeoTIFF of heights ({error}): check the file"
         raise CameraError(message) from error
     unknown = float(np.mean(~np.isfinite(cells_m)))

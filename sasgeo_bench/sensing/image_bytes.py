@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ImageError, StoreError
 from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, pack, unpack
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.image import MOST_PIXELS, AerialImage, LabelledImage
@@ -149,7 +150,7 @@ class LabelledFiles(Sequence[LabelledImage]):
             return LabelledFiles(self.paths[at])
         path = self.paths[at]
         try:
-            return labelled_from(path.read_bytes())
+            return labelled_from(plain_file(path).read_bytes())
         except ImageError as error:
             message = f"{path}: {error}"
             raise ImageError(message) from error

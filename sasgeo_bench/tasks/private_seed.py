@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.paths import plain_file
 
 LEAST_BITS: Final = 64  # fewer can be guessed: a query's id verifies a guess, some 10^6 a second
 REPRODUCING_BITS: Final = 128  # least for a seed that certifies a row
@@ -128,7 +129,7 @@ def _read(file: Path) -> str:
         message = f"{file} must be named <name>{SUFFIX}, by which runs know what to hide from matchers: rename it"
         raise StoreError(message)
     try:
-        status, text = file.stat(), file.read_bytes()[: _MOST_BYTES + 1].decode("ascii", errors="replace")
+        status, text = file.stat(), plain_file(file).read_bytes()[: _MOST_BYTES + 1].decode("ascii", errors="replace")
     except OSError as error:
         message = f"{file} cannot be read ({error.strerror or error}): name a file with a seed that you can read"
         raise StoreError(message) from error

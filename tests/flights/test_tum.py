@@ -88,7 +88,7 @@ def test_no_file_a_folder_a_pipe_and_a_file_over_the_limits_are_refused(lay, tmp
     with pytest.raises(FlightError, match="cannot be read as a trajectory"):
         read_tum(tmp_path)
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(FlightError, match="pipe is a pipe, which is not read"):
+    with pytest.raises(FlightError, match="it is a pipe, a plain file is needed"):
         read_tum(tmp_path / "pipe")
     monkeypatch.setattr(tum, "MOST_POSES", 2)
     with pytest.raises(FlightError, match="line 6: more than 2 poses"):

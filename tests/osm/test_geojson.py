@@ -58,6 +58,14 @@ def test_properties_are_tags_and_classes_that_are_not_asked_for_are_left_out(tmp
     assert both.drops == {"Polygon without a class": 1}
 
 
+@pytest.mark.parametrize("properties", [["building", "yes"], "building=yes", 7, True])
+def test_properties_that_are_no_object_are_refused_by_their_feature(tmp_path, properties):
+    broken = {**feature(HOUSE), "properties": properties}
+    path = written(tmp_path / "a.geojson", feature(SHED), broken)
+    with pytest.raises(ExtractError, match=r"the properties of feature 1 are .*, and no object of keys and values"):
+        read(path)
+
+
 def test_several_files_are_one_map_and_an_object_of_both_is_taken_once(tmp_path):
     first = written(tmp_path / "a.geojson", feature(HOUSE, osm_id=7), feature(SHED))
     second = written(tmp_path / "b.geojson", feature(HOUSE, osm_id=7), feature(SHED, osm_id=8))

@@ -268,6 +268,28 @@ def test_a_manifest_without_a_file_of_a_region_is_refused(there):
         read_manifest(plan.folder)
 
 
+@pytest.mark.parametrize(
+    "changes", [{"rows": 10**9}, {"cols": 1}, {"cell_size_m": 1e-6}, {"rows": 10**9, "cols": 10**9}]
+)
+def test_a_manifest_whose_cells_are_not_those_of_its_bounds_is_refused(there, changes):
+    plan, _ = there
+    path = plan.folder / "region.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+    with pytest.raises(StoreError, match=r"is damaged \(it has .* cells, its bounds hold .*: build the region again"):
+        read_manifest(plan.folder)
+
+
+def test_a_raster_of_another_size_than_the_manifest_says_is_refused(there):
+    plan, _ = there
+    path = plan.folder / "region.json"
+    about = json.loads(path.read_text())
+    west, _, east, north = about["bounds_m"]
+    south = north - 10**9 * about["cell_size_m"]
+    path.write_text(json.dumps(about | {"rows": 10**9, "bounds_m": [west, south, east, north]}))
+    with pytest.raises(StoreError, match=r"layers.tif has layers, rows and columns .*: build the region again"):
+        read_region(plan.folder)
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"schema_version": 1}', "[" * 100_000])
 def test_a_damaged_manifest_is_told_in_one_line(content, tmp_path):
     (tmp_path / "region.json").write_text(content)

@@ -96,11 +96,20 @@ def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
 @pytest.mark.parametrize(
     ("address", "words"),
     [
-        ("local:0", "local:N with N >= 1"),
-        ("local:", "local:N with N >= 1"),
-        ("local:two", "local:N with N >= 1"),
+        ("local:0", "local:N with N from 1 to 1000"),
+        ("local:", "local:N with N from 1 to 1000"),
+        ("local:two", "local:N with N from 1 to 1000"),
+        ("local:100000000", "local:N with N from 1 to 1000"),
+        ("local:" + "9" * 5000, "local:N with N from 1 to 1000"),
         ("tcp://127.0.0.1:9", "no dask scheduler answers at 'tcp://127.0.0.1:9'"),
-        ("nonsense", "no dask scheduler answers at 'nonsense'"),
+        ("tls://127.0.0.1:9", "no dask scheduler answers at 'tls://127.0.0.1:9'"),
+        ("nonsense", "as tcp://host:port, got 'nonsense'"),
+        ("", "as tcp://host:port, got ''"),
+        ("ftp://127.0.0.1:9", "as tcp://host:port, got 'ftp://127.0.0.1:9'"),
+        ("ucx://127.0.0.1:9", "as tcp://host:port, got 'ucx://127.0.0.1:9'"),
+        ("inproc://here", "as tcp://host:port, got 'inproc://here'"),
+        ("tcp://127.0.0.1", "as tcp://host:port, got 'tcp://127.0.0.1'"),
+        ("tcp://127.0.0.1:nine", "as tcp://host:port, got 'tcp://127.0.0.1:nine'"),
     ],
 )
 def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeypatch, address, words):

@@ -244,7 +244,7 @@ def test_what_a_card_says_it_cannot_is_not_applicable(task, tmp_path, name, mess
     ("changes", "error", "words"),
     [
         ({"shard": (3, 2)}, ConfigError, "--shard must be i/n"),
-        ({"jobs": 0}, ConfigError, "--jobs must be at least 1"),
+        ({"jobs": 0}, ConfigError, "--jobs must lie between 1 and 1000, got 0"),
         ({"top_k": 0}, ConfigError, "--top-k must be at least 1"),
         ({"top_k": 1001}, ConfigError, "--top-k must be at most 1000, the bound of an answer, got 1001"),
         ({"spec": "hostile:NoCard"}, MatchError, "card is a NoneType"),

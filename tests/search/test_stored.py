@@ -2,6 +2,8 @@
 """Levels on disk are those made in memory, whatever the windows; a search on either finds the same."""
 
 import json
+import os
+import re
 import shutil
 from dataclasses import replace
 
@@ -147,6 +149,35 @@ def test_damaged_levels_are_told_in_one_line(tmp_path, stored, name, content, wo
     with pytest.raises(StoreError, match=words) as told:
         StoredField.open(folder)
     assert "store the levels of the map again" in str(told.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "spoil", "words"),
+    [
+        ("level-2.npy", lambda _: b"\x93NUMPY\x01\x00v\x00" + b"(" * 118, "TokenError"),
+        ("level-2.npy", lambda _: b"PK\x03\x04 no archive", "magic string"),
+        ("level-2.npy", lambda data: data + b"x", "longer than its cells"),
+        ("level-2.npy", lambda data: data.replace(b"order': False", b"order': True "), "expected uint8"),
+        ("levels.json", lambda data: data.replace(b"1.0]", b"1e308]"), "are no shares"),
+        ("levels.json", lambda data: data.replace(b"1.0]", b'"nan"]'), "are no shares"),
+        ("levels.json", lambda data: re.sub(rb'"thinner": {.*?}', b'"thinner": {}', data), "lists no level 1"),
+    ],
+)
+def test_levels_whose_bytes_are_damaged_are_told_in_one_line(tmp_path, stored, name, spoil, words):
+    folder = shutil.copytree(stored.folder, tmp_path / "map")
+    (folder / name).write_bytes(spoil((folder / name).read_bytes()))
+    with pytest.raises(StoreError, match=f"is damaged .*{words}.*store the levels of the map again"):
+        StoredField.open(folder)
+
+
+def test_a_pipe_in_place_of_a_level_is_refused_not_waited_for(tmp_path, stored):
+    folder = shutil.copytree(stored.folder, tmp_path / "map")
+    opened = StoredField.open(folder)
+    (folder / "level-2.npy").unlink()
+    os.mkfifo(folder / "level-2.npy")
+    for read in (lambda: StoredField.open(folder), lambda: opened.level(2)):
+        with pytest.raises(StoreError, match="it is a pipe"):
+            read()
 
 
 def test_levels_of_another_shape_are_damaged(tmp_path, stored):

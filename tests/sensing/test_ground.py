@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Planes and heights out of GeoTIFFs: where rays meet them, and what is refused."""
 
+import os
+
 import numpy as np
 import pytest
 import rasterio
@@ -138,6 +140,9 @@ def test_heights_of_rows_in_any_direction_are_the_same(turn, tmp_path):
         ({"crs": "IAU_2015:30100"}, "no way leads to EPSG:32632"),  # the Moon
         ({"count": 3, "dtype": "uint8"}, "no file of heights"),
         ({"nodata": 1.0}, "does not cover"),
+        ({"crs": 'LOCAL_CS["site",UNIT["metre",1]]'}, "cannot be transformed to EPSG:32632"),
+        ({"crs": "EPSG:5773"}, "cannot be transformed to EPSG:32632"),  # heights alone
+        ({"crs": "IAU_2015:30100"}, "cannot be transformed to EPSG:32632"),  # of the Moon
     ],
 )
 def test_a_file_that_is_no_ground_is_refused_on_one_line(tmp_path, how, hint):
@@ -157,7 +162,8 @@ def test_heights_in_an_unknown_unit_are_refused(tmp_path):
 
 def test_a_file_that_is_no_raster_is_refused(tmp_path):
     (tmp_path / "dem.tif").write_bytes(b"no heights")
-    for name in ("dem.tif", "none.tif"):
+    os.mkfifo(tmp_path / "pipe.tif")
+    for name in ("dem.tif", "none.tif", "pipe.tif"):
         with pytest.raises(CameraError, match="cannot be read"):
             read_dem(tmp_path / name, GRID)
 

@@ -16,7 +16,7 @@ from osmium.osm.mutable import Node as OsmNode
 from osmium.osm.mutable import Relation as OsmRelation
 from osmium.osm.mutable import Way as OsmWay
 
-from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.errors import ExtractError, SasgeoError
 from sasgeo_bench.osm.synthetic.morphology import Morphology, draw
 from sasgeo_bench.osm.synthetic.sketch import Line, Sketch, Tags, join_streets
 
@@ -103,6 +103,8 @@ def write_town(plan: TownPlan, path: Path, *, on: dt.date | None = None) -> None
     try:
         _write(elements, plan, temporary)
         temporary.replace(path)
+    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
+        raise
     except (OSError, RuntimeError) as error:
         message = f"{path} cannot be written ({error}): check the free space and the rights of its folder"
         raise ExtractError(message) from error

@@ -17,6 +17,7 @@ from pydantic import Field, field_validator, model_validator
 from sasgeo_bench.config import Document, Line, Short, parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredErrors
 
@@ -100,7 +101,7 @@ def read_profile(path: Path) -> PerceptionProfile:
         if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
             message = f"{path} is no perception profile: expected a file of at most {_MOST_BYTES} bytes"
             raise ConfigError(message)
-        text = path.read_text(encoding="utf-8")
+        text = plain_file(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         message = f"{path} cannot be read as a perception profile ({error}): {_MEND}"
         raise ConfigError(message) from error

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The page of a profile: what a matcher costs on a small computer, in a folder of its own."""
 
+import base64
+import hashlib
 import json
 import math
 from collections.abc import Iterator
@@ -80,7 +82,9 @@ def write_profile(of: Profile, folder: Path, *, tell: Tell) -> None:
             (scratch / RECORD).write_text(record, encoding="utf-8")
             _draw(of, scratch / FIGURE)
             template = environment().get_template("profile.html")
-            text = template.render(of=of, rows=list(facts(of)), made_by=made_by)
+            style = hashlib.sha256(environment().get_template("site.css").render().encode()).digest()
+            style_sha256 = base64.b64encode(style).decode()
+            text = template.render(of=of, rows=list(facts(of)), made_by=made_by, style_sha256=style_sha256)
             (scratch / PAGE).write_text(text, encoding="utf-8")
     except StoreError:
         raise

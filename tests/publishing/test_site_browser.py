@@ -82,6 +82,18 @@ def test_no_page_asks_another_host_nor_the_console_nor_scrolls_sideways(page, si
         assert page.value("document.title").endswith("mine")
 
 
+def test_what_a_page_is_made_to_hold_by_a_stranger_is_not_run_nor_asked_of_another_host(page, site, tmp_path):
+    spoilt = shutil.copytree(site, tmp_path / "site")
+    text = (spoilt / "index.html").read_text(encoding="utf-8")
+    planted = "<script>window.planted = 1</script><img src='x' onerror='window.planted = 2'>"
+    planted += "<img src='http://other.example/a.png'><style>main { display: none }</style>"
+    (spoilt / "index.html").write_text(text.replace("<h1>", f"{planted}<h1>"), encoding="utf-8")
+    page.open(address(spoilt))
+    assert page.value("window.planted") is None
+    assert page.value("getComputedStyle(document.querySelector('main')).display") == "block"
+    assert sum("Content Security Policy" in fault for fault in page.faults) == 4, page.faults
+
+
 def test_pictures_are_there(page, site):
     for name in ("figures.html", "failures.html", "regions.html", "suite-real-age.html", "ageing.html"):
         page.open(address(site, name))

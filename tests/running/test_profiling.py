@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """A profile says what was measured: of answers, minute by minute, with what the sensors say where there are some."""
 
+import base64
+import hashlib
 import json
 import math
 import os
+import re
 from dataclasses import replace
 
 import pytest
@@ -142,6 +145,9 @@ def test_a_page_is_written_whole_and_replaces_none_but_a_profile(slowing, tmp_pa
     assert {path.name for path in (tmp_path / "mine").iterdir()} == {RECORD, PAGE, FIGURE}
     text = (tmp_path / "mine" / PAGE).read_text(encoding="utf-8")
     assert "<script>" not in text
+    style = re.search(r"<style>(.*)</style>", text, re.DOTALL)[1]
+    digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
+    assert f"default-src 'none'; style-src 'sha256-{digest}'" in text  # else a browser leaves out its style
     assert "1 timeout" in text
     assert "OpenStreetMap contributors" in text
     said = json.loads((tmp_path / "mine" / RECORD).read_text(encoding="utf-8"))

@@ -2,6 +2,7 @@
 """Parse TOML into a frozen pydantic model, with every fault on one line."""
 
 import difflib
+import errno
 import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
@@ -12,7 +13,6 @@ from typing import Annotated, Any, Final, Literal, TypeVar, get_origin
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.files.paths import plain_file
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -164,13 +164,20 @@ def shipped_dir(kind: Kind) -> Path:
 def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
     """Read a file of a kind that ships; raise `ConfigError`, with all faults on one line, if it is wrong."""
     try:
-        text = plain_file(path).read_text(encoding="utf-8-sig")  # some editors write a byte order mark
+        text = _text_of(path)
     except (OSError, UnicodeDecodeError) as error:
         noun = kind.removesuffix("s")
         message = f"{path} cannot be read as a {noun} file ({error}): name a .toml file, or the id of one that ships"
         raise ConfigError(message) from error
     parsed: Model = _parsed(text, model, str(path))
     return parsed
+
+
+def _text_of(path: Path) -> str:
+    """Read a file; raise `OSError` for a pipe, which would be waited for."""
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EINVAL, "it is no plain file", str(path))
+    return path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark
 
 
 @lru_cache(maxsize=512)  # every lookup of an id reads all files of its kind

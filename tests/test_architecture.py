@@ -21,7 +21,7 @@ HOUSE = (
     # The pipeline.
     *("geometry", "osm", "regions", "ageing", "search", "sensing", "flights", "tasks"),
     *("datasets", "matching", "sasgeo", "running"),
-    *("scoring", "leaderboard", "publishing", "importers", "experiments", "cli"),
+    *("scoring", "leaderboard", "publishing", "importers", "experiments", "cli", "__main__"),
 )
 
 # What draws the queries, and what answers them: a scorer that used a generator's code would know too much.

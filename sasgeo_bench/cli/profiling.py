@@ -18,7 +18,10 @@ class ProfileOptions(Options):
     """Flags of profile."""
 
     matcher: Annotated[str, typer.Option(help="name from list-matchers or list-trackers, or module:Class")]
-    tasks: Annotated[list[Path], typer.Option(help="task folder, OUT/tasks/SUITE/REGION; may be repeated, of one map")]
+    tasks: Annotated[
+        list[Path],
+        typer.Option(help="task folders, OUT/tasks/SUITE/REGION, of one map"),
+    ]
     cores: Annotated[int, typer.Option(help="processors that the matcher and this program share")] = 1
     memory_mb: Annotated[int, typer.Option(help="MB (10^6 bytes) for all processes of the matcher")] = 2000
     seconds: Annotated[

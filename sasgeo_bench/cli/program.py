@@ -6,7 +6,7 @@ import inspect
 import sys
 import traceback
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from importlib import import_module, metadata, resources
 from pathlib import Path
@@ -112,7 +112,32 @@ class _Group(TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:  # noqa: ANN401 - as below
         """Name, command and the words that are left; the command is imported now."""
         name, command, rest = super().resolve_command(ctx, args)
-        return name, command and load(name or ""), rest
+        command = command and load(name or "")
+        return name, command, spelled_out(rest, command.params) if command else rest
+
+
+def spelled_out(words: Sequence[str], params: Sequence[Any]) -> list[str]:
+    """Repeat an option before each of several values that follow it, as a shell leaves them of a pattern.
+
+    `--tasks out/tasks/clean/*` names every folder there. Nothing is repeated for a command with arguments: a value
+    might be one of these.
+    """
+    several = {flag for one in params if getattr(one, "multiple", False) for flag in one.opts}
+    if any(one.param_type_name == "argument" for one in params):
+        return list(words)
+    found: list[str] = []
+    flag, count = "", 0
+    for at, word in enumerate(words):
+        if word == "--":
+            return [*found, *words[at:]]
+        if word.startswith("-"):
+            name, is_joined, _ = word.partition("=")
+            flag, count = name if name in several else "", len(is_joined)
+        else:
+            count += 1
+            found += [flag] if flag and count > 1 else []
+        found.append(word)
+    return found
 
 
 def load(name: str) -> Any:  # noqa: ANN401 - typer makes its commands of a class that it does not name

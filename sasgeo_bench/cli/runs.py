@@ -10,7 +10,7 @@ from typing import Annotated, Final
 import typer
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
-from sasgeo_bench.cli.options import Dask, Options, Out, takes
+from sasgeo_bench.cli.options import Dask, Options, Out, RegionFolders, takes
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.matching.results import SOUND
 from sasgeo_bench.running import runner
@@ -29,7 +29,7 @@ class RunOptions(Options):
     """Flags of run."""
 
     matcher: Annotated[str, typer.Option(help="name from list-matchers or list-trackers, or module:Class")]
-    tasks: Annotated[list[Path], typer.Option(help="task folder, OUT/tasks/SUITE/REGION; may be repeated")]
+    tasks: Annotated[list[Path], typer.Option(help="task folders, as OUT/tasks/SUITE/*")]
     top_k: Annotated[int, typer.Option(help="poses asked of each query")] = 25
     jobs: Annotated[int, typer.Option(help="processes at once")] = 1
     dask: Dask = None
@@ -55,6 +55,7 @@ class RunOptions(Options):
         str | None,
         typer.Option(help="with --train, what is one place; default: the split of the tasks, if it is a shipped one"),
     ] = None
+    region_files: RegionFolders = None
     again: Annotated[list[str] | None, typer.Option(help="ask rows of this status again, as in timeout")] = None
     trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the matcher in; run.json says so")] = False
     dry_run: Annotated[bool, typer.Option("--dry-run", help="say what is left to do, and stop")] = False
@@ -110,7 +111,7 @@ def run(options: RunOptions) -> RunReport:
             is_shut_in=not options.trusted,
             train=tuple(options.train or ()),
             most_trained=options.most_trained,
-            split=_split(options.split, options.tasks) if options.train else None,
+            split=_split(options.split, options.tasks, options.region_files) if options.train else None,
         )
     )
     if options.dry_run:
@@ -146,13 +147,13 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
-def _split(name: str | None, tasks: Sequence[Path]) -> Split | None:
-    """The split that is named, or else that of the tasks, with all shipped regions; None where nobody knows it."""
+def _split(name: str | None, tasks: Sequence[Path], folders: Sequence[Path] | None) -> Split | None:
+    """The split that is named, or else that of the tasks, with all known regions; None where nobody knows it."""
     if name is None:
         name = str(read_task(tasks[0]).get("split"))
         if name not in list_split_files():
             return None
-    return find_split(name)
+    return find_split(name, folders=tuple(folders or ()))
 
 
 def merge_command(

@@ -9,7 +9,7 @@ import typer
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
 from sasgeo_bench.cli.matchers import end_with_checks, lay_package
-from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.cli.options import Options, Out, RegionFolders, takes
 from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.running.segmenter_testing import check_segmenter
@@ -23,7 +23,10 @@ class SegmentOptions(Options):
     """Flags of segment."""
 
     segmenter: Annotated[str, typer.Option(help="name from list-segmenters, or module:Class")]
-    tasks: Annotated[list[Path], typer.Option(help="task folder of pictures, OUT/tasks/SUITE/REGION; may be repeated")]
+    tasks: Annotated[
+        list[Path],
+        typer.Option(help="task folders of pictures, OUT/tasks/SUITE/REGION"),
+    ]
     split: Annotated[
         str | None, typer.Option(help="which places a segmenter learns from for which; default: the split of the tasks")
     ] = None
@@ -34,6 +37,7 @@ class SegmentOptions(Options):
     segment_s: Annotated[float, typer.Option(help="seconds for one picture")] = Limits().match_s
     learn_s: Annotated[float, typer.Option(help="seconds to learn")] = Limits().learn_s
     trusted: Annotated[bool, typer.Option("--trusted", help="do not shut the segmenter in")] = False
+    region_files: RegionFolders = None
     jobs: Annotated[int, typer.Option(min=1, help="tasks at once")] = 1
     out: Out = Path("out")
 
@@ -61,7 +65,10 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
         SegmentTasks(
             spec=options.segmenter,
             tasks=options.tasks,
-            split=find_split(options.split or str(read_task(options.tasks[0]).get("split"))),
+            split=find_split(
+                options.split or str(read_task(options.tasks[0]).get("split")),
+                folders=tuple(options.region_files or ()),
+            ),
             out=options.out,
             is_recalibrated=options.recalibrated,
             most=options.most_trained,

@@ -359,15 +359,19 @@ def cost_table(book: Book) -> Table:
     kinds = sorted({(SHOWN_COSTS.index(key[-1]), key[-1], key[1]) for key in found})
     by_kind = {(key[3], key[-1], key[1]): row for key, row in found.items()}
     units = {key[-1]: str(row["unit"]) for key, row in found.items()}
-    names = sorted({key[3] for key in found})
-    rows = []
-    for name in names:
-        mine = [by_kind.get((name, metric, track)) for _, metric, track in kinds]
-        values = [number_cell(math.nan if row is None else float(row["value"])) for row in mine]
-        rows.append(Row(cells=(book.name_cell(name), *values)))
+    values = {
+        name: [_cost(by_kind.get((name, metric, track))) for _, metric, track in kinds]
+        for name in sorted({key[3] for key in found})
+    }
+    order = sorted(values, key=lambda name: [(math.isnan(value), value) for value in values[name][:1]])
+    rows = [Row(cells=(book.name_cell(name), *map(number_cell, values[name]))) for name in order]
     columns = [
-        column(metric, title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})")
-        for _, metric, track in kinds
+        column(
+            metric,
+            title=f"{metric}{'' if track == 'all' else f', {track}'} ({units[metric]})",
+            order="ascending" if at == 0 else "none",
+        )
+        for at, (_, metric, track) in enumerate(kinds)
     ]
     notes = (
         "Measured once, on the machine that made the board; 1 kB is 1000 bytes, 1 MB a million.",
@@ -375,6 +379,10 @@ def cost_table(book: Book) -> Table:
     )
     first = column("matcher", is_number=False)
     return Table(name="costs", title="What answers cost", columns=(first, *columns), rows=tuple(rows), notes=notes)
+
+
+def _cost(row: Record | None) -> float:
+    return math.nan if row is None else float(row["value"])
 
 
 def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:

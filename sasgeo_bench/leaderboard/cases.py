@@ -97,6 +97,8 @@ def find_cases(scores: pd.DataFrame, matcher: str, judged: pd.DataFrame | None =
         scores[name].to_numpy(bool) for name in ("is_present", "is_right", "is_answered")
     )
     is_stress, is_asked = ((scores["role"] != role).to_numpy(bool) for role in ("control", "falsifier"))
+    is_applicable = (scores["status"] != "not applicable").to_numpy(bool)  # else its card says so: nothing failed
+    is_asked = is_asked & is_applicable
     is_wrong = is_present & ~is_right & is_asked
     control = _controls(scores)
     is_paired = is_wrong & is_stress & control["is_right"].to_numpy(bool)

@@ -163,9 +163,9 @@ def prior_words(name: str) -> str:
     """Return a prior group in words, or its name where that is none of ours.
 
     >>> prior_words("r500-weak-s3")
-    'within 500 m, heading known to 20 deg, scale to 3 %'
+    'searched: disc of 500 m, heading +-20 deg, scale +-3 %'
     >>> prior_words("rnone-unknown-s15"), prior_words("another")
-    ('anywhere on the map, heading unknown, scale to 15 %', 'another')
+    ('searched: whole map, heading unknown, scale +-15 %', 'another')
     """
     try:
         return PriorGroup.parse(name).words

@@ -215,13 +215,19 @@ def acceptance_tables(acceptance: pd.DataFrame) -> tuple[Table, ...]:
 
 
 def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
-    rows = []
-    for key, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
+    """Return risk and coverage, who has the least risk over all absences first, and an absence a line."""
+    rows: dict[tuple[str, ...], Row] = {}
+    risks: dict[tuple[str, ...], float] = {}
+    for names, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
+        key = tuple(map(str, names))
         by_mixture = {str(row["mixture"]): row for row in records_of(mine)}
         some = next(iter(by_mixture.values()))
         absent = plain_cell(int(some["absent"]))
         cells = [_cell(by_mixture.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")]
-        rows.append(Row(cells=(*text_cells(*map(str, key)), absent, *cells)))
+        rows[key] = Row(cells=(*text_cells(*key), absent, *cells))
+        if AS_DRAWN in by_mixture and not math.isnan(by_mixture[AS_DRAWN]["risk"]):
+            risks[key] = float(by_mixture[AS_DRAWN]["risk"])
+    order = sorted(rows, key=lambda key: (risks.get((*key[:2], "all"), math.inf), key))
     titles = [
         (term, f"{term.split()[0]}, {mixture if mixture == AS_DRAWN else f'{100 * (1 - share):.0f} % absent'}")
         for mixture, share in zip(_MIXTURES, (math.nan, *PRESENT_SHARES), strict=True)
@@ -235,7 +241,7 @@ def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table
             column("absent"),
             *(column(term, title=title) for term, title in titles),
         ),
-        rows=tuple(rows),
+        rows=tuple(rows[key] for key in order),
         notes=(f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",),
     )
 

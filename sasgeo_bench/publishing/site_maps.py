@@ -28,7 +28,12 @@ MOST_BYTES: Final = 1_000_000  # of all scripts, nearly
 _QUERY_BYTES: Final = 95  # as of the board `modules`
 _ANSWER_BYTES: Final = 27
 SOUND: Final = "as it should be"  # neither a failure nor a crash
-OUTCOMES: Final = {SOUND: "right, or rightly none", **{name: MEANINGS[name] for name in FAILURES}}
+NOT_ASKED: Final = "not applicable"
+OUTCOMES: Final = {
+    SOUND: "right, or rightly none",
+    **{name: MEANINGS[name] for name in FAILURES},
+    NOT_ASKED: "not asked: the card of the matcher excludes the query",
+}
 _NUMBERS: Final = {name: at for at, name in enumerate(OUTCOMES)}
 
 
@@ -134,7 +139,8 @@ def _queries(rows: pd.DataFrame, west_m: float, south_m: float) -> Iterator[list
 
 def _outcome(row: Mapping[Any, Any]) -> int:
     """Return the number of an outcome in `OUTCOMES`, -1 for a class that this version does not know."""
-    return _NUMBERS.get(row["failure"] or SOUND, -1)
+    is_asked = row["status"] != NOT_ASKED
+    return _NUMBERS.get(row["failure"] or SOUND, -1) if is_asked else _NUMBERS[NOT_ASKED]
 
 
 def _point(row: Mapping[Any, Any], what: str, west_m: float, south_m: float) -> list[float | None]:

@@ -256,13 +256,15 @@ def protection_tables(protection: pd.DataFrame) -> tuple[Table, ...]:
     for key, part in protection[protection["alert_limit_m"] == shown_m].groupby("prior_group", sort=True):
         prior_group = str(key)
         rows = []
-        for row in part.to_dict("records"):
+        order = ["risk", "available", "matcher", "method"]
+        for row in part.sort_values(order, ascending=[True, False, True, True]).to_dict("records"):
             shares = [_share_cell(row, area) for area in _AREAS]
             names = (Cell(text=str(row["matcher"])), Cell(text=str(row["method"])))
             rest = (plain_cell(int(row["n"])), Cell(text=str(row["supports"])))
             rows.append(Row(cells=(*names, number_cell(float(row["risk"])), *shares, *rest)))
         words = (column("matcher", is_number=False), column("method", is_number=False))
-        columns = (*words, *map(column, ("risk", *_AREAS, "n")), column("supports", is_number=False))
+        figures = (column("risk", order="ascending"), *map(column, (*_AREAS, "n")))
+        columns = (*words, *figures, column("supports", is_number=False))
         title = f"Alert limit {shown_m:g} m, {prior_words(prior_group)}"
         name = file_stem("protection", prior_group)
         found.append(Table(name=name, title=title, columns=columns, rows=tuple(rows), notes=notes))

@@ -14,6 +14,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import PlainFigure
@@ -38,7 +39,9 @@ _MAP_INCHES: Final = 9.6
 _LEAST_INCHES: Final = 4.6
 _LEAST_WIDTH_INCHES: Final = 7.4  # the line of facts is about as long
 _TITLE_INCHES: Final = 0.85
-_FOOT_INCHES: Final = 0.95
+_LEFT_INCHES: Final = 0.65  # northings
+_FOOT_INCHES: Final = 1.35  # eastings, scale and attribution
+_STRIP_FROM_INCHES: Final = 0.42
 _STRIP_INCHES: Final = 0.5  # under the map, for scale and north
 _ARROW_INCHES: Final = 0.3
 _EDGE: Final = "#d81b60"
@@ -105,20 +108,22 @@ def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     rows, cols = overview.shape[1:]
     scale = _MAP_INCHES / max(rows, cols)
     width, height = max(cols * scale, 2.0), max(rows * scale, _LEAST_INCHES)
-    total = (max(width + _LEGEND_INCHES + 0.6, _LEAST_WIDTH_INCHES), height + _TITLE_INCHES + _FOOT_INCHES)
+    across = _LEFT_INCHES + width + _LEGEND_INCHES + 0.3
+    total = (max(across, _LEAST_WIDTH_INCHES), height + _TITLE_INCHES + _FOOT_INCHES)
     figure = PlainFigure(figsize=total, dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
-    chart = figure.add_axes((0.3 / total[0], _FOOT_INCHES / total[1], width / total[0], height / total[1]))
+    chart = figure.add_axes((_LEFT_INCHES / total[0], _FOOT_INCHES / total[1], width / total[0], height / total[1]))
     side_m = (cols * _cell_m(manifest, overview), rows * _cell_m(manifest, overview))
-    chart.imshow(paint_overview(manifest, overview), extent=(0, side_m[0], 0, side_m[1]), interpolation="antialiased")
-    chart.set_xticks([])
-    chart.set_yticks([])
+    west_m, _, _, north_m = manifest.bounds_m
+    extent = (west_m, west_m + side_m[0], north_m - side_m[1], north_m)  # what fills no whole cell lies south and east
+    chart.imshow(paint_overview(manifest, overview), extent=extent, interpolation="antialiased")
     chart.set_anchor("NW")
     _draw_edge(chart, manifest)
+    _draw_axes(chart, manifest)
     m_per_inch = max(side_m[0] / width, side_m[1] / height)
     _draw_strip(figure, total, width_m=side_m[0], m_per_inch=m_per_inch)
     _words(figure, manifest, total)
-    _legend(figure, manifest, overview, left=(width + 0.45) / total[0], top=1 - _TITLE_INCHES / total[1])
+    _legend(figure, manifest, overview, left=(_LEFT_INCHES + width + 0.15) / total[0], top=1 - _TITLE_INCHES / total[1])
     return figure
 
 
@@ -127,16 +132,27 @@ def _draw_edge(chart: Axes, manifest: Manifest) -> None:
     frame = shapely.boundary(shapely.box(west, south, east, north))
     edge = shapely.difference(shapely.boundary(shapely.from_wkt(manifest.coverage.wkt)), shapely.buffer(frame, 0.5))
     for line in shapely.get_parts(edge):
-        at = shapely.get_coordinates(line) - (west, south)
-        chart.plot(*at.T, color=_EDGE, lw=1.0)
-    chart.set(xlim=(0, east - west), ylim=(0, north - south))
+        chart.plot(*shapely.get_coordinates(line).T, color=_EDGE, lw=1.0)
+    chart.set(xlim=(west, east), ylim=(south, north))
+
+
+def _draw_axes(chart: Axes, manifest: Manifest) -> None:
+    """Label the map with its coordinates, a few round ones a side, as a GIS shows them."""
+    for axis in (chart.xaxis, chart.yaxis):
+        axis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
+    chart.ticklabel_format(style="plain", useOffset=False)
+    chart.tick_params(labelsize=8)
+    chart.set_xlabel(f"easting (m, EPSG:{manifest.epsg})", fontsize=8)
+    chart.set_ylabel("northing (m)", fontsize=8)
+    for label in chart.get_yticklabels():
+        label.set(rotation=90, va="center")
 
 
 def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m_per_inch: float) -> None:
     """Draw scale bar and north arrow under the map, at its scale, so that they hide nothing of it."""
     width = width_m / m_per_inch
     strip = figure.add_axes(
-        (0.3 / total[0], (_FOOT_INCHES - _STRIP_INCHES) / total[1], width / total[0], _STRIP_INCHES / total[1])
+        (_LEFT_INCHES / total[0], _STRIP_FROM_INCHES / total[1], width / total[0], _STRIP_INCHES / total[1])
     )
     strip.axis("off")
     strip.set_zorder(-1)  # its white ground must not hide the frame of the map

@@ -97,9 +97,9 @@ class PriorGroup:
     @property
     def words(self) -> str:
         """Return the group in words, as people read it."""
-        place = "anywhere on the map" if self.radius_m is None else f"within {self.radius_m:g} m"
-        heading = {"known": "known to 5 deg", "weak": "known to 20 deg", "unknown": "unknown"}[self.yaw]
-        return f"{place}, heading {heading}, scale to {100 * self.scale_sigma:g} %"
+        place = "whole map" if self.radius_m is None else f"disc of {self.radius_m:g} m"
+        heading = {"known": "+-5 deg", "weak": "+-20 deg", "unknown": "unknown"}[self.yaw]
+        return f"searched: {place}, heading {heading}, scale +-{100 * self.scale_sigma:g} %"
 
     @classmethod
     def parse(cls, name: str) -> Self:

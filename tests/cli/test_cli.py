@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.cli.program import COMMANDS, help_of
+from sasgeo_bench.cli.program import COMMANDS, help_of, load, spelled_out
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import read_region_file
@@ -39,6 +39,32 @@ def test_a_process_ends_with_the_exit_code_and_keeps_results_and_messages_apart(
     assert ended[1].stdout == ""
     assert "did you mean 'vaduz'" in ended[1].stderr
     assert len(ended[1].stderr.splitlines()) == 1
+
+
+def test_the_package_is_the_program_too():
+    command = [sys.executable, "-m", "sasgeo_bench", "--version"]
+    ended = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
+    assert ended.stdout == f"sasgeo-bench {metadata.version('sasgeo-bench')}\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "found"),
+    [
+        ("--tasks a b c --jobs 2", "--tasks a --tasks b --tasks c --jobs 2"),
+        ("--tasks a --tasks b c", "--tasks a --tasks b --tasks c"),
+        ("--tasks=a b --dry-run", "--tasks=a --tasks b --dry-run"),
+        ("--matcher random extra", "--matcher random extra"),
+        ("--tasks a -- b", "--tasks a -- b"),
+        ("", ""),
+    ],
+)
+def test_several_values_of_an_option_are_those_that_a_shell_makes_of_a_pattern(words, found):
+    assert " ".join(spelled_out(words.split(), load("run").params)) == found
+
+
+def test_a_command_with_arguments_takes_one_value_for_each_option():
+    words = ["docs/results/systems", "--without", "vaduz", "eschen"]
+    assert spelled_out(words, load("enter").params) == words
 
 
 HELP = """

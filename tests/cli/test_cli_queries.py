@@ -170,7 +170,8 @@ def test_a_mistake_gets_one_line_and_exit_2_and_nothing_is_written(words, told, 
 def test_a_split_that_names_an_unknown_region_or_leaves_one_out_gets_one_line(mistake, tmp_path):
     path = split_file(tmp_path, RIVERSIDE, "atlantis")
     words = ("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--split", path)
-    assert "split 'mine' names the unknown region 'atlantis': list-regions shows all there are" in mistake(*words)
+    named = "--region-files names a folder of your own"
+    assert f"unknown region 'atlantis': list-regions shows all that ship; {named}" in mistake(*words)
     split_file(tmp_path, "town-grid", "town-suburb")
     assert f"split 'mine' does not speak of region '{RIVERSIDE}'" in mistake(*words)
     path.write_text(path.read_text().replace("buffer_m", "bufer_m"))

@@ -30,6 +30,7 @@ OPENERS = {"rasterio.open", "Image.open", "tarfile.open", "gzip.open", "pq.Parqu
 # Files of the kernel; and reads of what ships with the package, or what the same function has just written.
 APART = {f"running/{name}.py" for name in ("kernel", "memory", "root", "sandbox", "sensors")}
 OWN = {
+    ("config.py", "path.read_text"),  # which looks by itself: folders stand below it
     ("flights/drift_profile.py", "file.read_text"),
     ("matching/follower.py", "Path(module).read_bytes"),
     ("publishing/site.py", "vendor.joinpath(name).read_text"),
@@ -50,7 +51,6 @@ READERS: dict[str, Callable[[Path], object]] = {
     "a hash": sha256_of,
     "JSON": lambda path: read_json(path, mend="again"),
     "a table": lambda path: read_table(path, mend="again"),
-    "TOML": lambda path: read_document(path, RegionFile, "regions"),
     "layers": read_layers,
     "bits of layers": read_bits,
     "an overview": lambda path: read_overview(path, longest_cells=100),
@@ -74,6 +74,11 @@ def test_a_pipe_in_place_of_a_file_of_a_folder_is_refused(tmp_path: Path) -> Non
     os.mkfifo(tmp_path / "mine.tar.xz")
     with pytest.raises(SasgeoError, match="is no file"):
         unpack_head_start(tmp_path / "mine.toml", tmp_path / "out", tell=lambda _: None)
+
+
+def test_a_pipe_among_files_of_a_kind_is_refused(pipe: Path) -> None:
+    with pytest.raises(SasgeoError, match="it is no plain file"):
+        read_document(pipe, RegionFile, "regions")
 
 
 def test_links_are_followed_and_sockets_and_devices_refused(tmp_path: Path, pipe: Path) -> None:

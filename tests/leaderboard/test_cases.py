@@ -90,6 +90,12 @@ def test_a_right_answer_is_a_failure_only_where_a_threshold_rejects_it():
     assert classes(table, said(table, [False, True, np.nan])) == {"q0": "right but not accepted"}
 
 
+def test_what_a_card_excludes_is_no_case():
+    table = asked(row(np.inf), row(np.inf, is_present=False))
+    assert classes(table.assign(status="not applicable")) == {}
+    assert classes(table.assign(status="crash")) == {"q0": "other"}
+
+
 def test_falsifiers_are_no_cases():
     assert classes(asked(row(90.0, role="falsifier"), row(90.0, role="falsifier", is_present=False))) == {}
 

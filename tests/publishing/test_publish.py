@@ -209,10 +209,10 @@ def test_the_board_is_what_its_tables_say_read_by_meaning(pages):
     assert "Controls: all 1 held." in index.said("p")
     heads = [text for text in index.said("h3") if text.startswith(("real-age", "occlusion"))]
     assert heads == [
-        "occlusion: localization, within 500 m, heading known to 20 deg, scale to 3 %",
-        "occlusion: retrieval, anywhere on the map, heading known to 20 deg, scale to 3 %",
-        "real-age: localization, within 500 m, heading known to 20 deg, scale to 3 %",
-        "real-age: localization, anywhere on the map, heading unknown, scale to 15 %",
+        "occlusion: localization, searched: disc of 500 m, heading +-20 deg, scale +-3 %",
+        "occlusion: retrieval, searched: whole map, heading +-20 deg, scale +-3 %",
+        "real-age: localization, searched: disc of 500 m, heading +-20 deg, scale +-3 %",
+        "real-age: localization, searched: whole map, heading unknown, scale +-15 %",
     ]
     tied = [text for text in index.said("p") if text.startswith("Tied: ")]
     assert tied

@@ -5,6 +5,7 @@ import json
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.leaderboard.board_tables import Book, sections_of, suite_table
+from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, cost_table, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables, risk_tables_by_suite
@@ -26,7 +27,7 @@ from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import Case, Pictures, RegionMap, SiteSource, Spot
 from sasgeo_bench.scoring.contrasts import contrast_frame
 from sasgeo_bench.scoring.controls import Falsifier, falsifier_frame
-from sasgeo_bench.scoring.rows import Row, to_frame
+from sasgeo_bench.scoring.rows import ALL_SUITES, Row, to_frame
 from sasgeo_bench.scoring.verdicts import Finding
 from tests.handmade import BOUNDS_M, HOSTILE, MARKUP, about_of, answers_of, card_of, entry_of, many_rows
 
@@ -396,6 +397,33 @@ def test_a_place_has_its_answers_in_metres_from_the_corner_of_its_map():
     assert said["cases"] == {"1": 1}
     assert script.isascii()
     assert place_maps(replace(whole, answers=pd.DataFrame())) == {}
+
+
+def test_what_was_not_asked_is_no_failure_on_a_map():
+    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
+    answers = answers_of(["graph"]).assign(status="not applicable", failure="")
+    ((_, script),) = place_maps(replace(source(), answers=answers, pictures=Pictures(regions=(item,)))).items()
+    said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
+    number = list(site_maps.OUTCOMES).index("not applicable")
+    assert {row[1] for row in said["answers"][0][1]} == {number}
+    script = (Path(site_maps.__file__).parent / "templates" / "map.js").read_text(encoding="utf-8")
+    assert f"const NOT_ASKED = {number};" in script
+    assert len(re.search(r"COLOURS = \[(.*)\]", script)[1].split(",")) == len(site_maps.OUTCOMES)
+
+
+def test_costs_are_sorted_by_the_first_of_them():
+    metrics = SHOWN_COSTS[:2]
+    values = {"slow": (2.0, 1.0), "quick": (0.1, 9.0), "no answer": (math.nan, 5.0)}
+    figures = {
+        (ALL_SUITES, "all", "all", name, "all", metric): {"value": value, "unit": "s"}
+        for name, found in values.items()
+        for metric, value in zip(metrics, found, strict=True)
+    }
+    names = ("matchers", "strata", "entries", "matcher_pages", "suite_pages", "counted", "lost")
+    nothing = {name: {} for name in names}
+    table = cost_table(Book(figures=figures, controls=frozenset(), **nothing))
+    assert [row.cells[0].text for row in table.rows] == ["quick", "slow", "no answer"]
+    assert [column.order for column in table.columns] == ["none", "ascending", "none"]
 
 
 def test_of_many_answers_a_share_is_drawn_those_with_a_picture_first_and_the_page_says_so(monkeypatch):

@@ -7,6 +7,7 @@ import shapely
 from matplotlib import image
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions import preview
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
 from sasgeo_bench.regions.preview import write_preview
@@ -53,6 +54,19 @@ def test_what_is_not_mapped_does_not_look_like_empty_land(tmp_path, manifest):
 def test_narrow_and_tiny_regions_are_drawn_too(tmp_path, manifest, shape):
     picture = drawn(tmp_path, manifest, np.zeros((len(load_taxonomy().names), *shape), dtype=np.uint8))
     assert min(picture.shape[:2]) > 200
+
+
+def test_the_axes_are_those_of_the_crs(manifest):
+    empty = np.zeros((len(manifest.classes), manifest.rows, manifest.cols), np.uint8)
+    chart = preview._drawn(manifest, empty).axes[0]
+    west, south, east, north = manifest.bounds_m
+    assert (chart.get_xlim(), chart.get_ylim()) == ((west, east), (south, north))
+    assert chart.images[0].get_extent() == [west, east, south, north]
+    assert f"EPSG:{manifest.epsg}" in chart.get_xlabel()
+    chart.figure.canvas.draw()
+    ticks = {label.get_text(): at for label, at in zip(chart.get_xticklabels(), chart.get_xticks(), strict=True)}
+    assert all(float(text) == at for text, at in ticks.items())  # whole coordinates, no offset
+    assert sum(west <= at <= east for at in ticks.values()) >= 2
 
 
 def test_the_manifest_carries_the_attribution_that_is_drawn(manifest):

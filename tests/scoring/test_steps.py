@@ -31,7 +31,7 @@ def test_a_ladder_is_a_table_with_a_column_for_each_step_and_the_best_first():
     near, far = np.where(STRENGTHS < 0.4, 1.0, 99.0), np.where(STRENGTHS < 0.2, 1.0, 99.0)
     (table,) = step_tables(steps_of(plain=frame(far), better=frame(near)))
     assert table.title.startswith(
-        "occlusion: localization, within 500 m, heading known to 20 deg, scale to 3 %, step by"
+        "occlusion: localization, searched: disc of 500 m, heading +-20 deg, scale +-3 %, step by"
     )
     assert names_of(table) == ["matcher", *(f"{step}, 192 cells, n = 40" for step in ("0", "0.2", "0.4"))]
     assert [[cell.text.split()[0] for cell in row.cells] for row in table.rows] == [

@@ -315,7 +315,7 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
     assert "success_25m" not in latex.replace(r"\_", "~")
     (short,) = summary(Book.of(board, {}))
-    assert short.title.startswith("success_25m [95 %] (rank), localization, within 500 m")
+    assert short.title.startswith("success_25m [95 %] (rank), localization, searched: disc of 500 m")
     one, none = wilson(1, 4), wilson(0, 4)
     expected = [f"0.250 [{one.lo:.2f}, {one.hi:.2f}] (-)", f"0.000 [0.00, {none.hi:.2f}] (control)"]
     assert [column.name for column in short.columns] == ["matcher", "occlusion"]

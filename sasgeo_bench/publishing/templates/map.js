@@ -2,7 +2,8 @@
 // The map page: queries of a place on its picture, one of them in detail, and the same part of the map at each pose.
 "use strict";
 
-const COLOURS = ["#009e73", "#cc3311", "#e69f00", "#882255", "#332288", "#56b4e9", "#999933", "#555555", "#bbbbbb"];
+const COLOURS = ["#009e73", "#cc3311", "#e69f00", "#882255", "#332288", "#56b4e9", "#999933", "#555555", "#7a5230", "#bbbbbb"];
+const NOT_ASKED = 9; // of the outcomes: no failure
 const TRUE = "#000000";
 const SIDE_PX = 300;
 const [ID, SUITE, REGION, KIND, PRESENT, VIEW_M, EAST] = [0, 1, 2, 3, 4, 5, 6]; // of a query
@@ -67,7 +68,7 @@ async function openPlace() {
 // The answers of a matcher that the filters leave, each with its query.
 function chosen() {
   const [suite, outcome] = [field("suite").value, field("outcome").value];
-  const fits = (kind) => outcome === "" || (outcome === "failures" ? kind !== 0 : kind === Number(outcome));
+  const fits = (kind) => outcome === "" || (outcome === "failures" ? kind !== 0 && kind !== NOT_ASKED : kind === Number(outcome));
   return (answers.get(field("matcher").value) || [])
     .map(([number, kind, ...fix]) => ({ number, kind, fix, query: place.queries[number] }))
     .filter((one) => fits(one.kind) && (!suite || one.query[SUITE] === suite));
@@ -80,7 +81,7 @@ function draw() {
   shown.forEach((one, number) => {
     const where = one.query.length > EAST ? one.query.slice(EAST) : one.fix;
     if (!where.length) return;
-    L.circleMarker(latlng(where[0], where[1]), { radius: 6, weight: 1.5, color: "#ffffff", fillColor: COLOURS[one.kind] || COLOURS[8], fillOpacity: 0.95 })
+    L.circleMarker(latlng(where[0], where[1]), { radius: 6, weight: 1.5, color: "#ffffff", fillColor: COLOURS[one.kind] || COLOURS[9], fillOpacity: 0.95 })
       .bindTooltip(document.createTextNode(`${one.query[SUITE]}, ${one.query[KIND]}: ${outcomes[one.kind] || "unknown"}`))
       .on("click", () => show(number))
       .addTo(dots);
@@ -152,9 +153,9 @@ function show(number) {
     crops.append(crop("true place", truth, query[VIEW_M], TRUE));
   }
   if (fix.length) {
-    L.circleMarker(latlng(...fix), { radius: 8, weight: 3, color: COLOURS[kind] || COLOURS[8], fill: false }).bindTooltip(document.createTextNode(matcher)).addTo(detail);
+    L.circleMarker(latlng(...fix), { radius: 8, weight: 3, color: COLOURS[kind] || COLOURS[9], fill: false }).bindTooltip(document.createTextNode(matcher)).addTo(detail);
     if (truth.length) L.polyline([latlng(...truth), latlng(...fix)], { color: TRUE, weight: 2, dashArray: "4 4" }).addTo(detail);
-    crops.append(crop(matcher, fix, query[VIEW_M], COLOURS[kind] || COLOURS[8]));
+    crops.append(crop(matcher, fix, query[VIEW_M], COLOURS[kind] || COLOURS[9]));
   }
   const others = rivals(index);
   for (const one of others.filter((other) => other.fix.length)) {

@@ -131,6 +131,29 @@ def test_no_file_is_larger_than_half_a_megabyte() -> None:
     assert (ROOT / HEAD_START).stat().st_size <= 15 * MAX_FILE_BYTES
 
 
+# What others bring along
+
+
+def test_actions_and_the_base_image_are_pinned_by_what_cannot_be_moved() -> None:
+    used = re.findall(r"uses: (\S+)(.*)", read(".github/workflows/checks.yml"))
+    assert len(used) > 5
+    for action, comment in used:
+        assert re.fullmatch(r"[\w.-]+/[\w.-]+@[0-9a-f]{40}", action), action
+        assert re.fullmatch(r" # v\d+\.\d+\.\d+", comment), f"{action} does not say its version"
+    assert re.search(r"^ARG BASE=\S+@sha256:[0-9a-f]{64}$", read("Containerfile"), flags=re.MULTILINE)
+
+
+def test_no_image_holds_a_private_seed() -> None:
+    assert "**/*.seed" in read(".dockerignore").splitlines()
+    assert "*.seed" in read(".gitignore").splitlines()
+
+
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="no git repository here")
+def test_no_line_of_what_git_grep_prints_is_longer_than_a_screen_holds() -> None:
+    found = subprocess.run(["git", "grep", "-n", "-I", "-E", ".{5000,}"], cwd=ROOT, capture_output=True, text=True)  # noqa: S607, PLW1510
+    assert [line.partition(":")[0] for line in found.stdout.splitlines()] == []
+
+
 # What is installed
 
 

@@ -12,6 +12,8 @@ from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, failure_lines, plan_entry
+from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.publishing.elsewhere import elsewhere_lines
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,10 +63,13 @@ def enter_command(options: EnterOptions) -> None:
     with shown_progress() as progress:
         folder, board = enter(entry, into=options.into, tell=tell, progress=progress)
     show_board(board)
+    both = options.out / "boards" / f"{entry.board}-{folder.name}"
+    for line in elsewhere_lines(read_board(both)[0]):
+        say(line)
     name = checked.run.card.name
     for line in failure_lines(board.predictions.get(name, {}).values()):
         say(f"{name}: {line}")
     say(folder)
-    tell(f"the board of both, without pictures: {options.out / 'boards' / f'{entry.board}-{folder.name}'}")
+    tell(f"the board of both, without pictures: {both}")
     tell(f"next: look at your row, then open a pull request with {folder}")
     check_controls(board)

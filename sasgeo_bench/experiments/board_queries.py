@@ -2,9 +2,10 @@
 """The queries of a published board, drawn again by its pipeline and held against the hashes that it stores."""
 
 import difflib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.entry_cost import fetch_extracts
@@ -16,8 +17,11 @@ from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive import laid_tasks, stored_settings
 from sasgeo_bench.publishing.archive_folder import is_pack
 from sasgeo_bench.publishing.release_files import BoardTasks
+from sasgeo_bench.regions.build import package_version
+from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.query import TASK_VERSION
 from sasgeo_bench.tasks.suites.all_suites import PICTURED
 
 
@@ -68,6 +72,7 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
         fault = "holds no stored results" if stored.is_dir() else "is no folder here"
         message = f"{stored} {fault}: {mend}"
         raise StoreError(message)
+    _check_version(stored, tell)
     made_by = stored_settings([stored]).pipeline
     if not made_by.get("id"):
         message = f"{stored} are stored results of no pipeline, so nobody knows how its queries are drawn"
@@ -76,7 +81,7 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
     if spec.identity != dict(made_by):
         message = (
             f"{stored} was made by another text of the pipeline {made_by['id']!r} than this one: take the version of "
-            "the program that made it, or name the file by --pipeline"
+            f"the program that made it ({_version_of(read_board(stored)[0])}), or name the file by --pipeline"
         )
         raise ConfigError(message)
     _check_seed(stored, request.sealed)
@@ -121,6 +126,28 @@ def draw_board(request: BoardRequest, *, tell: Tell, progress: Progress | None =
     )
 
 
+def _version_of(about: Mapping[str, Any]) -> str:
+    """Name the version that made a board, by the numbers that its queries follow from."""
+    numbers = (f"{name} version {about.get(f'{name}_version', 'unknown')}" for name in ("data", "task"))
+    return f"{about.get('made_by') or 'an unknown version'}, {', '.join(numbers)}"
+
+
+def _check_version(stored: Path, tell: Tell) -> None:
+    """Refuse a board on maps that this version makes otherwise; tell of one whose tasks are of another version."""
+    about = read_board(stored)[0]
+    here = _version_of(
+        {"made_by": f"sasgeo-bench {package_version()}", "data_version": DATA_VERSION, "task_version": TASK_VERSION}
+    )
+    if about.get("data_version", DATA_VERSION) != DATA_VERSION:
+        message = (
+            f"{stored} was made by {_version_of(about)}, and this is {here}, which makes other maps: enter it with the "
+            "version that made it, or enter a board of this one"
+        )
+        raise ConfigError(message)
+    if about.get("task_version", TASK_VERSION) != TASK_VERSION:
+        tell(f"{stored} was made by {_version_of(about)}, this is {here}: queries are held against its hashes")
+
+
 def _check_seed(stored: Path, seed: PrivateSeed | None) -> None:
     """Refuse a seed that did not draw the sealed places of the board: none of their queries would be the same."""
     opened = read_board(stored)[0].get("sealed", {})
@@ -153,9 +180,10 @@ def same_queries(stored: Path, tasks: Sequence[Path], *, tell: Tell) -> dict[str
     board = {name: asked for task in asked_tasks(stored) for name, asked in task.asked.items()}
     same = {name: asked for name, asked in board.items() if drawn.get(name) == asked}
     if not same:
+        made_by = _version_of(read_board(stored)[0])
         message = (
             f"none of the {len(board)} queries of {stored} is drawn here as it was: they were drawn by another "
-            "version of the program, or from other extracts; take the version that made the board"
+            f"version of the program, or from other extracts; take the version that made the board ({made_by})"
         )
         raise ConfigError(message)
     tell(f"{len(same)} of {counted(len(board), 'query', 'queries')} of the board are drawn as they were")

@@ -171,6 +171,25 @@ class _Task(_Record):
     queries_sha256: str | None = None
 
 
+class _Elsewhere(_Record):
+    matcher: str
+    n: Annotated[int, Field(ge=1)]
+    value: float
+    lo: float
+    hi: float
+
+
+class ElsewhereRecord(_Record):
+    """Rows of another board that asked the same queries of a suite, track and prior group."""
+
+    board: Plain
+    suite: str
+    track: str
+    prior_group: str
+    metric: str
+    rows: Annotated[list[_Elsewhere], Field(min_length=1)]
+
+
 class BoardRecord(_Record):
     """The fields of `board.json` that pages use; every board has those without a default.
 
@@ -197,6 +216,7 @@ class BoardRecord(_Record):
     without: list[str] = []
     rejectors: list[dict[str, str | bool | None]] = []
     remarks: list[str] = []
+    elsewhere: list[ElsewhereRecord] = []
     failed: dict[str, str] = {}
 
 

@@ -59,7 +59,8 @@ class ScoreRequest:
     seed of the same pipeline to compare rows with. `kept` is the `board.json` of stored results: it keeps the version
     of their maps, and their results on a private seed where no private board is named; their sealed places, too.
     `sealed` is the record of sealed places (`openings.sealed_record`). `failed` names entries that failed before
-    scoring, and why. `stored` are figures of entries that are not fitted again.
+    scoring, and why. `stored` are figures of entries that are not fitted again, `elsewhere` rows of other
+    boards that asked the same queries.
     """
 
     predictions: Sequence[Path]
@@ -84,6 +85,7 @@ class ScoreRequest:
     sealed: Mapping[str, Any] = field(default_factory=dict)
     failed: Mapping[str, str] = field(default_factory=dict)
     stored: StoredFigures | None = None
+    elsewhere: Sequence[Mapping[str, Any]] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -200,6 +202,7 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
         "without": sorted(set(request.without)),
         "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
         "remarks": list(board.remarks),
+        **({"elsewhere": [dict(item) for item in request.elsewhere]} if request.elsewhere else {}),
         "failed": board.failures.found,  # what fails while figures are drawn is added until the file is written
         "entries": [
             {

@@ -29,6 +29,7 @@ from sasgeo_bench.publishing.archive_file import (
     write_pack,
 )
 from sasgeo_bench.publishing.archive_folder import check_results, is_pack, read_settings
+from sasgeo_bench.publishing.elsewhere import asked_elsewhere
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry
@@ -190,6 +191,7 @@ def request_of(
         by_block=settings.by_block,
         pipeline=settings.pipeline,
         failed=failed,
+        elsewhere=() if stored is None else asked_elsewhere(stored),
     )
 
 

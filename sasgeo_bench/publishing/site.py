@@ -30,6 +30,7 @@ from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, inter
 from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, training_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.publishing.elsewhere import elsewhere_tables
 from sasgeo_bench.publishing.site_maps import OUTCOMES as ANSWER_OUTCOMES
 from sasgeo_bench.publishing.site_maps import place_maps
 from sasgeo_bench.publishing.site_pages import (
@@ -308,6 +309,7 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
     prices = {table.name.replace("summary", "price", 1) for table in overview}
     return {
         "sections": sections,
+        "elsewhere": elsewhere_tables(source.about),
         "words_of": {item.prior_group: item.prior for item in sections},
         "overview": overview,
         "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),

@@ -23,9 +23,11 @@ from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.publishing import submissions
 from sasgeo_bench.publishing.submissions import beside_stored, hold_submission, with_submissions
+from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.scoring.contrasts import contrast_frame
 from sasgeo_bench.scoring.submission_files import read_submission
 from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.query import TASK_VERSION
 from sasgeo_bench.tasks.task_plan import Request
 from tests.experiments.test_pipeline import TEXT as PIPELINE
 from tests.threaded import threaded
@@ -372,8 +374,25 @@ def test_a_partial_entry_is_said_to_be_one(request_):
 
 def test_another_text_of_the_pipeline_is_refused(request_, tmp_path):
     (tmp_path / "small.toml").write_text(TEXT.replace("sites = 1", "sites = 2"), encoding="utf-8")
-    with pytest.raises(ConfigError, match=r"made by another text of the pipeline 'small'.* or name the file by"):
+    with pytest.raises(
+        ConfigError,
+        match=r"made by another text of the pipeline 'small'.* \(sasgeo-bench .*, task version \d+\), or name the file by",
+    ):
         plan_entry(replace(request_, pipeline=tmp_path / "small.toml"), tell=silent)
+
+
+def test_a_board_on_other_maps_is_refused_at_once_by_the_version_that_made_it(request_, monkeypatch):
+    monkeypatch.setattr(board_queries, "DATA_VERSION", DATA_VERSION + 1)
+    made_by = rf"made by sasgeo-bench \S+, data version {DATA_VERSION}, task version {TASK_VERSION}, and this is "
+    with pytest.raises(ConfigError, match=rf"{made_by}sasgeo-bench \S+, data version {DATA_VERSION + 1}, task version"):
+        plan_entry(request_, tell=silent)
+
+
+def test_a_board_of_tasks_of_another_version_is_told(request_, monkeypatch):
+    monkeypatch.setattr(board_queries, "TASK_VERSION", TASK_VERSION + 1)
+    lines: list[str] = []
+    plan_entry(request_, tell=lines.append)
+    assert [line for line in lines if f"task version {TASK_VERSION}, this is sasgeo-bench" in line]
 
 
 def test_a_folder_without_results_is_refused(request_, tmp_path):

@@ -115,7 +115,7 @@ def plan_training(
     pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split, chosen_by)]
     if not pairs:
         first = next(iter(tasks.values()))
-        message = f"--train {first} holds no queries {chosen_by.to_text()}: there is nothing to learn from"
+        message = f"{first}, to learn from, holds no queries {chosen_by.to_text()}: there is nothing to learn from"
         raise ConfigError(message)
     chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
     order = sorted({pair.task for pair in chosen}, key=lambda task: (abouts[task]["region"], abouts[task]["suite"]))
@@ -142,20 +142,21 @@ def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Spl
     """
     both = next((name for name in train if name in asked), None)
     if both is not None:
-        message = f"--train {train[both]} is of region {both!r}, and so is {asked[both]}, which is asked: leave one out"
+        folders = f"{train[both]}, to learn from, is of region {both!r}, and so is {asked[both]}"
+        message = f"{folders}, which is asked: leave one out"
         raise ConfigError(message)
     if split is None:
         return
     sealed = next((name for name in train if split.sealed_place(name)), None)
     if sealed is not None:
         place = split.sealed_place(sealed)
-        message = f"--train {train[sealed]} is of the sealed place {place!r}, which never trains: leave it out"
+        message = f"{train[sealed]}, to learn from, is of the sealed place {place!r}, which never trains: leave it out"
         raise ConfigError(message)
     places = {place: name for name in train for place in split.places_in(name)}
     shared = next(((place, name) for name in asked for place in split.places_in(name) if place in places), None)
     if shared is not None:
         place, name = shared
-        folders = f"--train {train[places[place]]} is of place {place!r}, and so is {asked[name]}"
+        folders = f"{train[places[place]]}, to learn from, is of place {place!r}, and so is {asked[name]}"
         message = f"{folders}, which is asked: leave one out"
         raise ConfigError(message)
     parts = {part: _blocks_of(names, split) for part, names in (("train", train), ("asked", asked))}
@@ -163,7 +164,7 @@ def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Spl
     near = nearest_blocks(parts, within_m=least_m)
     if near is not None and near.gap_m < least_m:
         message = (
-            f"--train: blocks {near.first} and {near.second}, one for training and one that is asked, are "
+            f"blocks {near.first} and {near.second}, one for training and one that is asked, are "
             f"{near.gap_m:.0f} m apart, split {split.spec.id!r} needs {least_m:.0f} m: leave one of the regions out"
         )
         raise ConfigError(message)
@@ -197,7 +198,9 @@ def _check_names(maps: Mapping[Path, Path]) -> None:
     seen: dict[str, Path] = {}
     for task, region in maps.items():
         if seen.setdefault(region.name, region) != region:
-            message = f"--train {task} lies on {region}, another task on {seen[region.name]}: leave one of them out"
+            message = (
+                f"{task}, to learn from, lies on {region}, another task on {seen[region.name]}: leave one of them out"
+            )
             raise ConfigError(message)
 
 
@@ -252,6 +255,6 @@ def read_pairs(training_set: TrainingSet) -> list[tuple[bytes, Truth]]:
                 found.append((blob, truths[query.query_id]))
                 hashes.append((asked, truth_sha256(truths[query.query_id])))
     if _hash_of(hashes) != training_set.sha256:
-        message = f"{training_set.taken[0].task} or another task of --train was made anew meanwhile: run again"
+        message = f"{training_set.taken[0].task} or another task to learn from was made anew meanwhile: run again"
         raise StoreError(message)
     return found

@@ -374,10 +374,8 @@ def test_a_partial_entry_is_said_to_be_one(request_):
 
 def test_another_text_of_the_pipeline_is_refused(request_, tmp_path):
     (tmp_path / "small.toml").write_text(TEXT.replace("sites = 1", "sites = 2"), encoding="utf-8")
-    with pytest.raises(
-        ConfigError,
-        match=r"made by another text of the pipeline 'small'.* \(sasgeo-bench .*, task version \d+\), or name the file by",
-    ):
+    words = r"made by another text of the pipeline 'small'.* \(sasgeo-bench .*, task version \d+\), or name the file by"
+    with pytest.raises(ConfigError, match=words):
         plan_entry(replace(request_, pipeline=tmp_path / "small.toml"), tell=silent)
 
 

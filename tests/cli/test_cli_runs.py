@@ -303,7 +303,7 @@ def test_a_shard_that_is_none_gets_one_line(mistake, out, text) -> None:
         (("--shard", "0/2"), "--shard must be i/n with 1 <= i <= n, got 0/2"),
         (("--shard", "3/2"), "--shard must be i/n with 1 <= i <= n, got 3/2"),
         (("--shard", "0/0"), "--shard must be i/n with 1 <= i <= n, got 0/0"),
-        (("--jobs", "0"), "--jobs must be at least 1, got 0"),
+        (("--jobs", "0"), "--jobs must lie between 1 and 1000, got 0"),
         (("--limit", "-1"), "--limit must be at least 1, got -1"),
         (("--top-k", "0"), "--top-k must be at least 1, got 0"),
         (("--match-s", "nan"), "--match-s must be seconds between 0 and 604800, got nan"),

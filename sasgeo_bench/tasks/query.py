@@ -81,7 +81,7 @@ class PriorGroup:
     --------
     >>> group = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
     >>> group.name, group.words
-    ('r500-weak-s3', 'within 500 m, heading known to 20 deg, scale to 3 %')
+    ('r500-weak-s3', 'searched: disc of 500 m, heading +-20 deg, scale +-3 %')
     """
 
     radius_m: float | None

@@ -114,6 +114,8 @@ def with_rules(found: pd.DataFrame, plain: Plain, frame: Frame) -> list[dict[str
     """List the objects that differ, for each other reader, with the rule that comes to our size, or none."""
     listed = []
     owned = set(plain.owners.values())
+    there = found[(found["kind"] == "r") & (found["size_ours"] > 0)]
+    told = set(zip(there["id"], there["class"], strict=True))
     for reader, rules in (("gdal", GDAL_RULES), ("osmium", OSMIUM_RULES)):
         if f"size_{reader}" not in found:
             continue
@@ -124,8 +126,10 @@ def with_rules(found: pd.DataFrame, plain: Plain, frame: Frame) -> list[dict[str
         is_way = differ["kind"] == "w"
         facts = Facts.read(plain.source, frame, ways=differ["id"][is_way], relations=differ["id"][~is_way])
         for row in differ.to_dict("records"):
-            case = Case(row["kind"], row["id"], row["form"], row["size_ours"], row["size_gdal"], facts)
-            kept = {name: row[name] for name in ("kind", "id", "class", "form")}
+            above = plain.above.get(row["id"], ()) if row["kind"] == "w" else ()
+            is_told = any((owner, row["class"]) in told for owner in above)
+            kept = {name: row[name] for name in KEY}
+            case = Case(*kept.values(), row["size_ours"], row["size_gdal"], is_told, facts)
             other = row[f"size_{reader}"]
             rule = explain(case, rules)
             listed.append({"reader": reader, **kept, "ours": row["size_ours"], "other": other, "rule": rule})
@@ -166,7 +170,7 @@ def tables(results: list[dict[str, Any]]) -> tuple[pd.DataFrame, pd.DataFrame]:
     sums = pd.DataFrame([{"file": each["file"], **row} for each in results for row in each["sums"]])
     differ = pd.DataFrame(
         [{"file": each["file"], **row} for each in results for row in each["differences"]],
-        columns=["file", "reader", "kind", "id", "class", "form", "ours", "other", "rule"],
+        columns=["file", "reader", *KEY, "ours", "other", "rule"],
     )
     return sums, differ.assign(by=(differ["ours"] - differ["other"]).abs())
 

@@ -17,11 +17,12 @@ import osmium
 import pandas as pd
 import shapely
 
-from benchmarks.other_readings import Frame
+from benchmarks.other_readings import Frame, Tags
 
 SMALL: Final = 1.0  # m2 or m: rounding of coordinates
 SHARE: Final = 1e-4  # of an object
 AREAS: Final = ("multipolygon", "boundary")
+TAGS: Final = Tags.load()
 Place = tuple[float, float]
 
 
@@ -145,13 +146,18 @@ def by_nesting(relation: Relation, facts: Facts) -> shapely.Geometry:
 
 @dataclass(frozen=True)
 class Case:
-    """One object, class and form that two readings differ on; sizes as ours, GDAL's and osmium's."""
+    """One object, class and form that two readings differ on.
+
+    `is_told` says that it is an outer way of a relation which has the class in our reading.
+    """
 
     kind: str
     identifier: int
+    name: str
     form: str
     ours: float
     gdal: float
+    is_told: bool
     facts: Facts
 
     @property
@@ -216,10 +222,27 @@ def building_relation(case: Case) -> float | None:
     return case.size(by_role(Relation(relation.tags, members), case.facts))
 
 
+def lines_lie_on_their_way(case: Case) -> float | None:
+    """A relation without tags whose outer way is a fence, say, and an area: the fence lies along that way alone."""
+    relation = case.relation
+    if relation is None or case.form != "line":
+        return None
+    outer = [case.facts.ways[ref] for ref, role in relation.members if role in ("outer", "") and ref in case.facts.ways]
+    drawn = [way for way in outer if case.name in TAGS.rules(way.tags, "line")]
+    return float(sum(shapely.length(shapely.LineString(run)) for way in drawn for run in way.runs() if len(run) > 1))
+
+
+def class_of_the_relation(case: Case) -> float | None:
+    """An outer way with a class that its relation has: counted once, with the relation."""
+    return 0.0 if case.is_told else None
+
+
 GDAL_RULES: Final[tuple[Rule, ...]] = (
     no_line_across_a_gap,
     rings_that_close,
     building_relation,
+    class_of_the_relation,
+    lines_lie_on_their_way,
     holes_by_role,
     holes_by_nesting,
 )

@@ -145,7 +145,8 @@ class Plain:
     """A file that other software reads as we read ours.
 
     `source` is the same without the changes for GDAL. `copies` are ways that are in it twice, and the classes that do not count the second time. `fewer` are relations
-    that lost members. `owners` are outer ways of relations without tags, and their relation: an area is either's.
+    that lost members. `owners` are outer ways of relations without a class of their own, and their relation: an area is
+    either's. `above` are the area relations of outer ways.
     """
 
     path: Path
@@ -153,6 +154,7 @@ class Plain:
     copies: dict[int, set[str]] = field(default_factory=dict)
     fewer: set[int] = field(default_factory=set)
     owners: dict[int, int] = field(default_factory=dict)
+    above: dict[int, list[int]] = field(default_factory=dict)
 
 
 def make_plain(path: Path, tags: Tags, scratch: Path, *, at: str) -> Plain:
@@ -166,8 +168,11 @@ def make_plain(path: Path, tags: Tags, scratch: Path, *, at: str) -> Plain:
     source = _one_state(path, scratch, at=at)
     relations = list(_relations(source, tags))
     ways = {ref for each in relations for ref in each.members}
-    owners = {ref: each.identifier for each in relations if not each.has_tags for ref in each.outer}
+    owners = {ref: each.identifier for each in relations if not each.classes for ref in each.outer}
     plain, present = Plain(path=scratch / "plain.osm.pbf", source=source, owners=owners), set()
+    for each in relations:
+        for ref in each.said_outer:
+            plain.above.setdefault(ref, []).append(each.identifier)
     above = {ref: each for each in relations if each.has_tags for ref in each.said_outer}
     copies = []
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.RELATION)

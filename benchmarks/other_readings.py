@@ -274,7 +274,7 @@ def read_gdal(path: Path, tags: Tags, scratch: Path) -> list[Objects]:
             warnings.simplefilter("ignore", RuntimeWarning)  # rings that are no rings: they count for nothing here too
             meta, _, wkb, data = pyogrio.raw.read(path, layer=layer)
         columns = dict(zip(meta["fields"], data, strict=True))
-        geometry, identifier = shapely.from_wkb(wkb), columns["osm_id"]
+        geometry, identifier = _from_wkb(wkb), columns["osm_id"]
         shape = np.where(shapely.is_closed(geometry), "closed", "open")
         if layer == "multipolygons":
             is_way = np.array([each is not None for each in columns["osm_way_id"]], dtype=bool)
@@ -284,6 +284,13 @@ def read_gdal(path: Path, tags: Tags, scratch: Path) -> list[Objects]:
         said = [{key: value for key, value in zip(keys, each, strict=True) if value is not None} for each in values]
         found.append(Objects(said, geometry, shape, identifier.astype(np.int64)))
     return found
+
+
+def _from_wkb(wkb: Any) -> Any:  # noqa: ANN401 - arrays
+    """Geometries; a ring of two points, which GDAL gives for a way of two nodes there and back, is empty."""
+    geometry = shapely.from_wkb(wkb, on_invalid="ignore")
+    geometry[shapely.is_missing(geometry)] = shapely.Polygon()
+    return geometry
 
 
 def read_osmium(path: Path, tags: Tags, scratch: Path) -> list[Objects]:
@@ -298,7 +305,7 @@ def read_osmium(path: Path, tags: Tags, scratch: Path) -> list[Objects]:
     parts = [line.split("\t") for line in lines]
     kind = np.array([part[0][0] for part in parts])
     number = np.array([int(part[0][1:]) for part in parts], dtype=np.int64)
-    geometry = shapely.from_wkb(np.array([part[1] for part in parts], dtype=object))
+    geometry = _from_wkb(np.array([part[1] for part in parts], dtype=object))
     said = [json.loads(part[2].replace("\\\\", "\\")) for part in parts]
     is_area, is_way = kind == "a", (kind == "w") | (number % 2 == 0)
     as_line = np.where(shapely.is_closed(geometry), "ring", "open")

@@ -228,3 +228,15 @@ def test_the_site_is_built_without_a_warning(tmp_path):
     built = subprocess.run(command, cwd=ROOT, env=outside, capture_output=True, text=True, check=False)  # noqa: S603 - our own
     assert built.returncode == 0, built.stderr
     assert (tmp_path / "site" / "reference" / "api" / "index.html").exists()
+
+
+def test_every_line_of_kept_right_has_its_test_and_its_script():
+    lines = (ROOT / "docs" / "concepts" / "kept-right.md").read_text(encoding="utf-8").splitlines()
+    code = "".join(path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("test_*.py"))
+    rows = [line for line in lines if line.startswith("| ")][1:]
+    assert len(rows) == 12
+    for row in rows:
+        named = re.findall(r"`(test_\w+)`", row)
+        assert named, row
+        assert all(f"def {name}(" in code for name in named), row
+        assert all((ROOT / "findings" / name).is_file() for name in re.findall(r"`(\w+\.sh)`", row)), row

@@ -78,6 +78,18 @@ def test_a_part_has_the_whole_features_that_meet_it(folder, whole, bounds_m):
     assert part.features.attrs == whole.features.attrs
 
 
+def test_a_part_leaves_out_a_feature_of_which_the_envelope_alone_meets_it(folder, whole):
+    shapes = whole.features.geometry.to_numpy()
+    west, south, east, north = shapely.bounds(shapes).T
+    sides = shapely.box(west, south, west + 2.0, south + 2.0)
+    within = shapely.contains(shapely.box(*whole.grid.bounds_m), shapely.box(west, south, east, north))
+    bent = np.flatnonzero(within & (shapely.distance(shapes, sides) > 20.0))  # its south-western corner lies beside it
+    assert len(bent) > 0
+    corner = shapely.bounds(sides[bent[0]])
+    part = read_region(folder, bounds_m=tuple(corner))
+    assert keys(whole.features.iloc[bent[:1]])[0] not in keys(part.features)
+
+
 def test_a_part_has_the_nodes_in_it_and_the_edges_between_them(folder, whole, bounds_m):
     part = read_region(folder, bounds_m=bounds_m)
     nodes, edges = whole.graph.nodes, whole.graph.edges

@@ -60,6 +60,11 @@ def test_wilson_at_its_ends() -> None:
     assert wilson_mean([]).hi == 1.0
 
 
+def test_none_of_n_reaches_down_to_0_and_all_of_n_up_to_1_without_rounding() -> None:
+    ends = [(wilson(0, n).lo, wilson(n, n).hi) for n in range(1, 1001)]
+    assert set(ends) == {(0.0, 1.0)}
+
+
 def test_shared_hits_count_in_proportion() -> None:
     assert wilson_mean([1.0, 0.25, 0.25, 0.5]) == wilson(2, 4)
     with pytest.raises(MetricError, match="shares"):

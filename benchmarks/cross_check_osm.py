@@ -7,8 +7,8 @@ Every extract of a folder is read whole by all three. The area (holes taken out)
 compared in one UTM zone. A difference of more than 1 m2 (or m) and 0.01 % of an object must be what a rule of
 `map_rules.py` says: the rule works out the size of that object by itself, and our reader must have come to it. What no
 rule explains may be 0.2 % of a class of a file, and what one rule explains against GDAL 2 % of a class of all files;
-else a line says so, with some ids, and the exit status is 1. Bare relations, whose tags stand on outer ways, are held
-against GDAL alone: osmium makes no areas of them.
+else a line says so, with some ids, and the exit status is 1. Relations whose tags stand on outer ways are held against
+GDAL alone: osmium makes no areas of them.
 
 A result is kept in OUT by the hash of the file and of the code, so that a second run does what has changed.
 """
@@ -24,6 +24,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -89,7 +90,9 @@ def check(path: Path, *, at: str) -> dict[str, Any]:
         readings["ours"] = read_ours(path, frame, at=at)
         found = compare(readings, plain)
         explained = with_rules(found, plain, frame)
-    sums = found.groupby(CLASS, as_index=False)[[name for name in found if name.startswith(("size", "holes"))]].sum()
+    sums = found.groupby(CLASS, as_index=False)[
+        [name for name in found if str(name).startswith(("size", "holes"))]
+    ].sum()
     return {
         "seconds": round(time.time() - start, 1),
         "sums": sums.round(2).to_dict("records"),
@@ -129,7 +132,8 @@ def with_rules(found: pd.DataFrame, plain: Plain, frame: Frame) -> list[dict[str
             above = plain.above.get(row["id"], ()) if row["kind"] == "w" else ()
             is_told = any((owner, row["class"]) in told for owner in above)
             kept = {name: row[name] for name in KEY}
-            case = Case(*kept.values(), row["size_ours"], row["size_gdal"], is_told, facts)
+            told_sizes = (row["size_ours"], row["size_gdal"])
+            case = Case(row["kind"], row["id"], row["class"], row["form"], *told_sizes, is_told=is_told, facts=facts)
             other = row[f"size_{reader}"]
             rule = explain(case, rules)
             listed.append({"reader": reader, **kept, "ours": row["size_ours"], "other": other, "rule": rule})
@@ -210,9 +214,9 @@ def faults(rows: pd.DataFrame, differ: pd.DataFrame, rules: pd.DataFrame) -> lis
             f"{row['file']}: {row['class']} ({row['form']}) differs from {row['reader']} by {row['unexplained']:.0f} "
             f"{unit} without a rule, {100 * row['share']:.2f} %: {ids}"
         )
-    for row in rules[(rules["reader"] == "gdal") & (rules["share"] > MOST_RULE)].to_dict("records"):
-        lines.append(f"rule {row['rule']} explains {100 * row['share']:.2f} % of {row['class']} ({row['form']})")
-    return lines
+    broad = rules[(rules["reader"] == "gdal") & (rules["share"] > MOST_RULE)].to_dict("records")
+    said = "rule {rule} explains {share:.2%} of {class} ({form}) of all files"
+    return [*lines, *(said.format_map(row) for row in broad)]
 
 
 def rule_rows(sums: pd.DataFrame, differ: pd.DataFrame) -> pd.DataFrame:
@@ -242,7 +246,8 @@ def report(results: list[dict[str, Any]], out: Path, *, is_full: bool) -> int:
         lines = faults(rows, differ, rules)
     lines += refused
     print("\n".join(["", *lines]))
-    print(f"{len(results)} files, {len(lines)} faults, {sum(each['seconds'] for each in results) / 60:.1f} minutes of work")
+    minutes = sum(each["seconds"] for each in results) / 60
+    print(f"{len(results)} files, {len(lines)} faults, {minutes:.1f} minutes of work")
     return len(lines)
 
 
@@ -250,15 +255,15 @@ def _show(title: str, table: pd.DataFrame) -> None:
     print(f"\n{title}\n{table.to_string(index=False, float_format=lambda value: f'{value:.2f}')}" if len(table) else "")
 
 
-def main() -> None:
-    """Check every file of a folder."""
+def main(words: list[str] | None = None) -> None:
+    """Check every file of a folder; `words` stand in for those of the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--extracts", type=Path, default=os.environ.get("SASGEO_EXTRACTS"), help="folder of OSM files")
     parser.add_argument("--out", type=Path, default=Path("out/cross-check"), help="results of files, and tables")
     parser.add_argument("--jobs", type=int, default=1, help="processes (default 1)")
     parser.add_argument("--only", nargs="+", default=[""], help="files whose names begin so")
     parser.add_argument("--full", action="store_true", help="print classes without a difference too")
-    how = parser.parse_args()
+    how = parser.parse_args(words)
     if how.extracts is None or not Path(how.extracts).is_dir():
         parser.error("name the folder of the extracts: --extracts DIR or SASGEO_EXTRACTS")
     names = [path for path in Path(how.extracts).iterdir() if path.name.endswith(SUFFIXES)]
@@ -268,8 +273,9 @@ def main() -> None:
     how.out.mkdir(parents=True, exist_ok=True)
     paths.sort(key=lambda path: (-path.stat().st_size, path.name))  # the longest first
     results = []
-    with ProcessPoolExecutor(how.jobs) as pool:
-        for result in pool.map(partial(checked, out=how.out, code=code_hash()), paths):
+    each_file = partial(checked, out=how.out, code=code_hash())
+    with ProcessPoolExecutor(how.jobs) if how.jobs > 1 else nullcontext() as pool:
+        for result in pool.map(each_file, paths) if pool else map(each_file, paths):
             results.append(result)
             print(f"{len(results)} of {len(paths)}: {result['file']}, {result['seconds']:.0f} s", file=sys.stderr)
     sys.exit(min(report(sorted(results, key=lambda each: each["file"]), how.out, is_full=how.full), 1))

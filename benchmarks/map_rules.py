@@ -10,17 +10,16 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
-import numpy as np
 import osmium
-import pandas as pd
 import shapely
 
 from benchmarks.other_readings import Frame, Tags
 
 SMALL: Final = 1.0  # m2 or m: rounding of coordinates
 SHARE: Final = 1e-4  # of an object
+BARE: Final = {"type", "created_by"}  # a relation without other tags is of the old style
 AREAS: Final = ("multipolygon", "boundary")
 TAGS: Final = Tags.load()
 Place = tuple[float, float]
@@ -232,6 +231,17 @@ def lines_lie_on_their_way(case: Case) -> float | None:
     return float(sum(shapely.length(shapely.LineString(run)) for way in drawn for run in way.runs() if len(run) > 1))
 
 
+def tags_of_open_ways(case: Case) -> float | None:
+    """A relation without tags whose outer ways are open: an area by their tags (GDAL keeps those of rings alone)."""
+    relation = case.relation
+    if relation is None or relation.tags.keys() - BARE:
+        return None
+    outer = [case.facts.ways[ref] for ref, role in relation.members if role in ("outer", "") and ref in case.facts.ways]
+    if any(way.refs[0] == way.refs[-1] for way in outer):
+        return None
+    return case.size(by_role(relation, case.facts))
+
+
 def class_of_the_relation(case: Case) -> float | None:
     """An outer way with a class that its relation has: counted once, with the relation."""
     return 0.0 if case.is_told else None
@@ -243,6 +253,7 @@ GDAL_RULES: Final[tuple[Rule, ...]] = (
     building_relation,
     class_of_the_relation,
     lines_lie_on_their_way,
+    tags_of_open_ways,
     holes_by_role,
     holes_by_nesting,
 )
@@ -250,18 +261,18 @@ GDAL_RULES: Final[tuple[Rule, ...]] = (
 
 def ring_that_crosses_itself(case: Case) -> float | None:
     """A closed way that crosses or touches itself: all that it encloses (`osmium export` leaves it out)."""
-    if case.way is None or case.form != "area":
+    if case.way is None:
         return None
     points = [place for run in case.way.runs() for place in run]
     if len(points) < 4 or shapely.is_valid(shapely.Polygon(points)):  # noqa: PLR2004 - no ring
         return None
-    return float(shapely.area(_filled(points)))
+    return case.size(_filled(points))
 
 
 def tags_on_outer_ways(case: Case) -> float | None:
     """A relation without tags: an area by the tags of its outer ways (`osmium export` makes none)."""
     relation = case.relation
-    if relation is None or relation.tags.keys() - {"type", "created_by"}:
+    if relation is None or relation.tags.keys() - BARE:
         return None
     return case.gdal if case.gdal > 0 else None
 

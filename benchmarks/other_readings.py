@@ -6,6 +6,7 @@ object and sums are not. `cross_check_osm.py` holds our reader against what come
 """
 
 import json
+import math
 import subprocess
 import tomllib
 import warnings
@@ -25,7 +26,8 @@ import shapely
 
 KEY: Final = ["kind", "id", "class", "form"]
 MEASURES: Final = ["size", "holes"]  # size: m2 of an area, m of a line; holes: m2 of its inner rings
-MORE_KEYS: Final = ["area", "type"]  # which decide what an object is, besides the keys of the taxonomy
+MORE_KEYS: Final = ["area", "name", "type"]  # which decide what an object is, besides the keys of the taxonomy
+YARD_KEYS: Final = {"landuse", "amenity", "leisure", "name"}  # of what a barrier goes around
 HISTORY: Final = (".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")
 COPY: Final = 10**15  # added to the id of a way that is handed to GDAL a second time
 REACH_M: Final = 100_000.0
@@ -75,6 +77,11 @@ class Tags:
         listed = ((each["name"], each["outline_of"]) for each in self.classes if "outline_of" in each)
         return {name for name, outline in listed if tags.get(outline["key"]) in outline["values"]}
 
+    def widest_m(self, tags: dict[str, str], name: str) -> float:
+        """How wide an area of a line rule may be anywhere; a wider one is an outline."""
+        rule = {} if name in self.rules(tags, "area") else self.rules(tags, "line").get(name, {})
+        return rule["fills_to"] * rule["widths"][tags[rule["key"]]] if "fills_to" in rule else math.inf
+
     def forms(self, tags: dict[str, str], shape: str) -> list[tuple[str, str]]:
         """List (class, "area" or "line") of an object; `shape` is "open" or "closed" for a way, or "relation".
 
@@ -89,7 +96,8 @@ class Tags:
             return drawn
         filled = [(name, "area") for name in areas]
         if not filled and not edges and tags.get("area") == "yes":
-            return [(name, "area") for name in lines]
+            is_yard = not YARD_KEYS.isdisjoint(tags)
+            return [(name, "line" if is_yard and rule.get("fills_to") else "area") for name, rule in lines.items()]
         if shape == "closed":
             return [*drawn, *filled, *((name, "line") for name in edges - set(lines))]
         squares = {name for name, rule in lines.items() if rule.get("multipolygon") == "filled"}
@@ -100,7 +108,7 @@ class Tags:
 
 @dataclass(frozen=True)
 class Objects:
-    """Objects as a reader gives them: tags, geometry in longitude and latitude, shape ("open", "closed", "relation")."""
+    """Objects as a reader gives them: tags, geometry in longitude and latitude, shape (of `Tags.forms`) and id."""
 
     tags: list[dict[str, str]]
     geometry: Any
@@ -144,15 +152,14 @@ class Frame:
 class Plain:
     """A file that other software reads as we read ours.
 
-    `source` is the same without the changes for GDAL. `copies` are ways that are in it twice, and the classes that do not count the second time. `fewer` are relations
-    that lost members. `owners` are outer ways of relations without a class of their own, and their relation: an area is
-    either's. `above` are the area relations of outer ways.
+    `source` is the same file without the changes for GDAL. `copies` are ways that are in it twice, and the classes that
+    do not count the second time. `owners` are outer ways of relations without a class of their own, and their relation:
+    an area is either's. `above` are the area relations of outer ways.
     """
 
     path: Path
     source: Path
     copies: dict[int, set[str]] = field(default_factory=dict)
-    fewer: set[int] = field(default_factory=set)
     owners: dict[int, int] = field(default_factory=dict)
     above: dict[int, list[int]] = field(default_factory=dict)
 
@@ -160,47 +167,49 @@ class Plain:
 def make_plain(path: Path, tags: Tags, scratch: Path, *, at: str) -> Plain:
     """Write a file as GDAL can read it, and so that its known habits do not hide others.
 
-    A history is cut at the end of a day, bz2 unpacked, and all is sorted. GDAL leaves out a relation as soon as one member is missing,
-    which is most of those at the edge of an extract: members that are not in the file are taken out. GDAL leaves out a
-    closed way that is the outer ring of a relation with tags, even if its class is another (a wood in a park): such
-    ways are given a second time under an id of their own.
+    A history is cut at the end of a day, bz2 unpacked, and all is sorted. GDAL leaves out a relation as soon as one
+    member is missing, which is most of those at the edge of an extract: members that are not in the file are taken out.
+    GDAL leaves out a closed way that is the outer ring of a relation with tags, even if its class is another (a wood in
+    a park): such ways are given a second time under an id of their own.
     """
     source = _one_state(path, scratch, at=at)
     relations = list(_relations(source, tags))
-    ways = {ref for each in relations for ref in each.members}
     owners = {ref: each.identifier for each in relations if not each.classes for ref in each.outer}
-    plain, present = Plain(path=scratch / "plain.osm.pbf", source=source, owners=owners), set()
+    plain = Plain(path=scratch / "plain.osm.pbf", source=source, owners=owners)
+    above = {ref: each for each in relations if each.has_tags for ref in each.said_outer}
     for each in relations:
         for ref in each.said_outer:
             plain.above.setdefault(ref, []).append(each.identifier)
-    above = {ref: each for each in relations if each.has_tags for ref in each.said_outer}
-    copies = []
+    ways = {ref for each in relations for ref in each.members}
+    present: set[int] = set()
+    copies: list[Any] = []
     kinds = osmium.filter.EntityFilter(osmium.osm.WAY | osmium.osm.RELATION)
     with osmium.SimpleWriter(str(plain.path), overwrite=True) as writer:
         for item in osmium.FileProcessor(str(source)).with_filter(kinds).handler_for_filtered(writer):
-            if item.is_way():
-                writer.add(item)
-                if item.id in ways:
-                    present.add(item.id)
-                if item.id in above and item.is_closed():
-                    own = dict(item.tags)
-                    said = {name for name, _ in tags.forms(own, "closed")}
-                    if tags.is_polygon(own) and said - above[item.id].classes:
-                        plain.copies[item.id + COPY] = above[item.id].classes
-                        nodes = [node.ref for node in item.nodes]
-                        copies.append(osmium.osm.mutable.Way(id=item.id + COPY, tags=dict(item.tags), nodes=nodes))
+            if item.is_relation():
+                while copies:  # their ids are the highest
+                    writer.add(copies.pop(0))
+                writer.add(_with_members(item, present))
                 continue
-            for copy in copies:
-                writer.add(copy)
-            copies.clear()
-            there = [each for each in item.members if each.type != "w" or each.ref in present]
-            if item.tags.get("type") in _AREAS and len(there) < len(item.members):
-                plain.fewer.add(item.id)
-                if not any(each.type == "w" and each.role != "inner" for each in there):
-                    there = []  # holes alone are no area
-                item = item.replace(members=[(each.type, each.ref, each.role) for each in there])
             writer.add(item)
+            if item.id in ways:
+                present.add(item.id)
+            own = dict(item.tags)
+            is_lost = item.id in above and item.is_closed() and tags.is_polygon(own)
+            if is_lost and not {name for name, _ in tags.forms(own, "closed")} <= above[item.id].classes:
+                plain.copies[item.id + COPY] = above[item.id].classes
+                nodes = [node.ref for node in item.nodes]
+                copies.append(osmium.osm.mutable.Way(id=item.id + COPY, tags=own, nodes=nodes))
     return plain
+
+
+def _with_members(relation: Any, present: set[int]) -> Any:  # noqa: ANN401 - osmium relations
+    """Return an area relation with the member ways that are present, without any if holes alone are left."""
+    there = [each for each in relation.members if each.type != "w" or each.ref in present]
+    if relation.tags.get("type") not in _AREAS or len(there) == len(relation.members):
+        return relation
+    has_ring = any(each.type == "w" and each.role != "inner" for each in there)
+    return relation.replace(members=[(each.type, each.ref, each.role) for each in there] if has_ring else [])
 
 
 def _one_state(path: Path, scratch: Path, *, at: str) -> Path:
@@ -332,7 +341,14 @@ def _measured(objects: Objects, tags: Tags, frame: Frame, copies: dict[int, set[
         rows += [(index, name, form) for name, form in known[signature] if name not in apart]
     at = np.array([row[0] for row in rows], dtype=np.int64)
     form = np.array([row[2] for row in rows], dtype=object)
-    size, holes, meets = sizes(frame.project(objects.geometry[at]), form == "area", frame)
+    shapes = frame.project(objects.geometry[at])
+    most_m = np.array(
+        [tags.widest_m(objects.tags[index], name) if form == "area" else math.inf for index, name, form in rows]
+    )
+    for index in np.flatnonzero(most_m < math.inf):
+        radius = shapely.maximum_inscribed_circle(_area(shapes[index]), 0.01)
+        form[index] = "line" if shapely.length(radius) > most_m[index] / 2 else "area"
+    size, holes, meets = sizes(shapes, form == "area", frame)
     table = pd.DataFrame(
         {
             "kind": np.where(objects.shape[at] == "relation", "r", "w"),
@@ -350,9 +366,8 @@ def sizes(geometry: Any, is_area: Any, frame: Frame) -> tuple[Any, Any, Any]:  #
     """Area or length, area of holes, and whether they meet the frame; edges that two rings share are no outline."""
     is_ring = shapely.get_dimensions(geometry) == 1
     filled = geometry.copy()
-    for index in np.flatnonzero(is_area & is_ring):  # a line of which the inside is asked
-        points = shapely.get_coordinates(geometry[index])
-        filled[index] = shapely.Polygon(points) if len(points) > 3 else shapely.Polygon()  # noqa: PLR2004 - a triangle
+    for index in np.flatnonzero(is_area & is_ring):
+        filled[index] = _area(geometry[index])
     filled[~is_ring | is_area] = shapely.make_valid(filled[~is_ring | is_area])
     parts, owner = _polygons(filled)
     area = shapely.area(parts)
@@ -361,6 +376,14 @@ def sizes(geometry: Any, is_area: Any, frame: Frame) -> tuple[Any, Any, Any]:  #
     size = np.where(is_area, np.bincount(owner, area, len(geometry)), length)
     holes = np.where(is_area, np.bincount(owner, outer - area, len(geometry)), 0.0)
     return size, holes, shapely.intersects(geometry, shapely.box(*frame.bounds_m))
+
+
+def _area(geometry: Any) -> Any:  # noqa: ANN401 - a geometry
+    """Return an area, or what a line encloses."""
+    if shapely.get_dimensions(geometry) != 1:
+        return geometry
+    points = shapely.get_coordinates(geometry)
+    return shapely.Polygon(points) if len(points) > 3 else shapely.Polygon()  # noqa: PLR2004 - a triangle
 
 
 def _polygons(geometry: Any) -> tuple[Any, Any]:  # noqa: ANN401 - arrays

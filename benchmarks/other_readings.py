@@ -196,8 +196,9 @@ def make_plain(path: Path, tags: Tags, scratch: Path, *, at: str) -> Plain:
                 present.add(item.id)
             own = dict(item.tags)
             is_lost = item.id in above and item.is_closed() and tags.is_polygon(own)
-            if is_lost and not {name for name, _ in tags.forms(own, "closed")} <= above[item.id].classes:
-                plain.copies[item.id + COPY] = above[item.id].classes
+            told = above[item.id].told(own) if is_lost else set()
+            if is_lost and not {name for name, _ in tags.forms(own, "closed")} <= told:
+                plain.copies[item.id + COPY] = told
                 nodes = [node.ref for node in item.nodes]
                 copies.append(osmium.osm.mutable.Way(id=item.id + COPY, tags=own, nodes=nodes))
     return plain
@@ -231,16 +232,23 @@ def _run(*command: str | Path) -> None:
 
 _AREAS: Final = ("multipolygon", "boundary")
 _NO_TAGS: Final = {"type", "created_by"}
+_HIDING: Final = ("tunnel", "layer", "location")  # what is below ground is not what lies above it
 
 
 @dataclass(frozen=True)
 class _Relation:
     identifier: int
+    tags: dict[str, str]
     classes: set[str]
     has_tags: bool
     members: list[int]
     outer: list[int]
     said_outer: list[int]
+
+    def told(self, tags: dict[str, str]) -> set[str]:
+        """Classes of an outer way that are the relation's, of which they are counted."""
+        is_alike = all(self.tags.get(key) == tags.get(key) for key in _HIDING)
+        return self.classes if is_alike else set()
 
 
 def _relations(source: Path, tags: Tags) -> Iterator[_Relation]:
@@ -250,6 +258,7 @@ def _relations(source: Path, tags: Tags) -> Iterator[_Relation]:
             ways = [each for each in item.members if each.type == "w"]
             yield _Relation(
                 identifier=item.id,
+                tags=own,
                 classes={name for name, _ in tags.forms(own, "relation")},
                 has_tags=bool(own.keys() - _NO_TAGS),
                 members=[each.ref for each in ways],

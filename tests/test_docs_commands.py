@@ -81,6 +81,8 @@ OTHERS = {
     r"^python benchmarks/segmenters\.py ": "minutes; tests/scoring/test_segmenter_program.py makes a small board",
     r"^python benchmarks/image_matchers\.py ": "minutes of matching, on a region with imagery and a task of pictures",
     r"^python benchmarks/open_numbers\.py ": "minutes; tests/baselines/test_tunable.py tries made-up systems",
+    r"^python -m benchmarks\.cross_check_osm ": "needs extracts; tests/osm/test_cross_check.py reads small maps",
+    r"^bash findings/NAME\.sh": "needs the package registry, and a name",
     r"^python -m benchmarks\.related_work docs/results/": "tests/leaderboard/test_results.py prints the same table",
     r"umask.*secrets\.token_hex": "makes a secret; tests/tasks/test_private_seed.py reads one",
     r"^pip install 'sasgeo-bench\[publish\]'$": "an installation needs the package registry",

@@ -177,6 +177,16 @@ def test_what_no_rule_explains_is_named_and_is_the_exit_status(tmp_path, monkeyp
     assert "1 files, 0 faults" in capsys.readouterr().out
 
 
+def test_a_file_that_cannot_be_read_is_a_fault_and_the_others_are_read(tmp_path, capsys):
+    today().write(tmp_path / "today.osm")
+    (tmp_path / "bad.osm").write_text('<osm version="0.6"><node')
+    with pytest.raises(SystemExit, match="1"):
+        main(["--extracts", str(tmp_path), "--out", str(tmp_path / "out")])
+    printed = capsys.readouterr().out
+    assert "\nbad.osm: RuntimeError: " in printed
+    assert "2 files, 1 faults" in printed
+
+
 def test_rules_of_tags_are_those_of_the_taxonomy():
     tags = Tags.load()
     assert tags.forms({"landuse": "meadow", "barrier": "fence"}, "relation") == [

@@ -126,7 +126,9 @@ def with_rules(found: pd.DataFrame, plain: Plain, frame: Frame) -> list[dict[str
         if reader == "osmium":
             differ = differ[~((differ["kind"] == "r") & differ["id"].isin(owned))]
         is_way = differ["kind"] == "w"
-        facts = Facts.read(plain.source, frame, ways=differ["id"][is_way], relations=differ["id"][~is_way])
+        ways = differ["id"][is_way].tolist()
+        around = [relation for way in ways for relation in plain.around.get(way, ())]
+        facts = Facts.read(plain.source, frame, ways=ways, relations=[*differ["id"][~is_way], *around])
         for row in differ.to_dict("records"):
             above = plain.above.get(row["id"], ()) if row["kind"] == "w" else ()
             is_told = any((owner, row["class"]) in told for owner in above)

@@ -250,6 +250,31 @@ def tags_of_open_ways(case: Case) -> float | None:
     return case.size(by_role(relation, case.facts))
 
 
+def outer_ways_that_disagree(case: Case) -> float | None:
+    """A relation without tags whose outer ways are of different classes: each is its own (GDAL goes by the first)."""
+    relation = case.relation
+    if relation is None or relation.tags.keys() - BARE:
+        return None
+    outer = [case.facts.ways[ref] for ref, role in relation.members if role in ("outer", "") and ref in case.facts.ways]
+    forms = [TAGS.forms(way.tags, "closed") for way in outer]
+    if len({tuple(each) for each in forms}) < 2:  # noqa: PLR2004 - they agree
+        return None
+    own = [way for way, each in zip(outer, forms, strict=True) if (case.name, case.form) in each]
+    return float(sum(case.size(area) for area in rings(own)))
+
+
+def hole_told_as_its_area(case: Case) -> float | None:
+    """An inner way, whose tags are all on an outer way of a relation without a class: a hole, as osm2pgsql had it."""
+    way = case.way
+    for relation in case.facts.relations.values() if way is not None else ():
+        roles = dict(relation.members)
+        outer = [case.facts.ways[ref] for ref, role in roles.items() if role == "outer" and ref in case.facts.ways]
+        told = {item for each in outer for item in each.tags.items()}
+        if way is not None and roles.get(case.identifier) == "inner" and way.tags.items() <= told:
+            return 0.0
+    return None
+
+
 def class_of_the_relation(case: Case) -> float | None:
     """An outer way with a class that its relation has: counted once, with the relation."""
     return 0.0 if case.is_told else None
@@ -261,8 +286,10 @@ GDAL_RULES: Final[tuple[Rule, ...]] = (
     rings_that_close,
     building_relation,
     class_of_the_relation,
+    hole_told_as_its_area,
     lines_lie_on_their_way,
     tags_of_open_ways,
+    outer_ways_that_disagree,
     holes_by_role,
     holes_by_nesting,
 )

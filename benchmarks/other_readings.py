@@ -153,8 +153,9 @@ class Plain:
     """A file that other software reads as we read ours.
 
     `source` is the same file without the changes for GDAL. `copies` are ways that are in it twice, and the classes that
-    do not count the second time. `owners` are outer ways of relations without a class of their own, and their relation:
-    an area is either's. `above` are the area relations of outer ways.
+    do not count the second time. `owners` are closed outer ways of relations without a class of their own, and their
+    relation: an area is either's. `above` are the area relations of outer ways, `around` those without a class of ways
+    that are inner ones.
     """
 
     path: Path
@@ -162,6 +163,7 @@ class Plain:
     copies: dict[int, set[str]] = field(default_factory=dict)
     owners: dict[int, int] = field(default_factory=dict)
     above: dict[int, list[int]] = field(default_factory=dict)
+    around: dict[int, list[int]] = field(default_factory=dict)
 
 
 def make_plain(path: Path, tags: Tags, scratch: Path, *, at: str) -> Plain:
@@ -178,8 +180,10 @@ def make_plain(path: Path, tags: Tags, scratch: Path, *, at: str) -> Plain:
     plain = Plain(path=scratch / "plain.osm.pbf", source=source, owners=owners)
     above = {ref: each for each in relations if each.has_tags for ref in each.said_outer}
     for each in relations:
-        for ref in each.said_outer:
+        for ref in each.said_outer or each.outer:
             plain.above.setdefault(ref, []).append(each.identifier)
+        for ref in set(each.members).difference(each.outer) if not each.classes else ():
+            plain.around.setdefault(ref, []).append(each.identifier)
     ways = {ref for each in relations for ref in each.members}
     present: set[int] = set()
     copies: list[Any] = []
@@ -194,6 +198,8 @@ def make_plain(path: Path, tags: Tags, scratch: Path, *, at: str) -> Plain:
             writer.add(item)
             if item.id in ways:
                 present.add(item.id)
+            if not item.is_closed():
+                owners.pop(item.id, None)  # a line by itself
             own = dict(item.tags)
             is_lost = item.id in above and item.is_closed() and tags.is_polygon(own)
             told = above[item.id].told(own) if is_lost else set()

@@ -111,9 +111,6 @@ def _features(path: Path) -> Iterator[Any]:
 def _shape(feature: Any, path: Path, number: int) -> shapely.Geometry | None:  # noqa: ANN401 - what a file holds
     """Return the geometry of a feature, mended where its rings cross; None if it has none."""
     geometry = feature.get("geometry") if isinstance(feature, dict) else None
-    if isinstance(feature, dict) and not isinstance(feature.get("properties") or {}, dict):
-        message = f"{path}: feature {number} has properties that are no object: export it again"
-        raise ExtractError(message)
     if geometry is None and isinstance(feature, dict):
         return None
     try:

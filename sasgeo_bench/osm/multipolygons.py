@@ -183,10 +183,15 @@ def mended_ring(line: shapely.Geometry) -> shapely.Geometry:
 def mended_area(relation: Relation, lines: Mapping[int, shapely.Geometry]) -> shapely.Geometry:
     """Return closed outer rings less closed inner rings, from the member ways that are present."""
     outer, inner = (
-        shapely.union_all(shapely.get_parts(shapely.polygonize([lines[ref] for ref in refs if ref in lines])))
-        for refs in (relation.outer, relation.inner)
+        _closed_rings([lines[ref] for ref in refs if ref in lines]) for refs in (relation.outer, relation.inner)
     )
     return polygons_of(shapely.make_valid(shapely.difference(outer, inner)))
+
+
+def _closed_rings(lines: list[shapely.Geometry]) -> shapely.Geometry:
+    """Return the area of rings that close; one that crosses itself is split, as a closed way is."""
+    rings, _, _, crossed = shapely.polygonize_full(lines)
+    return shapely.union_all([*shapely.get_parts(rings), *map(mended_ring, shapely.get_parts(crossed))])
 
 
 def polygons_of(geometry: shapely.Geometry) -> shapely.Geometry:

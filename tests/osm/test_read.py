@@ -374,8 +374,8 @@ def test_counts_agree_with_a_second_reader(name, real_extracts):
     relations = reading.features["osm_type"].eq("relation").sum()
     for class_name, count in counting.found.items():
         extra = found.get(class_name, 0) - count
-        # Ours may have more: what the plain reader must give up (nodes missing, relations to be mended). Fewer only where
-        # a relation and its outer ways are one building.
+        # Ours may have more: what the plain reader must give up (nodes missing, relations to be mended). It has fewer
+        # only where a relation and its outer ways are one building.
         joined = relations * (class_name == "building")
         assert -joined <= extra <= mended + joined, (class_name, extra)
         if not mended:

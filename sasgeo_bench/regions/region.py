@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SCHEMA_VERSION: Final = 1  # of region.json and its tables
-DATA_VERSION: Final = 2  # of regions: raised whenever the same input gives another region
+DATA_VERSION: Final = 3  # of regions: raised whenever the same input gives another region
 OLD_STYLE_DATA_VERSION: Final = 3  # from this one on multipolygons of the old style are assembled (`osm.multipolygons`)
 MADE_UP: Final = ("town-", "demo-")  # how the names of regions begin that a program made up
 ATTRIBUTION: Final = "(c) OpenStreetMap contributors, ODbL"

@@ -23,8 +23,8 @@ TWIN_EAST, TWIN_NORTH = "twin_east_m", "twin_north_m"  # measured: offset from a
 CEILING: Final = "ceiling"  # measured: the most that a matcher can expect, where copies leave nothing to tell them by
 UNRIVALLED: Final = "unrivalled"  # begins the kind of a stress whose rival is out of reach: it decides nothing
 COPIES: Final = "twins"  # measured: exact copies of the place among the candidates
-TASK_VERSION: Final = 4  # of queries.parquet and truth.parquet: raised when the same request gives other queries
-TASK_VERSIONS: Final = (1, 2, 3, TASK_VERSION)  # readable versions: their files are alike
+TASK_VERSION: Final = 5  # of queries.parquet and truth.parquet: raised when the same request gives other queries
+TASK_VERSIONS: Final = (1, 2, 3, 4, TASK_VERSION)  # readable versions: their files are alike
 
 Track = Literal["retrieval", "localization", "sequence"]
 Yaw = Literal["known", "weak", "unknown"]

@@ -170,7 +170,7 @@ BAD = {
     "{": "cannot be read as GeoJSON",
     "null": "no GeoJSON FeatureCollection",
     '{"type": "Feature"}': "no GeoJSON FeatureCollection",
-    '{"type": "FeatureCollection", "features": [{"properties": "a", "geometry": null}]}': 'of feature 0 are "a", and no object',
+    '{"type": "FeatureCollection", "features": [{"properties": "a", "geometry": null}]}': "and no object of keys",
     '{"type": "FeatureCollection", "features": [7]}': "feature 0 has a broken geometry",
     '{"type": "FeatureCollection", "features": [{"geometry": {"type": "Circle"}}]}': "feature 0 has a broken geometry",
     '{"type": "FeatureCollection", "features": [{"geometry": {"type": "Polygon", "coordinates": [[[1]]]}}]}': "broken",

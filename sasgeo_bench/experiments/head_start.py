@@ -191,7 +191,7 @@ def _check_runs(archive: Path, scratch: Path) -> None:
     """Refuse answers without a sound record of their run: it is what tells who gave them."""
     for folder in sorted({path.parent for path in scratch.rglob("*") if path.is_file()}):
         try:
-            about = parse_json((folder / prediction_files.RUN).read_bytes())
+            about = parse_json(plain_file(folder / prediction_files.RUN).read_bytes())
         except (OSError, ValueError, RecursionError):
             about = None
         if not isinstance(about, dict):

@@ -230,7 +230,7 @@ def _texts_of(path: Path, group: int, columns: Sequence[str]) -> Iterator[tuple[
     """Yield the bytes of some texts of a row group, all of them and the longest one, without unpacking them."""
     if not columns:
         return
-    with pq.ParquetFile(path, **VERIFIED, read_dictionary=list(columns)) as source:
+    with pq.ParquetFile(plain_file(path), **VERIFIED, read_dictionary=list(columns)) as source:
         for name in columns:
             for batch in source.iter_batches(_TEXTS_AT_ONCE, row_groups=[group], columns=[name]):
                 for texts in (found for column in batch.columns for found in _dictionaries(column)):

@@ -21,6 +21,8 @@ from pathlib import Path
 from typing import Any, Final
 from urllib.parse import unquote, urlsplit
 
+from sasgeo_bench.files.paths import plain_file
+
 SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
 _MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
 _HERE: Final = Path(__file__).resolve().parents[1]
@@ -148,7 +150,7 @@ def _linked(sites: Sequence[Path]) -> Iterator[Path]:
     for folder in sites:
         for path in sorted(folder.glob("*.pth")):
             with suppress(OSError, UnicodeDecodeError):
-                lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+                lines = [line.strip() for line in plain_file(path).read_text(encoding="utf-8").splitlines()]
                 yield from (folder / line for line in lines if line and not line.startswith(("#", "import")))
     for found in distributions(path=list(map(str, sites))):
         if found.name in SHIPPED:

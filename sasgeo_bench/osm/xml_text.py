@@ -11,6 +11,8 @@ from typing import IO, Final, cast
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
+from sasgeo_bench.files.paths import plain_file
+
 Box = tuple[float, float, float, float]
 
 NEW_IDS: Final = 2**40  # objects that have no id of OpenStreetMap yet are numbered from here, above all of its ids
@@ -28,11 +30,11 @@ _PARTS: Final = {"node": ("tag",), "way": ("tag", "nd"), "relation": ("tag", "me
 
 def open_text(path: Path) -> IO[bytes]:
     """Open an XML file, unpacked if it is packed by gzip or bzip2."""
-    with path.open("rb") as source:
+    with plain_file(path).open("rb") as source:
         start = source.read(3)
     if start.startswith(b"\x1f\x8b"):
-        return cast("IO[bytes]", gzip.open(path, "rb"))
-    return bz2.open(path, "rb") if start == b"BZh" else path.open("rb")
+        return cast("IO[bytes]", gzip.open(plain_file(path), "rb"))
+    return bz2.open(plain_file(path), "rb") if start == b"BZh" else plain_file(path).open("rb")
 
 
 def chunks(path: Path) -> Iterator[bytes]:

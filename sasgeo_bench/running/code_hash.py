@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import MatchError, counted
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.card_file import CARD_FILE
 from sasgeo_bench.matching.plugin_files import Home, file_of, find_module, home_of, import_paths, is_installed_file
 from sasgeo_bench.matching.plugins import MATCHERS, SEGMENTERS, TRACKERS, code_of
@@ -90,9 +91,9 @@ def file_digest(path: Path) -> bytes:
 def _file_digest(path: Path, size: int, changed_ns: int) -> bytes:
     del size, changed_ns
     if path.suffix != ".py":
-        with path.open("rb") as file:
+        with plain_file(path).open("rb") as file:
             return hashlib.file_digest(file, "sha256").digest()
-    data = path.read_bytes()
+    data = plain_file(path).read_bytes()
     tree = _tree(data)
     return hashlib.sha256(data if tree is None else "".join(_shape(tree)).encode(errors="replace")).digest()
 
@@ -161,7 +162,7 @@ def _ways(module: str, name: str, paths: Sequence[str]) -> list[str]:
     ways, wanted = [module], name.partition(".")[0]
     for _ in range(_MOST_STEPS):
         path = file_of(find_module(ways[-1], paths))
-        tree = None if path is None or path.suffix != ".py" else _tree(path.read_bytes())
+        tree = None if path is None or path.suffix != ".py" else _tree(plain_file(path).read_bytes())
         found = next(
             (
                 (_absolute(node, ways[-1], is_package=path is not None and path.name == "__init__.py"), alias.name)
@@ -237,7 +238,7 @@ def _imported(path: Path) -> frozenset[str]:
 def _imports_of(path: Path, size: int, changed_ns: int) -> frozenset[str]:
     """Return the modules that a file imports anywhere, and names that it takes out of this package as a whole."""
     del size, changed_ns
-    tree = _tree(path.read_bytes())
+    tree = _tree(plain_file(path).read_bytes())
     nodes = [] if tree is None else list(ast.walk(tree))
     found: set[str] = set()
     known_as = set()

@@ -13,6 +13,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from sasgeo_bench.errors import ImageError
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.texts import message_of
 
 _TIFF: Final = (b"II*\0", b"MM\0*")
@@ -42,11 +43,11 @@ class PhotoHead:
 def read_head(path: Path) -> PhotoHead:
     """Read the head of a photo; raise `ImageError` if it is no sound JPEG, TIFF or DNG."""
     try:
-        with warnings.catch_warnings(), path.open("rb") as file:
+        with warnings.catch_warnings(), plain_file(path).open("rb") as file:
             warnings.simplefilter("ignore")  # of Pillow: odd metadata; what is needed and odd is refused later
             if file.read(4) in _TIFF:
                 return _read_tiff(file)
-            with Image.open(path, formats=("JPEG",)) as image:  # a JPEG with several pictures (MPO) is one, too
+            with Image.open(plain_file(path), formats=("JPEG",)) as image:  # one of several (MPO) is one, too
                 return _head(image.size, image.getexif(), image.info.get("xmp"))
     except ImageError:
         raise

@@ -5,7 +5,9 @@ from collections.abc import Sequence
 from typing import Final
 
 import geopandas as gpd
+import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 FAMILIES: Final = {
     "roads": ("road_major", "road_minor", "path_track"),
@@ -14,29 +16,44 @@ FAMILIES: Final = {
 }
 _ROAD_KM: Final = 5.0  # of roads a square kilometre: villages have more, fields and mountains less
 _HOUSES: Final = 50  # buildings a square kilometre
+_RAIL_KM: Final = 1.0  # of railways a square kilometre: there is a station, and nowhere are rails without a way to them
+_LAND: Final = 0.1  # of the ground, where people live or work
 _LEAST_KM2: Final = 0.1  # a smaller place may well be all street
 
 
-def missing_families(features: gpd.GeoDataFrame, coverage: shapely.Geometry, *, classes: Sequence[str]) -> str:
+def missing_families(
+    features: gpd.GeoDataFrame,
+    coverage: shapely.Geometry,
+    *,
+    classes: Sequence[str],
+    built_up: Sequence[shapely.Geometry] | NDArray[np.object_],
+) -> str:
     """Return a warning that names the classes of which a built-up area has nothing, by family; empty if it has all.
 
-    `features` and `coverage`, the mapped area, share a projected CRS, metres; `classes` are those that the map should
-    hold. An extract that was filtered to roads looks like a town without a house.
+    `features`, `coverage`, the mapped area, and `built_up`, areas where people live or work, share a projected CRS,
+    metres; `classes` are those that the map should hold. An extract that was filtered to roads looks like a town
+    without a house.
     """
     km2 = shapely.area(coverage) / 1e6
-    if km2 < _LEAST_KM2:
-        return ""
     there = {name: features.geometry.array[(features["class"] == name).to_numpy()] for name in classes}
-    roads = [shape for name in FAMILIES["roads"] for shape in there.get(name, ())]
-    road_km = float(shapely.length(shapely.intersection(roads, coverage)).sum()) / 1e3 if roads else 0.0
-    houses = int(shapely.intersects(there.get("building", ()), coverage).sum())
-    if road_km < _ROAD_KM * km2 and houses < _HOUSES * km2:
-        return ""
     wanted = [[name for name in family if name in there] for family in FAMILIES.values()]
     missing = [name for family in wanted if not any(len(there[name]) for name in family) for name in family]
-    if not missing:
+    if km2 < _LEAST_KM2 or not missing:
+        return ""
+    road_km = sum(_km(there.get(name, ()), coverage) for name in FAMILIES["roads"])
+    rail_km = _km(there.get("railway", ()), coverage)
+    houses = int(shapely.intersects(there.get("building", ()), coverage).sum())
+    land = shapely.make_valid(np.asarray(built_up, dtype=object))
+    land_km2 = float(shapely.area(shapely.intersection(land, coverage)).sum()) / 1e6
+    limits = ((road_km, _ROAD_KM), (rail_km, _RAIL_KM), (houses, _HOUSES), (land_km2, _LAND))
+    if all(found < limit * km2 for found, limit in limits):
         return ""
     return (
-        f"{km2:.1f} km2 are built up ({road_km:.1f} km of roads, {houses} buildings), and nothing is of "
-        f"{', '.join(missing)}: if the extract was filtered, name what it holds by `classes` in the region file"
+        f"{km2:.1f} km2 are built up ({road_km:.1f} km of roads, {rail_km:.1f} km of railways, {houses} buildings, "
+        f"{land_km2:.1f} km2 to live or work on), and nothing is of {', '.join(missing)}: if the extract was filtered, "
+        "name what it holds by `classes` in the region file"
     )
+
+
+def _km(lines: Sequence[shapely.Geometry], coverage: shapely.Geometry) -> float:
+    return float(shapely.length(shapely.intersection(lines, coverage)).sum()) / 1e3 if len(lines) else 0.0

@@ -24,6 +24,7 @@ from sasgeo_bench.osm.multipolygons import (
     roles_by_place,
 )
 from sasgeo_bench.osm.scan import (
+    BUILT_UP,
     SEVERAL_LINES,
     Box,
     Classifier,
@@ -185,6 +186,8 @@ def _scan_area(area: Any, scan: Scan, classifier: Classifier, box: Box) -> bool:
         scan.rows.append(ScanRow(wkb, kind, area.orig_id(), is_relation, area.version, area.timestamp))
         return True
     scan.far.append(wkb)
+    if get("landuse") in BUILT_UP:
+        scan.built_up.append(wkb)
     if not classifier.as_line(get).line:
         scan.tally.drops.update(f"no rule for {text}" for text in classifier.as_area(get).unknown)
     return True

@@ -168,7 +168,8 @@ def _reading(
         message = f"{name} holds no element of {of_class} within {box_text(grid_lonlat)}: move or enlarge the bounds"
         raise CoverageError(message)
     kept = taxonomy.names if classes is None else classes
-    warnings = (*warnings, missing_families(features, mapped.coverage, classes=kept))
+    built_up = project(shapely.from_wkb(np.array(scan.built_up, dtype=object)), grid.epsg)
+    warnings = (*warnings, missing_families(features, mapped.coverage, classes=kept, built_up=built_up))
     newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
     return Reading(
         features=features,

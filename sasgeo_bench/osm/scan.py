@@ -23,6 +23,7 @@ _NO: Final = (None, "no", "false", "0")
 _HIDING: Final = ("tunnel", "layer", "location", "covered", "indoor", "cutting")
 _AREA_MODIFIERS: Final = (*_HIDING, "parking", "width")
 _LINE_MODIFIERS: Final = (*_HIDING, "width", "lanes")
+BUILT_UP: Final = ("residential", "commercial", "retail", "industrial", "garages")  # values of landuse without a class
 _ROOFED: Final = ("building", "bridge")
 _OPEN: Final = ("water", "waterway", "coastline")  # with layer=-1 they lie below bridges, in the open
 
@@ -76,13 +77,15 @@ class Scan:
     """Result of one pass: a row for each object, the distinct traits they share, and what was not used.
 
     `far` holds geometry outside the requested box or without a class: it still shows what is mapped. `coast` holds
-    every coastline of the file, `gaps` the gaps of ways of a class, by way id.
+    every coastline of the file, `gaps` the gaps of ways of a class, by way id, `built_up` the areas near the box whose
+    landuse says that people live or work there.
     """
 
     rows: list[ScanRow] = field(default_factory=list)
     far: list[bytes] = field(default_factory=list)
     coast: list[bytes] = field(default_factory=list)
     gaps: dict[int, list[shapely.Geometry]] = field(default_factory=dict)
+    built_up: list[bytes] = field(default_factory=list)
     traits: list[Traits] = field(default_factory=list)
     tally: Tally = field(default_factory=Tally)
 

@@ -154,7 +154,36 @@ def test_a_town_of_houses_alone_lacks_its_streets_and_a_whole_town_nothing(tmp_p
 def test_open_country_lacks_nothing(tmp_path):
     path = written(tmp_path / "a.osm", *ACROSS, *UP)
     reading = read_extract(path, GRID)
-    assert missing_families(reading.features, reading.coverage, classes=("road_major", "building")) == ""
+    assert missing_families(reading.features, reading.coverage, classes=("green", "building"), built_up=()) == ""
+
+
+INNER = (-1200, -1200, 1200, 1200)
+
+
+@pytest.mark.parametrize("landuse", ["residential", "commercial", "industrial", "retail"])
+def test_a_town_of_land_use_alone_lacks_its_streets_and_houses(landuse, tmp_path):
+    blocks = [
+        ({"landuse": landuse}, house(x, y, 270)) for x in range(-1190, 1000, 300) for y in range(-1190, 1000, 300)
+    ]
+    park = ({"leisure": "park"}, house(0, 0, 200))
+    (warning,) = warnings_of(written(tmp_path / "a.osm", *blocks, park, box=INNER))
+    assert "nothing is of road_major, road_minor, path_track, building:" in warning
+
+
+def test_a_town_of_railways_alone_lacks_the_rest(tmp_path):
+    rails = [({"railway": "rail"}, [(x, y) for x in range(-1300, 1301, 100)]) for y in range(-1100, 1200, 200)]
+    (warning,) = warnings_of(written(tmp_path / "a.osm", *rails, box=INNER))
+    assert "km of railways" in warning
+    assert "nothing is of road_major, road_minor, path_track, building, water" in warning
+
+
+def test_fields_woods_and_one_farm_without_a_road_lack_nothing(tmp_path):
+    fields = [
+        ({"landuse": "farmland"}, house(x, y, 270)) for x in range(-1190, 1000, 300) for y in range(-1190, 1000, 300)
+    ]
+    farm = ({"landuse": "residential"}, house(0, 0, 300))
+    rail = ({"railway": "rail"}, [(x, 50) for x in range(-1300, 1301, 100)])
+    assert warnings_of(written(tmp_path / "a.osm", *fields, farm, rail, box=INNER)) == ()
 
 
 def test_a_grid_with_a_corner_beyond_the_antimeridian_ends_there():

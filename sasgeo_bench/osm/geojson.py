@@ -4,16 +4,17 @@
 import datetime as dt
 import json
 import re
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import shapely
 
-from sasgeo_bench.errors import ExtractError, counted
+from sasgeo_bench.errors import ExtractError, counted, named
 from sasgeo_bench.files.json import MOST_BYTES, parse_json
 from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.osm.scan import Box, Classifier, Scan, ScanRow
+from sasgeo_bench.osm.scan import BUILT_UP, Box, Classifier, Get, Scan, ScanRow
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy
 from sasgeo_bench.osm.xml_text import NEW_IDS
 
@@ -22,12 +23,32 @@ _WGS84: Final = ("CRS84", "EPSG::4326", "EPSG:4326")  # ends of the names of lon
 _MORE_TAGS: Final = ("all_tags", "other_tags", "tags")
 _NO_TAGS: Final = (*_MORE_TAGS, "osm_id", "osm_way_id", "osm_type", "version", "timestamp", "type", "id", "@id")
 _NUMBERS: Final = ("layer", "level", "width", "lanes", "height")  # of which 0 and 1 are values
-_SWITCHES: Final = {"true": "yes", "1": "yes", "false": "no", "0": "no"}
+# Keys that say yes or no; not `oneway`, whose F and T in shapefiles of OpenStreetMap are forward and backward.
+_SWITCHES: Final = (
+    "bridge",
+    "tunnel",
+    "building",
+    "building:part",
+    "area",
+    "covered",
+    "indoor",
+    "cutting",
+    "embankment",
+)
+_YES: Final = ("yes", "true", "t", "y", "1")
+_NO: Final = ("no", "false", "f", "n", "0")
+_WHOLE: Final = re.compile(r"([-+]?[0-9]+)\.0*")
 _NOTHING: Final = ("", "none", "null", "<null>", "nan")  # how tables write that there is no value
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"\s*=>\s*"((?:[^"\\]|\\.)*)"')
 _NAMED_ID: Final = re.compile(r"(n|w|r|node|way|relation)/?([0-9]{1,12})")
 _EXACT: Final = 2**53  # whole numbers below it are exact as floats
 _CLASSLESS: Final = " without a class"
+_CLOSED: Final = "closed line that is no polygon"
+_OTHER: Final = " with the tags of a line or an area"
+_UNREAD: Final = (_CLASSLESS, _CLOSED, _OTHER)  # how the reasons end for which a feature in the region is no object
+_ASK: Final = "are they tags of OpenStreetMap, are areas polygons, and does `tags` say what all of them have?"
+_MOST_NAMED: Final = 8
+_MOST_NAME: Final = 40  # characters
 _LEAST_CLASSED: Final = 0.05
 _AREAS: Final = ("Polygon", "MultiPolygon")
 _LINES: Final = ("LineString", "MultiLineString")
@@ -44,22 +65,49 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
     outside it are neither classified nor counted.
 
     Raise `ExtractError`, which names the file and the feature, if a file is no GeoJSON in longitude and latitude, or a
-    geometry is broken.
+    geometry is broken, or there are features in the box and none has a class.
     """
-    scan = Scan()
+    scan, keys = Scan(), Counter[str]()
     classifier = Classifier(taxonomy, scan)
     frame = shapely.box(*box)
     parts: dict[tuple[Identity, int], int] = {}
     for path in files:
-        for number, feature in enumerate(_features(path)):
+        features = list(_features(path))
+        is_ogr = any("osm_way_id" in _properties(feature) for feature in features)
+        for number, feature in enumerate(features):
             shape = _shape(feature, path, number)
             if shape is None:
                 scan.tally.drops["feature without a geometry"] += 1
             elif not shapely.intersects(shape, frame):
                 scan.far.append(bytes(shapely.to_wkb(shape)))
             else:
-                _take({**tags, **tags_of(feature)}, identity_of(feature), shape, scan, classifier, parts)
+                identity = identity_of(feature, is_ogr=is_ogr)
+                _take({**tags, **tags_of(feature)}, identity, shape, scan, classifier, parts)
+                keys.update(list(_properties(feature)))
+    _check_classed(scan, files, keys)
     return scan
+
+
+def _check_classed(scan: Scan, files: Sequence[Path], keys: Counter[str]) -> None:
+    """Refuse files with features in the region of which none has a class; `keys` are those of their properties."""
+    unread = _unread(scan)
+    if scan.rows or not unread:
+        return
+    names = ", ".join(key[:_MOST_NAME] for key, _ in keys.most_common(_MOST_NAMED)) or "none"
+    more = ", ..." if len(keys) > _MOST_NAMED else ""
+    message = (
+        f"{named([path.name for path in files], 'file')}: none of {counted(unread.total(), 'feature')} in the region "
+        f"has a class ({_reasons(unread)}); their properties are {names}{more}: {_ASK}"
+    )
+    raise ExtractError(message)
+
+
+def _unread(scan: Scan) -> Counter[str]:
+    return Counter({reason: count for reason, count in scan.tally.drops.items() if reason.endswith(_UNREAD)})
+
+
+def _reasons(unread: Counter[str]) -> str:
+    return ", ".join(f"{count} x {reason}" for reason, count in unread.most_common())
 
 
 def classless(scan: Scan) -> str:
@@ -67,13 +115,13 @@ def classless(scan: Scan) -> str:
 
     Then the tags most likely stand where they were not looked for.
     """
-    without = sum(count for reason, count in scan.tally.drops.items() if reason.endswith(_CLASSLESS))
-    features = without + len(scan.rows)
+    unread = _unread(scan)
+    features = unread.total() + len(scan.rows)
     if len(scan.rows) >= _LEAST_CLASSED * features:
         return ""
     return (
-        f"{len(scan.rows)} of {counted(features, 'feature')} have a class: are their properties tags of OpenStreetMap, "
-        "and does `tags` say what all of them have?"
+        f"{len(scan.rows)} of {counted(features, 'feature')} became objects of a class ({_reasons(unread)}). "
+        f"Their properties: {_ASK}"
     )
 
 
@@ -106,6 +154,10 @@ def _features(path: Path) -> Iterator[Any]:
             )
             raise ExtractError(message)
         yield feature
+
+
+def _properties(feature: Any) -> Mapping[str, Any]:  # noqa: ANN401 - what a file holds
+    return (feature.get("properties") if isinstance(feature, dict) else None) or {}
 
 
 def _shape(feature: Any, path: Path, number: int) -> shapely.Geometry | None:  # noqa: ANN401 - what a file holds
@@ -141,7 +193,8 @@ def tags_of(feature: Mapping[str, Any]) -> dict[str, str]:
 
     osmtogeojson has an object `tags`, ogr2ogr a text `other_tags` ("key"=>"value" or JSON); own properties come first.
     No value and an empty text are no tag. True, false and numbers become what a mapper writes: yes, no, and whole
-    numbers without a fraction; 1 and 0 mean yes and no, save of a layer, a width and lanes.
+    numbers without a fraction. Of keys that say yes or no, such as `bridge`, so do 1, "t", "Y" or "0.0"; texts of other
+    keys stay as they are.
 
     >>> tags_of({"properties": {"bridge": False, "layer": -1.0, "name": "", "other_tags": '"highway"=>"path"'}})
     {'highway': 'path', 'bridge': 'no', 'layer': '-1'}
@@ -184,7 +237,13 @@ def _text(key: str, value: Any) -> str:  # noqa: ANN401 - any JSON
     text = str(value).strip()
     if text.lower() in _NOTHING:
         return ""
-    return text if key in _NUMBERS else _SWITCHES.get(text.lower(), text)
+    if key not in _NUMBERS and key not in _SWITCHES:
+        return text
+    whole = _WHOLE.fullmatch(text)
+    text = str(int(whole[1])) if whole is not None else text
+    if key in _NUMBERS:
+        return text
+    return "yes" if text.lower() in _YES else "no" if text.lower() in _NO else text
 
 
 class Identity(NamedTuple):
@@ -194,11 +253,12 @@ class Identity(NamedTuple):
     osm_id: int
 
 
-def identity_of(feature: Mapping[str, Any]) -> Identity | None:
+def identity_of(feature: Mapping[str, Any], *, is_ogr: bool = False) -> Identity | None:
     """Return which object of OpenStreetMap a feature is, or None if it does not say so.
 
     Read are `osm_id` with `osm_type`, `osm_way_id` (ogr2ogr), `id` with `type`, and "way/7" in `@id`, `id` or the id of
-    the feature. A negative `osm_id` is that of a relation, as osm2pgsql writes it.
+    the feature. A negative `osm_id` is that of a relation, as osm2pgsql writes it. So is that of an area without a type
+    if `is_ogr`: ogr2ogr gives areas `osm_way_id` if they are ways and `osm_id` if they are relations.
 
     >>> identity_of({"id": "relation/7", "properties": {}})
     Identity(is_relation=True, osm_id=7)
@@ -211,12 +271,19 @@ def identity_of(feature: Mapping[str, Any]) -> Identity | None:
         named = _NAMED_ID.fullmatch(value) if isinstance(value, str) else None
         if named is not None:
             return Identity(named[1].startswith("r"), int(named[2]))
+    if is_ogr and not kind and (number := _whole(properties.get("osm_way_id"))):
+        return Identity(is_relation=False, osm_id=abs(number))
     is_object = kind in ("way", "relation", "node")
+    is_relation = kind.startswith("r") or (is_ogr and not is_object and _kind_of(feature) in _AREAS)
     for name in ("osm_id", "osm_way_id", *(("id",) if is_object else ())):
         number = _whole(properties.get(name))
         if number:
-            return Identity(kind.startswith("r") or number < 0, abs(number))
+            return Identity(is_relation or number < 0, abs(number))
     return None
+
+
+def _kind_of(feature: Mapping[str, Any]) -> str:
+    return str((feature.get("geometry") or {}).get("type"))
 
 
 def _whole(value: Any) -> int | None:  # noqa: ANN401 - any JSON
@@ -248,8 +315,10 @@ def _take(
         labels = classifier.as_line(get).line
     wkb = bytes(shapely.to_wkb(shape))
     if not labels:
-        scan.tally.drops[f"{shape.geom_type}{_CLASSLESS}"] += 1
+        scan.tally.drops[_reason(get, shape, classifier)] += 1
         scan.far.append(wkb)
+        if is_area and get("landuse") in BUILT_UP:
+            scan.built_up.append(wkb)
         return
     kind = classifier.kind(get, labels, is_area=is_area)
     if identity is None:
@@ -266,6 +335,14 @@ def _take(
         return
     scan.tally.notes["further part of an object, joined to it"] += 1
     scan.rows[place] = scan.rows[place]._replace(wkb=bytes(shapely.to_wkb(_joined(before, shape))))
+
+
+def _reason(get: Get, shape: shapely.Geometry, classifier: Classifier) -> str:
+    """Say why a feature is no object: it has no class, or one that this kind of geometry cannot have."""
+    if not classifier.area_labels(get, is_relation=True):
+        return f"{shape.geom_type}{_CLASSLESS}"
+    is_closed = shape.geom_type in _LINES and bool(shapely.is_closed(shapely.get_parts(shape)).all())
+    return _CLOSED if is_closed else f"{shape.geom_type}{_OTHER}"
 
 
 def _joined(before: shapely.Geometry, part: shapely.Geometry) -> shapely.Geometry:

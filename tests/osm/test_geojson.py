@@ -85,6 +85,10 @@ def test_a_crossing_ring_is_mended_and_a_feature_without_geometry_counted(tmp_pa
     assert reading.drops == {"feature without a geometry": 1}
 
 
+SWITCHES = ("bridge", "tunnel", "building", "area")
+REAL = {"ref": "1", "name": "No", "addr:housenumber": "1.0", "route": "T", "bridge": "viaduct", "oneway": "-1"}
+
+
 @pytest.mark.parametrize(
     ("properties", "tags"),
     [
@@ -95,6 +99,14 @@ def test_a_crossing_ring_is_mended_and_a_feature_without_geometry_counted(tmp_pa
             {"bridge": "no", "tunnel": "yes", "layer": "1", "lanes": "0"},
         ),
         ({"bridge": "False", "tunnel": "0", "area": "TRUE"}, {"bridge": "no", "tunnel": "no", "area": "yes"}),
+        ({"layer": "-1.0", "lanes": "2.00", "width": "3.50"}, {"layer": "-1", "lanes": "2", "width": "3.50"}),
+        ({"tunnel": "0.0", "bridge": "1.0", "covered": "0."}, {"tunnel": "no", "bridge": "yes", "covered": "no"}),
+        ({"bridge": "F", "tunnel": "f", "building": "n", "area": "N"}, dict.fromkeys(SWITCHES, "no")),
+        ({"bridge": "T", "tunnel": "t", "building": "y", "area": "Y"}, dict.fromkeys(SWITCHES, "yes")),
+        ({"bridge": "No", "tunnel": "NO", "building": "False", "area": "nO"}, dict.fromkeys(SWITCHES, "no")),
+        ({"bridge": "Yes", "tunnel": "YES", "building": "TRUE", "area": "True"}, dict.fromkeys(SWITCHES, "yes")),
+        ({"other_tags": '"bridge"=>"F","ref"=>"T"'}, {"bridge": "no", "ref": "T"}),
+        (REAL, REAL),
         ({"layer": -1.0, "width": 3.5, "lanes": 2.0}, {"layer": "-1", "width": "3.5", "lanes": "2"}),
         ({"building": "None", "landuse": "nan", "natural": "<Null>"}, {}),
         ({"type": "way", "id": 5, "tags": {"building": "yes"}, "meta": {}}, {"building": "yes"}),
@@ -131,6 +143,83 @@ def test_an_object_is_named_in_many_ways(feature, identity):
     assert identity_of(feature) == identity
 
 
+@pytest.mark.parametrize(
+    ("kind", "properties", "identity"),
+    [
+        ("MultiPolygon", {"osm_id": "7", "osm_way_id": None}, (True, 7)),
+        ("Polygon", {"osm_id": "7"}, (True, 7)),
+        ("MultiPolygon", {"osm_id": None, "osm_way_id": "7"}, (False, 7)),
+        ("MultiPolygon", {"osm_id": 7, "osm_type": "way"}, (False, 7)),
+        ("LineString", {"osm_id": "7"}, (False, 7)),
+        (None, {"osm_id": "7"}, (False, 7)),
+    ],
+)
+def test_an_area_of_ogr2ogr_has_the_id_of_a_relation_or_of_a_way(kind, properties, identity):
+    geometry = kind and {"type": kind}
+    assert identity_of({"properties": properties, "geometry": geometry}, is_ogr=True) == identity
+
+
+def test_a_relation_and_a_way_of_one_number_are_two_objects(tmp_path):
+    inside = shapely.box(WEST + 12, SOUTH + 12, WEST + 20, SOUTH + 18)
+    relation = feature(HOUSE, osm_id="7", osm_way_id=None, building="yes")
+    way = feature(inside, osm_id=None, osm_way_id="7", building="yes")
+    found = read(written(tmp_path / "a.geojson", relation, way), tags={}).features
+    assert found["osm_type"].tolist() == ["way", "relation"]
+    assert found.geometry.area.tolist() == pytest.approx([inside.area, HOUSE.area], rel=1e-2)
+
+
+def test_a_level_that_is_a_text_with_a_fraction_hides(tmp_path):
+    path = written(tmp_path / "a.geojson", feature(HOUSE, building="yes", layer="-1.0"), feature(SHED, building="yes"))
+    assert sorted(read(path, tags={}).features["is_visible"]) == [False, True]
+
+
+def closed(shape):
+    return shapely.LineString(shape.exterior.coords)
+
+
+@pytest.mark.parametrize(
+    ("shape", "properties", "reason"),
+    [
+        (closed(HOUSE), {"building": "yes"}, "closed line that is no polygon"),
+        (closed(HOUSE), {"name": "a"}, "LineString without a class"),
+        (
+            shapely.LineString(HOUSE.exterior.coords[:3]),
+            {"building": "yes"},
+            "LineString with the tags of a line or an area",
+        ),
+        (
+            shapely.GeometryCollection([HOUSE]),
+            {"building": "yes"},
+            "GeometryCollection with the tags of a line or an area",
+        ),
+        (HOUSE.centroid, {"building": "yes"}, "Point with the tags of a line or an area"),
+        (HOUSE.centroid, {"shop": "bakery"}, "Point without a class"),
+    ],
+)
+def test_what_is_no_object_is_counted_as_what_it_is(shape, properties, reason, tmp_path):
+    path = written(tmp_path / "a.geojson", feature(shape, **properties), feature(SHED, building="yes"))
+    assert read(path, tags={}).drops == {reason: 1}
+
+
+def test_features_of_which_none_has_a_class_are_refused_with_the_names_of_their_properties(tmp_path):
+    parts = [feature(HOUSE, **{"class": "residential", "height": 3}), feature(SHED, **{"class": "garage"})]
+    with pytest.raises(ExtractError, match="none of 2 features in the region has a class") as found:
+        read(written(tmp_path / "a.geojson", *parts), tags={}, classes=None)
+    assert "(2 x Polygon without a class); their properties are class, height: are they tags" in str(found.value)
+    assert "move or enlarge" not in str(found.value)
+    with pytest.raises(ExtractError, match=r"1 x closed line that is no polygon.*are areas polygons"):
+        read(written(tmp_path / "b.geojson", feature(closed(HOUSE), building="yes")), tags={})
+
+
+def test_a_map_of_land_use_alone_lacks_roads_and_buildings(tmp_path):
+    grid = Grid(epsg=EPSG, west_m=WEST, north_m=SOUTH + 400, cell_size_m=4.0, rows=100, cols=100)
+    place = shapely.box(WEST, SOUTH, WEST + 400, SOUTH + 400)
+    homes = shapely.box(WEST, SOUTH, WEST + 200, SOUTH + 200)
+    path = written(tmp_path / "a.geojson", feature(homes, landuse="residential"), feature(SHED, leisure="park"))
+    reading = read_geojson([path], grid, tags={}, stated_coverage=to_lonlat(place), classes=("building", "green"))
+    assert "nothing is of building:" in reading.warnings[0]
+
+
 def test_features_of_one_object_are_its_parts(tmp_path):
     parts = [feature(shape, osm_id=7, osm_type="relation", building="yes") for shape in (HOUSE, SHED, HOUSE)]
     line = [shapely.LineString([(WEST, SOUTH + y), (WEST + 90, SOUTH + y)]) for y in (40, 60)]
@@ -161,7 +250,7 @@ def test_a_byte_order_mark_is_passed_over(tmp_path):
 def test_a_file_with_hardly_a_tag_says_so(tmp_path):
     few = [feature(HOUSE, building="yes"), *(feature(SHED, kind="building") for _ in range(20))]
     reading = read(written(tmp_path / "a.geojson", *few), tags={})
-    assert reading.warnings[0].startswith("1 of 21 features have a class: are their properties tags")
+    assert reading.warnings[0].startswith("1 of 21 features became objects of a class (20 x Polygon without a class)")
     assert read(written(tmp_path / "b.geojson", *few[:20]), tags={}).warnings == ()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.flights.trajectory import Trajectory
@@ -28,6 +29,14 @@ _LOOKING: Final = 0.01  # a camera looks along its way, and turns by 8 degrees a
 _TURNED: Final = 0.2  # any body turns by 40 degrees (rms) about another axis than the third
 _AROUND: Final = 0.7  # a body that turns by 45 degrees (rms): its axis is known well, and may lie less off, 18 degrees
 _TILTED: Final = 0.05
+# A camera that looks ahead and down: the body turns about an axis off the third, and the path lies across that axis.
+_PITCHED_DEG: Final = (
+    10.0,
+    80.0,
+)  # beyond: the third axis itself, or a level one
+_ACROSS_DEG: Final = 10.0  # between that axis and the normal of the path's plane
+_THIN: Final = 0.2  # thickness of the path's plane, in its width
+_WIDE: Final = 0.05  # width of the path, in its spread
 
 
 def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
@@ -54,7 +63,8 @@ def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
     the body: the mean of the axis in the axes of the body has a length near 1. A body that does not turn tells nothing:
     straight up and straight ahead of a camera look alike, and so do a front and the ground. A loop turns about a level
     axis as well; it is told by the body's first axis, which points along the way, where a camera looks with its third.
-    Warnings say so of both.
+    Warnings say so of both. A camera that looks ahead and down turns about an axis off the third by 10 to 80 degrees,
+    and its path lies flat across that axis, as none does that climbs.
 
     Examples
     --------
@@ -85,6 +95,18 @@ def _out_of_camera(flown: Trajectory) -> Trajectory:
     )
 
 
+def _between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
+    """Return the angle between two lines of unit vectors."""
+    return math.degrees(math.acos(min(1.0, abs(float(first @ second)))))
+
+
+def _lies_across(position_m: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:
+    """Return whether a path is flat, and the normal of its plane is an axis."""
+    _, spread, normals = np.linalg.svd(position_m - position_m.mean(axis=0), full_matrices=False)
+    is_plane = spread[1] > _WIDE * spread[0] and spread[2] < _THIN * spread[1]
+    return bool(is_plane) and _between_deg(normals[2], axis) < _ACROSS_DEG
+
+
 def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
     """Raise `FlightError` if the third axis is shown not to point up; warn if the path leaves it open."""
     turns = flown.rotation.as_matrix()
@@ -102,9 +124,14 @@ def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
     loops = share >= _ALONG and ahead[0] >= _AHEAD
     is_around = strength[1] < _AROUND
     is_tilted = strength[0] - kept[2] > (_TILTED if is_around else _TURNED)
-    if (looks and kept[1] - kept[2] > _LOOKING) or (is_tilted and not loops):
-        off_deg = math.degrees(math.acos(min(1.0, abs(float(axes_of_turn[2, 0])))))
-        is_second = abs(float(axes_of_turn[1, 0])) > _LEVEL or (looks and not is_around)
+    off_deg = _between_deg(axes_of_turn[:, 0], np.array([0.0, 0.0, 1.0]))
+    is_pitched = (
+        _PITCHED_DEG[0] < off_deg < _PITCHED_DEG[1]
+        and strength[0] - strength[1] > _LOOKING
+        and _lies_across(flown.position_m, axes_of_turn[:, 0])
+    )
+    if (looks and kept[1] - kept[2] > _LOOKING) or (is_tilted and not loops) or is_pitched:
+        is_second = not is_pitched and (abs(float(axes_of_turn[1, 0])) > _LEVEL or (looks and not is_around))
         mend = "turn the frame first, or say --axes up if it is right"
         if is_second and axes is None:
             mend = "say --axes camera (as of ORB-SLAM)"

@@ -7,7 +7,7 @@ the units of a format come from: the table in `docs/concepts/flights.md`.
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
@@ -49,6 +49,32 @@ NAMES: Final = MappingProxyType(
 ALTITUDES: Final = ("alt", "altitude", "ele", "elevation", "amsl", "alt_amsl", "altitude_amsl", "alt_msl")
 
 _DATES: Final = ("date", "date_local", "date_utc", "gps_date")
+# Of several receivers or drones in one table, where the format names no such column.
+_RECEIVERS: Final = (
+    *("instance", "gps_instance", "device_id", "sysid", "sys_id", "system_id", "src_system", "srcsystem", "gps_id"),
+    *("receiver", "receiver_id", "drone_id", "uav_id", "vehicle_id", "id"),
+)
+# Of the sign of a place, beside its value.
+_HEMISPHERES: Final = MappingProxyType(
+    {
+        name: re.compile(
+            rf"(?:(?:gps_?)?{place}_?)?(?:{both})(?:_?(?:ind|indicator|hemi|hemisphere))?"
+            rf"|(?:gps_?)?{place}_?(?:hemi|hemisphere|dir|direction|ref|sign|indicator)"
+        )
+        for name, place, both in (
+            ("latitude", "lat(?:itude)?", "n_?s|n_or_s|north_?south"),
+            ("longitude", "(?:lon|lng|long|longitude)", "e_?w|e_or_w|east_?west"),
+        )
+    }
+)
+# Of the part of a second beside whole seconds.
+_PARTS: Final = MappingProxyType(
+    {word: unit for word, unit in WORDS["time"].items() if unit != "s"}
+    | dict.fromkeys(("nanosec", "nanosecs"), "ns")
+    | dict.fromkeys(("microsec", "microsecs"), "us")
+    | dict.fromkeys(("millisec", "millisecs"), "ms")
+)
+_OF_GPS: Final = frozenset({"status", "gms", "gwk", "n_sats", "nsats", "hdop", "h_dop", "gcrs", "g_crs", "spd"})
 _MOST_NAMES: Final = 12  # of columns in a message
 
 
@@ -206,6 +232,8 @@ class Layout:
     format: Format
     keys: tuple[str, ...]  # of all columns, without their topics
     fields: dict[str, Column]
+    hemispheres: dict[str, Column] = field(default_factory=dict)  # of the sign of a latitude or longitude
+    part: Column | None = None  # of a second, beside whole seconds
     date: Column | None = None
     receiver: Column | None = None
     fix: Column | None = None
@@ -223,8 +251,12 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
     names = {key for both in keys for key in both} | {name.rpartition(".")[2].strip() for name in header}
     told = next((one for one in FORMATS if any(sign <= names for sign in one.signs)), _ANY)
     found: dict[str, Column] = {}
+    part: Column | None = None
     for name in NAMES:
         matches = list(_matches(name, header, keys, told))
+        if name == "time":
+            part = _part(header, short, matches, told)
+            matches = [column for column in matches if part is None or column.at != part.at]
         if len(matches) > 1:  # of several messages, that of the places
             matches = [column for column in matches if _topic(column) == _topic(found.get("latitude"))] or matches
         if len(matches) > 1:
@@ -240,18 +272,73 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
         raise source.fault(message)
     fix = next((name for name in told.fix if name in names), "")
     topic = _topic(found["latitude"])
+    if told.no_yaw == 0 and "yaw" in found and not _is_yaw_of_gps(found["yaw"], short):
+        told = replace(told, no_yaw=None)
     layout = Layout(
         format=told,
         keys=tuple(short),
         fields={name: column for name, column in found.items() if facts.unit(QUANTITIES[name]) != "none"},
         date=_named(header, keys, _DATES),
-        receiver=_named([name if _topic_of(name) == topic else "" for name in header], keys, (told.receiver,)),
+        hemispheres=_hemispheres(header, short, told),
+        part=part if facts.time_unit != "none" else None,
+        receiver=_receiver(header, keys, told, topic),
         fix=_named(header, keys, (fix,)),
         least_fix=told.fix.get(fix, 0.0),
     )
     if "time" not in found and facts.time_unit != "none":
         _check_no_time(source, header, keys, layout)
     return layout
+
+
+def _receiver(header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format, topic: str | None) -> Column | None:
+    """Return the column that tells receivers, of the topic of the places or of none."""
+    if told.receiver:
+        return _named([name if _topic_of(name) == topic else "" for name in header], keys, (told.receiver,))
+    names = [name if _topic_of(name) in (topic, "") else "" for name in header]
+    found = (_named(names, keys, (name,)) for name in _RECEIVERS)
+    return next((column for column in found if column is not None), None)
+
+
+def _hemispheres(header: Sequence[str], short: Sequence[str], told: Format) -> dict[str, Column]:
+    """Return the columns of N or S, and of E or W; NS of RTKLIB counts satellites."""
+    found = {}
+    for name, pattern in _HEMISPHERES.items():
+        places = [at for at, key in enumerate(short) if pattern.fullmatch(key)]
+        if places and told.name != "RTKLIB":
+            found[name] = Column(at=places[0], name=header[places[0]])
+    return found
+
+
+def _part(header: Sequence[str], short: Sequence[str], times: Sequence[Column], told: Format) -> Column | None:
+    """Return the column of parts of a second that goes with a column of seconds, or of dates and clocks."""
+    whole = next((column for column in times if column.unit in ("s", None)), None)
+    if whole is None:
+        return None
+    # NS beside EW is a hemisphere, and counts satellites for RTKLIB.
+    is_no_time = told.name == "RTKLIB" or any(_HEMISPHERES["longitude"].fullmatch(key) for key in short)
+    base = _words_of(short[whole.at], WORDS["time"])[0]
+    for at, key in enumerate(short):
+        start, word = _words_of(key, _PARTS)
+        is_beside = _topic_of(header[at]) == _topic_of(whole.name) and at != whole.at
+        if key == "ns" and is_no_time:
+            continue
+        if word and is_beside and start in ("", base, "stamp"):
+            return Column(at=at, name=header[at], unit=_PARTS[word])
+    return None
+
+
+def _words_of(key: str, words: Mapping[str, str]) -> tuple[str, str]:
+    """Return a key without the unit at its end, and that unit; it may be all of the key."""
+    start, _, word = key.rpartition("_")
+    return (start, word) if word in words else (key, "")
+
+
+def _is_yaw_of_gps(yaw: Column, short: Sequence[str]) -> bool:
+    """Return whether a yaw is of ArduPilot's message GPS, and not of one of attitudes."""
+    topic = _topic_of(yaw.name)
+    if topic:
+        return topic.upper().startswith("GPS")
+    return bool(_OF_GPS & set(short)) and not {"pitch", "roll"} & set(short)
 
 
 def key_of(name: str) -> str:
@@ -315,7 +402,10 @@ def _named(header: Sequence[str], keys: Sequence[tuple[str, str]], names: Sequen
 
 def _check_no_time(source: LogSource, header: Sequence[str], keys: Sequence[tuple[str, str]], layout: Layout) -> None:
     """Raise `FlightError` if a column that is not known may be the time."""
-    known = {column.at for column in (layout.receiver, layout.fix, *layout.fields.values()) if column is not None}
+    known = {column.at for column in (layout.fix, layout.part, *layout.fields.values()) if column is not None}
+    known |= {column.at for column in layout.hemispheres.values()}
+    if layout.receiver is not None and "id" not in keys[layout.receiver.at]:  # a number of lines may be the time
+        known.add(layout.receiver.at)
     open_ones = [header[at] for at, both in enumerate(keys) if at not in known and not _is_no_time(both)]
     if open_ones:
         message = (

@@ -47,6 +47,12 @@ def _is_units(header: Sequence[str], cells: Sequence[str]) -> bool:
     return bool(header) and len(others) < len(cells) and not any(re.match(r"\s*[-+.]?\d", cell) for cell in others)
 
 
+def _is_head(comment: Sequence[str], cells: Sequence[str]) -> bool:
+    """Return whether a comment has the names of the cells below, as `numpy.savetxt` writes them."""
+    starts = [re.match(r"\s*[-+.]?\d", cell) for cell in (*comment, *cells)]
+    return len(comment) == len(cells) and not any(starts[: len(comment)]) and any(starts[len(comment) :])
+
+
 def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
     """Yield number and cells of each line that has any; the first is the header."""
     source.check_size()
@@ -64,13 +70,20 @@ def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
             delimiter = separator[1] if separator else max(",;\t", key=head.count)
             reader = csv.reader(file, delimiter=delimiter, strict=True, skipinitialspace=True)
             skip = separator is not None
+            comment, is_begun = (0, [""]), False
             for row in reader:
                 line = reader.line_num
-                if not any(cell.strip() for cell in row) or row[0].startswith("#"):
+                if not any(cell.strip() for cell in row):
+                    continue
+                if row[0].startswith("#"):
+                    comment = (line, [row[0].lstrip("# "), *row[1:]])
                     continue
                 if skip:
                     skip = False
                     continue
+                if not is_begun and _is_head(comment[1], row):
+                    yield comment
+                is_begun = True
                 yield line, row
     except (OSError, UnicodeDecodeError) as error:
         message = f"no text in UTF-8 ({message_of(error)}): export it anew"

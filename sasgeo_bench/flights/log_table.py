@@ -9,9 +9,10 @@ import math
 import re
 from array import array
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -30,6 +31,12 @@ _MAY_LACK: Final = ("height", "yaw", "pitch", "roll")
 _UNKNOWN: Final = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
 _DMS: Final = re.compile(r"(\d+)\s*(?:deg|°)\s*(\d+)\s*'\s*(\d+(?:\.\d+)?)\s*\"\s*([NSEW])")
 _LAST_BOOT_US: Final = 1e14  # three years: no PX4 runs for longer, so later times count from 1970
+_SIGNS: Final = MappingProxyType(
+    {
+        "latitude": {"N": 1, "NORTH": 1, "S": -1, "SOUTH": -1},
+        "longitude": {"E": 1, "EAST": 1, "W": -1, "WEST": -1},
+    }
+)
 _HALF_TURN: Final = 180.0
 
 
@@ -78,6 +85,7 @@ def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
     values = {name: column[start:] for name, column in values.items()}
     layout = layout if table.has_dates else _as_px4(layout, values)
     numbers, values = _known(source, layout.format, numbers, values)
+    values = _with_parts(source, layout, values, in_seconds=table.has_dates or facts.time_unit == "s")
     columns, told = _converted(source, layout, facts, values, has_dates=table.has_dates)
     if not layout.format.is_sorted and "time_s" in columns:
         order = np.argsort(columns["time_s"], kind="stable")
@@ -91,13 +99,14 @@ def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
 
 def _read(source: LogSource, layout: Layout, lines: Lines) -> _Table:
     """Return the values of the lines that are points; warn of those that are none."""
-    table = _Table(values={name: array("d") for name in layout.fields})
+    layout, rows = _checked_receiver(layout, lines.rows)
+    table = _Table(values={name: array("d") for name in (*layout.fields, *(["part"] if layout.part else []))})
     gate, clock = _Gate(layout=layout), Clock(source=source)
     time = layout.fields.get("time")
     # The first point tells.
     has_dates: bool | None = False if time is None or time.unit is not None else None
     decimal = ""
-    for number, cells in lines.rows:
+    for number, cells in rows:
         row = _trimmed(source, cells, len(lines.header), number)
         if not gate.lets(row):
             continue
@@ -115,7 +124,11 @@ def _read(source: LogSource, layout: Layout, lines: Lines) -> _Table:
                 value = math.nan
             else:
                 value = _number(source, text, name, number, decimal)
+            if name in _SIGNS:
+                value *= _sign(source, layout, row, name, number, value)
             table.values[name].append(value)
+        if layout.part is not None:
+            table.values["part"].append(_number(source, row[layout.part.at], layout.part.name, number, decimal))
     for which, count in gate.left.items():
         tell_left_out(source, count, which)
     return replace(table, has_dates=bool(has_dates))
@@ -173,7 +186,7 @@ def _is_unknown(text: str) -> bool:
 
 
 def _number(source: LogSource, text: str, name: str, number: int, decimal: str) -> float:
-    match = _DMS.fullmatch(text.strip()) if QUANTITIES[name] == "place" else None
+    match = _DMS.fullmatch(text.strip()) if name in _SIGNS else None
     if match:
         degrees = int(match[1]) + int(match[2]) / 60 + float(match[3]) / 3600
         if (match[4] in "NS") != (name == "latitude"):
@@ -186,6 +199,59 @@ def _number(source: LogSource, text: str, name: str, number: int, decimal: str) 
             raise source.fault(message, number)
         text = text.replace(",", ".")
     return source.number(text, name, number)
+
+
+def _sign(source: LogSource, layout: Layout, row: Sequence[str], name: str, number: int, value: float) -> int:
+    """Return the factor to a latitude or longitude out of its column of N or S, E or W; 1 if there is none."""
+    signs, column = _SIGNS[name], layout.hemispheres.get(name)
+    if column is None:
+        at = layout.fields[name].at
+        for beside in (at - 1, at + 1):
+            if 0 <= beside < len(row) and signs.get(row[beside].strip().upper(), 1) < 0:
+                message = f"{shown(row[beside])} beside {name}: name its column {name}_hemisphere, or delete it"
+                raise source.fault(message, number)
+        return 1
+    text = row[column.at].strip().upper()
+    if text not in signs:
+        if re.fullmatch(r"[-+]?[\d.]+", text) and "hemi" not in column.name.lower():  # as NS, a count of satellites
+            return 1
+        letters = " or ".join(word for word in signs if len(word) == 1)
+        message = f"column {shown(column.name)} is {shown(text)}, not {letters}: mend the cell, or delete the column"
+        raise source.fault(message, number)
+    if value < 0 < signs[text]:
+        message = f"{name} is negative, column {shown(column.name)} is {shown(text)}: mend one of them"
+        raise source.fault(message, number)
+    return 1 if value < 0 else signs[text]
+
+
+def _checked_receiver(
+    layout: Layout, rows: Iterable[tuple[int, list[str]]]
+) -> tuple[Layout, Iterable[tuple[int, list[str]]]]:
+    """Return the layout without an "id" that numbers lines: it tells receivers only if its values recur."""
+    at = -1 if layout.receiver is None else layout.receiver.at
+    if at < 0 or layout.keys[at] != "id":
+        return layout, rows
+    kept = list(rows)
+    count = len({cells[at].strip() for _, cells in kept if at < len(cells)})
+    return (layout if 2 * count <= len(kept) else replace(layout, receiver=None)), kept
+
+
+def _with_parts(source: LogSource, layout: Layout, values: dict[str, Floats], *, in_seconds: bool) -> dict[str, Floats]:
+    """Return times with the parts of a second that another column holds, unless they have their own."""
+    part, time = values.pop("part", None), layout.fields.get("time")
+    if part is None or layout.part is None or time is None or not (in_seconds or time.unit == "s"):
+        return values
+    whole = values["time"]
+    if (whole != np.floor(whole)).any():
+        return values
+    parts_s = part * UNITS["time"][layout.part.unit or "s"]
+    if ((parts_s < 0) | (parts_s >= 1)).any():
+        message = (
+            f"column {shown(layout.part.name)} is no part of a second, and {shown(time.name)} has whole seconds: "
+            "keep the one that is the time"
+        )
+        raise source.fault(message)
+    return {**values, "time": whole - whole[:1] + parts_s}
 
 
 def _as_px4(layout: Layout, values: dict[str, Floats]) -> Layout:

@@ -113,6 +113,16 @@ def test_a_frame_of_other_axes_is_refused_with_its_tilt(flown: Trajectory, off: 
         in_axes(_tilted(90), None, PATH)
 
 
+@pytest.mark.parametrize("down_deg", [15, 20, 30, 45, 60, 70])
+def test_a_camera_that_looks_ahead_and_down_is_refused_with_its_tilt(down_deg: int) -> None:
+    down = Rotation.from_euler("x", -down_deg, degrees=True)
+    level = _camera(*_slalom(swing_deg=30))
+    flown = _flown(down.inv().apply(level.position_m.copy()).T, down.inv() * level.rotation * down)
+    for axes, off_deg in ((None, 90 - down_deg), ("camera", down_deg)):
+        with pytest.raises(FlightError, match=rf"an axis {off_deg} degrees off the third .*: turn the frame first"):
+            in_axes(flown, axes, PATH)
+
+
 def test_axes_that_are_named_wrongly_are_refused() -> None:
     with pytest.raises(FlightError, match=r"turn the frame first, or say --axes up"):
         in_axes(_up(*_slalom()), "camera", PATH)
@@ -127,6 +137,8 @@ def test_axes_that_are_named_wrongly_are_refused() -> None:
         _up(*_slalom(), ahead=2),  # a body whose third axis looks ahead, as that of EuRoC
         _up(200 * np.sin(LOOP), 200 * np.cos(LOOP), LOOP + np.pi / 2),
         _up(AT_M, 0 * AT_M, 0 * AT_M + np.pi / 2),  # straight
+        _flown((*_slalom()[:2], AT_M / 3), Rotation.from_euler("z", -_slalom()[2][:, None])),  # a climb, nearly flat
+        _flown((200 * np.sin(LOOP), 200 * np.cos(LOOP), 90 * np.sin(LOOP)), Rotation.from_euler("z", -LOOP[:, None])),
         _up(AT_M, 0 * AT_M, 0 * AT_M + np.pi / 2, ahead=2),
         _flown((90 * np.sin(LOOP), 20 * np.sin(LOOP), 90 * np.cos(LOOP)), _still()),  # a circle before a front, level
         _flown((0 * AT_M, 0 * AT_M, 90 * np.sin(LOOP)), Rotation.from_euler("z", LOOP[:, None])),  # up and down

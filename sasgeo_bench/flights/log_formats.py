@@ -185,6 +185,7 @@ FORMATS: Final = (
             frozenset({"latitude_deg", "longitude_deg", "q", "ns"}),
             frozenset({"latitude_deg", "longitude_deg", "sdn_m"}),
             frozenset({"latitude_deg", "longitude_deg", "gpst"}),
+            frozenset({"utc", "latitude_deg", "longitude_deg", "height_m"}),
         ),
         columns={"time": {"gpst": None, "utc": None, "jst": None, "time": None}, "height": {}},
         fix={"q": 1.0},

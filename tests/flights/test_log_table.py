@@ -104,6 +104,12 @@ def _check(log: FlightLog, *, height_m: float | None = None, yaw_deg: float | No
             None,
             None,
         ),
+        (
+            "UTC,latitude(deg),longitude(deg),height(m)",
+            lambda y, x, s: f"2024-05-17T10:00:0{s}Z,{y},{x},612.3",
+            None,
+            None,
+        ),
         (POS_HEAD, lambda y, x, s: f"2024/05/17 10:00:0{s}.000   {y}   {x}   612.3   1  9   0.1", None, None),
         (POS.replace("GPST", "UTC"), lambda y, x, s: f"2314 {TOW_S + s}   {y}   {x}   612.3   1  9   0.1", None, None),
         (

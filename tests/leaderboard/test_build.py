@@ -402,7 +402,7 @@ def cut_part(out):
         (break_truth, "holds the truths of other queries"),
         (cut_truth, r"truth\.json .*(JSON|Expecting)"),
         (lose_truth, "holds no truths of .*: name their folder with --truth, or make the queries again"),
-        (age_truth, "holds truths of task version 0, this version reads 1, 2, 3, 4: make the queries again"),
+        (age_truth, "holds truths of task version 0, this version reads 1, 2, 3, 4, 5: make the queries again"),
         (age_run, r"holds answers to other queries than its task does now: run again \(.*, or make the old queries"),
         (cut_part, "cannot be read"),
     ],

@@ -282,7 +282,9 @@ def test_another_version_of_a_matcher_has_a_folder_of_its_own(place, task, tmp_p
     source = place / "hostile.py"
     text = source.read_text(encoding="utf-8")
     try:
-        source.write_text(text + "\n# changed\n", encoding="utf-8")
+        source.write_text(text + "\n# only a comment\n", encoding="utf-8")
+        assert plan_run(request_of(task, tmp_path)).parts[0].folder == first
+        source.write_text(text + "\nCHANGED = True\n", encoding="utf-8")
         second = plan_run(request_of(task, tmp_path)).parts[0].folder
     finally:
         source.write_text(text, encoding="utf-8")

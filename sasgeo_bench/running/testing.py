@@ -66,6 +66,7 @@ def tiny_place(path: str | Path) -> TinyPlace:
     Map, queries and truths go to the folder `path`, in place of earlier ones. Raise `StoreError` if it cannot be
     written.
 
+    >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     place = tiny_place(folder)
     >>> place.region.grid.shape, sorted({query.track for query in place.queries})

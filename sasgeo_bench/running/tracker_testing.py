@@ -65,6 +65,7 @@ def tiny_flights(path: str | Path) -> TinyFlights:
     The first has an odometer that drifts, the others one that does not. Map, queries and truths go to the folder
     `path`, in place of earlier ones. Raise `StoreError` if it cannot be written.
 
+    >>> import tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
     ...     made = tiny_flights(folder)
     >>> len(made.flights), made.flights[0][1].step.frame, made.flights[0][1].track

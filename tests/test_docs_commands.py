@@ -160,6 +160,7 @@ def first_runs() -> dict[str, Line]:
 EVERY = [line for document in DOCUMENTS for line in commands(document)]
 RUN = first_runs()
 WALKS = sorted({line.document for line in RUN.values()}, key=DOCUMENTS.index)
+LONG = tuple(f"docs/howto/{name}.md" for name in ("matcher", "submission", "tracker"))
 
 
 def test_every_command_of_a_document_is_one_that_this_test_knows() -> None:
@@ -295,7 +296,9 @@ def by_one_process(words: list[str]) -> list[str]:
 
 
 @pytest.mark.usefixtures("without_drawings")
-@pytest.mark.parametrize("document", WALKS)
+@pytest.mark.parametrize(
+    "document", [pytest.param(one, marks=pytest.mark.slow if one in LONG else ()) for one in WALKS]
+)
 def test_the_commands_of_a_document_do_what_they_say(
     document: str, reader: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -85,6 +85,7 @@ def test_a_function_takes_the_words_of_the_flags_of_its_command(command, functio
         assert f"\n{name} : " in getattr(sgb, function).__doc__
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_threads", "without_drawings", "plain_site")
 def test_a_town_is_driven_from_region_to_site_by_functions_alone(tmp_path, capfd):
     out, notes = tmp_path / "out", []

@@ -63,6 +63,7 @@ def requests_of(plan):
     return [(item.suite, item.region.id) for item in plan.requests]
 
 
+@pytest.mark.slow
 def test_train_places_teach_calibration_places_fit_rejectors_and_test_places_are_ranked(plan_of, lay_towns, tmp_path):
     lay_towns(tmp_path / "out", TRAIN, CALIBRATION, TEST)
     plan = plan_of()

@@ -189,6 +189,7 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     assert "to be drawn" not in told
 
 
+@pytest.mark.slow
 def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_coming(made):
     plan, board, _ = made
     changes = {'id = "small"': 'id = "other"\nseed = 1', "sites = 1": "sites = 2"}
@@ -458,6 +459,7 @@ oracles = ["learners:Oracle"]
 """
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("few_controls")
 def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(tmp_path, monkeypatch, lay_towns):
     lay_towns(tmp_path, "town-suburb", "town-agricultural")

@@ -61,6 +61,7 @@ def about_board(out):
     return read_board(out / "boards" / "closed")[0]
 
 
+@pytest.mark.slow
 def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_it(split, tmp_path, lay_towns):
     out = lay_towns(tmp_path / "out", OPEN, SEALED)
     told = []

@@ -109,6 +109,7 @@ def unanswered(board):
     return replace(board, scores={name: frame.assign(is_answered=False) for name, frame in board.scores.items()})
 
 
+@pytest.mark.slow
 def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path):
     told = []
     figures = figures_extra(board, tell=told.append, contrasts=CONTRASTS).figures

@@ -365,6 +365,7 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
 # Bad input
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain_site")
 def test_interrupted_the_old_site_stays_whole_and_the_next_takes_its_place(few):
     publish(few, tell=quiet)

@@ -346,7 +346,10 @@ axe.run(document, {resultTypes: ["violations"]}).then((found) => found.violation
 """
 
 
-@pytest.mark.parametrize(("scheme", "width"), [("light", WIDE), ("dark", WIDE), ("light", 390)])
+@pytest.mark.parametrize(
+    ("scheme", "width"),
+    [("light", WIDE), *(pytest.param(*one, marks=pytest.mark.slow) for one in (("dark", WIDE), ("light", 390)))],
+)
 def test_axe_finds_no_barrier_on_any_page(page, site, scheme, width):
     page.prefer(scheme)
     page.width(width)

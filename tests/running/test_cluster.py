@@ -40,7 +40,7 @@ def rows(folder):
     }
 
 
-@pytest.mark.slow  # the next one holds as much against a run without a cluster, with a kill on the way
+@pytest.mark.slow
 def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     alone, spread = (
         plan_run(request_of(task, tmp_path / name, dask=dask)) for name, dask in (("one", None), ("two", "local:2"))
@@ -58,6 +58,7 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     assert "nothing left" in told[-1]
 
 
+@pytest.mark.slow
 def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
     with threaded():
         alone = plan_run(request_of(task, tmp_path / "one"))

@@ -161,7 +161,8 @@ def command_of(program, task, out, *words):
     return [*command, "--out", str(out), "--match-s", "600", *words]
 
 
-@pytest.mark.parametrize("kills", [1, pytest.param(20, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("kills", [1, 20])
 def test_killed_once_or_at_random_moments_a_run_ends_with_the_same_rows(place, task, undisturbed, tmp_path, kills):
     folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
     killed = command_of(SIGNALLED.format(number=int(signal.SIGKILL)), task, tmp_path, "--jobs", "2")
@@ -191,7 +192,7 @@ def env_with(place):
     return os.environ | {"PYTHONPATH": f"{place}:{os.environ.get('PYTHONPATH', '')}"}
 
 
-@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task, undisturbed, tmp_path, jobs):
     folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
     command = command_of(SIGNALLED.format(number=int(signal.SIGINT)), task, tmp_path, "--jobs", str(jobs))
@@ -300,6 +301,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 def test_hostile_matchers_cost_their_own_rows_from_the_run_to_the_board(task, undisturbed, tmp_path):
     folders = {"Plain": undisturbed[1]}
     for name, (status, words) in HOSTILE.items():

@@ -112,6 +112,7 @@ def test_truths_of_other_flights_and_a_map_built_anew_are_refused(made, tmp_path
         panels_of(out, count=12)
 
 
+@pytest.mark.slow
 def test_inspect_draws_flights_one_flight_or_the_sheet_of_one_view(made, program, mistake, tmp_path):
     out = Path(shutil.copytree(made, tmp_path / "out"))
     view = next(read_queries(out / "tasks" / NAME)).query_id

@@ -48,6 +48,7 @@ def gaps(carried):
     return of_suite
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CHANGED)
 def test_vectors_tell_a_place_from_its_twin_and_those_of_the_falsifier_do_not(gaps, name):
     # By luck a detector overlooks one of the two roads that cross: of all seeds together.

@@ -160,7 +160,7 @@ def first_runs() -> dict[str, Line]:
 EVERY = [line for document in DOCUMENTS for line in commands(document)]
 RUN = first_runs()
 WALKS = sorted({line.document for line in RUN.values()}, key=DOCUMENTS.index)
-LONG = tuple(f"docs/howto/{name}.md" for name in ("matcher", "submission", "tracker"))
+LONG = tuple(f"docs/howto/{name}.md" for name in ("imagery", "matcher", "submission", "tracker"))
 
 
 def test_every_command_of_a_document_is_one_that_this_test_knows() -> None:

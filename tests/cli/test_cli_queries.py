@@ -77,6 +77,7 @@ def test_each_task_gets_one_line_on_stderr_and_stdout_stays_empty(program, own_o
     assert f"5 queries at 1 site in {own_out}/tasks/absent/{RIVERSIDE}" in err.splitlines()[0]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("in_this_process")
 def test_regions_are_built_on_the_way_and_two_at_once_give_what_one_after_the_other_does(program, tasks, tmp_path):
     # Views of a wrong place are taken in the next region of the split: both of them want the grid.

@@ -269,6 +269,7 @@ def test_a_picture_that_fits_in_no_quality_and_size_is_refused():
 # --- the command ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_inspect_counts_the_failures_of_a_run_and_draws_any_of_its_queries(root, program, tmp_path):
     run = root / "runs" / "mine" / HASH
     code, text, err = program("inspect", run)

@@ -432,6 +432,7 @@ def test_truths_may_lie_in_a_folder_of_another_name(out, tmp_path):
     assert primary(board_of(out, truth=tmp_path / "secret"), "oracle_pose")["value"] == 1.0
 
 
+@pytest.mark.slow
 def test_rows_that_a_board_has_no_more_are_told(out, tmp_path):
     submission(out, tmp_path / "mine.parquet")
     board = out / "boards" / "twice"

@@ -89,6 +89,7 @@ def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path
     assert contents_of(again) == {name: data for name, data in there.items() if name.parts[0] != "pictures"}
 
 
+@pytest.mark.slow
 def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept, tmp_path, monkeypatch):
     _, plan, folder, _ = kept
     shutil.copytree(plan.out, tmp_path / "out", ignore=shutil.ignore_patterns("boards", "runs"))
@@ -188,6 +189,7 @@ def test_a_lean_store_gives_the_same_scores(kept, program, tmp_path):
         pd.testing.assert_frame_equal(first, pd.read_parquet(tmp_path / "out" / "boards" / "again" / f"{name}.parquet"))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_stored_again_nothing_but_the_board_changes(kept, program, tmp_path):
     board, plan, folder, _ = kept
@@ -390,6 +392,7 @@ def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replace
         pack_board(kept[0], request_of(kept[1]), former)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("plain_site")
 def test_publishing_stored_results_draws_their_figures_and_leaves_them_as_they_are(kept, tmp_path):
     _, plan, folder, _ = kept

@@ -315,6 +315,7 @@ def _build_in_process(out: str) -> None:
     build_region(plan_build(small(), out=Path(out)), tell=lambda _: None)
 
 
+@pytest.mark.slow
 def test_two_builds_of_one_region_at_once_both_end_well(tmp_path):
     context = multiprocessing.get_context("spawn")
     pair = [context.Process(target=_build_in_process, args=(str(tmp_path),)) for _ in range(2)]

@@ -192,7 +192,8 @@ def env_with(place):
     return os.environ | {"PYTHONPATH": f"{place}:{os.environ.get('PYTHONPATH', '')}"}
 
 
-@pytest.mark.parametrize("jobs", [pytest.param(1, marks=pytest.mark.slow), 2])
+@pytest.mark.slow
+@pytest.mark.parametrize("jobs", [1, 2])
 def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task, undisturbed, tmp_path, jobs):
     folder = plan_run(request_of(task, tmp_path, name="Slow")).parts[0].folder
     command = command_of(SIGNALLED.format(number=int(signal.SIGINT)), task, tmp_path, "--jobs", str(jobs))

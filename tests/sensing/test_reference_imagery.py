@@ -248,6 +248,7 @@ def test_a_full_disk_while_tiles_are_written_is_one_line(rendered, tmp_path, mon
     assert state_of(out / "regions" / TOWN) == before
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_image_and_refuses_in_one_line(program, lay_towns, tmp_path):
     lay_towns(tmp_path / "out", TOWN)
     code, told, _ = program("render-imagery", TOWN, "--gsd-m", 2, "--season", "winter")

@@ -84,6 +84,7 @@ def test_a_flight_is_found_by_the_beginning_of_its_id_and_a_wrong_one_gets_a_lin
         panels_of(made, flight="zz")
 
 
+@pytest.mark.slow
 def test_a_sheet_is_a_picture_with_attribution_and_a_row_for_each_site(made, tmp_path):
     about, path = read_task(made / "tasks" / NAME), tmp_path / "sheet.png"
     assert is_of_flights(about)

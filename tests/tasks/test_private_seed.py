@@ -102,6 +102,7 @@ def test_a_seed_of_the_environment_is_taken_out_of_it(tmp_path):
         take_seed(put_seed(tmp_path), {"SASGEO_SEED": TEXT})
 
 
+@pytest.mark.slow
 def test_make_queries_draws_by_a_private_seed_into_a_root_of_its_own(program, tmp_path):
     asked = ("make-queries", "--suite", "clean", "--suite", "occlusion", "--regions", "town-riverside", "--n", 1)
     seed_file = put_seed(tmp_path)

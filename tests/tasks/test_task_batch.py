@@ -31,6 +31,7 @@ def queries_of(drawn):
     }
 
 
+@pytest.mark.slow
 def test_two_processes_draw_the_queries_that_one_draws_and_tell_what_a_region_lacks(tmp_path, lay_towns):
     found, few = {}, Choice(views_cells=(96,))
     for name, jobs in (("one", 1), ("two", 2)):

@@ -443,6 +443,7 @@ def test_a_refused_request_leaves_nothing_behind(own_out):
     assert sorted(path for path in own_out.rglob("*") if not path.name.endswith(".lock")) == before
 
 
+@pytest.mark.slow
 def test_a_run_that_is_killed_leaves_the_old_task_and_the_next_one_clears_up(own_out):
     make(own_out)
     before = content(own_out)

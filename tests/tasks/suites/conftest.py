@@ -112,7 +112,9 @@ def _view_reach_m(suite: Suite) -> float:
     return max(item.side_m for item in suite.variants) / 2 * 2**0.5 * largest_scale(suite.card.group)
 
 
-@pytest.fixture(params=ROOTS, ids="root {}".format)
+@pytest.fixture(
+    params=[ROOTS[0], *(pytest.param(other, marks=pytest.mark.slow) for other in ROOTS[1:])], ids="root {}".format
+)
 def root(request) -> int:
     """Each of several root seeds: a check of what a suite promises takes all of them."""
     return request.param

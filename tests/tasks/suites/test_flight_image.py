@@ -21,6 +21,7 @@ def rgb(query):
     return query.frames[0].image().rgb.astype(float)
 
 
+@pytest.mark.slow
 def test_the_evidence_of_each_view_is_unknown_until_its_labels_show_the_map_at_its_place(flown):
     made = flown(NAME)
     for variant, pairs in made.views.items():

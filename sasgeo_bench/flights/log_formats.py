@@ -51,8 +51,13 @@ ALTITUDES: Final = ("alt", "altitude", "ele", "elevation", "amsl", "alt_amsl", "
 _DATES: Final = ("date", "date_local", "date_utc", "gps_date")
 # Of several receivers or drones in one table, where the format names no such column.
 _RECEIVERS: Final = (
-    *("instance", "gps_instance", "device_id", "sysid", "sys_id", "system_id", "src_system", "srcsystem", "gps_id"),
-    *("receiver", "receiver_id", "drone_id", "uav_id", "vehicle_id", "id"),
+    *("instance", "gps_instance", "sysid", "sys_id", "system_id", "src_system", "srcsystem", "gps_id"),
+    *(
+        f"{word}{end}"
+        for word in ("receiver", "antenna", "sensor", "device", "drone", "uav", "vehicle")
+        for end in ("", "_id")
+    ),
+    *("callsign", "id"),
 )
 # Of the sign of a place, beside its value.
 _HEMISPHERES: Final = MappingProxyType(
@@ -74,6 +79,14 @@ _PARTS: Final = MappingProxyType(
     | dict.fromkeys(("microsec", "microsecs"), "us")
     | dict.fromkeys(("millisec", "millisecs"), "ms")
 )
+# Topics of what turns by itself.
+_CARRIED: Final = re.compile(r"gimbal|camera|mount|payload|\b(?:cam|mnt)\d*\b", re.IGNORECASE)
+# Beside heights above the ellipsoid.
+_GEODETIC: Final = re.compile(
+    rf"(?:g(?:ps|nss)_)?(?:undulation|geoid(?:al)?(?:_(?:sep(?:aration)?|height|undulation))?|h_?msl|sd[neu])"
+    rf"(?:_(?:{'|'.join(WORDS['height'])}))?"
+)
+_PARTS_OF_DAY: Final = re.compile(r"(?:(?:utc|gps|gnss|local|time)_)?(?:(hours?|hh?)|minutes?|mins?|mm)")
 _OF_GPS: Final = frozenset({"status", "gms", "gwk", "n_sats", "nsats", "hdop", "h_dop", "gcrs", "g_crs", "spd"})
 _MOST_NAMES: Final = 12  # of columns in a message
 
@@ -265,10 +278,12 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
             raise source.fault(message)
         if matches:
             found[name] = matches[0]
+    _check_meaning(source, header, short, told, found, facts)
     lacking = [name for name in ("latitude", "longitude") if name not in found]
     if lacking:
         message = (
-            f"no column of {' and '.join(lacking)}, found {listed(header) if header else 'none'}: name them lat and lon"
+            f"no column of {' and '.join(lacking)}, found {listed(header) if header else 'none'}: name "
+            "them lat_deg and lon_deg"
         )
         raise source.fault(message)
     fix = next((name for name in told.fix if name in names), "")
@@ -289,6 +304,31 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
     if "time" not in found and facts.time_unit != "none":
         _check_no_time(source, header, keys, layout)
     return layout
+
+
+def _check_meaning(
+    source: LogSource,
+    header: Sequence[str],
+    short: Sequence[str],
+    told: Format,
+    found: Mapping[str, Column],
+    facts: LogFacts,
+) -> None:
+    """Raise `FlightError` if other columns tell that seconds are of a minute, or heights above the ellipsoid."""
+    parts = {bool(match[1]): header[at] for at, key in enumerate(short) if (match := _PARTS_OF_DAY.fullmatch(key))}
+    if len(parts) > 1 and "time" in found and found["time"].unit == "s" and facts.time_unit is None:
+        names = listed([parts[True], parts[False], found["time"].name])
+        message = f"the time is in parts, columns {names}: join them, as in 10:02:03.5, or say --time-unit none"
+        raise source.fault(message)
+    height = found.get("height")
+    beside = next((header[at] for at, key in enumerate(short) if _GEODETIC.fullmatch(key)), "")
+    is_plain = height is not None and _words_of(short[height.at], WORDS["height"])[0] in ("height", "")
+    if height is not None and is_plain and beside and "height" not in told.columns and facts.height_unit is None:
+        message = (
+            f"column {shown(height.name)} may count from the ellipsoid, as {shown(beside)} beside it tells: say "
+            "--height-unit none, or name it height_agl_m if it counts from the ground"
+        )
+        raise source.fault(message)
 
 
 def _receiver(header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format, topic: str | None) -> Column | None:
@@ -361,6 +401,8 @@ def listed(names: Sequence[str]) -> str:
 
 def _matches(name: str, header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format) -> list[Column]:
     """Return the columns of a field: by the format, else by its names, of which those with a unit go first."""
+    if QUANTITIES[name] == "angle":
+        keys = [("", "") if _CARRIED.search(_topic_of(header[at])) else both for at, both in enumerate(keys)]
     if name in told.columns:
         found = ((key, unit) for key, unit in told.columns[name].items() if any(key in both for both in keys))
         best, unit = next(found, ("", None))

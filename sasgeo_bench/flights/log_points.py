@@ -22,6 +22,8 @@ MOST_BYTES: Final = 64 * 2**20  # of a log
 MOST_POINTS: Final = 1_000_000
 FASTEST_MPS: Final = 100.0  # between two points: no drone of this benchmark is faster
 
+BEFORE_FIX: Final = "at 0, 0 before the first fix"
+
 _LARGEST: Final = 1e30  # a number beyond is a fault; times in ns are 2e18
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
@@ -127,7 +129,7 @@ class FlightLog:
             If fewer than two points are left, a place is none on Earth or 0, 0 (no fix), time goes back, the flight is
             faster than 100 m/s, or a height or an angle is out of range.
         """
-        start = first_fix(source, columns["lon_deg"], columns["lat_deg"])
+        start = _first_fix(source, columns["lon_deg"], columns["lat_deg"])
         numbers, columns = numbers[start:], {name: column[start:] for name, column in columns.items()}
         _check_places(source, numbers, columns)
         is_new = np.append(True, _gained(columns) != 0)[: len(numbers)]
@@ -160,11 +162,11 @@ def steps_m(lon_deg: Floats, lat_deg: Floats) -> Floats:
     return np.asarray(_WGS84.inv(lon_deg[:-1], lat_deg[:-1], lon_deg[1:], lat_deg[1:])[2])
 
 
-def first_fix(source: LogSource, lon_deg: Floats, lat_deg: Floats) -> int:
+def _first_fix(source: LogSource, lon_deg: Floats, lat_deg: Floats) -> int:
     """Return the index of the first point that is not at 0, 0, and warn of those before; 0 if there is none."""
     first = int(np.argmax((lon_deg != 0) | (lat_deg != 0))) if len(lon_deg) else 0
     if first:
-        tell_left_out(source, first, "at 0, 0 before the first fix")
+        tell_left_out(source, first, BEFORE_FIX)
     return first
 
 

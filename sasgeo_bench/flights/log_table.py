@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.flights.log_clock import Clock, is_clock
 from sasgeo_bench.flights.log_formats import PX4, QUANTITIES, Column, Format, Layout, find_layout
-from sasgeo_bench.flights.log_points import FlightLog, LogSource, first_fix, shown, tell_left_out
+from sasgeo_bench.flights.log_points import BEFORE_FIX, FlightLog, LogSource, shown, tell_left_out
 from sasgeo_bench.flights.log_rows import Lines, read_lines
 from sasgeo_bench.flights.log_units import UNITS, LogFacts, choices_of
 from sasgeo_bench.texts import plain
@@ -37,6 +37,7 @@ _SIGNS: Final = MappingProxyType(
         "longitude": {"E": 1, "EAST": 1, "W": -1, "WEST": -1},
     }
 )
+_ZERO: Final = re.compile(r"[-+]?0+(?:[.,]0*)?(?:[eE][-+]?\d+)?")
 _HALF_TURN: Final = 180.0
 
 
@@ -79,10 +80,7 @@ def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
     layout = find_layout(source, lines.header, facts)
     table = _read(source, layout, lines)
     values = {name: np.array(column) for name, column in table.values.items()}
-    # Before the units: what is logged before the first fix tells nothing.
-    start = first_fix(source, values["longitude"], values["latitude"])
-    numbers = np.array(table.numbers)[start:]
-    values = {name: column[start:] for name, column in values.items()}
+    numbers = np.array(table.numbers)
     layout = layout if table.has_dates else _as_px4(layout, values)
     numbers, values = _known(source, layout.format, numbers, values)
     values = _with_parts(source, layout, values, in_seconds=table.has_dates or facts.time_unit == "s")
@@ -139,6 +137,7 @@ class _Gate:
     """Lets lines through that are points of one receiver, and counts the others by reason."""
 
     layout: Layout
+    is_begun: bool = False  # what is logged before the first fix tells nothing, of units neither
     receiver: str | None = None
     left: "Counter[str]" = field(default_factory=Counter)
 
@@ -147,14 +146,18 @@ class _Gate:
         reason = self._reason(row)
         if reason:
             self.left[reason] += 1
+        self.is_begun = self.is_begun or not reason
         return not reason
 
     def _reason(self, row: Sequence[str]) -> str:
         fields, receiver = self.layout.fields, self.layout.receiver
         if _has_no_fix(self.layout, row):
             return "without a fix"
-        if all(_is_unknown(row[fields[name].at]) for name in ("latitude", "longitude")):
+        places = [row[fields[name].at].strip() for name in ("latitude", "longitude")]
+        if all(map(_is_unknown, places)):
             return "without a place"
+        if not self.is_begun and all(map(_ZERO.fullmatch, places)):
+            return BEFORE_FIX
         if receiver is not None:
             cell = row[receiver.at].strip()
             self.receiver = cell if self.receiver is None else self.receiver
@@ -227,11 +230,10 @@ def _sign(source: LogSource, layout: Layout, row: Sequence[str], name: str, numb
 def _checked_receiver(
     layout: Layout, rows: Iterable[tuple[int, list[str]]]
 ) -> tuple[Layout, Iterable[tuple[int, list[str]]]]:
-    """Return the layout without an "id" that numbers lines: it tells receivers only if its values recur."""
-    at = -1 if layout.receiver is None else layout.receiver.at
-    if at < 0 or layout.keys[at] != "id":
+    """Return the layout without a column that numbers lines: it tells receivers only if its values recur."""
+    if layout.receiver is None or layout.format.receiver:
         return layout, rows
-    kept = list(rows)
+    at, kept = layout.receiver.at, list(rows)
     count = len({cells[at].strip() for _, cells in kept if at < len(cells)})
     return (layout if 2 * count <= len(kept) else replace(layout, receiver=None)), kept
 
@@ -333,7 +335,7 @@ def _converted(
         factor = UNITS[quantity][unit]
         if quantity == "place":
             # As the nearest numbers to what is meant: 0.1 times 3 is not 0.3.
-            columns[f"{name[:3]}_deg"] = (column * factor).round(7) if unit == "e7" else column
+            columns[f"{name[:3]}_deg"] = (column * factor).round(7) if unit == "e7" else column * factor
         else:
             base = column - column[:1] if name == "time" else column
             columns[{"time": "time_s", "height": "height_m"}.get(name, f"{name}_deg")] = base * factor

@@ -14,7 +14,7 @@ from sasgeo_bench.texts import plain
 TimeUnit = Literal["s", "ms", "us", "ns", "none"]
 HeightUnit = Literal["m", "cm", "mm", "ft", "none"]
 AngleUnit = Literal["deg", "cdeg", "rad", "none"]
-PlaceUnit = Literal["deg", "e7"]
+PlaceUnit = Literal["deg", "rad", "e7"]
 
 SPEED_MPS: Final = 10.0  # of a log without times
 
@@ -24,8 +24,11 @@ UNITS: Final = MappingProxyType(
         "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
         "height": {"m": 1.0, "cm": 0.01, "mm": 1e-3, "ft": 0.3048},
         "angle": {"deg": 1.0, "cdeg": 0.01, "rad": math.degrees(1.0)},
-        "place": {"deg": 1.0, "e7": 1e-7},
+        "place": {"deg": 1.0, "rad": math.degrees(1.0), "e7": 1e-7},
     }
+)
+_TURNS: Final = dict.fromkeys(("deg", "degs", "degree", "degrees"), "deg") | dict.fromkeys(
+    ("rad", "rads", "radian", "radians"), "rad"
 )
 # Quantity -> end of a name -> unit.
 WORDS: Final = MappingProxyType(
@@ -38,10 +41,11 @@ WORDS: Final = MappingProxyType(
         | dict.fromkeys(("cm", "centimeters", "centimetres"), "cm")
         | dict.fromkeys(("mm", "millimeters", "millimetres"), "mm")
         | dict.fromkeys(("ft", "feet", "foot"), "ft"),
-        "angle": dict.fromkeys(("deg", "degs", "degree", "degrees", "360"), "deg")
-        | dict.fromkeys(("cdeg", "centideg", "centidegrees", "0_01_deg"), "cdeg")
-        | dict.fromkeys(("rad", "rads", "radian", "radians"), "rad"),
-        "place": dict.fromkeys(("deg", "degs", "degree", "degrees", "dd"), "deg")
+        "angle": _TURNS
+        | dict.fromkeys(("360",), "deg")
+        | dict.fromkeys(("cdeg", "centideg", "centidegrees", "0_01_deg"), "cdeg"),
+        "place": _TURNS
+        | dict.fromkeys(("dd",), "deg")
         | dict.fromkeys(("e7", "1e7", "dege7", "deg_e7", "1e_7", "1e_7_deg", "1e_7deg"), "e7"),
     }
 )
@@ -59,7 +63,7 @@ class LogFacts:
         Unit of heights; "none": heights are not read.
     angle_unit : {"deg", "cdeg", "rad", "none"}, optional
         Unit of yaw, pitch and roll (cdeg: 0.01 degrees); "none": they are not read.
-    place_unit : {"deg", "e7"}, optional
+    place_unit : {"deg", "rad", "e7"}, optional
         Unit of latitude and longitude (e7: 1e-7 degrees).
     axes : {"up", "camera"}, optional
         Axes of a TUM file (`sasgeo_bench.flights.axes`).
@@ -115,6 +119,6 @@ def choices_of(quantity: str) -> tuple[str, ...]:
     """Return the units of a quantity, and "none" where it may be left out.
 
     >>> choices_of("place"), choices_of("angle")
-    (('deg', 'e7'), ('deg', 'cdeg', 'rad', 'none'))
+    (('deg', 'rad', 'e7'), ('deg', 'cdeg', 'rad', 'none'))
     """
     return (*UNITS[quantity], *(("none",) if quantity != "place" else ()))

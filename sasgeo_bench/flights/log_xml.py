@@ -4,6 +4,7 @@
 import io
 import re
 from array import array
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -60,18 +61,19 @@ def read_gpx(path: Path) -> FlightLog:
     Segments of the track follow each other. Elevations are above the sea, and are not read.
     """
     track, route = _Track(source=LogSource(path=path)), _Track(source=LogSource(path=path))
-    tracks = 0
+    counts = Counter[str]()
     for event, element, parent in _elements(track.source):
         name = _name(element)
-        tracks += event == "start" and name == "trk"
-        if tracks > 1:
-            message = "more than one track: keep the one that is meant"
-            raise track.source.fault(message)
+        counts[name] += event == "start" and name in ("trk", "rte")
         if event == "start" and name in _POINTS:
             _add_place(track if name == _POINTS[0] else route, [element.get("lon"), element.get("lat")])
         elif event == "end" and name == "time" and parent in _POINTS:
             _add_time(track if parent == _POINTS[0] else route, element.text)
-    return (track if len(track) else route).log()
+    kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
+    if counts[kind] > 1:
+        message = f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant"
+        raise track.source.fault(message)
+    return read.log()
 
 
 def read_kml(path: Path) -> FlightLog:
@@ -84,7 +86,7 @@ def read_kml(path: Path) -> FlightLog:
     lines: list[_Track] = []
     opened = ""  # times and places of other elements are not of the line
     texts: dict[str, str] = {}
-    for event, element, _ in _elements(source):
+    for event, element, parent in _elements(source):
         name, text = _name(element), element.text or ""
         if event == "start":
             if name in ("LineString", "Track"):
@@ -92,9 +94,9 @@ def read_kml(path: Path) -> FlightLog:
                 opened, texts = name, {}
         elif not opened:
             continue
-        elif name in ("altitudeMode", "coordinates"):
+        elif parent == opened and name in ("altitudeMode", "coordinates"):
             texts[name] = text
-        elif name in ("when", "coord"):
+        elif parent == opened and name in ("when", "coord"):
             _add(lines[-1], name, text)
         elif name == opened:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())

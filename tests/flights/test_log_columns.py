@@ -86,7 +86,7 @@ def test_parts_of_a_second_are_added(tmp_path: Path, head: str, digits: int) -> 
     assert log.time_s == pytest.approx([0, 0.9, 1.8, 2.7, 3.6, 4.5], abs=1e-6)
 
 
-@pytest.mark.parametrize("name", ["instance", "device_id", "sysid", "gps_id", "receiver", "id"])
+@pytest.mark.parametrize("name", ["instance", "device_id", "sysid", "antenna", "uav", "Sensor ID", "id"])
 def test_the_first_of_several_receivers_is_read(tmp_path: Path, name: str) -> None:
     def row(y: float, x: float, s: int) -> str:
         return f"{s},7,{y},{x}\n{s}.1,8,{y + 2e-5},{x}"
@@ -104,6 +104,16 @@ def test_a_heading_of_0_is_north_but_in_the_message_of_gps(tmp_path: Path, head:
     _check(log)
     assert log.height_m == pytest.approx(80)
     assert log.yaw_deg == pytest.approx(0)
+
+
+@pytest.mark.parametrize("topic", ["gimbal", "a.Camera", "MNT", "cam1"])
+def test_angles_of_what_turns_by_itself_are_none_of_the_body(tmp_path: Path, topic: str) -> None:
+    head = f"time_s,drone.lat,drone.lon,drone.yaw_deg,{topic}.yaw_deg,{topic}.pitch_deg,{topic}.roll_deg"
+    log = _read(tmp_path, head, lambda y, x, s: f"{s},{y},{x},90,45,-90,1")
+    assert log.yaw_deg == pytest.approx(90)
+    assert (log.pitch_deg, log.roll_deg) == (None, None)
+    log = _read(tmp_path, head.replace("drone.yaw", "none.x"), lambda y, x, s: f"{s},{y},{x},90,45,-90,1")
+    assert log.yaw_deg is None
 
 
 def test_a_comment_above_the_numbers_is_the_head(tmp_path: Path) -> None:

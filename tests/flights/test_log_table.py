@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tables of flight logs: units by names and formats, asked for where neither tells them, and never guessed."""
 
+import math
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +22,7 @@ Row = Callable[[float, float, int], str]
 STEP_DEG = 6.838e-5  # of longitude, 5 m at 49 degrees north
 TOW_S = 433341.5  # of a week of GPS
 DJI = "OSD.latitude,OSD.longitude"
+PLAIN = "time_s,lat,lon"
 MAV = "time_boot_ms,lat,lon,alt,relative_alt,hdg"
 PX4_GPS = "timestamp,time_utc_usec,lat,lon,alt,alt_ellipsoid,eph,heading,fix_type"
 GPS = "TimeUS,I,Status,GMS,Lat,Lng,Alt,Yaw,U"
@@ -149,6 +151,12 @@ def _check(log: FlightLog, *, height_m: float | None = None, yaw_deg: float | No
             -5,
         ),
         ("Date\tTime\tLat\tLon", lambda y, x, s: f"17/5/24\t9:59:0{s}.5 AM\t{y}\t{x}", None, None),
+        (
+            "time_s,Latitude [rad],lon (radians),height_agl_m,geoid_height_m",
+            lambda y, x, s: f"{s},{math.radians(y):.12f},{math.radians(x):.12f},80,47",
+            80,
+            None,
+        ),
         ("timeUs,latitude,longitude,agl_feet", lambda y, x, s: f"{s}000000,{y},{x},10", 3.048, None),
     ],
 )
@@ -182,6 +190,12 @@ def test_a_log_of_any_format_is_the_same_flight(
             lambda y, x, s: f"{s}000000,{min(s, 3)},{_e7(y) * (s > 1)},{_e7(x) * (s > 1)},512000,1",
             {"count": 4},
             ["left out 2 points without a fix"],
+        ),
+        (  # what is logged before the first fix tells no decimals, no dates, and need be no number
+            "utc;lat;lon;height_m",
+            lambda y, x, s: f"2024-05-17T10:00:0{s}Z;{y};{x};80,25".replace(".", ",") if s else ";0;0,0;0,0\n;0;0;x",
+            {"height_m": 80.25, "count": 5},
+            ["left out 2 points at 0, 0 before the first fix"],
         ),
         (
             POS,
@@ -238,9 +252,6 @@ def test_what_is_no_place_or_no_value_is_left_out_with_a_word(
         else:
             _check(_read(tmp_path, head, row, name="a.pos" if head == POS else "log.csv"), **expected)
     assert [str(one.message).partition(": ")[2] for one in told] == left_out
-
-
-PLAIN = "time_s,lat,lon"
 
 
 @pytest.mark.filterwarnings("ignore:.*no line has a yaw")
@@ -379,6 +390,21 @@ def test_what_neither_name_nor_format_tells_is_asked_for_in_one_line(
             "'utc' is in dates, not in s",
         ),
         ("time,lat,lon", lambda y, x, s: f"01/05/2024 10:00:0{s},{y},{x}", {}, "line 2: time is no date and time"),
+        (
+            "utc_hour,utc_minute,utc_second,lat,lon",
+            lambda y, x, s: f"10,{s},{s},{y},{x}",
+            {},
+            "the time is in parts, columns 'utc_hour', 'utc_minute', 'utc_second': join them",
+        ),
+        *(
+            (
+                f"{PLAIN},Height [m],{beside}",
+                lambda y, x, s: f"{s},{y},{x},612.3,1",
+                {},
+                "'Height .m.' may count from the ellipsoid, as .* tells: say --height-unit none, or name it height_agl",
+            )
+            for beside in ("Undulation [m]", "hMSL", "geoid_separation_m", "sdn")
+        ),
         ("time,lat,lon", lambda y, x, s: f"25:00:0{s},{y},{x}", {}, "line 2: time is no time of day, '25:00:00'"),
         ("time,lat,lon", lambda y, x, s: f"13:00:0{s} PM,{y},{x}", {}, "line 2: time is no time of day"),
         (
@@ -419,7 +445,7 @@ def test_what_contradicts_or_may_be_two_things_is_refused(
     ("facts", "match"),
     [
         ({"time_unit": "min"}, "time_unit must be one of s, ms, us, ns, none, got 'min'"),
-        ({"place_unit": "none"}, "place_unit must be one of deg, e7, got 'none'"),
+        ({"place_unit": "none"}, "place_unit must be one of deg, rad, e7, got 'none'"),
         ({"axes": "ned"}, "axes must be one of up, camera, got 'ned'"),
         ({"speed_mps": float("nan")}, "speed_mps must be positive, got nan"),
     ],

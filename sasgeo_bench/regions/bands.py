@@ -14,6 +14,7 @@ from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.windows import Window
 
 from sasgeo_bench.errors import ImageryError
+from sasgeo_bench.texts import one_line
 
 _COLOURS: Final = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
 _SILENT: Final = frozenset({ColorInterp.undefined, ColorInterp.gray, ColorInterp.alpha})  # say nothing of a colour
@@ -23,6 +24,7 @@ _SAMPLES: Final = 8  # blocks along each side of a picture that are looked at
 _SAMPLE_PX: Final = 1024  # of a block, where it is larger
 _BETWEEN: Final = (2, 249)  # levels of an alpha that are neither transparent nor opaque; 1 is, in masks of 0 and 1
 _MOST_BETWEEN: Final = 0.1  # of the pixels of a mask, at its edges, are neither opaque nor transparent
+_FEW: Final = 8  # levels of a mask of any shares, of which one is opaque
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,8 +85,9 @@ def colour_bands(interpretation: Sequence[ColorInterp], names: Sequence[str | No
     >>> colour_bands([ColorInterp.gray, *[ColorInterp.undefined] * 3], ["blue", "green", "red", "red edge"]).rgb
     (3, 2, 1)
     """
-    words = [_WORD.findall(name or "") for name in names]
-    named = _each_once([found[0].lower() if len(found) == 1 else "" for found in words])
+    found = [_WORD.findall((name or "").replace("_", " ")) for name in names]
+    words = [each[0].lower() if len(each) == 1 else "" for each in found]
+    named, listed = _each_once(words), ", ".join(one_line(name or "")[:20] or "nothing" for name in names[:8])
     told = _each_once([item.name if item in _COLOURS else "" for item in interpretation])
     if told and named and told != named:
         return _Colours(fault=f"red, green and blue are {told} by their colour interpretation, {named} by their names")
@@ -92,13 +95,14 @@ def colour_bands(interpretation: Sequence[ColorInterp], names: Sequence[str | No
         return _Colours(told)
     if len(interpretation) < len(_COLOURS) or not set(interpretation) <= _SILENT:
         return _Colours()
-    if named:
-        return _Colours(named)
+    if named or any(words):
+        return _Colours(named, fault=f"its bands are called {listed}")
     first = [band for band, item in enumerate(interpretation, start=1) if item is not ColorInterp.alpha][:3]
     if len(first) < len(_COLOURS):
         return _Colours()
     rgb = (first[0], first[1], first[2])
-    return _Colours(rgb, f"it does not say what its bands show: bands {rgb} are taken as red, green, blue")
+    what = f"its bands are called {listed}" if any(names) else "it does not say what its bands show"
+    return _Colours(rgb, f"{what}: bands {rgb} are taken as red, green, blue")
 
 
 def _each_once(words: Sequence[str]) -> tuple[int, int, int] | None:
@@ -119,14 +123,14 @@ def _is_mask(source: rasterio.io.DatasetReader, band: int) -> bool:
     tops = np.unique(np.linspace(0, (source.height - 1) // tall, _SAMPLES).astype(int)) * tall
     lefts = np.unique(np.linspace(0, (source.width - 1) // wide, _SAMPLES).astype(int)) * wide
     low, high = _BETWEEN
-    between = total = 0
+    counts = np.zeros(2**_BITS, dtype=np.int64)
     for top in tops.tolist():
         for left in lefts.tolist():
             rows, cols = min(tall, _SAMPLE_PX, source.height - top), min(wide, _SAMPLE_PX, source.width - left)
             alpha = source.read(band, window=Window(left, top, cols, rows))
-            between += int(((alpha >= low) & (alpha <= high)).sum())
-            total += alpha.size
-    return between <= _MOST_BETWEEN * total
+            counts += np.bincount(alpha.ravel(), minlength=len(counts))
+    is_of_few = np.count_nonzero(counts) <= _FEW and counts[high + 1 :].any()
+    return bool(is_of_few) or counts[low : high + 1].sum() <= _MOST_BETWEEN * counts.sum()
 
 
 def selected(source: rasterio.io.DatasetReader, bands: Bands) -> str | None:

@@ -110,14 +110,18 @@ def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
         if isinstance(error, ImageryError | CRSError):
             raise
         message = (
-            f"{path} cannot be read as a GeoTIFF ({str(error)[:200]}): it is damaged or of another kind; get it again"
+            f"{path} cannot be read as a GeoTIFF ({str(error)[:200]}): it is damaged (get it again) or of another kind "
+            "(make it one with gdal_translate)"
         )
         raise ImageryError(message) from error
 
 
 def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
     if source.crs is None or source.transform.is_identity:
-        message = f"{path} says no place (a CRS and a transform): get a georeferenced one, or write them with gdal_edit"
+        message = (
+            f"{path} says no place (a CRS and a transform): get a georeferenced one, write them (gdal_edit), or warp "
+            "by its control points (gdalwarp)"
+        )
         raise ImageryError(message)
     crs = CRS.from_wkt(source.crs.to_wkt())
     if not (crs.is_geographic or crs.is_projected):

@@ -103,7 +103,7 @@ WHOLE = {
     "by the names of the bands": Made(
         (RGB[::-1], INFRARED, INFRARED),
         (*GREY, NO),
-        names=("Blue", "Green", "Band 3 (red)", "Red Edge", "Near Infrared"),
+        names=("blue_band", "Green", "Band 3 (red)", "Red_Edge", "Near Infrared"),
         profile=MINISBLACK,
     ),
     "alpha everywhere, black is empty": Made((RGB, FULL), RGB_ALPHA, profile={"nodata": 0}),
@@ -120,6 +120,7 @@ CUT = {
     "alpha after infrared": Made((RGB, INFRARED, SHOWN), (*RGB_ALPHA[:3], NO, Is.alpha)),
     "alpha last, black is empty too": Made((RGB, SHOWN), RGB_ALPHA, profile={"nodata": 0}),
     "alpha last, white is empty too": Made((RGB, SHOWN), RGB_ALPHA, profile={"nodata": 255}),
+    "alpha of three levels": Made((RGB, np.where(np.arange(SIDE) % 2, SHOWN, SHOWN // 2)), RGB_ALPHA),
     "alpha of 0 and 1": Made((RGB, SHOWN // 255), RGB_ALPHA),
     "alpha and a mask": Made((RGB, FULL), RGB_ALPHA, mask=SHOWN[0]),
     "a mask that shows more than alpha": Made((SHOWN, RGB), ALPHA_RGB, mask=FULL[0], beside=True),
@@ -137,6 +138,11 @@ NOTED = {
     "infrared that calls itself alpha": (
         Made((RGB, INFRARED), RGB_ALPHA),
         "band 4 calls itself alpha and holds a picture",
+    ),
+    "bands of one level and water": (Made((RGB, np.where(B == 60, 0, 130).astype(np.uint8)), RGB_ALPHA), "infrared"),
+    "names that say no colour": (
+        Made((RGB,), (*GREY[:3],), names=("B4", "B3", "B2"), profile=MINISBLACK),
+        r"its bands are called B4, B3, B2: bands \(1, 2, 3\) are taken as red",
     ),
     "bands without a word": (Made((RGB, INFRARED), GREY, profile=MINISBLACK), r"bands \(1, 2, 3\) are taken as red"),
 }
@@ -215,6 +221,10 @@ REFUSED = {
     "names against colours": (
         Made((RGB[::-1],), names=("Blue", "Green", "Red")),
         r"\(1, 2, 3\) by their colour interpretation, \(3, 2, 1\) by their names",
+    ),
+    "infrared, red, green": (
+        Made((INFRARED, R, G), GREY[:3], names=("nir", "red", "green"), profile=MINISBLACK),
+        "its bands are called nir, red, green",
     ),
     "a building site": (Made((RGB,), profile={"crs": rasterio.crs.CRS.from_wkt(SITE)}), "'site', which is neither"),
     "metres from the Earth's centre": (Made((RGB,), profile={"crs": "EPSG:4978"}), "neither geographic nor projected"),

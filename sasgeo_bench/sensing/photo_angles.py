@@ -19,6 +19,7 @@ AUTEL: Final = "http://www.autelrobotics.com/drone/1.0"
 PARROT: Final = "http://www.parrot.com/drone-parrot/1.0"
 SKYDIO: Final = "https://www.skydio.com/drone-skydio/1.0"
 PIX4D: Final = "http://pix4d.com/camera/1.0"
+SENSEFLY: Final = "http://ns.sensefly.com/Camera/1.0"
 
 _GIMBAL: Final = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
 _CAMERA: Final[Mapping[str, tuple[str, str, str]]] = {  # makers before Pix4D, whose tags several of them write as well
@@ -27,9 +28,10 @@ _CAMERA: Final[Mapping[str, tuple[str, str, str]]] = {  # makers before Pix4D, w
     PARROT: ("CameraRollDegree", "CameraPitchDegree", "CameraYawDegree"),
     SKYDIO: ("CameraOrientationNED/Roll", "CameraOrientationNED/Pitch", "CameraOrientationNED/Yaw"),
     PIX4D: ("Roll", "Pitch", "Yaw"),
+    SENSEFLY: ("Roll", "Pitch", "Yaw"),
 }
 _HEIGHT: Final = ((DJI, "RelativeAltitude"), (AUTEL, "RelativeAltitude"), (SKYDIO, "RelativeAltitude"),
-                  (PIX4D, "AboveGroundAltitude"))  # fmt: skip
+                  (PIX4D, "AboveGroundAltitude"), (SENSEFLY, "AboveGroundAltitude"))  # fmt: skip
 _ALTITUDE: Final = tuple((uri, "AbsoluteAltitude") for uri in (DJI, AUTEL, SKYDIO))
 _HIGHEST_DEG: Final = 30.0  # to which Autel's gimbals rise above the horizon
 _BACKWARD_DEG: Final = -20.0  # no camera that looks down at 0 leans back more, but one that counts from the horizon
@@ -58,7 +60,7 @@ def camera_angles(xmp: Xmp, make: str) -> Angles:
         found = _attitude(xmp, uri, names)
         if found is None:
             continue
-        if uri == PIX4D:
+        if uri in (PIX4D, SENSEFLY):
             return _pix4d(found, make)
         return _autel(found) if uri == AUTEL or "autel" in make.lower() else Angles(attitude=found)
     return Angles()

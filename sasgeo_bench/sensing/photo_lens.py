@@ -42,7 +42,8 @@ class Lens:
         """Return the focal length in pixels of a picture of a size; raise `CameraError` if there is none for it.
 
         A calibrated one comes first, then that on film, then that by the pixels of the sensor; the latter two must
-        agree. A picture scaled down keeps its field of view; one that was cut does not say of what.
+        agree, and with a calibrated one whose picture has no size. A picture scaled down keeps its field of view; one
+        that was cut does not say of what.
 
         >>> lens = Lens(calibrated_px=3666.67, calibrated_size_px=(4000.0, 3000.0))
         >>> lens.focal_px("a.jpg", (2000, 1500))
@@ -53,10 +54,14 @@ class Lens:
             raise CameraError(message)
         calibrated, film = self._by_calibration(name, size_px), self._by_film(name, size_px)
         sensor = self._by_sensor(name, size_px)
-        if calibrated is None and film is not None and sensor is not None and abs(film / sensor - 1) > _AGREES:
+        by, other = "the pixels of its sensor", sensor
+        if calibrated is not None:
+            is_sized = self.calibrated_size_px or self.native_size_px
+            by, other = "calibration", None if is_sized else calibrated
+        if film is not None and other is not None and abs(film / other - 1) > _AGREES:
             message = (
-                f"{name} has two focal lengths, {film:.0f} px by 35 mm film and {sensor:.0f} px by the pixels of its "
-                "sensor: it was cut or resized; use the drone's own file, or give the camera's intrinsics"
+                f"{name} has two focal lengths, {film:.0f} px by 35 mm film and {other:.0f} px by {by}: it was cut or "
+                "resized; use the drone's own file, or give the camera's intrinsics"
             )
             raise CameraError(message)
         found = next((focal_px for focal_px in (calibrated, film, sensor) if focal_px is not None), None)

@@ -120,8 +120,13 @@ class Photo:
             raise CameraError(message)
         if self.lon_deg is None or self.lat_deg is None or height_m is None or self.gimbal is None:
             facts = {"GPS": self.lon_deg, "height above take-off": height_m, "gimbal angles": self.gimbal}
-            lacking = ", ".join(name for name, value in facts.items() if value is None)
-            message = f"{self.name} has no pose: {lacking} missing; use the drone's own file, not an edited copy"
+            lacking = [name for name, value in facts.items() if value is None]
+            mend = (
+                "give height_m"
+                if height_m is None and len(lacking) == 1
+                else "use the drone's own file, not an edited copy"
+            )
+            message = f"{self.name} has no pose: {', '.join(lacking)} missing; {mend}"
             raise CameraError(message)
         if not height_m > 0:
             message = (

@@ -133,6 +133,7 @@ POINTED = [
     ("Sentera", pix4d(0, 0, 10), 0, (-SIDE_10, 0)),  # right wing down: the camera looks to the left
     ("Sentera", pix4d(90, 0, 10), 90, (0, SIDE_10)),
     ("senseFly", pix4d(0, 0, 10), 0, (SIDE_10, 0)),
+    ("senseFly", pix4d(0, 0, 10).replace(PIX4D, "http://ns.sensefly.com/Camera/1.0/"), 0, (SIDE_10, 0)),
     ("", pix4d(0, 0, 10) + part_of("http://ns.adobe.com/tiff/1.0/", {"Make": "senseFly"}), 0, (SIDE_10, 0)),
 ]
 
@@ -243,6 +244,12 @@ UNFIT = [
     ("zoom out", {"make": "DJI", "inner": {ZOOM: 0.5}}, gimbal(), "digital zoom of 0.5"),
     ("zoom of a calibrated one", {"make": "DJI", "inner": {ZOOM: 2.0}}, CALIBRATED, "digital zoom of 2"),
     ("film against sensor", {"inner": sensor(80.0)}, gimbal(), "two focal lengths, 277 px by 35 mm film and 704 px"),
+    (
+        "calibrated, of no size",
+        {"size": HALF},
+        gimbal(CalibratedFocalLength="277"),
+        "139 px by 35 mm film and 277 px by calibration",
+    ),
     ("nothing", {"film": None}, gimbal(), "no focal length"),
     ("no unit", {"film": None, "inner": sensor(40.0, unit=1)}, gimbal(), "no focal length"),
 ]

@@ -86,8 +86,8 @@ def test_south_and_west_are_negative(photo_path):
 
 
 def test_a_calibrated_focal_length_goes_before_that_on_film(photo_path):
-    pose = POSE | {"CalibratedFocalLength": "365.5"}
-    assert read_photo(write_photo(photo_path, xmp=xmp_of(pose))).intrinsics().focal_px == (365.5, 365.5)
+    pose = POSE | {"CalibratedFocalLength": "255.5"}
+    assert read_photo(write_photo(photo_path, xmp=xmp_of(pose))).intrinsics().focal_px == (255.5, 255.5)
 
 
 def test_a_wide_photo_is_cut_out_of_a_sensor_of_four_to_three(photo_path):
@@ -129,7 +129,7 @@ def without(*names):
         ),
         ({"gps": ZURICH | {ExifTags.GPS.GPSLatitude: (97.0, 0.0, 0.0)}}, "GPS"),
         ({"gps": ZURICH | {ExifTags.GPS.GPSLatitude: (IFDRational(0, 0), 0.0, 0.0)}}, "GPS"),
-        ({"xmp": xmp_of(without("RelativeAltitude"))}, "height above take-off missing"),
+        ({"xmp": xmp_of(without("RelativeAltitude"))}, "height above take-off missing; give height_m"),
         ({"xmp": xmp_of(without("GimbalPitchDegree"))}, "gimbal angles missing"),
         ({"xmp": xmp_of(POSE | {"GimbalYawDegree": "nan"})}, "gimbal angles missing"),
         ({"xmp": xmp_of({})}, "gimbal angles missing"),

@@ -142,7 +142,7 @@ def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
         )
         raise FlightError(message)
     is_flat = share >= _ALONG and spread_m[1] < _FLAT * np.linalg.norm(spread_m)
-    if axes is None and is_flat and (strength[2] > _STILL or loops):
+    if axes is None and ((is_flat and strength[2] > _STILL) or (loops and (is_flat or is_tilted))):
         message = (
             f"{name}: the path lies along the third axis, which is read as up, since the body does not turn or loops; "
             "if that axis points ahead, as in the axes of a camera, say --axes camera"

@@ -160,6 +160,8 @@ def test_a_path_with_its_third_axis_up_is_read_without_a_word(flown: Trajectory)
         _flown((0 * AT_M, 0 * AT_M, 90 * np.sin(LOOP)), _still()),
         _flown((90 * np.sin(LOOP), 0 * AT_M, 90 * np.cos(LOOP)), _still()),  # a circle before a front, or level
         _flown((90 * np.sin(LOOP), 0 * AT_M, 90 * np.cos(LOOP)), Rotation.from_euler("y", LOOP[:, None])),  # a loop
+        # The same with heights, as of a camera that looks sideways.
+        _flown((90 * np.sin(LOOP), 20 * np.sin(LOOP), 90 * np.cos(LOOP)), Rotation.from_euler("y", LOOP[:, None])),
     ],
 )
 def test_a_path_that_may_be_of_either_axes_is_read_with_a_word(flown: Trajectory) -> None:

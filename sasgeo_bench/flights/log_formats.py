@@ -193,6 +193,19 @@ FORMATS: Final = (
         no_yaw=0.0,
     ),
     Format(
+        name="QGroundControl",
+        signs=(frozenset({"timestamp", "altitude_relative", "heading", "gps_lat", "gps_lon"}),),
+        columns={
+            "latitude": {"gps_lat": "deg"},
+            "longitude": {"gps_lon": "deg"},
+            "time": {"timestamp": None},
+            "height": {"altitude_relative": None},
+            "yaw": {"heading": "deg"},
+            "pitch": {"pitch": "deg"},
+            "roll": {"roll": "deg"},
+        },
+    ),
+    Format(
         name="RTKLIB",
         signs=(
             frozenset({"latitude_deg", "longitude_deg", "q", "ns"}),
@@ -271,8 +284,10 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
         if name == "time":
             part = _part(header, short, matches, told)
             matches = [column for column in matches if part is None or column.at != part.at]
-        if len(matches) > 1:  # of several messages, that of the places
-            matches = [column for column in matches if _topic(column) == _topic(found.get("latitude"))] or matches
+        # Of several messages, that of the places, or of the vehicle.
+        for topic in (_topic(found["latitude"]), "") if "latitude" in found else ():
+            if len(matches) > 1:
+                matches = [column for column in matches if _topic(column) == topic] or matches
         if len(matches) > 1:
             message = f"{name} is ambiguous, columns {listed([item.name for item in matches])}: keep one of them"
             raise source.fault(message)

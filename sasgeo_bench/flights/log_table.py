@@ -28,7 +28,7 @@ from sasgeo_bench.texts import plain
 Floats = NDArray[np.float64]
 
 _MAY_LACK: Final = ("height", "yaw", "pitch", "roll")
-_UNKNOWN: Final = frozenset({"", "nan", "null", "none", "na", "n/a", "-"})
+_UNKNOWN: Final = frozenset({"", "nan", "null", "none", "na", "n/a", "-", "--", "--.--"})
 _DMS: Final = re.compile(r"(\d+)\s*(?:deg|°)\s*(\d+)\s*'\s*(\d+(?:\.\d+)?)\s*\"\s*([NSEW])")
 _LAST_BOOT_US: Final = 1e14  # three years: no PX4 runs for longer, so later times count from 1970
 _SIGNS: Final = MappingProxyType(

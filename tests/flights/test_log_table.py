@@ -22,6 +22,8 @@ Row = Callable[[float, float, int], str]
 STEP_DEG = 6.838e-5  # of longitude, 5 m at 49 degrees north
 TOW_S = 433341.5  # of a week of GPS
 DJI = "OSD.latitude,OSD.longitude"
+QGC = "Timestamp,roll,pitch,heading,altitudeRelative,altitudeAMSL,flightTime,battery0.id,gps.lat,gps.lon,gps2.lat,"
+QGC += "gps2.lon,setpoint.roll,setpoint.pitch,setpoint.yaw"
 PLAIN = "time_s,lat,lon"
 MAV = "time_boot_ms,lat,lon,alt,relative_alt,hdg"
 PX4_GPS = "timestamp,time_utc_usec,lat,lon,alt,alt_ellipsoid,eph,heading,fix_type"
@@ -306,6 +308,13 @@ def test_what_is_no_place_or_no_value_is_left_out_with_a_word(
             "'relative_alt' states no unit",
             {"height_unit": "none"},
             {},
+        ),
+        (
+            QGC,
+            lambda y, x, s: f"2024-05-17 10:00:0{s}.123,1,2,90,80,560,00:00:0{s},{s},{y},{x},--.--,--.--,5,6,7",
+            "'altitudeRelative' states no unit",
+            {"height_unit": "m"},
+            {"height_m": 80, "yaw_deg": 90},
         ),
         # gpsd has names of PX4, and times since 1970.
         (

@@ -231,6 +231,8 @@ FORMATS: Final = (
         name="exiftool",
         signs=(frozenset({"SourceFile", "GPSLatitude", "GPSLongitude"}),),
         columns={
+            "latitude": {"gpslatitude": "deg"},
+            "longitude": {"gpslongitude": "deg"},
             "time": {"sub_sec_date_time_original": None, "date_time_original": None},
             "height": {"relative_altitude": "m"},
             "yaw": {"flight_yaw_degree": "deg"},

@@ -33,7 +33,9 @@ POS_HEAD = f"% program   : RTKPOST ver.2.4.2\n% (lat/lon/height=WGS84/ellipsoida
 AIRDATA = "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff({0}),"
 AIRDATA += "height_above_ground_at_drone_location({0}),altitude_above_seaLevel({0}), compass_heading(degrees)"
 ROS = "%time,field.header.seq,field.header.stamp,field.status.status,field.latitude,field.longitude,field.altitude"
-PHOTOS = "SourceFile,DateTimeOriginal,GPSLatitude,GPSLongitude,AbsoluteAltitude,RelativeAltitude,FlightYawDegree"
+PHOTOS = (
+    "SourceFile,DateTimeOriginal,GPSLatitude,GPSLongitude,AbsoluteAltitude,RelativeAltitude,FlightYawDegree,Latitude"
+)
 
 
 def _e7(value: float) -> int:
@@ -134,7 +136,7 @@ def _check(log: FlightLog, *, height_m: float | None = None, yaw_deg: float | No
         (ROS, lambda y, x, s: f"{17 * 10**17 + s * 10**9},{s},{s},0,{y},{x},560.1", None, None),
         (
             PHOTOS,
-            lambda _y, _x, s: f"""{s},2024:05:17 10:00:0{5 - s},"49 deg 0' 18.00"" N",{_east(5 - s)},9,+80,-9""",
+            lambda _y, _x, s: f"""{s},2024:05:17 10:00:0{5 - s},"49 deg 0' 18.00"" N",{_east(5 - s)},9,+80,-9,1""",
             80,
             -9,
         ),

@@ -29,7 +29,9 @@ Floats = NDArray[np.float64]
 
 _MAY_LACK: Final = ("height", "yaw", "pitch", "roll")
 _UNKNOWN: Final = frozenset({"", "nan", "null", "none", "na", "n/a", "-", "--", "--.--"})
-_DMS: Final = re.compile(r"(\d+)\s*(?:deg|°)\s*(\d+)\s*'\s*(\d+(?:\.\d+)?)\s*\"\s*([NSEW])")
+_LETTERED: Final = re.compile(
+    r"(\d+(?:\.\d+)?)\s*(?:deg|°)?\s*(?:([0-5]?\d(?:\.\d+)?)\s*['\u2032]\s*)?(?:([0-5]?\d(?:\.\d+)?)\s*[\"\u2033]\s*)?([NSEW])"
+)
 _LAST_BOOT_US: Final = 1e14  # three years: no PX4 runs for longer, so later times count from 1970
 _SIGNS: Final = MappingProxyType(
     {
@@ -189,9 +191,9 @@ def _is_unknown(text: str) -> bool:
 
 
 def _number(source: LogSource, text: str, name: str, number: int, decimal: str) -> float:
-    match = _DMS.fullmatch(text.strip()) if name in _SIGNS else None
+    match = _LETTERED.fullmatch(text.strip()) if name in _SIGNS else None
     if match:
-        degrees = int(match[1]) + int(match[2]) / 60 + float(match[3]) / 3600
+        degrees = float(match[1]) + float(match[2] or 0) / 60 + float(match[3] or 0) / 3600
         if (match[4] in "NS") != (name == "latitude"):
             message = f"{name} is {shown(text)}: check which column is which"
             raise source.fault(message, number)

@@ -155,6 +155,10 @@ def _check(log: FlightLog, *, height_m: float | None = None, yaw_deg: float | No
             -5,
         ),
         ("Date\tTime\tLat\tLon", lambda y, x, s: f"17/5/24\t9:59:0{s}.5 AM\t{y}\t{x}", None, None),
+        *(
+            ("time_s,lat,lon", lambda _y, _x, s, lat=lat: f'{s},"{lat}",{_east(s)} E', None, None)
+            for lat in ("49.005 N", "49 deg 0.3' N", '49° 0\' 18.0"" N', "49°00\u203218.00\u2033N")
+        ),
         (
             "time_s,Latitude [rad],lon (radians),height_agl_m,geoid_height_m",
             lambda y, x, s: f"{s},{math.radians(y):.12f},{math.radians(x):.12f},80,47",

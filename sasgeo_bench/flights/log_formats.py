@@ -86,7 +86,7 @@ _GEODETIC: Final = re.compile(
     rf"(?:g(?:ps|nss)_)?(?:undulation|geoid(?:al)?(?:_(?:sep(?:aration)?|height|undulation))?|h_?msl|sd[neu])"
     rf"(?:_(?:{'|'.join(WORDS['height'])}))?"
 )
-_PARTS_OF_DAY: Final = re.compile(r"(?:(?:utc|gps|gnss|local|time)_)?(?:(hours?|hh?)|minutes?|mins?|mm)")
+_PARTS_OF_DAY: Final = re.compile(r"(?:(?:utc|gps|gnss|local|time)_)?(?:(hours?|hh)|minutes?|mins?|mm)")
 _OF_GPS: Final = frozenset({"status", "gms", "gwk", "n_sats", "nsats", "hdop", "h_dop", "gcrs", "g_crs", "spd"})
 _MOST_NAMES: Final = 12  # of columns in a message
 
@@ -337,10 +337,11 @@ def _check_meaning(
         names = listed([parts[True], parts[False], found["time"].name])
         message = f"the time is in parts, columns {names}: join them, as in 10:02:03.5, or say --time-unit none"
         raise source.fault(message)
-    height = found.get("height")
+    if "height" not in found or "height" in told.columns or facts.height_unit == "none":
+        return
+    height = found["height"]
     beside = next((header[at] for at, key in enumerate(short) if _GEODETIC.fullmatch(key)), "")
-    is_plain = height is not None and _words_of(short[height.at], WORDS["height"])[0] in ("height", "")
-    if height is not None and is_plain and beside and "height" not in told.columns and facts.height_unit is None:
+    if beside and _words_of(short[height.at], WORDS["height"])[0] == "height":
         message = (
             f"column {shown(height.name)} may count from the ellipsoid, as {shown(beside)} beside it tells: say "
             "--height-unit none, or name it height_agl_m if it counts from the ground"

@@ -415,7 +415,7 @@ def test_what_neither_name_nor_format_tells_is_asked_for_in_one_line(
             (
                 f"{PLAIN},Height [m],{beside}",
                 lambda y, x, s: f"{s},{y},{x},612.3,1",
-                {},
+                {"height_unit": "m"},
                 "'Height .m.' may count from the ellipsoid, as .* tells: say --height-unit none, or name it height_agl",
             )
             for beside in ("Undulation [m]", "hMSL", "geoid_separation_m", "sdn")

@@ -63,7 +63,7 @@ class FlightOptions(Options):
         """Return what the file does not say."""
         return LogFacts(
             time_unit=self.time_unit,
-            height_unit=self.height_unit,
+            height_unit=self.height_unit if self.height_m is None else "none",
             angle_unit=self.angle_unit,
             place_unit=self.place_unit,
             axes=self.axes,
@@ -95,7 +95,7 @@ def read_flight_command(flight: FlightOptions) -> None:
         flight.facts.check_untold(flight.file)
         say(_summary(read_tum(flight.file, axes=flight.axes)))
     else:
-        _show(read_log(flight.file, flight.facts))
+        _show(read_log(flight.file, flight.facts), flight.height_m)
 
 
 def measure_drift_command(
@@ -135,7 +135,7 @@ def _summary(flown: Trajectory) -> str:
     )
 
 
-def _show(log: FlightLog) -> None:
+def _show(log: FlightLog, height_m: float | None) -> None:
     """Print what was read of a log."""
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
     lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
@@ -148,7 +148,7 @@ def _show(log: FlightLog) -> None:
             say(f"{name.partition('_')[0]} from {values.min():.1f} to {values.max():.1f} {unit}")
     if log.time_s is None:
         tell(f"no times: a flight has an even speed (--speed-mps, {SPEED_MPS:g} m/s)")
-    if log.height_m is None:
+    if log.height_m is None and height_m is None:
         tell("no height above the ground: a flight needs --height-m")
 
 

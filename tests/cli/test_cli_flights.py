@@ -135,6 +135,8 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
         words += [f"--{quantity}-unit", unit]
     assert "height from 100.0 to 100.0 m" in program("read-flight", "log.csv", *words)[1]
     assert "heading" not in program("read-flight", "log.csv", *words)[1]
+    words[words.index("--height-unit") : words.index("--height-unit") + 2] = ["--height-m", "80"]
+    assert program("read-flight", "log.csv", *words)[2] == ""  # its heights are not asked for
     (tmp_path / "line.csv").write_text("lat,lon\n49.005,11.001\n49.005,11.002\n")
     _, out, err = program("read-flight", "line.csv")
     assert out.startswith("2 points, 73 m, no times\n")

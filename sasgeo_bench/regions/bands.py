@@ -18,7 +18,8 @@ from sasgeo_bench.texts import one_line
 
 _COLOURS: Final = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
 _SILENT: Final = frozenset({ColorInterp.undefined, ColorInterp.gray, ColorInterp.alpha})  # say nothing of a colour
-_WORD: Final = re.compile(r"\b(red|green|blue)\b(?!\W*edge)", re.IGNORECASE)  # not the red edge
+_WORD: Final = re.compile(r"\b(red|green|blue)\b(?!\W*edge)")  # not the red edge
+_LETTERS: Final[dict[str, str]] = {item.name[0]: item.name for item in _COLOURS}
 _BITS: Final = 8
 _SAMPLES: Final = 8  # blocks along each side of a picture that are looked at
 _SAMPLE_PX: Final = 1024  # of a block, where it is larger
@@ -85,14 +86,15 @@ def colour_bands(interpretation: Sequence[ColorInterp], names: Sequence[str | No
     >>> colour_bands([ColorInterp.gray, *[ColorInterp.undefined] * 3], ["blue", "green", "red", "red edge"]).rgb
     (3, 2, 1)
     """
-    found = [_WORD.findall((name or "").replace("_", " ")) for name in names]
-    words = [each[0].lower() if len(each) == 1 else "" for each in found]
+    words = [_colour_of(name or "") for name in names]
     named, listed = _each_once(words), ", ".join(one_line(name or "")[:20] or "nothing" for name in names[:8])
     told = _each_once([item.name if item in _COLOURS else "" for item in interpretation])
-    if told and named and told != named:
-        return _Colours(fault=f"red, green and blue are {told} by their colour interpretation, {named} by their names")
     if told:
-        return _Colours(told)
+        called = [(words[band - 1], item.name) for band, item in zip(told, _COLOURS, strict=True)]
+        if all(word in ("", colour) for word, colour in called) and named in (None, told):
+            return _Colours(told)
+        by_names = f"{named or listed} by their names"
+        return _Colours(fault=f"red, green and blue are {told} by their colour interpretation, {by_names}")
     if len(interpretation) < len(_COLOURS) or not set(interpretation) <= _SILENT:
         return _Colours()
     if named or any(words):
@@ -103,6 +105,13 @@ def colour_bands(interpretation: Sequence[ColorInterp], names: Sequence[str | No
     rgb = (first[0], first[1], first[2])
     what = f"its bands are called {listed}" if any(names) else "it does not say what its bands show"
     return _Colours(rgb, f"{what}: bands {rgb} are taken as red, green, blue")
+
+
+def _colour_of(name: str) -> str:
+    """Return the colour that a name of a band says, empty if it says none or several."""
+    text = name.replace("_", " ").strip().lower()
+    found: list[str] = _WORD.findall(text)
+    return _LETTERS.get(text, found[0] if len(found) == 1 else "")
 
 
 def _each_once(words: Sequence[str]) -> tuple[int, int, int] | None:

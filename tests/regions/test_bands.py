@@ -106,6 +106,7 @@ WHOLE = {
         names=("blue_band", "Green", "Band 3 (red)", "Red_Edge", "Near Infrared"),
         profile=MINISBLACK,
     ),
+    "by letters": Made((RGB[::-1],), GREY[:3], names=("B", "G", "R"), profile=MINISBLACK),
     "alpha everywhere, black is empty": Made((RGB, FULL), RGB_ALPHA, profile={"nodata": 0}),
     "rows from south to north": Made((RGB[:, ::-1],), transform=Affine(1, 0, WEST, 0, 1, NORTH - SIDE)),
     "columns from east to west": Made((RGB[:, :, ::-1],), transform=Affine(-1, 0, WEST + SIDE, 0, -1, NORTH)),
@@ -225,6 +226,10 @@ REFUSED = {
     "infrared, red, green": (
         Made((INFRARED, R, G), GREY[:3], names=("nir", "red", "green"), profile=MINISBLACK),
         "its bands are called nir, red, green",
+    ),
+    "infrared, red, green in the place of colours": (
+        Made((INFRARED, R, G), names=("nir", "red", "green")),
+        r"\(1, 2, 3\) by their colour interpretation, nir, red, green by their names",
     ),
     "a building site": (Made((RGB,), profile={"crs": rasterio.crs.CRS.from_wkt(SITE)}), "'site', which is neither"),
     "metres from the Earth's centre": (Made((RGB,), profile={"crs": "EPSG:4978"}), "neither geographic nor projected"),

@@ -49,15 +49,12 @@ NAMES: Final = MappingProxyType(
 ALTITUDES: Final = ("alt", "altitude", "ele", "elevation", "amsl", "alt_amsl", "altitude_amsl", "alt_msl")
 
 _DATES: Final = ("date", "date_local", "date_utc", "gps_date")
-# Of several receivers or drones in one table, where the format names no such column.
+# Of several receivers or drones in one table, where the format names no such column; these may number lines as well.
+NUMBERING: Final = ("receiver", "antenna", "sensor", "device", "drone", "uav", "vehicle", "id")
 _RECEIVERS: Final = (
     *("instance", "gps_instance", "sysid", "sys_id", "system_id", "src_system", "srcsystem", "gps_id"),
-    *(
-        f"{word}{end}"
-        for word in ("receiver", "antenna", "sensor", "device", "drone", "uav", "vehicle")
-        for end in ("", "_id")
-    ),
-    *("callsign", "id"),
+    *(f"{word}_id" for word in NUMBERING[:-1]),
+    *NUMBERING,
 )
 # Of the sign of a place, beside its value.
 _HEMISPHERES: Final = MappingProxyType(

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.flights.log_clock import Clock, is_clock
-from sasgeo_bench.flights.log_formats import PX4, QUANTITIES, Column, Format, Layout, find_layout
+from sasgeo_bench.flights.log_formats import NUMBERING, PX4, QUANTITIES, Column, Format, Layout, find_layout
 from sasgeo_bench.flights.log_points import BEFORE_FIX, FlightLog, LogSource, shown, tell_left_out
 from sasgeo_bench.flights.log_rows import Lines, read_lines
 from sasgeo_bench.flights.log_units import UNITS, LogFacts, choices_of
@@ -233,7 +233,7 @@ def _checked_receiver(
     layout: Layout, rows: Iterable[tuple[int, list[str]]]
 ) -> tuple[Layout, Iterable[tuple[int, list[str]]]]:
     """Return the layout without a column that numbers lines: it tells receivers only if its values recur."""
-    if layout.receiver is None or layout.format.receiver:
+    if layout.receiver is None or layout.keys[layout.receiver.at] not in NUMBERING:
         return layout, rows
     at, kept = layout.receiver.at, list(rows)
     count = len({cells[at].strip() for _, cells in kept if at < len(cells)})

@@ -13,6 +13,7 @@ _YEAR_FIRST: Final = re.compile(r"(\d{4})[-/:.](\d{1,2})[-/:.](\d{1,2})[ T]+(\d{
 _DAY_TIME: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)\s*(?:([AaPp])\.?\s?[Mm]\.?)?Z?")
 _WEEK: Final = re.compile(r"(\d{3,4}) +(\d+(?:\.\d+)?)")
 _SPAN: Final = re.compile(r"(?:(\d+)h\s*)?(?:(\d+)m\s*)?(\d+(?:\.\d+)?)s")
+_ZONE: Final = re.compile(r"\s*(?:UTC|GMT)(?=[-+]|$)")  # which a time is in without a word, too
 _DATE: Final = re.compile(r"\d[-/.:]\d+[-/.:]\d|\dT\d")  # of a time that is no number, in any order
 
 
@@ -35,7 +36,7 @@ class Clock:
 
     def seconds(self, text: str, date: str, number: int) -> float:
         """Return a cell in seconds; raise `FlightError` if it is none of the forms that are read."""
-        text = text.strip()
+        text = _ZONE.sub("", text.strip())
         if match := _DAY_TIME.fullmatch(text):
             return self._of_day(match, date.strip(), number)
         if match := _WEEK.fullmatch(text):

@@ -132,6 +132,7 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
         _csv("TimeUS,GPS.Lat,GPS.Lng,GPS.Alt", "7,47.14,9.52,480.5", "1000007,47.1401,9.52,480.5"),
         _csv("time(millisecond),datetime(utc),latitude,longitude", "0,x,47.14,9.52", "1000,x,47.1401,9.52"),
         _csv("utc,lat,lon", '"2025-05-01T10:00:00+02:00",47.14,9.52', "2025-05-01T08:00:01Z,47.1401,9.52"),
+        _csv("utc,lat,lon", "2025-05-01 10:00:00 UTC,47.14,9.52", "2025-05-01 12:00:01.0 UTC+02:00,47.1401,9.52"),
     ],
 )
 def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Callable, text: str) -> None:

@@ -14,12 +14,14 @@ import shapely
 from sasgeo_bench.errors import ExtractError, counted, named
 from sasgeo_bench.files.json import MOST_BYTES, parse_json
 from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.osm.multipolygons import MIN_RING_POINTS
 from sasgeo_bench.osm.scan import BUILT_UP, Box, Classifier, Get, Scan, ScanRow
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy
 from sasgeo_bench.osm.xml_text import NEW_IDS
 
 _NO_TIME: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
-_WGS84: Final = ("CRS84", "EPSG::4326", "EPSG:4326")  # ends of the names of longitude and latitude in old files
+_WGS84: Final = re.compile(r"(.*[:/])?(CRS84h?|4326|WGS ?84)", re.IGNORECASE)  # names in files before RFC 7946
+_SEQUENCE: Final = re.compile(rb'\s*(\x1e|\{[^\n]*"Feature"[^\n]*\}\s*\n\s*\{)')  # RFC 8142, or a feature a line
 _MORE_TAGS: Final = ("all_tags", "other_tags", "tags")
 _NO_TAGS: Final = (*_MORE_TAGS, "osm_id", "osm_way_id", "osm_type", "version", "timestamp", "type", "id", "@id")
 _NUMBERS: Final = ("layer", "level", "width", "lanes", "height")  # of which 0 and 1 are values
@@ -40,7 +42,9 @@ _NO: Final = ("no", "false", "f", "n", "0")
 _WHOLE: Final = re.compile(r"([-+]?[0-9]+)\.0*")
 _NOTHING: Final = ("", "none", "null", "<null>", "nan")  # how tables write that there is no value
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"\s*=>\s*"((?:[^"\\]|\\.)*)"')
-_NAMED_ID: Final = re.compile(r"(n|w|r|node|way|relation)/?([0-9]{1,12})")
+_NAMED_ID: Final = re.compile(r"(n|w|r|a|node|way|relation)/?([0-9]{1,12})")
+_TYPES: Final = ("osm_type", "@type", "element", "element_type", "type")
+_OBJECTS: Final = {"n": "node", "w": "way", "r": "relation", "node": "node", "way": "way", "relation": "relation"}
 _EXACT: Final = 2**53  # whole numbers below it are exact as floats
 _CLASSLESS: Final = " without a class"
 _CLOSED: Final = "closed line that is no polygon"
@@ -61,8 +65,9 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
 
     Properties are tags (`tags_of`); `tags` are added where a feature lacks them. Properties or the id of a feature say
     which object of OpenStreetMap it is (`identity_of`); without them it gets a negative id. Features of one object are
-    its parts, and one that stands there twice is taken once. `box` is west, south, east, north, degrees; features
-    outside it are neither classified nor counted.
+    its parts, and one that stands there twice is taken once. A closed way that comes as a line and as an area, as from
+    `osmium export`, is what it is in an OSM file. `box` is west, south, east, north, degrees; features outside it are
+    neither classified nor counted.
 
     Raise `ExtractError`, which names the file and the feature, if a file is no GeoJSON in longitude and latitude, or a
     geometry is broken, or there are features in the box and none has a class.
@@ -70,7 +75,7 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
     scan, keys = Scan(), Counter[str]()
     classifier = Classifier(taxonomy, scan)
     frame = shapely.box(*box)
-    parts: dict[tuple[Identity, int], int] = {}
+    found: list[_Found] = []
     for path in files:
         features = list(_features(path))
         is_ogr = any("osm_way_id" in _properties(feature) for feature in features)
@@ -81,11 +86,34 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
             elif not shapely.intersects(shape, frame):
                 scan.far.append(bytes(shapely.to_wkb(shape)))
             else:
-                identity = identity_of(feature, is_ogr=is_ogr)
-                _take({**tags, **tags_of(feature)}, identity, shape, scan, classifier, parts)
+                found.append(_Found({**tags, **tags_of(feature)}, identity_of(feature, is_ogr=is_ogr), shape))
                 keys.update(list(_properties(feature)))
+    parts: dict[tuple[Identity, int], int] = {}
+    lines, areas = ({_ring(each) for each in found if each.shape.geom_type in kinds} for kinds in (_LINES, _AREAS))
+    twins = (lines & areas) - {None}
+    for each in found:
+        _take(each, scan, classifier, parts, is_twin=bool(twins) and _ring(each) in twins)
     _check_classed(scan, files, keys)
     return scan
+
+
+class _Found(NamedTuple):
+    """A feature in the region: its tags, the object that it is of, its geometry."""
+
+    tags: Mapping[str, str]
+    identity: "Identity | None"
+    shape: shapely.Geometry
+
+
+def _ring(found: _Found) -> tuple[bytes, frozenset[tuple[str, str]]] | None:
+    """Return the ring and the tags of what may be a closed way, as a line or as an area; None of what is none."""
+    parts = shapely.get_parts(found.shape)
+    if len(parts) != 1 or shapely.get_num_interior_rings(parts[0]) > 0:
+        return None
+    points = shapely.get_coordinates(parts[0])
+    if len(points) <= MIN_RING_POINTS or (points[0] != points[-1]).any():
+        return None
+    return bytes(shapely.to_wkb(shapely.normalize(shapely.polygons(points)))), frozenset(found.tags.items())
 
 
 def _check_classed(scan: Scan, files: Sequence[Path], keys: Counter[str]) -> None:
@@ -130,17 +158,21 @@ def _features(path: Path) -> Iterator[Any]:
     if path.stat().st_size > MOST_BYTES:
         message = f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region"
         raise ExtractError(message)
+    text = b""
     try:
-        content = parse_json(plain_file(path).read_bytes().removeprefix(b"\xef\xbb\xbf"))
+        text = plain_file(path).read_bytes().removeprefix(b"\xef\xbb\xbf")
+        content = parse_json(text)
     except (OSError, ValueError) as error:
         message = f"{path} cannot be read as GeoJSON ({str(error)[:200]}): get it again"
+        if _SEQUENCE.match(text):
+            message = f"{path} is a sequence of features: make one FeatureCollection of them (ogr2ogr -f GeoJSON)"
         raise ExtractError(message) from error
     features = content.get("features") if isinstance(content, dict) else None
     if not isinstance(features, list) or content.get("type") != "FeatureCollection":
         message = f"{path} is no GeoJSON FeatureCollection: export the features of OpenStreetMap as one"
         raise ExtractError(message)
     crs = content.get("crs")
-    if crs is not None and not json.dumps(crs).rstrip('"}').endswith(_WGS84):
+    if crs is not None and not _is_lonlat(crs):
         message = (
             f"{path} is in {json.dumps(crs)[:100]}, GeoJSON is in longitude and latitude: reproject it to EPSG:4326"
         )
@@ -154,6 +186,13 @@ def _features(path: Path) -> Iterator[Any]:
             )
             raise ExtractError(message)
         yield feature
+
+
+def _is_lonlat(crs: Any) -> bool:  # noqa: ANN401 - what a file holds
+    """Return whether a coordinate reference system, as old files name it, is longitude and latitude."""
+    said = crs.get("properties", crs) if isinstance(crs, dict) else {"name": crs}
+    name = said.get("name", said.get("code")) if isinstance(said, dict) else None
+    return _WGS84.fullmatch(str(name)) is not None
 
 
 def _properties(feature: Any) -> Mapping[str, Any]:  # noqa: ANN401 - what a file holds
@@ -256,9 +295,10 @@ class Identity(NamedTuple):
 def identity_of(feature: Mapping[str, Any], *, is_ogr: bool = False) -> Identity | None:
     """Return which object of OpenStreetMap a feature is, or None if it does not say so.
 
-    Read are `osm_id` with `osm_type`, `osm_way_id` (ogr2ogr), `id` with `type`, and "way/7" in `@id`, `id` or the id of
-    the feature. A negative `osm_id` is that of a relation, as osm2pgsql writes it. So is that of an area without a type
-    if `is_ogr`: ogr2ogr gives areas `osm_way_id` if they are ways and `osm_id` if they are relations.
+    Read are `osm_id` with `osm_type`, `osm_way_id` (ogr2ogr), `id` or `@id` with a type (`_TYPES`), and "way/7" in
+    `@id`, `@osmId`, `id` or the id of the feature, where "a14" is the area of way 7 (osmium). A negative `osm_id` is
+    that of a relation, as osm2pgsql writes it. So is that of an area without a type if `is_ogr`: ogr2ogr gives areas
+    `osm_way_id` if they are ways and `osm_id` if they are relations.
 
     >>> identity_of({"id": "relation/7", "properties": {}})
     Identity(is_relation=True, osm_id=7)
@@ -266,16 +306,18 @@ def identity_of(feature: Mapping[str, Any], *, is_ogr: bool = False) -> Identity
     Identity(is_relation=False, osm_id=13)
     """
     properties = feature.get("properties") or {}
-    kind = str(properties.get("osm_type") or properties.get("type") or "").lower()
-    for value in (properties.get("@id"), properties.get("id"), feature.get("id")):
+    said = (str(properties.get(name)).lower() for name in _TYPES)
+    kind = next((_OBJECTS[each] for each in said if each in _OBJECTS), "")
+    for value in (*(properties.get(name) for name in ("@id", "@osmId", "id")), feature.get("id")):
         named = _NAMED_ID.fullmatch(value) if isinstance(value, str) else None
+        if named is not None and named[1] == "a":
+            return Identity(int(named[2]) % 2 == 1, int(named[2]) // 2)
         if named is not None:
             return Identity(named[1].startswith("r"), int(named[2]))
     if is_ogr and not kind and (number := _whole(properties.get("osm_way_id"))):
         return Identity(is_relation=False, osm_id=abs(number))
-    is_object = kind in ("way", "relation", "node")
-    is_relation = kind.startswith("r") or (is_ogr and not is_object and _kind_of(feature) in _AREAS)
-    for name in ("osm_id", "osm_way_id", *(("id",) if is_object else ())):
+    is_relation = kind == "relation" or (is_ogr and not kind and _kind_of(feature) in _AREAS)
+    for name in ("osm_id", "osm_way_id", "osmid", *(("id", "@id") if kind else ())):
         number = _whole(properties.get(name))
         if number:
             return Identity(is_relation or number < 0, abs(number))
@@ -299,23 +341,24 @@ def _whole(value: Any) -> int | None:  # noqa: ANN401 - any JSON
 
 
 def _take(
-    tags: Mapping[str, str],
-    identity: Identity | None,
-    shape: shapely.Geometry,
-    scan: Scan,
-    classifier: Classifier,
-    parts: dict[tuple[Identity, int], int],
+    found: _Found, scan: Scan, classifier: Classifier, parts: dict[tuple[Identity, int], int], *, is_twin: bool
 ) -> None:
-    """Classify one feature by its tags, and keep it under its id; a further part joins those before it."""
-    get, is_area = tags.get, shape.geom_type in _AREAS
+    """Classify one feature by its tags, and keep it under its id; a further part joins those before it.
+
+    `is_twin`: it is one of the two features, a line and an area, that a closed way came as.
+    """
+    get, identity, shape = found.tags.get, found.identity, found.shape
     labels: tuple[Label, ...] = ()
+    is_area = shape.geom_type in _AREAS
     if is_area:
-        labels = classifier.area_labels(get, is_relation=True)
+        labels = classifier.area_labels(get, is_relation=not is_twin)
     elif shape.geom_type in _LINES:
         labels = classifier.as_line(get).line
     wkb = bytes(shapely.to_wkb(shape))
     if not labels:
-        scan.tally.drops[_reason(get, shape, classifier)] += 1
+        reason = _reason(get, shape, classifier)
+        if not is_twin or reason.endswith(_CLASSLESS):
+            scan.tally.drops[reason] += 1
         scan.far.append(wkb)
         if is_area and get("landuse") in BUILT_UP:
             scan.built_up.append(wkb)

@@ -127,6 +127,8 @@ def _mapped(
     """Return the mapped ground of a grid; raise `CoverageError` if there is none."""
     if area.is_empty:
         message = f"{name} holds no element of any class: is it an extract of map data?"
+        if scan.rows or scan.far:
+            message = f"{name} holds nothing within its own bounds, {box_text(frame.bounds)}: mend or remove them"
         raise CoverageError(message)
     mapped = map_ground(
         grid,
@@ -166,6 +168,8 @@ def _reading(
     if len(features) == 0:
         of_class = "any class" if classes is None else f"class {', '.join(classes)}"
         message = f"{name} holds no element of {of_class} within {box_text(grid_lonlat)}: move or enlarge the bounds"
+        if len(objects) and not near.any():
+            message += f" (what it holds lies within {box_text(shapely.total_bounds(objects))})"
         raise CoverageError(message)
     kept = taxonomy.names if classes is None else classes
     built_up = project(shapely.from_wkb(np.array(scan.built_up, dtype=object)), grid.epsg)
@@ -199,7 +203,7 @@ def _check_nodes(name: str, scan: Scan) -> None:
     if lost > MOST_LOST * ways:
         message = (
             f"{name} lacks the nodes of {lost} of its {ways} ways: they were filtered away; filter again and keep the "
-            "nodes that ways refer to (osmium tags-filter without -R)"
+            "nodes that ways refer to (osmium tags-filter without -R; Overpass: (._;>;); out;)"
         )
         raise ExtractError(message)
 

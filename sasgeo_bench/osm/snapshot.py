@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from shutil import copyfileobj
 from typing import Any, Final
 
 import numpy as np
@@ -16,11 +17,11 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import ExtractError, counted
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.files.scratch import scratch_folder
-from sasgeo_bench.osm.xml_text import NEW_IDS, Box, clean, needs_cleaning, read_boxes
+from sasgeo_bench.osm.xml_text import NEW_IDS, Box, clean, has_several_streams, needs_cleaning, open_text, read_boxes
 
 SUFFIXES: Final = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")
 _HISTORY_SUFFIXES: Final = tuple(suffix for suffix in SUFFIXES if suffix.startswith(".osh"))
-_CHANGE_SUFFIXES: Final = (".osc", ".osc.gz", ".osc.bz2", ".o5c")
+_CHANGE_SUFFIXES: Final = (".osc", ".osc.gz", ".osc.bz2", ".osc.pbf", ".o5c")
 _OTHER_SUFFIXES: Final = (".o5m", ".opl", ".opl.gz", ".opl.bz2")
 _PBF_MARK: Final = b"\n\tOSMHeader"  # after four bytes of length
 _MOST_QUOTED: Final = 200  # characters of an error of osmium, which quotes a value of any length
@@ -138,7 +139,7 @@ def _check_file(path: Path) -> None:
         message = f"{path.name} is not read in its format: convert it (osmium cat {path.name} -o NAME.osm.pbf)"
         raise ExtractError(message)
     if not path.name.endswith(SUFFIXES):
-        message = f"{path.name} is of no known format: name it {', '.join(SUFFIXES[:6])}"
+        message = f"{path.name} is of no known format: unpack or convert it to {', '.join(SUFFIXES[:6])}"
         raise ExtractError(message)
     if path.stat().st_size == 0:
         message = f"{path} is empty: copy or download it again"
@@ -163,6 +164,10 @@ def _as_its_content(path: Path, scratch: Path) -> Path:
     if suffix != ".osm.pbf" and needs_cleaning(path):
         clean(path, scratch / "clean.osm")
         return scratch / "clean.osm"
+    if suffix == ".osm.bz2" and has_several_streams(path):
+        with open_text(path) as source, (scratch / "unpacked.osm").open("wb") as target:
+            copyfileobj(source, target)
+        return scratch / "unpacked.osm"
     if path.name.endswith(suffix):
         return path
     link = scratch / f"extract{suffix}"
@@ -214,12 +219,11 @@ def _header(path: Path, content: Path) -> Header:
     if _is_xml(content) and header.has_multiple_object_versions:
         message = f"{path.name} holds changes: give the extract, with the changes applied (osmium apply-changes)"
         raise ExtractError(message)
-    return Header(boxes_lonlat=_header_boxes(content, header), replicated_at=_header_time(header))
+    boxes = read_boxes(path) if _is_xml(content) else _header_boxes(header)  # osmium gives the first of several alone
+    return Header(boxes_lonlat=boxes, replicated_at=_header_time(header))
 
 
-def _header_boxes(content: Path, header: osmium.io.Header) -> tuple[Box, ...]:
-    if _is_xml(content):
-        return read_boxes(content)  # osmium gives the first of several alone
+def _header_boxes(header: osmium.io.Header) -> tuple[Box, ...]:
     box = header.box()
     if not box.valid():
         return ()

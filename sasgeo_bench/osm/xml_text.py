@@ -3,6 +3,7 @@
 
 import bz2
 import gzip
+import mmap
 import re
 import zlib
 from collections.abc import Iterator
@@ -19,8 +20,11 @@ NEW_IDS: Final = 2**40  # objects that have no id of OpenStreetMap yet are numbe
 _DESCRIBED_IDS: Final = 2 * NEW_IDS  # of places inside members, which have no node
 _CHUNK: Final = 1 << 20
 _OVERLAP: Final = 1 << 12  # no start tag of interest is longer
-# What osmium passes over or refuses: objects deleted in an editor, and the places that Overpass adds.
-_MARKS: Final = re.compile(rb"""\baction\s*=\s*["']delete|<center\b|<member\b[^<>]*[^/<>]>\s*<nd\b""")
+# What osmium passes over or refuses: objects deleted in an editor, and what Overpass adds.
+_MARKS: Final = re.compile(rb"""\baction\s*=\s*["']delete|<(center|area|remark)\b|<member\b[^<>]*[^/<>]>\s*<nd\b""")
+_FAILED: Final = ("error", "timed out")  # in a remark of Overpass: what came until then stands before it
+_COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
+_STREAM: Final = re.compile(rb"BZh[1-9]1AY&SY")  # how the packed text of a stream of bzip2 begins
 _OBJECT: Final = re.compile(rb"<(node|way|relation|changeset)\b")
 _BOX: Final = re.compile(rb"<(bounds?)\s([^<>]*)>")
 _VALUE: Final = re.compile(rb"""(\w+)\s*=\s*["']([^"']*)["']""")
@@ -47,6 +51,12 @@ def chunks(path: Path) -> Iterator[bytes]:
         raise RuntimeError(str(error)) from error
 
 
+def has_several_streams(path: Path) -> bool:
+    """Return whether a file is packed by bzip2 in several streams, as pbzip2 does: osmium reads the first alone."""
+    with plain_file(path).open("rb") as source, mmap.mmap(source.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        return content[:3] == b"BZh" and _STREAM.search(content, 1) is not None
+
+
 def read_boxes(path: Path) -> tuple[Box, ...]:
     """Return the boxes (west, south, east, north) that stand before the first object; JOSM writes one per download.
 
@@ -57,6 +67,7 @@ def read_boxes(path: Path) -> tuple[Box, ...]:
         head += data
         if _OBJECT.search(data) or len(head) > 4 * _CHUNK:
             break
+    head = _COMMENT.sub(b"", head)
     first = _OBJECT.search(head)
     found = []
     for kind, text in _BOX.findall(head[: first.start()] if first else head):
@@ -88,7 +99,7 @@ def clean(path: Path, target: Path) -> None:
     """Write the objects of a file alone: without those deleted in an editor, and with the ways that members describe.
 
     Overpass (`out geom`) writes the places of a member way inside the member; a way that does not stand in the file
-    itself is made of them. Raise `RuntimeError` if the file is no XML.
+    itself is made of them. Raise `RuntimeError` if the file is no XML, or Overpass remarks that it is not whole.
     """
     with target.open("w", encoding="utf-8") as out:
         _Cleaner(out).run(path)
@@ -107,8 +118,9 @@ class _Cleaner:
 
     def run(self, path: Path) -> None:
         parser = expat.ParserCreate()
+        parser.buffer_text = True
         parser.StartElementHandler, parser.EndElementHandler = self._begin, self._end
-        parser.EntityDeclHandler = _refuse_entities
+        parser.EntityDeclHandler, parser.CharacterDataHandler = _refuse_entities, self._read_remark
         try:
             for data in chunks(path):
                 parser.Parse(data, False)  # noqa: FBT003 - expat knows no keywords
@@ -149,6 +161,11 @@ class _Cleaner:
         elif depth == 0:
             self._write_described()
             self._out.write(f"</{name}>\n")
+
+    def _read_remark(self, text: str) -> None:
+        if self._open[-1:] == ["remark"] and any(word in text for word in _FAILED):
+            message = f"its last line says: {text.strip()}"
+            raise RuntimeError(message)
 
     def _write_described(self) -> None:
         """Write the ways that only members describe; a place is one node, wherever it occurs."""

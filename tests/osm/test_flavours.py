@@ -106,6 +106,16 @@ def test_a_relation_that_was_deleted_is_no_area_and_its_ways_stay(tmp_path):
     assert houses(tmp_path / "a.osm") == (1600, [ring])
 
 
+def test_a_file_packed_in_several_streams_is_read_whole(tmp_path):
+    town = Town()
+    house = town.way(square(0, 0), building="yes")
+    text = town.text().encode()
+    for pack, suffix in ((bz2.compress, "bz2"), (gzip.compress, "gz")):
+        streams = [pack(text[at : at + 999]) for at in range(0, len(text), 999)]
+        (tmp_path / f"a.osm.{suffix}").write_bytes(b"".join(streams))
+        assert houses(tmp_path / f"a.osm.{suffix}") == (1600, [house])
+
+
 @pytest.mark.parametrize("order", [1, -1])
 def test_what_was_drawn_and_not_uploaded_yet_is_read_and_keeps_its_negative_id(order, tmp_path):
     town = Town()
@@ -140,6 +150,19 @@ def test_the_boxes_of_several_downloads_are_one_mapped_area(tmp_path):
     assert len(read_header(tmp_path / "a.osm").boxes_lonlat) == 2
     assert reading.coverage_source == "header box"
     assert shapely.area(reading.coverage) == pytest.approx(640 * 620, rel=0.05)
+
+
+def test_boxes_stay_where_something_was_deleted_and_a_comment_is_none(tmp_path):
+    town, two = Town(), bounds(-320, -320, 0, 320) + bounds(0, -320, 320, 320)
+    town.way(square(0, 0), "action='delete'", building="yes")
+    path = town.write(tmp_path / "a.osm", f"<!-- {bounds(-9, -9, 9, 9)} -->{two}")
+    assert len(read_header(path).boxes_lonlat) == 2
+
+
+def test_a_box_that_holds_none_of_the_data_is_named(tmp_path):
+    far = '<bounds minlat="9" minlon="47" maxlat="9.01" maxlon="47.01"/>'
+    with pytest.raises(CoverageError, match=r"nothing within its own bounds, \[47.0000, 9.0000, .* remove them"):
+        read_extract(Town().write(tmp_path / "a.osm", far), GRID)
 
 
 def test_a_box_in_the_older_form_is_a_box(tmp_path):
@@ -259,16 +282,23 @@ def test_of_merged_files_each_object_is_taken_once_and_newest(versions, tmp_path
     assert reading.warnings[0].startswith("1 object stood there in more than one version")
 
 
+NODE = "<node id='1' lat='47' lon='9'/>"
+
+
 @pytest.mark.parametrize(
     ("name", "text", "words"),
     [
         ("a.osc", "", "is a change file"),
         ("a.osc.gz", "", "is a change file"),
         ("a.o5c", "", "is a change file"),
+        ("a.osc.pbf", "", "is a change file"),
+        ("a.osm.zip", "", "of no known format: unpack or convert it to .osm.pbf"),
+        ("a.osm", f"<osm version='0.6'>{NODE}<remark> runtime error: Query timed out </remark></osm>", "timed out"),
+        ("a.osm", f"<osm version='0.6'>{NODE}<area id='1'><tag k='a' v='b'/></area></osm>", "holds no element"),
         ("a.osm", '<osmChange version="0.6"><create><node id="1" version="1" lat="47" lon="9"/></create></osmChange>',
          "holds changes: give the extract"),
-        ("a.osm", "<osm version='0.6'></osm>", "holds no element of any class"),
-        ("a.osm", "<osm version='0.6'><node id='1' lat='47' lon='9'/></osm>", "holds no element of any class"),
+        ("a.osm", "<osm version='0.6'></osm>", "holds no element"),
+        ("a.osm", f"<osm version='0.6'>{NODE}</osm>", "holds no element"),
         ("a.o5m", "x", r"convert it \(osmium cat a.o5m"),
         ("a.opl", "n1 x9 y47", r"convert it \(osmium cat a.opl"),
         ("a.osm", "<osm version='0.6'><way id='1' action='delete'></osm>", "cannot be read as OSM data"),

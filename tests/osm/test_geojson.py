@@ -137,6 +137,14 @@ def test_values_are_tags_as_a_mapper_writes_them(properties, tags):
         ({"properties": {"osm_id": True}}, None),
         ({"properties": {"osm_id": 2**62}}, None),
         ({"properties": {"osm_id": "7a"}}, None),
+        ({"properties": {"osm_id": 7, "type": "retail"}}, (False, 7)),
+        ({"properties": {"osm_id": 7, "osm_type": "R"}}, (True, 7)),
+        ({"properties": {"@id": 7, "@type": "relation"}}, (True, 7)),
+        ({"properties": {"id": 7, "element": "relation", "type": "multipolygon"}}, (True, 7)),
+        ({"properties": {"@osmId": "way/7"}}, (False, 7)),
+        ({"properties": {"osmid": 7}}, (False, 7)),
+        ({"id": "a14", "properties": {}}, (False, 7)),
+        ({"id": "a15", "properties": {}}, (True, 7)),
     ],
 )
 def test_an_object_is_named_in_many_ways(feature, identity):
@@ -235,6 +243,25 @@ def test_features_of_one_object_are_its_parts(tmp_path):
     }
 
 
+@pytest.mark.parametrize(
+    ("tags", "classes"),
+    [
+        ({"highway": "service"}, ["road_minor"]),
+        ({"highway": "service", "name": "other"}, ["road_minor", "road_minor"]),
+        ({"barrier": "fence"}, ["field_boundary"]),
+        ({"landuse": "meadow", "barrier": "hedge"}, ["green", "field_boundary"]),
+        ({"building": "yes"}, ["building"]),
+    ],
+)
+def test_a_closed_way_that_comes_as_a_line_and_as_an_area_is_one_object(tags, classes, tmp_path):
+    turned = shapely.LineString([*HOUSE.exterior.coords[2:], *HOUSE.exterior.coords[1:3]])
+    said = {key: value for key, value in tags.items() if key != "name"}  # with other tags it is another object
+    both = [feature(shapely.MultiPolygon([HOUSE]), **tags), feature(turned, **said)]
+    reading = read(written(tmp_path / "a.geojson", *both, feature(SHED)), tags={}, classes=None)
+    assert reading.features["class"].tolist() == classes
+    assert reading.drops == {"Polygon without a class": 1}
+
+
 def test_an_object_of_two_classes_in_two_features_keeps_both(tmp_path):
     both = [feature(HOUSE, osm_id=7, building="yes"), feature(HOUSE, osm_id=7, landuse="grass")]
     reading = read(written(tmp_path / "a.geojson", *both), tags={}, classes=("building", "green"))
@@ -265,7 +292,38 @@ BAD = {
     '{"type": "FeatureCollection", "features": [{"geometry": {"type": "Polygon", "coordinates": [[[1]]]}}]}': "broken",
     '{"type": "FeatureCollection", "features": [{"geometry": {"type": "Point", "coordinates": [5e5, 5e6]}}]}': "broken",
     '{"type": "FeatureCollection", "features": [], "crs": {"name": "EPSG:3857"}}': "reproject it to EPSG:4326",
+    '\x1e{"type": "Feature"}\n': "is a sequence of features: make one FeatureCollection",
+    '{"type": "Feature"}\n{"type": "Feature"}\n': "is a sequence of features: make one FeatureCollection",
 }
+
+
+@pytest.mark.parametrize(
+    ("crs", "is_lonlat"),
+    [
+        ({"type": "name", "properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}}, True),
+        ({"properties": {"name": "urn:ogc:def:crs:OGC:1.3:CRS84"}, "type": "name"}, True),
+        ({"type": "EPSG", "properties": {"code": 4326}}, True),
+        ({"type": "name", "properties": {"name": "http://www.opengis.net/def/crs/EPSG/0/4326"}}, True),
+        ({"type": "name", "properties": {"name": "EPSG:14326"}}, False),
+        ({"type": "name", "properties": {"name": "urn:ogc:def:crs:EPSG::25832"}}, False),
+        ({"type": "link", "properties": {"href": "https://example.org/4326"}}, False),
+        ({"type": "name", "properties": None}, False),
+    ],
+)
+def test_longitude_and_latitude_have_many_names(crs, is_lonlat, tmp_path):
+    path = written(tmp_path / "a.geojson", feature(HOUSE), crs=crs)
+    if is_lonlat:
+        assert len(read(path).features) == 1
+        return
+    with pytest.raises(ExtractError, match="reproject it to EPSG:4326"):
+        read(path)
+
+
+def test_a_map_that_lies_elsewhere_says_where(tmp_path):
+    turned = feature(HOUSE)
+    turned["geometry"] = shapely.geometry.mapping(shapely.transform(to_lonlat(HOUSE), lambda points: points[:, ::-1]))
+    with pytest.raises(CoverageError, match=r"move or enlarge the bounds \(what it holds lies within \[47"):
+        read(written(tmp_path / "a.geojson", turned))
 
 
 @pytest.mark.parametrize("text", BAD)

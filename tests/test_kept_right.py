@@ -49,6 +49,10 @@ CUTS = {
     ],
     "diagonal": [shapely.Polygon([(0, 0), (10, 0), (10, 10)]), shapely.Polygon([(0, 0), (10, 10), (0, 10)])],
     "falling": [shapely.Polygon([(0, 10), (0, 0), (10, 0)]), shapely.Polygon([(0, 10), (10, 0), (10, 10)])],
+    "aslant": [
+        shapely.Polygon([(0, 0), (10, 0), (10, 3.3), (9.9, 3.3)]),
+        shapely.Polygon([(0, 0), (9.9, 3.3), (10, 3.3), (10, 10), (0, 10)]),
+    ],
     "fan": [
         shapely.Polygon([(4.5, 4.5), first, second])
         for first, second in (((0, 0), (10, 0)), ((10, 0), (10, 10)), ((10, 10), (0, 10)), ((0, 10), (0, 0)))

@@ -203,10 +203,13 @@ def _crossings(
     count = last - first
     edge = np.repeat(np.arange(len(count)), count)
     row = np.arange(len(edge)) - np.repeat(np.cumsum(count) - count, count) + first[edge]
-    down = (end - start)[edge]
-    u = start[edge, 0] + (row + 0.5 - start[edge, 1]) * down[:, 0] / down[:, 1]
+    is_down = (end[:, 1] > start[:, 1])[edge]
+    # From its upper end, whichever way the ring runs: two parcels round the place on a shared edge alike.
+    upper = np.where(is_down[:, None], start[edge], end[edge])
+    across = np.where(is_down[:, None], end[edge], start[edge]) - upper
+    u = upper[:, 0] + (row + 0.5 - upper[:, 1]) * across[:, 0] / across[:, 1]
     col = np.clip(np.ceil(u - 0.5), 0, grid.cols).astype(np.int64)
-    return row, col, np.where(down[:, 1] > 0, 1, -1)
+    return row, col, np.where(is_down, 1, -1)
 
 
 BLOCK_CELLS: Final = 512

@@ -138,6 +138,11 @@ def _check_file(path: Path) -> None:
     if path.name.endswith(_OTHER_SUFFIXES):
         message = f"{path.name} is not read in its format: convert it (osmium cat {path.name} -o NAME.osm.pbf)"
         raise ExtractError(message)
+    if path.name.endswith((".json", ".geojson")):
+        message = (
+            f"{path.name} is not read as an OSM file: say format = 'geojson' of a GeoJSON extract in its region file"
+        )
+        raise ExtractError(message)
     if not path.name.endswith(SUFFIXES):
         message = f"{path.name} is of no known format: unpack or convert it to {', '.join(SUFFIXES[:6])}"
         raise ExtractError(message)

@@ -292,6 +292,7 @@ NODE = "<node id='1' lat='47' lon='9'/>"
         ("a.osc.gz", "", "is a change file"),
         ("a.o5c", "", "is a change file"),
         ("a.osc.pbf", "", "is a change file"),
+        ("a.geojson", "", "say format = 'geojson'"),
         ("a.osm.zip", "", "of no known format: unpack or convert it to .osm.pbf"),
         ("a.osm", f"<osm version='0.6'>{NODE}<remark> runtime error: Query timed out </remark></osm>", "timed out"),
         ("a.osm", f"<osm version='0.6'>{NODE}<area id='1'><tag k='a' v='b'/></area></osm>", "holds no element"),

@@ -98,6 +98,11 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
             current = scratch / "at-date.osm.pbf"
             _cut_history(content, current, at=at if is_past else None)
             survey = _survey(current)
+        if survey.largest_id >= NEW_IDS:
+            message = (
+                f"{path.name} has ids of up to {survey.largest_id}, OpenStreetMap of 12 digits: use osmium renumber"
+            )
+            raise ExtractError(message)
         if survey.has_negative or survey.has_places:
             source, current = current, scratch / "plain.osm.pbf"
             _write_plain(source, current)
@@ -256,6 +261,7 @@ class _Survey:
     is_sorted: bool = True
     has_versions: bool = False
     has_negative: bool = False
+    largest_id: int = 0
     has_places: bool = False
     repeated: int = 0
     deleted: int = 0
@@ -292,6 +298,7 @@ def _survey(path: Path) -> _Survey:
         is_sorted=is_sorted or bool((order == np.arange(len(order))).all()),
         has_versions=bool((is_again & (version[1:] != version[:-1])).any()),
         has_negative=bool((number < 0).any()),
+        largest_id=max(-int(number.min()), int(number.max())) if len(number) else 0,
         has_places=has_places,
         repeated=int(is_again.sum()),
         deleted=deleted,

@@ -298,6 +298,7 @@ NODE = "<node id='1' lat='47' lon='9'/>"
         ("a.osm", f"<osm version='0.6'>{NODE}<area id='1'><tag k='a' v='b'/></area></osm>", "holds no element"),
         ("a.osm", '<osmChange version="0.6"><create><node id="1" version="1" lat="47" lon="9"/></create></osmChange>',
          "holds changes: give the extract"),
+        ("a.osm", f"<osm version='0.6'>{NODE}<way id='{9 * 10**18}'/></osm>", "ids of up to 9000.*renumber"),
         ("a.osm", "<osm version='0.6'></osm>", "holds no element"),
         ("a.osm", f"<osm version='0.6'>{NODE}</osm>", "holds no element"),
         ("a.o5m", "x", r"convert it \(osmium cat a.o5m"),

@@ -277,10 +277,9 @@ def _survey(path: Path) -> _Survey:
     header = _header_of(path)
     if header.has_multiple_object_versions:
         return _Survey(is_flagged=True)
-    is_sorted = header.get("sorting") == "Type_then_ID"
     kinds, ids, versions = array("q"), array("q"), array("q")
     deleted, has_places = 0, False
-    wanted = osmium.osm.WAY | osmium.osm.RELATION if is_sorted else OBJECTS
+    wanted = osmium.osm.WAY | osmium.osm.RELATION if header.get("sorting") == "Type_then_ID" else OBJECTS
     for item in elements(osmium.FileProcessor(str(path), wanted)):
         kinds.append(_TYPES.index(item.type_str()))
         ids.append(item.id)
@@ -295,7 +294,7 @@ def _survey(path: Path) -> _Survey:
     version = np.array(versions, dtype=np.int64)[order]
     return _Survey(
         is_flagged=False,
-        is_sorted=is_sorted or bool((order == np.arange(len(order))).all()),
+        is_sorted=bool((order == np.arange(len(order))).all()),
         has_versions=bool((is_again & (version[1:] != version[:-1])).any()),
         has_negative=bool((number < 0).any()),
         largest_id=max(-int(number.min()), int(number.max())) if len(number) else 0,

@@ -314,6 +314,20 @@ def test_what_is_no_extract_is_refused_with_what_to_do(name, text, words, tmp_pa
     assert "\n" not in str(caught.value)
 
 
+def test_a_header_that_promises_an_order_is_not_believed(tmp_path):
+    town, header = Town(), osmium.io.Header()
+    outer, inner = town.way(square(0, 0, 100)), town.way(square(0, 0))
+    members = "".join(f'<member type="way" ref="{r}" role="{s}"/>' for r, s in ((outer, "outer"), (inner, "inner")))
+    tags = '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
+    town.relations.append(f'<relation id="9">{members}{tags}</relation>')
+    town.ways.reverse()
+    header.set("sorting", "Type_then_ID")
+    with osmium.SimpleWriter(str(tmp_path / "a.osm.pbf"), header=header) as writer:
+        for item in osmium.FileProcessor(str(town.write(tmp_path / "a.osm"))):
+            writer.add(item)
+    assert houses(tmp_path / "a.osm.pbf") == (8400, [9])
+
+
 @pytest.mark.parametrize("keep", [0, 3, 4])
 def test_ways_without_their_nodes_are_refused_in_one_line(keep, tmp_path):
     town = Town()

@@ -21,7 +21,6 @@ from sasgeo_bench.osm.xml_text import NEW_IDS
 
 _NO_TIME: Final = dt.datetime(1970, 1, 1, tzinfo=dt.UTC)
 _WGS84: Final = re.compile(r"(.*[:/])?(CRS84h?|4326|WGS ?84)", re.IGNORECASE)  # names in files before RFC 7946
-_SEQUENCE: Final = re.compile(rb'\s*(\x1e|\{[^\n]*"Feature"[^\n]*\}\s*\n\s*\{)')  # RFC 8142, or a feature a line
 _MORE_TAGS: Final = ("all_tags", "other_tags", "tags")
 _NO_TAGS: Final = (*_MORE_TAGS, "osm_id", "osm_way_id", "osm_type", "version", "timestamp", "type", "id", "@id")
 _NUMBERS: Final = ("layer", "level", "width", "lanes", "height")  # of which 0 and 1 are values
@@ -164,7 +163,7 @@ def _features(path: Path) -> Iterator[Any]:
         content = parse_json(text)
     except (OSError, ValueError) as error:
         message = f"{path} cannot be read as GeoJSON ({str(error)[:200]}): get it again"
-        if _SEQUENCE.match(text):
+        if _is_sequence(text):
             message = f"{path} is a sequence of features: make one FeatureCollection of them (ogr2ogr -f GeoJSON)"
         raise ExtractError(message) from error
     features = content.get("features") if isinstance(content, dict) else None
@@ -186,6 +185,13 @@ def _features(path: Path) -> Iterator[Any]:
             )
             raise ExtractError(message)
         yield feature
+
+
+def _is_sequence(text: bytes) -> bool:
+    """Return whether a text is a sequence of features: after RFC 8142, or one a line."""
+    first, _, rest = text.lstrip().partition(b"\n")
+    is_line = first.rstrip().endswith(b"}") and b'"Feature"' in first
+    return first.startswith(b"\x1e") or (is_line and rest.lstrip().startswith(b"{"))
 
 
 def _is_lonlat(crs: Any) -> bool:  # noqa: ANN401 - what a file holds

@@ -23,7 +23,6 @@ _OVERLAP: Final = 1 << 12  # no start tag of interest is longer
 # What osmium passes over or refuses: objects deleted in an editor, and what Overpass adds.
 _MARKS: Final = re.compile(rb"""\baction\s*=\s*["']delete|<(center|area|remark)\b|<member\b[^<>]*[^/<>]>\s*<nd\b""")
 _FAILED: Final = ("error", "timed out")  # in a remark of Overpass: what came until then stands before it
-_COMMENT: Final = re.compile(rb"<!--.*?-->", re.DOTALL)
 _STREAM: Final = re.compile(rb"BZh[1-9]1AY&SY")  # how the packed text of a stream of bzip2 begins
 _OBJECT: Final = re.compile(rb"<(node|way|relation|changeset)\b")
 _BOX: Final = re.compile(rb"<(bounds?)\s([^<>]*)>")
@@ -67,7 +66,8 @@ def read_boxes(path: Path) -> tuple[Box, ...]:
         head += data
         if _OBJECT.search(data) or len(head) > 4 * _CHUNK:
             break
-    head = _COMMENT.sub(b"", head)
+    before, *comments = head.split(b"<!--")
+    head = before + b"".join(comment.partition(b"-->")[2] for comment in comments)
     first = _OBJECT.search(head)
     found = []
     for kind, text in _BOX.findall(head[: first.start()] if first else head):

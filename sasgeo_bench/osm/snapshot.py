@@ -98,11 +98,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
             current = scratch / "at-date.osm.pbf"
             _cut_history(content, current, at=at if is_past else None)
             survey = _survey(current)
-        if survey.largest_id >= NEW_IDS:
-            message = (
-                f"{path.name} has ids of up to {survey.largest_id}, OpenStreetMap of 12 digits: use osmium renumber"
-            )
-            raise ExtractError(message)
+        _check_ids(path, survey, at=at if is_past else None)
         if survey.has_negative or survey.has_places:
             source, current = current, scratch / "plain.osm.pbf"
             _write_plain(source, current)
@@ -117,6 +113,16 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
             replicated_at=None if is_past else stated.replicated_at,
             warnings=tuple(warnings),
         )
+
+
+def _check_ids(path: Path, survey: "_Survey", *, at: dt.date | None) -> None:
+    """Refuse a history that begins after the day `at`, and ids of objects beyond those of OpenStreetMap."""
+    if at is not None and survey.largest_id == 0:
+        message = f"{path.name} holds nothing of {at} or before: choose a later date"
+        raise ExtractError(message)
+    if survey.largest_id >= NEW_IDS:
+        message = f"{path.name} has ids of up to {survey.largest_id}, OpenStreetMap of 12 digits: use osmium renumber"
+        raise ExtractError(message)
 
 
 def is_history(path: Path) -> bool:

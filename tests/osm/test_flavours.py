@@ -247,6 +247,8 @@ def test_a_history_is_told_by_its_header_whatever_its_name(tmp_path):
     assert houses(path, at=dt.date(2019, 1, 1)) == (0, [])
     with pytest.raises(ExtractError, match="give the date"):
         read_extract(path, GRID)
+    with pytest.raises(ExtractError, match="nothing of 2014-12-31 or before: choose a later date"):
+        read_extract(path, GRID, at=dt.date(2014, 12, 31))
 
 
 def test_what_is_only_named_like_a_history_is_read_as_it_stands(tmp_path):

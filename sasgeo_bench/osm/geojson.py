@@ -88,8 +88,8 @@ def scan_geojson(files: Sequence[Path], taxonomy: Taxonomy, *, tags: Mapping[str
                 found.append(_Found({**tags, **tags_of(feature)}, identity_of(feature, is_ogr=is_ogr), shape))
                 keys.update(list(_properties(feature)))
     parts: dict[tuple[Identity, int], int] = {}
-    lines, areas = ({_ring(each) for each in found if each.shape.geom_type in kinds} for kinds in (_LINES, _AREAS))
-    twins = (lines & areas) - {None}
+    rings = {_ring(each) for each in found if each.shape.geom_type in _LINES} - {None}
+    twins = rings & {_ring(each) for each in found if rings and each.shape.geom_type in _AREAS}
     for each in found:
         _take(each, scan, classifier, parts, is_twin=bool(twins) and _ring(each) in twins)
     _check_classed(scan, files, keys)

@@ -7,6 +7,7 @@ import mmap
 import re
 import zlib
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from typing import IO, Final, cast
 from xml.parsers import expat
@@ -168,14 +169,15 @@ class _Cleaner:
             raise RuntimeError(message)
 
     def _write_described(self) -> None:
-        """Write the ways that only members describe; a place is one node, wherever it occurs."""
-        numbers: dict[tuple[str, str] | None, int] = {}
+        """Write the ways that only members describe; a place is one node, and each that was cut off one of its own."""
+        numbers: dict[tuple[str, str], int] = {}
+        following = count(_DESCRIBED_IDS)
         for ref, places in self._members.items():
             if ref in self._ways or not any(places):
                 continue
             nodes = []
             for place in places:
-                number = numbers.setdefault(place, _DESCRIBED_IDS + len(numbers))
+                number = numbers.setdefault(place, next(following)) if place else next(following)
                 at = "" if place is None else f" lat={quoteattr(place[0])} lon={quoteattr(place[1])}"
                 nodes.append(f'<nd ref="{number}"{at}/>')
             self._out.write(f"<way id={quoteattr(ref)}>{''.join(nodes)}</way>\n")

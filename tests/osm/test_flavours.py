@@ -196,6 +196,18 @@ def test_places_inside_members_are_read(with_ways, tmp_path):
     assert houses(town.write(tmp_path / "a.osm")) == (8400, [999])
 
 
+def test_a_member_that_was_cut_off_at_both_ends_is_no_ring(tmp_path):
+    town, corners = Town(), square(0, 0, 100)
+    halves = "".join(
+        f'<member type="way" ref="{number}" role="outer"><nd/>{geom(half)}<nd/></member>'
+        for number, half in ((800, corners[:3]), (801, corners[3:]))
+    )
+    tags = '<tag k="type" v="multipolygon"/><tag k="building" v="yes"/>'
+    town.relations.append(f'<relation id="999">{halves}{tags}</relation>')
+    assert houses(town.write(tmp_path / "a.osm")) == (0, [])
+    assert read_extract(tmp_path / "a.osm", GRID).drops == {"relation with no closed ring left": 1}
+
+
 def test_ways_that_carry_the_places_of_their_nodes_need_no_nodes(tmp_path):
     town = Town()
     corners = square(0, 0)

@@ -6,69 +6,168 @@ Record them before the change and compare after it, each time into an empty fold
     python benchmarks/unchanged.py --out before --record before.json
     python benchmarks/unchanged.py --out after --against before.json
 
-It drives the program as a user would, so that no move of a module concerns it: builds a town and, where its extract is
-there, Vaduz; draws every suite on both; carries out the demo; scores the stored boards again. About fifteen minutes;
-with --quick, which makes no board, about two.
+It drives the program as a user would, so that no move of a module concerns it. It builds two towns and, where its
+extract is there, Vaduz; draws every suite on them, pictures and flights included, and some queries by a private seed;
+releases a town; carries out the demo and stores it; submits to it and enters it; scores every stored board again and
+publishes one. With --quick it builds and draws alone.
+
+A fingerprint is a SHA-256, and its name begins with its kind: `file` of bytes; `table` of a column of a table, for each
+matcher by itself where there are several; `words` of a text in which hashes, and where times are in it all numbers, are
+left out. So what goes is named column by column and matcher by matcher, and `--kinds table file` passes over words.
 """
 
 import argparse
 import hashlib
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import pandas as pd
 
+KINDS: Final = ("file", "table", "words")
+REGIONS: Final = ("town-riverside", "town-suburb", "vaduz")
 STORED: Final = Path(__file__).parents[1] / "docs" / "results"
-REGIONS: Final = ("town-riverside", "vaduz")
+PUBLISHED: Final = "systems-objects"
+PRIVATE: Final = "314159265358979323846264338327950288419716939937510"
 # What depends on the machine or the code, in the tables of a board: figures of time and storage, and the code's hash.
-_MEASURED: Final = r"latency|seconds|_s$|peak|memory|cpu|map_|bytes|^prepare$|^index$|^hash$"
+_MEASURED: Final = r"latency|seconds|_s$|peak|memory|cpu|map_|bytes|^prepare$|^index$|^hash$|sha256|version|created"
+_HASH: Final = re.compile(r"\b[0-9a-f]{6,64}\b")
+_NUMBER: Final = re.compile(r"\d[\d.,]*")
+_TEXTS: Final = (".csv", ".html", ".json", ".md", ".py", ".svg", ".tex", ".toml")
+_PASSED_OVER: Final = (".lock",)
+_ROOTLESS: Final = ("new-matcher", "submit", "validate")  # commands without --out
+
+Prints = Iterator[tuple[str, str]]
 
 
-def make(out: Path, *, is_quick: bool) -> Iterator[tuple[str, str]]:
+@dataclass(frozen=True, kw_only=True)
+class Program:
+    """The installed program, and the root of what it builds.
+
+    It keeps what each command says, with its status.
+    """
+
+    out: Path
+    said: dict[str, str] = field(default_factory=dict)
+
+    def run(self, *words: str, at: Path | None = None) -> bool:
+        """Run a command, in a working folder; return whether it ends with status 0."""
+        print("sasgeo-bench", *words, file=sys.stderr, flush=True)
+        root = () if words[0] in _ROOTLESS else ("--out", str(self.out))
+        command = [str(Path(sys.executable).with_name("sasgeo-bench")), *words, *root]
+        ended = subprocess.run(command, check=False, cwd=at, capture_output=True, text=True)  # noqa: S603 - our own program
+        said, name = (text.replace(str(self.out), "OUT") for text in (ended.stdout, " ".join(words)))
+        self.said[name] = f"{ended.returncode}\n{_masked(said, is_measured=True)}"
+        if ended.returncode:
+            print(ended.stderr[-2000:], file=sys.stderr, flush=True)
+        return ended.returncode == 0
+
+
+def make(out: Path, *, is_quick: bool) -> Prints:
     """Run the program, and yield name and SHA-256 of everything that it has made."""
-    regions = [name for name in REGIONS if _runs("build-region", name, "--out", str(out))]
+    program = Program(out=out)
+    yield from _places(program)
+    if not is_quick:
+        yield from _demo(program)
+        yield from _stored(program)
+    for command, text in program.said.items():
+        yield f"words: {command}", _sha256(text.encode())
+
+
+def _places(program: Program) -> Prints:
+    """Regions, every suite on them, queries of a private seed, and a release."""
+    out = program.out
+    regions = [name for name in REGIONS if program.run("build-region", name)]
     for name in regions:
         yield from _files(out, out / "regions" / name)
-        words = ("make-queries", "--regions", name, "--n", "2", "--up-to", "--skip", "--out", str(out))
-        if not _runs(*words):
-            sys.exit(f"no queries could be drawn on {name}")
-    for folder in ("tasks", "truth"):
+        program.run("make-queries", "--regions", name, "--n", "2", "--up-to", "--skip", "--jobs", "2")
+    seed = out / "own.seed"
+    seed.touch(mode=0o600)
+    seed.write_text(PRIVATE, encoding="utf-8")
+    words = ("--suite", "clean", "--suite", "instance-twins", "--regions", REGIONS[0], "--n", "2", "--up-to")
+    program.run("make-queries", *words, "--seed-file", str(seed))
+    for folder in ("tasks", "truth", "private/tasks", "private/truth"):
         yield from _files(out, out / folder)
-    if is_quick:
-        return
-    _runs("leaderboard", "demo", "--jobs", "2", "--out", str(out))
-    yield from _tables(out / "boards" / "demo", "demo", is_measured_here=True)
+    program.run("release", "--regions", REGIONS[0], "--into", str(out / "release"), "--date", "2026-01-01")
+    yield from _files(out, out / "release")
+
+
+def _demo(program: Program) -> Prints:
+    """The demo with its board, site and stored results; a submission to it, and an entry."""
+    out = program.out
+    results = out / "results" / "demo"
+    program.run("leaderboard", "demo", "--jobs", "2", "--results", str(results.parent))
+    yield from _board(out, out / "boards" / "demo", is_measured=True)
+    yield from _board(out, results, is_measured=True)
+    program.run("new-matcher", "my-matcher", "--into", str(out / "plugin"))
+    yield from _board(out, out / "plugin", is_measured=True)
+    source = out / "plugin" / "src"
+    program.run("enter", str(results), "--matcher", "my_matcher.matcher:MyMatcher", "--into", str(out / "entry"), at=source)
+    words = ("--predictions", str(out / "runs" / "my-matcher"), "--card", str(source / "my_matcher" / "card.toml"))
+    program.run("submit", *words, "--for", str(results), "--into", str(out / "submission"))
+    program.run("validate", "--predictions", str(out / "submission"), "--for", str(results))
+    words = ("--predictions", str(results), "--submissions", str(out / "submission"))
+    program.run("score", *words, "--name", "submitted")
+    for folder in ("entry", "submission", "boards/submitted"):
+        yield from _board(out, out / folder, is_measured=True)
+
+
+def _stored(program: Program) -> Prints:
+    """Stored boards, scored again; the site of one."""
+    out = program.out
     for board in sorted(STORED.iterdir()):
         if (board / "pack.json").is_file():
-            _runs("score", "--predictions", str(board), "--name", board.name, "--jobs", "2", "--out", str(out))
-            yield from _tables(out / "boards" / board.name, board.name, is_measured_here=False)
+            program.run("score", "--predictions", str(board), "--name", board.name, "--jobs", "2")
+            yield from _board(out, out / "boards" / board.name, is_measured=False)
+    program.run("publish", "--board", str(out / "boards" / PUBLISHED), "--into", str(out / "site"))
+    yield from _board(out, out / "site", is_measured=False)
 
 
-def _runs(*words: str) -> bool:
-    print("sasgeo-bench", *words, file=sys.stderr)
-    command = [str(Path(sys.executable).with_name("sasgeo-bench")), *words]
-    return subprocess.run(command, check=False, stdout=subprocess.DEVNULL).returncode == 0  # noqa: S603 - our own program
+def _files(root: Path, folder: Path) -> Prints:
+    for path in _all_files(folder):
+        yield f"file: {path.relative_to(root)}", _sha256(path.read_bytes())
 
 
-def _files(root: Path, folder: Path) -> Iterator[tuple[str, str]]:
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and not path.name.endswith(".lock"):
-            yield str(path.relative_to(root)), hashlib.sha256(path.read_bytes()).hexdigest()
+def _board(root: Path, folder: Path, *, is_measured: bool) -> Prints:
+    """Fingerprints of a board, a submission or a site; figures of time are passed over if they were measured now."""
+    for path in _all_files(folder):
+        name = str(path.relative_to(root))
+        if path.suffix == ".parquet":
+            yield from _columns(name, pd.read_parquet(path), is_measured=is_measured)
+        elif path.suffix in _TEXTS:
+            yield f"words: {name}", _sha256(_masked(path.read_text(encoding="utf-8"), is_measured=is_measured).encode())
+        elif not is_measured or "maps" not in path.parts:
+            yield f"file: {name}", _sha256(path.read_bytes())
 
 
-def _tables(board: Path, name: str, *, is_measured_here: bool) -> Iterator[tuple[str, str]]:
-    for path in sorted(board.glob("*.parquet")):
-        table = pd.read_parquet(path)
-        if is_measured_here:
-            table = table.loc[:, ~table.columns.str.contains(_MEASURED)]
-            if "metric" in table:
-                table = table[~table["metric"].str.contains(_MEASURED)]
-        text = table.to_csv(index=False, float_format="%.12g")
-        yield f"{name}: {path.name}", hashlib.sha256(text.encode()).hexdigest()
+def _columns(name: str, table: pd.DataFrame, *, is_measured: bool) -> Prints:
+    if is_measured:
+        table = table.loc[:, ~table.columns.str.contains(_MEASURED)]
+        if "metric" in table:
+            table = table[~table["metric"].astype(str).str.contains(_MEASURED)]
+    parts = table.groupby("matcher", sort=True, observed=True) if "matcher" in table else [("", table)]
+    for matcher, part in parts:
+        for column in part:
+            text = part[column].to_csv(index=False, float_format="%.12g")
+            yield f"table: {name}: {matcher}: {column}".replace(": :", ":"), _sha256(text.encode())
+
+
+def _masked(text: str, *, is_measured: bool) -> str:
+    text = _HASH.sub("#", text)
+    return _NUMBER.sub("0", text) if is_measured else text
+
+
+def _all_files(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*")) if path.is_file() and path.suffix not in _PASSED_OVER]
+
+
+def _sha256(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def main() -> None:
@@ -77,18 +176,21 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="an empty folder")
     parser.add_argument("--record", type=Path, help="JSON file to write")
     parser.add_argument("--against", type=Path, help="JSON file that was recorded before")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="of fingerprints to compare")
     parser.add_argument("--quick", action="store_true", help="regions and queries alone")
     words = parser.parse_args()
     if words.out.exists() and any(words.out.iterdir()):
         sys.exit(f"{words.out} is not empty: name another folder")
-    found = dict(make(words.out, is_quick=words.quick))
+    words.out.mkdir(parents=True, exist_ok=True)
+    found = dict(make(words.out.resolve(), is_quick=words.quick))
     if words.record:
         words.record.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     before = json.loads(words.against.read_text(encoding="utf-8")) if words.against else found
-    changed = sorted(name for name in before.keys() | found.keys() if before.get(name) != found.get(name))
+    names = {name for name in before.keys() | found.keys() if name.partition(":")[0] in words.kinds}
+    changed = sorted(name for name in names if before.get(name) != found.get(name))
     for name in changed:
-        print(f"{name}: {'changed' if name in before and name in found else 'in one of the two alone'}")
-    print(f"{len(found)} fingerprints, {len(changed)} changed")
+        print(f"{name}: {'changed' if name in before and name in found else 'gone' if name in before else 'new'}")
+    print(f"{len(names)} fingerprints, {len(changed)} changed")
     sys.exit(bool(changed))
 
 

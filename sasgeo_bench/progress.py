@@ -5,7 +5,7 @@ import logging
 import os
 import re
 import time
-from collections import defaultdict
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -205,7 +205,14 @@ def _found(work: Callable[[Item], Found], items: Sequence[Item], jobs: int) -> I
         return
     try:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_end_with_parent) as pool:
-            yield from pool.map(work, items)
+            tasks = deque(pool.submit(work, item) for item in items)
+            try:
+                while tasks:
+                    yield tasks.popleft().result()
+            except BaseException:
+                # `map` would cancel the tasks themselves, and a thread of the pool fail on them if a process dies, too.
+                pool.shutdown(wait=False, cancel_futures=True)
+                raise
     except BrokenProcessPool as error:
         message = (
             f"one of {jobs} processes died, by a signal or for want of memory: ask for fewer --jobs, and go on; "

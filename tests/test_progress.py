@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -50,6 +51,23 @@ def test_more_processes_than_a_computer_starts_are_refused(jobs) -> None:
 
 def test_results_come_in_order_from_several_processes():
     assert list(spread(abs, [-3, 2, -1], jobs=2)) == [3, 2, 1]
+
+
+def first_alone(number):
+    if number:
+        threading.Event().wait()
+
+
+@pytest.mark.parametrize("_", range(3))  # without the mend, two of three fail
+def test_who_is_interrupted_while_the_processes_end_too_hears_of_nothing_else(_):
+    """As where a system stops all at once; a thread that fails makes a test fail."""
+    found = spread(first_alone, range(8), jobs=2)
+    next(found)
+    for process in psutil.Process().children():
+        if "spawn_main" in " ".join(process.cmdline()):
+            process.terminate()
+    with pytest.raises(KeyboardInterrupt):
+        found.throw(KeyboardInterrupt())
 
 
 def test_a_killed_program_leaves_no_process_behind(tmp_path):

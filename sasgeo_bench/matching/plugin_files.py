@@ -25,6 +25,7 @@ from sasgeo_bench.files.paths import plain_file
 
 SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
 _MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
+_SITE_NAMES: Final = ("site-packages", "dist-packages")
 _HERE: Final = Path(__file__).resolve().parents[1]
 
 
@@ -139,10 +140,14 @@ def _name_of(found: Distribution) -> str:
 @lru_cache(maxsize=1)
 def _bases() -> tuple[Path, ...]:
     """Return the folders that the interpreter imports from by itself, without PYTHONPATH and the working folder."""
+    sites = _sites()
+    return tuple(dict.fromkeys(path.resolve() for path in (*sites, *_linked(sites), _HERE.parent)))
+
+
+def _sites() -> list[Path]:
     with_user = [site.getusersitepackages()] if site.ENABLE_USER_SITE else []
     known = (*site.getsitepackages(), *with_user, sysconfig.get_path("purelib"), sysconfig.get_path("platlib"))
-    sites = [Path(path) for path in dict.fromkeys(known) if Path(path).is_dir()]
-    return tuple(dict.fromkeys(path.resolve() for path in (*sites, *_linked(sites), _HERE.parent)))
+    return [Path(path) for path in dict.fromkeys(known) if Path(path).is_dir()]
 
 
 def _linked(sites: Sequence[Path]) -> Iterator[Path]:
@@ -182,7 +187,11 @@ def strange_file(module: str, paths: Sequence[str]) -> Path | None:
     return path
 
 
-def is_installed_file(path: Path) -> bool:
-    """Return whether a package or module lies among installed ones, and not in a folder of somebody's own."""
-    known = {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
-    return path.parent.resolve() in {*_bases(), *(Path(one).resolve() for one in known)}
+def is_installed(folder: Path) -> bool:
+    """Return whether a folder holds installed packages, and not code of somebody's own, installed for editing or not.
+
+    >>> is_installed(Path(os.__file__).parent), is_installed(Path("/home/me/my-matcher/src"))
+    (True, False)
+    """
+    known = (*_sites(), *(Path(sysconfig.get_path(name)) for name in ("stdlib", "platstdlib")))
+    return folder.name in _SITE_NAMES or folder.resolve() in {path.resolve() for path in known}

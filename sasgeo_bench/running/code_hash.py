@@ -17,7 +17,7 @@ from typing import Any, Final
 from sasgeo_bench.errors import MatchError, counted
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.card_file import CARD_FILE
-from sasgeo_bench.matching.plugin_files import Home, file_of, find_module, home_of, import_paths, is_installed_file
+from sasgeo_bench.matching.plugin_files import Home, file_of, find_module, home_of, import_paths, is_installed, is_shipped
 from sasgeo_bench.matching.plugins import MATCHERS, SEGMENTERS, TRACKERS, code_of
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
@@ -34,8 +34,10 @@ MOST_FILES: Final = 20_000  # of a plugin
 _MOST_STEPS: Final = 20  # from a name to where its class is
 _CACHES: Final = ("__pycache__",)
 _WORDS: Final = (CARD_FILE,)  # its version and places are told apart by themselves; all else in it is for readers
-_COMPILED: Final = (".pyc", ".pyo")
+_COMPILED: Final = ".pyc"
 _NO_CODE: Final = ("kind", "type_comment")  # fields of a syntax tree that change nothing
+_MOST_BITS: Final = 2000  # of a number that Python writes in decimal digits, however it is set up
+_IMPORTERS: Final = ("import_module", "__import__")
 
 
 def matcher_code(spec: str) -> str:
@@ -113,21 +115,29 @@ def _shape(node: object) -> Iterator[str]:
     >>> "".join(_shape(one)) == "".join(_shape(two))
     True
     """
-    if isinstance(node, ast.AST):
-        yield f"{type(node).__name__}("
-        for name, value in ast.iter_fields(node):
-            if name in _NO_CODE or value == [] or (value is None and not isinstance(node, ast.Constant)):
-                continue
-            yield f"{name}="
-            yield from _shape(value[1:] if name == "body" and _has_docstring(node) else value)
-        yield ")"
-    elif isinstance(node, list):
-        yield "["
-        for item in node:
-            yield from _shape(item)
-        yield "]"
-    else:
-        yield f"{node!r};"
+    left: list[tuple[str, object]] = [("", node)]  # what is said already, or else is still to be said, last first
+    while left:
+        text, item = left.pop()
+        if text:
+            yield text
+        elif isinstance(item, ast.AST):
+            left.append((")", None))
+            left += reversed([part for field in ast.iter_fields(item) for part in _field(item, *field)])
+            yield f"{type(item).__name__}("
+        elif isinstance(item, list):
+            left += [("]", None), *(("", one) for one in reversed(item))]
+            yield "["
+        else:
+            is_long = isinstance(item, int) and item.bit_length() > _MOST_BITS
+            yield f"{hex(item) if is_long else repr(item)};"
+
+
+def _field(node: ast.AST, name: str, value: object) -> list[tuple[str, object]]:
+    """Return what a field says, in the order of saying; nothing if it is empty or no code."""
+    if name in _NO_CODE or value == [] or (value is None and not isinstance(node, ast.Constant)):
+        return []
+    is_body = isinstance(value, list) and name == "body" and _has_docstring(node)
+    return [(f"{name}=", None), ("", value[1:] if is_body else value)]
 
 
 def _has_docstring(node: ast.AST) -> bool:
@@ -181,15 +191,25 @@ def _ways(module: str, name: str, paths: Sequence[str]) -> list[str]:
 
 
 def _named(label: str, path: Path) -> dict[str, Path]:
-    """Return a file, or the files of a folder, by name, without what Python itself has compiled, and hidden ones."""
+    """Return a file, or the files of a folder, by name, without what Python itself has compiled, and hidden ones.
+
+    A linked folder counts where it leads to one beside the package, which its process may read.
+    """
     if path.is_file():
         return {f"{label}{path.suffix}": path}
     found: dict[str, Path] = {}
-    for parent, folders, files in os.walk(path):
-        folders[:] = [one for one in folders if one not in _CACHES and not one.startswith(".")]
+    seen: set[Path] = set()
+    for parent, folders, files in os.walk(path, followlinks=True):
+        real = Path(parent).resolve()
+        if real in seen or not real.is_relative_to(path.parent):
+            folders.clear()
+            continue
+        seen.add(real)
+        folders[:] = sorted(one for one in folders if one not in _CACHES and not one.startswith("."))
         for one in files:
             inner = Path(parent, one)
-            if not one.startswith(".") and not one.endswith(_COMPILED) and one not in _WORDS and inner.is_file():
+            is_compiled = one.endswith(_COMPILED) and one[:-1] in files  # one without its source is what runs
+            if not one.startswith(".") and not is_compiled and one not in _WORDS and inner.is_file():
                 found[f"{label}/{inner.relative_to(path).as_posix()}"] = inner
         if len(found) > MOST_FILES:
             break
@@ -198,7 +218,8 @@ def _named(label: str, path: Path) -> dict[str, Path]:
 
 def _beside(home: Home, paths: Sequence[str]) -> dict[str, Path]:
     """Return the files of modules beside one of somebody's own, and that it imports; none of what is installed."""
-    if is_installed_file(home.path):
+    root = _root_of(home)
+    if is_installed(root) or is_shipped(home.name, paths):
         return {}
     found: dict[str, Path] = {}
     seen, left = {home.path}, [home]
@@ -207,12 +228,30 @@ def _beside(home: Home, paths: Sequence[str]) -> dict[str, Path]:
         own = _named(here.name, here.path).values()
         names = {name for path in own if path.suffix == ".py" for name in _imported(path)}
         package = here.name.rpartition(".")[0]
-        for other in (home_of(f"{package}{name}" if name[0] == "." else name, paths) for name in names):
-            if other is not None and other.path.parent == home.path.parent and other.path not in seen:
+        for other in (home_of(_resolved(name, package), paths) for name in names):
+            if other is not None and other.path not in seen and _root_of(other) == root:
                 seen.add(other.path)
                 found |= _named(other.name, other.path)
                 left.append(other)
     return found
+
+
+def _root_of(home: Home) -> Path:
+    """Return the folder on the import path that holds a module: above those without `__init__.py` that it lies in.
+
+    >>> str(_root_of(Home("plugin.inner.code", Path("/root/plugin/inner/code.py"))))
+    '/root'
+    """
+    above = home.path.parents
+    return above[min(home.name.count("."), len(above) - 1)]
+
+
+def _resolved(name: str, package: str) -> str:
+    """Return the whole name of a module that is imported within a package; empty where it leads out of it."""
+    try:
+        return resolve_name(name, package)
+    except ImportError:
+        return ""
 
 
 def _rooms(files: Iterable[Path]) -> set[str]:
@@ -246,9 +285,12 @@ def _imports_of(path: Path, size: int, changed_ns: int) -> frozenset[str]:
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
             known_as |= {alias.asname or _OURS for alias in node.names if alias.name == _OURS}
-        elif isinstance(node, ast.ImportFrom) and node.level <= 1:  # what lies farther up is in the package anyway
+        elif isinstance(node, ast.ImportFrom):
             source = f"{'.' * node.level}{node.module or ''}"
             found |= {source, *(f"{source.rstrip('.')}.{alias.name}" for alias in node.names)} - {"."}
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            called = getattr(node.func, "attr", getattr(node.func, "id", ""))
+            found |= {str(node.args[0].value)} - {""} if called in _IMPORTERS else set()
     for node in nodes:
         if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known_as:
             found.add(f"{_OURS}.{node.attr}")
@@ -260,10 +302,7 @@ def _absolute(node: ast.ImportFrom, module: str, *, is_package: bool) -> str:
     if not node.level:
         return str(node.module)
     package = module if is_package else module.rpartition(".")[0]
-    try:
-        return resolve_name("." * node.level + (node.module or ""), package)
-    except ImportError:
-        return ""
+    return _resolved("." * node.level + (node.module or ""), package)
 
 
 @lru_cache(maxsize=1)

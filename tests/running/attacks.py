@@ -65,7 +65,7 @@ def set_flags():
         )  # to be left out of backups
 
 
-NOBODY = 4_190_001  # the number of no group and no user: what finds nobody got through, and hurt nobody
+NOBODY = 4_190_001  # the number of no process, group and user: what finds nobody got through, and hurt nobody
 NUMBERS = {"ioprio_set": (251, 30), "move_pages": (279, 239)}
 
 
@@ -203,14 +203,15 @@ ATTACKS = {
     "signal another process": lambda: os.kill(PLACE["other"], signal.SIGCONT),
     "lower the limits of another process": lambda: resource.prlimit(PLACE["other"], resource.RLIMIT_CORE, (0, 0)),
     "read the limits of another process": lambda: resource.prlimit(PLACE["other"], resource.RLIMIT_CORE),
-    "slow another process": lambda: os.setpriority(os.PRIO_PROCESS, PLACE["other"], 5),
+    "slow a process": lambda: nobody(lambda: os.setpriority(os.PRIO_PROCESS, NOBODY, 5)),
     "slow a group": lambda: nobody(lambda: os.setpriority(os.PRIO_PGRP, NOBODY, 5)),
     "slow all processes of a user": lambda: nobody(lambda: os.setpriority(os.PRIO_USER, NOBODY, 5)),
-    "take a processor from another process": lambda: os.sched_setaffinity(PLACE["other"], os.sched_getaffinity(0)),
-    "schedule another process": lambda: os.sched_setscheduler(PLACE["other"], os.SCHED_BATCH, os.sched_param(0)),
-    "slow the files of another process": lambda: numbered("ioprio_set", 1, PLACE["other"], 2 << 13 | 7),
+    "take a processor from a process": lambda: nobody(lambda: os.sched_setaffinity(NOBODY, os.sched_getaffinity(0))),
+    "schedule a process": lambda: nobody(lambda: os.sched_setscheduler(NOBODY, os.SCHED_BATCH, os.sched_param(0))),
+    "rank a process": lambda: nobody(lambda: os.sched_setparam(NOBODY, os.sched_param(0))),
+    "slow the files of a process": lambda: nobody(lambda: numbered("ioprio_set", 1, NOBODY, 2 << 13 | 7)),
     "slow the files of a group": lambda: nobody(lambda: numbered("ioprio_set", 2, NOBODY, 2 << 13 | 7)),
-    "move the memory of another process": lambda: numbered("move_pages", PLACE["other"], 0, None, None, None, 0),
+    "move the memory of a process": lambda: nobody(lambda: numbered("move_pages", NOBODY, 0, None, None, None, 0)),
     "trace another process": lambda: call("ptrace", 0x4206, PLACE["other"], None, None),
     "read the memory of another process": lambda: look_into(PLACE["other"]),
     "hide our own memory": lambda: in_child(lambda: call("prctl", 4, 0, 0, 0, 0)),

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.matching import plugin_files
 from sasgeo_bench.matching.plugins import MATCHERS
 from sasgeo_bench.running import code_hash
 from sasgeo_bench.running.code_hash import SEGMENTER_TOOLS, TOOLS, digest_of, matcher_code, segmenter_code
@@ -84,6 +85,8 @@ def test_words_and_lines_change_no_hash_and_code_does(lay):
         ("from . import a", "from .. import a"),
         ("def f():\n  'doc'\n  'not'", "def f():\n  'doc'"),
         ("not = python", "not  = python"),
+        (f"x = 0x{'f' * 5000}", f"x = 0x{'f' * 4999}e"),
+        (f"x = {'a + ' * 2000} b", f"x = {'a + ' * 2000} c"),
     ],
 )
 def test_what_differs_as_code_differs_as_hash(lay, one, other):
@@ -120,6 +123,50 @@ def test_a_module_beside_it_that_it_imports_counts_and_another_does_not(lay):
     assert lay({"helper.py": "from deeper import x, y"}) != before
     before = lay({"deeper/__init__.py": "x = 1"})
     assert lay({"deeper/far.txt": "x"}) != before
+
+
+@pytest.mark.parametrize(
+    ("spec", "own", "name"),
+    [
+        ("a.b.plugin:Mine", "from a.c import helper", "a/c/helper.py"),  # none of the folders is a package
+        ("a.b.plugin:Mine", "from ..c import helper", "a/c/helper.py"),
+        ("plugin:Mine", "import lib.deep.code as c", "lib/deep/code.py"),
+        ("plugin:Mine", "def later():\n    return importlib.import_module('helper')", "helper.py"),
+        ("plugin:Mine", "x = __import__('helper')", "helper.py"),
+    ],
+)
+def test_whatever_way_a_module_beside_it_is_imported_it_counts(lay, spec, own, name):
+    before = lay({f"{spec.partition(':')[0].replace('.', '/')}.py": f"{own}\n{MODULE}", name: "x = 1"}, spec)
+    assert lay({name: "x = 2"}, spec) != before
+
+
+def test_what_is_installed_for_editing_counts_as_code_of_ones_own(lay, tmp_path, monkeypatch):
+    sites = tmp_path / "lib/site-packages"
+    monkeypatch.setattr(plugin_files, "_sites", lambda: [sites])
+    monkeypatch.setattr(plugin_files, "_bases", lambda: (sites, tmp_path / "src"))  # by a .pth file
+    monkeypatch.setattr(sys, "path", [str(sites), str(tmp_path / "src"), *sys.path])
+    for folder, counts in (("src", True), ("lib/site-packages", False)):
+        files = {f"{folder}/{folder[:3]}_plugin.py": f"import helper\n{MODULE}", f"{folder}/helper.py": "x = 1"}
+        before = lay(files, f"{folder[:3]}_plugin:Mine")
+        assert (lay({f"{folder}/helper.py": "x = 2"}, f"{folder[:3]}_plugin:Mine") != before) is counts, folder
+
+
+def test_a_linked_folder_beside_the_package_counts_and_one_elsewhere_or_around_does_not(lay, tmp_path):
+    before = lay({"here/plugin/__init__.py": MODULE, "here/models/a.npz": "1", "far/b.npz": "1"}, "here.plugin:Mine")
+    for link, target in (("far", "../../far"), ("me", "."), ("root", "../..")):
+        (tmp_path / "here/plugin" / link).symlink_to(target)
+        assert lay({}, "here.plugin:Mine") == before, link
+    (tmp_path / "here/plugin/models").symlink_to("../models")
+    linked = lay({}, "here.plugin:Mine")
+    assert linked != before
+    assert lay({"here/models/a.npz": "2"}, "here.plugin:Mine") != linked
+
+
+def test_compiled_code_counts_where_no_source_of_it_is_there(lay):
+    before = lay({"plugin/__init__.py": MODULE, "plugin/core.pyc": b"1"})
+    assert lay({"plugin/core.pyc": b"2"}) != before
+    before = lay({"plugin/core.py": "x = 1"})
+    assert lay({"plugin/core.pyc": b"3"}) == before
 
 
 def test_a_class_that_is_handed_on_counts_where_it_is(lay, tmp_path, monkeypatch):

@@ -85,8 +85,13 @@ GETS_THROUGH = {
     "signal another process": OPEN,
     "lower the limits of another process": UNFILTERED,
     "read the limits of another process": UNFILTERED,
+    "slow a process": UNFILTERED,
     "slow a group": UNFILTERED,
     "slow all processes of a user": UNFILTERED,
+    "take a processor from a process": UNFILTERED,
+    "schedule a process": UNFILTERED,
+    "rank a process": UNFILTERED,
+    "slow the files of a process": UNFILTERED,
     "slow the files of a group": UNFILTERED,
     "hide our own memory": UNFILTERED,
     "take covers off": set(),
@@ -102,9 +107,7 @@ GETS_THROUGH = {
 # What nothing at all refuses depends on the machine: some refuse to trace others, or are run by nobody special.
 BY_MACHINE = {
     *("trace another process", "read the memory of another process", "change the kernel's settings"),
-    *("change the mode of our own program", "keep memory secret", "move the memory of another process"),
-    *("slow another process", "take a processor from another process"),
-    *("schedule another process", "slow the files of another process"),
+    *("change the mode of our own program", "keep memory secret", "move the memory of a process"),
 }
 # What does not work within, by mode, and is no attack: where /dev/shm is the system's, and where modes are refused.
 LOST = {

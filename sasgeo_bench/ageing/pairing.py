@@ -12,7 +12,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.regions.shapes import overlapping
+from sasgeo_bench.geometry.pairs import overlapping
 
 MATCH_IOU: Final = 0.3  # of two areas that are one thing
 NEAR_M: Final = 5.0  # roads in OSM lie within about 6 m of the truth, and so do re-drawn ones

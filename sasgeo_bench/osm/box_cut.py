@@ -10,6 +10,7 @@ import osmium
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.coverage import FULL_SHARE, LONGEST_M, M_PER_DEG
 from sasgeo_bench.osm.mapped import find_shore
 from sasgeo_bench.osm.scan import Scan
@@ -90,7 +91,7 @@ def _ends_inside(
     ends = np.array([end for _, of_way in ways for end in of_way], dtype=object)
     ends = ends[shapely.contains(box, ends) & (shapely.distance(ends, shapely.boundary(box)) > LONGEST_M)]
     ends = ends[(shapely.distance(ends, shapely.boundary(area)) <= LONGEST_M) | ~shapely.intersects(ends, area)]
-    end, _ = shapely.STRtree(objects).query(ends, predicate="intersects")
+    end, _ = overlapping(ends, objects, predicate="intersects")
     loose = ends[np.bincount(end, minlength=len(ends)) <= 1]
     outside = int((~shapely.intersects(loose, area)).sum())
     return outside > _MOST_OUTSIDE or len(loose) > _MOST_ENDS * crossings
@@ -107,7 +108,7 @@ def _filled_share(objects: Geometries, area: shapely.Geometry, box: shapely.Geom
         return 1.0
     is_filled = shapely.intersects(probes, area)
     areas = objects[shapely.get_dimensions(objects) == 2]  # noqa: PLR2004 - polygons
-    probe, _ = shapely.STRtree(areas).query(probes, predicate="intersects")
+    probe, _ = overlapping(probes, areas, predicate="intersects")
     is_filled[probe] = True
     return float(is_filled.mean())
 

@@ -2,7 +2,7 @@
 """Shape and proximity of many geometries at once: bends of lines, orientation, groups and neighbours."""
 
 from dataclasses import dataclass
-from typing import Final, Literal
+from typing import Final
 
 import numpy as np
 import shapely
@@ -11,19 +11,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
-from sasgeo_bench.errors import ShapeError
+from sasgeo_bench.geometry.pairs import overlapping
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Shapes = NDArray[np.object_]
-Predicate = Literal["intersects", "crosses"]
 
 PLANE: Final = 2
 RING_CORNERS: Final = 5  # of a closed rectangle
 TRIANGLE: Final = 3
-MOST_PAIRS: Final = 5_000_000  # of shapes that overlap, or
-PAIRS_EACH: Final = 50  # times as many as there are shapes
-_AT_ONCE: Final = 10_000_000  # pairs that one step may find
 CO_CIRCULAR: Final = 1e-6  # sum of two cotangents that counts as 0, dimensionless
 
 
@@ -141,30 +137,6 @@ def _near_pairs(shapes: Shapes, gap_m: float) -> Ints:
     grown = shapely.box(*(shapely.bounds(shapes) + np.array([-gap_m, -gap_m, gap_m, gap_m])).T)
     pairs = overlapping(grown, shapes).T
     return np.asarray(pairs[pairs[:, 0] < pairs[:, 1]], dtype=np.int64)
-
-
-def overlapping(these: Shapes, others: Shapes, *, predicate: Predicate | None = None) -> Ints:
-    """Return rows of shapes, of which bounding boxes meet or a predicate holds, shape (2, K), in the order of `these`.
-
-    Shapes of a place overlap few others. Where each overlaps each, as one that is drawn thousands of times does, the
-    pairs would fill the memory: raise `ShapeError` if there are more than `MOST_PAIRS` and `PAIRS_EACH` for each shape.
-
-    >>> overlapping(shapely.box([0, 20], 0, [9, 29], 9), shapely.box([5, 50], 0, [6, 51], 9)).tolist()
-    [[0], [0]]
-    """
-    tree, count = shapely.STRtree(others), max(len(these), len(others))
-    step, most, found, total = max(1, _AT_ONCE // max(count, 1)), max(MOST_PAIRS, PAIRS_EACH * count), [], 0
-    for start in range(0, max(len(these), 1), step):
-        pairs = tree.query(these[start : start + step], predicate=predicate) + np.array([[start], [0]])
-        total += pairs.shape[1]
-        found.append(pairs)
-        if total > most:
-            message = (
-                f"more than {most} pairs of {len(these)} and {len(others)} shapes overlap: is one thing drawn many "
-                "times over? Take it out of the map"
-            )
-            raise ShapeError(message)
-    return np.concatenate(found, axis=1)
 
 
 def delaunay_pairs(en_m: Floats, longest_m: float) -> Ints:

@@ -17,7 +17,15 @@ from typing import Any, Final
 from sasgeo_bench.errors import MatchError, counted
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.card_file import CARD_FILE
-from sasgeo_bench.matching.plugin_files import Home, file_of, find_module, home_of, import_paths, is_installed, is_shipped
+from sasgeo_bench.matching.plugin_files import (
+    Home,
+    file_of,
+    find_module,
+    home_of,
+    import_paths,
+    is_installed,
+    is_shipped,
+)
 from sasgeo_bench.matching.plugins import MATCHERS, SEGMENTERS, TRACKERS, code_of
 
 _PACKAGE: Final = Path(__file__).resolve().parents[1]

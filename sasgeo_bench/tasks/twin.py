@@ -13,8 +13,8 @@ import shapely
 import shapely.affinity
 from numpy.typing import NDArray
 
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.features import check_features
-from sasgeo_bench.regions.shapes import overlapping
 
 if TYPE_CHECKING:
     import geopandas as gpd

@@ -1,22 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """Bends, long sides, groups and neighbours: properties first, then cases drawn by hand."""
 
-import tracemalloc
-
 import numpy as np
 import pytest
 import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.regions import shapes
 from sasgeo_bench.regions.shapes import (
     delaunay_pairs,
     find_bends,
     groups_within,
     long_sides,
-    overlapping,
     touching_pairs,
 )
 
@@ -110,26 +105,3 @@ def test_neighbours_in_a_row_beside_others_make_flat_triangles_and_no_noise():
     row = [(-25.0, -36.0), (-28.5, -31.5), (-31.3, -27.9), (-32.0, -27.0)]
     pairs = delaunay_pairs(np.array([*row, (18.0, -41.0), (54.0, 0.0), (-55.0, 46.0)]), 200.0).tolist()
     assert all(pair in pairs for pair in ([0, 1], [1, 2], [2, 3]))
-
-
-def test_one_shape_drawn_many_times_is_refused_with_a_count_and_many_that_overlap_few_are_not(monkeypatch):
-    monkeypatch.setattr(shapes, "MOST_PAIRS", 1000)
-    monkeypatch.setattr(shapes, "_AT_ONCE", 3000)  # several steps
-    same = np.full(60, shapely.box(0, 0, 9, 9))
-    row = shapely.box(np.arange(600) * 8.0, 0, np.arange(600) * 8.0 + 9, 9)
-    for find in (touching_pairs, lambda given: groups_within(given, 1.0), lambda given: overlapping(given, given)):
-        with pytest.raises(ShapeError, match=r"more than 3000 pairs of 60 and 60 shapes overlap.*drawn many times"):
-            find(same)
-        find(row)
-    assert touching_pairs(row).tolist() == [[at, at + 1] for at in range(599)]
-    both = overlapping(row, row[::2], predicate="intersects")
-    assert sorted(both.T.tolist()) == np.argwhere(abs(np.arange(600)[:, None] - np.arange(0, 600, 2)) < 2).tolist()
-
-
-def test_memory_for_shapes_that_overlap_grows_with_their_number_alone():
-    same = np.full(20_000, shapely.box(0, 0, 9, 9))
-    tracemalloc.start()
-    with pytest.raises(ShapeError, match="more than 5000000 pairs of 20000 and 20000 shapes"):
-        touching_pairs(same)
-    assert tracemalloc.get_traced_memory()[1] < 1_000_000_000  # all pairs of them would take 6.4 GB
-    tracemalloc.stop()

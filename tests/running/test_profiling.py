@@ -147,7 +147,8 @@ def test_a_page_is_written_whole_and_replaces_none_but_a_profile(slowing, tmp_pa
     assert "<script>" not in text
     style = re.search(r"<style>(.*)</style>", text, re.DOTALL)[1]
     digest = base64.b64encode(hashlib.sha256(style.encode()).digest()).decode()
-    assert f"default-src 'none'; style-src 'sha256-{digest}'" in text  # else a browser leaves out its style
+    policy = f"""<meta http-equiv="Content-Security-Policy" content="default-src 'none'; style-src 'sha256-{digest}';"""
+    assert policy in text  # else a browser leaves out its style
     assert "1 timeout" in text
     assert "OpenStreetMap contributors" in text
     said = json.loads((tmp_path / "mine" / RECORD).read_text(encoding="utf-8"))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.sensing import ground
 from sasgeo_bench.sensing.ground import Dem, Plane, read_dem
 
 GRID = Grid(epsg=32632, west_m=500_000.0, north_m=5_200_100.0, cell_size_m=10.0, rows=10, cols=12)
@@ -148,6 +149,13 @@ def test_a_file_that_is_no_ground_is_refused_on_one_line(tmp_path, how, hint):
     with pytest.raises(CameraError, match=hint) as caught:
         read_dem(path, GRID)
     assert "\n" not in str(caught.value)
+
+
+def test_a_ground_that_gdal_alone_finds_no_way_from_is_refused_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(ground, "_check_source", lambda *_: None)  # asks a library with tables of its own
+    path = write_dem(tmp_path / "dem.tif", slope_of(), crs="IAU_2015:30100")
+    with pytest.raises(CameraError, match="cannot be transformed to EPSG:32632"):
+        read_dem(path, GRID)
 
 
 def test_heights_in_an_unknown_unit_are_refused(tmp_path):

@@ -291,7 +291,7 @@ def check_files(folder: Path) -> None:
 
 def _check_file(path: Path, record: FileRecord) -> None:
     """Refuse a file that differs from its record: nothing else protects a raster, or the footer of a GeoParquet."""
-    if not path.is_file() or file_record(path) != record:
+    if not path.is_file() or path.stat().st_size != record.bytes or file_record(path) != record:
         message = f"{path} is missing, or not what {MANIFEST} says: {_MEND}"
         raise StoreError(message)
 

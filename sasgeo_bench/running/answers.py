@@ -210,14 +210,16 @@ class Watch:
         """Record that all rows are written, and their cost."""
 
 
-def answer(plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch) -> Cost:
+def answer(
+    plan: RunPlan, parts: Sequence[RunPart], *, jobs: int, watch: Watch, patience: Patience | None = None
+) -> Cost:
     """Ask the pending queries of some tasks in at most `jobs` processes, and write the rows.
 
-    Tasks that search one map share processes; no process has more than one map. Raise `StoreError` if rows cannot be
-    written; written ones stay.
+    Tasks that search one map share processes; no process has more than one map. `patience` is shared with other calls
+    of the same run. Raise `StoreError` if rows cannot be written; written ones stay.
     """
     groups = [[_Writer(part, watch=watch) for part in group] for group in by_map(plan.request.spec, parts)]
-    patience = Patience()
+    patience = Patience() if patience is None else patience
     maps = [_Map(plan, group, patience) for group in groups]
     writers = [writer for group in groups for writer in group]
     schedule = Schedule([(place.groups(), place.count) for place in maps])

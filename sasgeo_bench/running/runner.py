@@ -6,10 +6,11 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
+from uuid import uuid4
 
 from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.files.folders import locked
@@ -20,6 +21,7 @@ from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running import prediction_files, prediction_rows
 from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Watch, answer, pool_costs
+from sasgeo_bench.running.patience import Patience
 from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map, unit_of_task, whole_units
 from sasgeo_bench.running.training import trained
 from sasgeo_bench.tasks import task_files
@@ -46,7 +48,7 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
         for ids in _chunks(part.left, threads, unit_of_task(part.about)):
             numbers.append(number)
             chunks.append(replace(part, left=ids, asked={name: part.asked[name] for name in ids}))
-    for at, cost in done_on(client, partial(_answer_chunk, bare), chunks):
+    for at, cost in done_on(client, partial(_answer_chunk, bare, uuid4().hex), chunks):
         yield numbers[at], len(chunks[at].left), cost
 
 
@@ -64,9 +66,19 @@ def _chunks(ids: Sequence[str], threads: int, unit_of: Callable[[str], str]) -> 
         yield tuple(chunk)
 
 
-def _answer_chunk(plan: RunPlan, part: RunPart) -> Cost:
-    """Ask one chunk in the process of a dask worker, except queries that an earlier try of it has answered."""
-    return answer(plan, _still_left(plan, [part]), jobs=1, watch=Watch())
+def _answer_chunk(plan: RunPlan, token: str, part: RunPart) -> Cost:
+    """Ask one chunk in the process of a dask worker, except queries that an earlier try of it has answered.
+
+    `token` tells one run from another, which the worker may have taken part in before.
+    """
+    return answer(plan, _still_left(plan, [part]), jobs=1, watch=Watch(), patience=_patience_of(token))
+
+
+@lru_cache(maxsize=16)
+def _patience_of(token: str) -> Patience:
+    """Return the patience of this process with the matcher of one run, over all chunks of it."""
+    del token
+    return Patience()
 
 
 MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256

@@ -19,7 +19,8 @@ from shapely import affinity
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError, StoreError
 from sasgeo_bench.osm.features import DTYPES, fingerprint, make_features
 from sasgeo_bench.osm.read import Reading
-from sasgeo_bench.regions import build
+from sasgeo_bench.files.folders import FileRecord
+from sasgeo_bench.regions import build, region_files
 from sasgeo_bench.regions.build import build_made, build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT, LayerBits
 from sasgeo_bench.regions.layers import OUTSIDE, read_bits
@@ -266,6 +267,14 @@ def test_a_manifest_without_a_file_of_a_region_is_refused(there):
     path.write_text(json.dumps(json.loads(path.read_text()) | {"files": {}}))
     with pytest.raises(StoreError, match=r"is damaged \(its files lack layers.tif\): build the region again"):
         read_manifest(plan.folder)
+
+
+def test_a_file_of_another_size_is_refused_before_all_of_it_is_read(tmp_path, monkeypatch):
+    with (tmp_path / "layers.tif").open("wb") as file:
+        file.truncate(10**12)
+    monkeypatch.setattr(region_files, "file_record", pytest.fail)
+    with pytest.raises(StoreError, match=r"layers.tif is missing, or not what region.json says"):
+        region_files._check_file(tmp_path / "layers.tif", FileRecord(sha256="0" * 64, bytes=1))
 
 
 @pytest.mark.parametrize(

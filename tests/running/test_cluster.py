@@ -13,6 +13,7 @@ from sasgeo_bench import progress
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.running import prediction_files, runner
 from sasgeo_bench.running.answers import pool_costs
+from sasgeo_bench.running.patience import Patience
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
@@ -91,7 +92,17 @@ def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
     plan = plan_run(request_of(task, tmp_path))
     asked = task_files.read_asked(task)
     chunk = replace(plan.parts[0], left=tuple(asked)[:5], asked=asked)
-    assert runner._answer_chunk(plan, chunk).counts == {"ok": 2}
+    assert runner._answer_chunk(plan, "one", chunk).counts == {"ok": 2}
+
+
+def test_chunks_of_a_run_give_up_a_matcher_that_hangs_together_and_another_run_does_not(task, tmp_path, monkeypatch):
+    monkeypatch.setattr(Patience.__init__, "__kwdefaults__", {"most_late": 3})
+    plan = plan_run(request_of(task, tmp_path, name="Hangs", limits=Limits(match_s=0.01)))
+    asked = task_files.read_asked(task)
+    chunks = [replace(plan.parts[0], left=tuple(asked)[at : at + 2], asked=asked) for at in (0, 2, 4)]
+    with threaded():
+        costs = [runner._answer_chunk(plan, token, chunk) for token, chunk in zip(("a", "a", "b"), chunks, strict=True)]
+    assert [cost.messages["timeout"].startswith("given up after 3") for cost in costs] == [False, True, False]
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scratch folders in the system's temporary one, which the next program removes if theirs was killed."""
+"""Scratch folders, in the system's temporary one or elsewhere: the next program removes those of one that was killed."""
 
 import fcntl
 import os
@@ -17,13 +17,13 @@ _NEW: Final = ".sasgeo-new-"  # until it is locked: nobody sweeps a folder of th
 
 
 @contextmanager
-def scratch_folder(what: str) -> Iterator[Path]:
+def scratch_folder(what: str, *, within: Path | None = None) -> Iterator[Path]:
     """Yield an empty resolved folder, and remove it at the end, whatever is in it then.
 
     The folder is locked while its program lives: an unlocked one is a leftover, and is removed when another program
-    makes its first one. `what` is a word of the name.
+    makes its first one there. `what` is a word of the name, and `within` a folder other than the system's.
     """
-    root = Path(tempfile.gettempdir()).resolve()
+    root = Path(tempfile.gettempdir() if within is None else within).resolve()
     _sweep_once(root)
     folder = Path(tempfile.mkdtemp(prefix=f"{_NEW}{what}-", dir=root))
     lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

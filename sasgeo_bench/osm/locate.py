@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from threading import Event, Thread
 from typing import Annotated, Any, Final, Literal, Self
 from urllib.parse import urlsplit
@@ -25,6 +24,7 @@ from pydantic import (
 from sasgeo_bench.config import Document, Line
 from sasgeo_bench.errors import ExtractError
 from sasgeo_bench.files.folders import sha256_of
+from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.progress import QUIET
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
@@ -212,7 +212,7 @@ def _download(extract: Extract, url: str) -> Path:
     pooch.get_logger().setLevel("WARNING")  # else it prints the path of its temporary file
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=folder, prefix=".download-") as scratch:
+        with scratch_folder("download", within=folder) as scratch:
             # pooch checks one hash, and several may be accepted here: so it gets none, and we check.
             got = Path(pooch.retrieve(url, known_hash=None, fname=extract.file, path=scratch, downloader=load))
             found = sha256_of(got)

@@ -10,6 +10,7 @@ import pooch
 import pytest
 
 from sasgeo_bench.errors import ExtractError
+from sasgeo_bench.files.scratch import PREFIX
 from sasgeo_bench.osm import locate
 from sasgeo_bench.osm.locate import Extract, TownEntry, extract_folders, find_extract
 
@@ -95,8 +96,10 @@ def test_offline_one_line_names_the_file_its_hash_and_where_to_put_it(tmp_path, 
 
 
 def test_a_download_lands_in_the_cache_and_is_found_there_next_time(server, cache):
+    (cache / f"{PREFIX}download-dead").mkdir(parents=True)  # of a program that was killed meanwhile
     assert find_extract(wanted(urls=(server,))) == cache / "a.osm.pbf"
     assert find_extract(wanted()) == cache / "a.osm.pbf"
+    assert [path.name for path in cache.iterdir()] == ["a.osm.pbf"]
 
 
 def test_a_download_with_another_hash_is_refused_and_leaves_nothing(server, cache):

@@ -18,6 +18,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
 _FEW: Final = 8  # known names, or faults, that an error lists in full
+_MOST_BYTES: Final = 10_000_000  # of a file that somebody writes by hand
 LONGEST_LINE: Final = 300
 
 
@@ -174,9 +175,11 @@ def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
 
 
 def _text_of(path: Path) -> str:
-    """Read a file; raise `OSError` for a pipe, which would be waited for."""
+    """Read a file; raise `OSError` for a pipe, which would be waited for, and for what nobody writes by hand."""
     if path.exists() and not path.is_file():
         raise OSError(errno.EINVAL, "it is no plain file", str(path))
+    if path.exists() and path.stat().st_size > _MOST_BYTES:
+        raise OSError(errno.EFBIG, f"it has more than {_MOST_BYTES} bytes", str(path))
     return path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark
 
 

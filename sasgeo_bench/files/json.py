@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.files.paths import read_bounded
 from sasgeo_bench.texts import plain
 
 MOST_BYTES: Final = 50_000_000
@@ -44,20 +44,11 @@ def read_json(path: Path, *, mend: str, most_bytes: int = MOST_BYTES) -> Any:  #
     `mend` is the advice of the message, as in "submit again".
     """
     try:
-        return parse_json(_read(path, most_bytes))
+        return parse_json(read_bounded(path, most_bytes))
     except (OSError, ValueError) as error:
         text = plain(getattr(error, "strerror", None) or str(error))[:_MOST_QUOTED]
         message = f"{path} is damaged ({text}): {mend}"
         raise StoreError(message) from error
-
-
-def _read(path: Path, most_bytes: int) -> bytes:
-    with plain_file(path).open("rb") as source:
-        data = source.read(most_bytes + 1)
-    if len(data) > most_bytes:
-        message = f"it has more than {most_bytes} bytes"
-        raise ValueError(message)
-    return data
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

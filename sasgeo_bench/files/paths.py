@@ -51,3 +51,16 @@ def plain_file(path: Path) -> Path:
     if kind is not None:
         raise OSError(errno.EINVAL, f"it is {kind}, a plain file is needed", str(path))
     return path
+
+
+def read_bounded(path: Path, most_bytes: int) -> bytes:
+    """Return the bytes of a file; raise `OSError` if it has more than so many, or as `plain_file` does.
+
+    >>> read_bounded(Path(__file__), 10**6)[:6]
+    b'# SPDX'
+    """
+    with plain_file(path).open("rb") as source:
+        data = source.read(most_bytes + 1)
+    if len(data) > most_bytes:
+        raise OSError(errno.EFBIG, f"it has more than {most_bytes} bytes", str(path))
+    return data

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scratch folders, in the system's temporary one or elsewhere: the next program removes those of one that was killed."""
+"""Scratch folders, in the system's temporary one or elsewhere; those of a killed program are removed by the next."""
 
 import fcntl
 import os

@@ -29,8 +29,8 @@ from sasgeo_bench.files.folders import (
     replace_folder,
     sha256_of,
 )
-from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.files.paths import given_path, plain_file
+from sasgeo_bench.files.json import MOST_BYTES, parse_json
+from sasgeo_bench.files.paths import given_path, plain_file, read_bounded
 from sasgeo_bench.texts import json_text, one_line
 
 if TYPE_CHECKING:
@@ -197,7 +197,7 @@ def _content_of(folder: Path) -> str:
     """
     for name, keys in _CONTENT.items():
         with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
-            about: Any = parse_json(plain_file(folder / name).read_bytes())
+            about: Any = parse_json(read_bounded(folder / name, MOST_BYTES))
             return "/".join(str(about[key]) for key in keys)
     return ""
 

@@ -21,9 +21,9 @@ from sasgeo_bench.files.folders import (
     fresh_folder,
     locked,
 )
-from sasgeo_bench.files.json import parse_json
+from sasgeo_bench.files.json import MOST_BYTES, parse_json
 from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.files.paths import read_bounded
 from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.scoring import acceptance, controls, protection
@@ -172,7 +172,7 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     Raise StoreError if there is none, or a file is damaged.
     """
     try:
-        data = plain_file(folder / BOARD).read_bytes()
+        data = read_bounded(folder / BOARD, MOST_BYTES)
         parse_record(data, BoardRecord)
         return dict(parse_json(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
     except StoreError:

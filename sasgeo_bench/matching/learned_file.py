@@ -8,8 +8,8 @@ from typing import Any, Final, Self
 
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
-from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.matching.matcher import check_learned
+from sasgeo_bench.files.paths import read_bounded
+from sasgeo_bench.matching.matcher import MOST_LEARNED_BYTES, check_learned
 from sasgeo_bench.texts import one_line
 
 FOLDER: Final = "learned"  # next to the suites of a run
@@ -68,7 +68,7 @@ def read_learned(path: Path) -> str | None:
         message = f"{path} is a folder, not a learned text: {WHERE}"
         raise StoreError(message)
     try:
-        return check_learned(plain_file(path).read_bytes().decode())
+        return check_learned(read_bounded(path, MOST_LEARNED_BYTES).decode())
     except FileNotFoundError:
         return None
     except (OSError, UnicodeDecodeError, MatchError) as error:

@@ -24,7 +24,8 @@ from sasgeo_bench.files.folders import (
     resolve_link,
     sha256_of,
 )
-from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.files.json import MOST_BYTES
+from sasgeo_bench.files.paths import read_bounded
 from sasgeo_bench.leaderboard.archive_record import ArchiveRecord, VersionRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
 from sasgeo_bench.running.prediction_rows import differing_columns, row_faults
@@ -58,7 +59,7 @@ def read_settings(folder: Path) -> dict[str, Any]:
     Raise `StoreError` if there are none, or they are damaged or of another schema.
     """
     with sound(folder):
-        data = plain_file(folder / PACK).read_bytes()
+        data = read_bounded(folder / PACK, MOST_BYTES)
         found = parse_record(data, VersionRecord).schema_version
         if found not in _READ:
             message = f"{folder} has schema version {found!r}, this version reads {SCHEMA_VERSION}: fetch them again"
@@ -121,7 +122,7 @@ def check_replaced(folder: Path) -> None:
         raise StoreError(message)
     if is_pack(folder):
         try:
-            listed = parse_record(plain_file(folder / PACK).read_bytes(), ArchiveRecord).files
+            listed = parse_record(read_bounded(folder / PACK, MOST_BYTES), ArchiveRecord).files
         except (OSError, ValueError):
             listed = None
         known, patterns = ({PACK}, _OLD_FILES) if listed is None else ({PACK, *listed}, ())

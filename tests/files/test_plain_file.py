@@ -101,6 +101,16 @@ def test_links_are_followed_and_sockets_and_devices_refused(tmp_path: Path, pipe
         assert plain_file(path) == path  # of these, the opening itself speaks
 
 
+@pytest.mark.parametrize("name", ["TOML", "JSON", "a learned text", "a board"])
+def test_a_file_of_a_hundred_gigabytes_is_refused_not_read(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "board.json"
+    with path.open("wb") as file:
+        file.truncate(10**11)
+    read = READERS.get(name, lambda path: read_board(path.parent))
+    with pytest.raises(SasgeoError, match=r"it has more than \d+ bytes"):
+        read(path)
+
+
 def unguarded(path: Path) -> Iterator[str]:
     """Reads of a file that do not go through `plain_file`, as `file:line: code`."""
     file = path.relative_to(CODE).as_posix()

@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import Delaunay
 
-from sasgeo_bench.geometry.pairs import overlapping
+from sasgeo_bench.geometry.pairs import overlapping as overlapping  # noqa: PLC0414 - for `network`
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

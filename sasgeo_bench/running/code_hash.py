@@ -136,16 +136,16 @@ def _shape(node: object) -> Iterator[str]:
             left += [("]", None), *(("", one) for one in reversed(item))]
             yield "["
         else:
-            is_long = isinstance(item, int) and item.bit_length() > _MOST_BITS
-            yield f"{hex(item) if is_long else repr(item)};"
+            yield f"{hex(item) if isinstance(item, int) and item.bit_length() > _MOST_BITS else repr(item)};"
 
 
 def _field(node: ast.AST, name: str, value: object) -> list[tuple[str, object]]:
     """Return what a field says, in the order of saying; nothing if it is empty or no code."""
     if name in _NO_CODE or value == [] or (value is None and not isinstance(node, ast.Constant)):
         return []
-    is_body = isinstance(value, list) and name == "body" and _has_docstring(node)
-    return [(f"{name}=", None), ("", value[1:] if is_body else value)]
+    if name == "body" and isinstance(value, list) and _has_docstring(node):
+        value = value[1:]
+    return [(f"{name}=", None), ("", value)]
 
 
 def _has_docstring(node: ast.AST) -> bool:

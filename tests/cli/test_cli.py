@@ -10,8 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from sasgeo_bench.cli import segmenters
 from sasgeo_bench.cli.program import COMMANDS, help_of, load, spelled_out
 from sasgeo_bench.config import shipped_dir
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import read_region_file
 
@@ -60,6 +62,18 @@ def test_the_package_is_the_program_too():
 )
 def test_several_values_of_an_option_are_those_that_a_shell_makes_of_a_pattern(words, found):
     assert " ".join(spelled_out(words.split(), load("run").params)) == found
+
+
+def test_a_run_and_segmentations_take_several_tasks(mistake, monkeypatch):
+    assert "a holds no task.json" in mistake("run", "--matcher", "random", "--tasks", "a", "b")
+
+    def split(name, *, folders):
+        message = f"asked for {name} of {folders}"
+        raise ConfigError(message)
+
+    monkeypatch.setattr(segmenters, "find_split", split)
+    words = ("--tasks", "a", "b", "--split", "mine", "--region-files", "own")
+    assert "asked for mine of (PosixPath('own'),)" in mistake("segment", "--segmenter", "unet", *words)
 
 
 def test_a_command_with_arguments_takes_one_value_for_each_option():

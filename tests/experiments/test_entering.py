@@ -6,11 +6,13 @@ import os
 import re
 import sys
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import pandas as pd
 import pytest
 
+from sasgeo_bench.cli import entering as cli_entering
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.experiments import board_queries, entering, entry_cost
@@ -412,6 +414,24 @@ def test_the_command_says_what_it_costs_and_stops(request_, program):
     code, out, err = program(*words, "--dry-run", "--out", request_.out)
     assert (code, err) == (0, "")
     assert out.splitlines()[0].startswith("small: ")
+
+
+def test_the_command_says_who_answered_the_same_queries_elsewhere(program, monkeypatch):
+    entry = SimpleNamespace(board="small", run=SimpleNamespace(card=SimpleNamespace(name="mine")))
+    board = SimpleNamespace(predictions={}, about=[], controls=[])
+    for name in ("plan_entry", "check_entry"):
+        monkeypatch.setattr(cli_entering, name, lambda *_, **__: entry)
+    for name in ("cost_lines", "failure_lines"):
+        monkeypatch.setattr(cli_entering, name, lambda *_: ())
+    for name in ("show_board", "check_controls"):
+        monkeypatch.setattr(cli_entering, name, lambda _: None)
+    monkeypatch.setattr(cli_entering, "enter", lambda *_, **__: (Path("sent/mine"), board))
+    monkeypatch.setattr(cli_entering, "read_board", lambda folder: ({"of": folder.name}, None))
+    monkeypatch.setattr(cli_entering, "elsewhere_lines", lambda about: [f"the same queries, of {about['of']}"])
+    assert program("enter", "small", "--matcher", "mine")[1].splitlines() == [
+        "the same queries, of small-mine",
+        "sent/mine",
+    ]
 
 
 def test_a_slip_in_a_training_place_does_not_untrain_a_matcher(request_):

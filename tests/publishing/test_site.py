@@ -102,6 +102,16 @@ def test_controls_and_those_without_a_rank_are_in_no_tie():
     assert ties_of(rows) == ()
 
 
+def test_rows_of_another_board_with_the_same_queries_stand_on_the_first_page():
+    row = {"matcher": "dense", "n": 7, "value": 0.9, "lo": 0.8, "hi": 1.0}
+    given = source()
+    (key,) = {(item.suite, item.track, item.prior_group) for item in sections_of(book_of(given))}
+    where = dict(zip(("suite", "track", "prior_group"), key, strict=True))
+    other = {"board": "systems", **where, "metric": "success_25m", "rows": [row]}
+    page = site_pages(replace(given, about={**given.about, "elsewhere": [other]}))["index.html"]
+    assert "The same 7 queries on the board systems: its best rows, not ranked here" in page
+
+
 def test_a_table_is_sorted_by_its_figure_and_says_who_is_tied():
     book = book_of(source())
     (section,) = sections_of(book)

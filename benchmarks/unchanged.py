@@ -33,6 +33,7 @@ KINDS: Final = ("file", "table", "words")
 REGIONS: Final = ("town-riverside", "town-suburb", "vaduz")
 STORED: Final = Path(__file__).parents[1] / "docs" / "results"
 PUBLISHED: Final = "systems-objects"
+MINE: Final = "my-matcher"
 PRIVATE: Final = "314159265358979323846264338327950288419716939937510"
 # What depends on the machine or the code, in the tables of a board: figures of time and storage, and the code's hash.
 _MEASURED: Final = r"latency|seconds|_s$|peak|memory|cpu|map_|bytes|^prepare$|^index$|^hash$|sha256|version|created"
@@ -104,17 +105,16 @@ def _demo(program: Program) -> Prints:
     program.run("leaderboard", "demo", "--jobs", "2", "--results", str(results.parent))
     yield from _board(out, out / "boards" / "demo", is_measured=True)
     yield from _board(out, results, is_measured=True)
-    program.run("new-matcher", "my-matcher", "--into", str(out / "plugin"))
+    program.run("new-matcher", MINE, "--into", str(out / "plugin"))
     yield from _board(out, out / "plugin", is_measured=True)
-    source = out / "plugin" / "src"
-    program.run("enter", str(results), "--matcher", "my_matcher.matcher:MyMatcher", "--into", str(out / "entry"), at=source)
-    words = ("--predictions", str(out / "runs" / "my-matcher"), "--card", str(source / "my_matcher" / "card.toml"))
-    program.run("submit", *words, "--for", str(results), "--into", str(out / "submission"))
-    program.run("validate", "--predictions", str(out / "submission"), "--for", str(results))
-    words = ("--predictions", str(results), "--submissions", str(out / "submission"))
-    program.run("score", *words, "--name", "submitted")
-    for folder in ("entry", "submission", "boards/submitted"):
-        yield from _board(out, out / folder, is_measured=True)
+    source, entered, submitted = out / "plugin" / "src", out / "entered" / MINE, out / "submitted" / MINE
+    program.run("enter", str(results), "--matcher", "my_matcher.matcher:MyMatcher", "--into", str(entered), at=source)
+    words = ("--predictions", str(out / "runs" / MINE), "--card", str(source / "my_matcher" / "card.toml"))
+    program.run("submit", *words, "--for", str(results), "--into", str(submitted))
+    program.run("validate", "--predictions", str(submitted), "--for", str(results))
+    program.run("score", "--predictions", str(results), "--submissions", str(submitted), "--name", "submitted")
+    for folder in (entered, submitted, out / "boards" / "submitted"):
+        yield from _board(out, folder, is_measured=True)
 
 
 def _stored(program: Program) -> Prints:

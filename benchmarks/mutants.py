@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many small faults in the code the tests find: a mutation score, by room, with its 95 % interval.
+
+    python -m pip install cosmic-ray==8.7.0
+    python benchmarks/mutants.py --into out/mutants.csv --jobs 2
+
+A sample of all mutants that Cosmic Ray can make of some rooms is drawn by a seed. Each is put into a copy of the
+checkout and tried by the tests of its module, else by those of its room, up to the first that fails; one that takes
+longer than `LONGEST_S` is found, too. Rows are written as they come, so that a run that was cut off goes on.
+"""
+
+import argparse
+import csv
+import os
+import random
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Final, NamedTuple
+
+from sasgeo_bench.scoring.intervals import wilson
+
+ROOT: Final = Path(__file__).parents[1]
+ROOMS: Final = ("scoring", "tasks", "flights", "sasgeo")
+MUTANTS: Final = 400
+LONGEST_S: Final = 300.0
+# Faults that somebody might make: what bits have to do with is a type error at once, and unions are annotations.
+_LEFT_OUT: Final = re.compile(r"Bit(Or|And|Xor)|Shift|_(Mod|FloorDiv|Pow)$|RemoveDecorator|ExceptionReplacer")
+_COPIED: Final = ("sasgeo_bench", "tests", "baselines", "pipelines", "regions", "splits", "docs", "pyproject.toml",
+                  "README.md", "CONTRIBUTING.md")  # fmt: skip
+
+
+class Mutant(NamedTuple):
+    """A fault: the operator that makes it, where it lies in a module, and the number of that place."""
+
+    module: str
+    operator: str
+    occurrence: int
+    line: int
+
+
+def mutants_of(rooms: list[str]) -> Iterator[Mutant]:
+    """Yield every mutant of the modules of some rooms."""
+    from cosmic_ray.ast import ast_nodes, get_ast_from_path  # noqa: PLC0415 - on demand
+    from cosmic_ray.plugins import get_operator, operator_names  # noqa: PLC0415
+
+    operators = {name: get_operator(name) for name in sorted(operator_names()) if not _LEFT_OUT.search(name)}
+    made = {name: operator() for name, operator in operators.items() if not operator.arguments()}
+    for path in sorted(path for room in rooms for path in (ROOT / "sasgeo_bench" / room).rglob("*.py")):
+        tree = get_ast_from_path(path)
+        for name, operator in made.items():
+            places = [start for node in ast_nodes(tree) for start, _ in operator.mutation_positions(node)]
+            for occurrence, (line, _) in enumerate(places):
+                yield Mutant(path.relative_to(ROOT).as_posix(), name, occurrence, line)
+
+
+def tests_of(module: str) -> list[str]:
+    """Return the tests that a module is tried by: its own, then those of its room that import it; else all of its room.
+
+    Its own examples come first.
+    """
+    path = Path(module)
+    room, dotted = Path("tests", *path.parts[1:-1]), ".".join(path.with_suffix("").parts)
+    own, uses = room / f"test_{path.stem}.py", f"from {dotted} import"
+    found = [
+        each for each in sorted((ROOT / "tests" / path.parts[1]).rglob("test_*.py")) if uses in each.read_text("utf-8")
+    ]
+    names = [each.relative_to(ROOT).as_posix() for each in found]
+    first = [own.as_posix()] if (ROOT / own).is_file() else []
+    return [module, *dict.fromkeys([*first, *names])] if first or names else [module, room.as_posix()]
+
+
+def tried(mutant: Mutant, copy: Path) -> str:
+    """Put a mutant into a copy of the checkout, run its tests, and take it out again; return what came of it."""
+    from cosmic_ray.mutating import mutate_code  # noqa: PLC0415
+    from cosmic_ray.plugins import get_operator  # noqa: PLC0415
+
+    path = copy / mutant.module
+    code = path.read_text(encoding="utf-8")
+    mutated = mutate_code(code, get_operator(mutant.operator)(), mutant.occurrence)
+    if mutated is None or mutated == code:
+        return "none"
+    path.write_text(mutated, encoding="utf-8")
+    try:
+        return outcome_of(tests_of(mutant.module), copy)
+    finally:
+        path.write_text(code, encoding="utf-8")
+
+
+def outcome_of(tests: list[str], copy: Path, *, longest_s: float = LONGEST_S) -> str:
+    """Run tests in a copy of the checkout: "left" if all pass, "found" if one fails, "late" if they take too long."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:benchmark", "-p", "no:cacheprovider"]
+    outside = os.environ | {"PYTHONPATH": str(copy), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+    try:
+        ended = subprocess.run([*command, *tests], cwd=copy, env=outside, check=False, timeout=longest_s,  # noqa: S603
+                               capture_output=True)  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return "late"
+    return {0: "left", 1: "found"}.get(ended.returncode, f"found ({ended.returncode})")
+
+
+def copied(folder: Path) -> Path:
+    """Return a copy of what the tests need, whose modules are read in place of the installed ones."""
+    for name in _COPIED:
+        source = ROOT / name
+        (shutil.copytree if source.is_dir() else shutil.copyfile)(source, folder / name)
+    return folder
+
+
+def main() -> None:
+    """Try the mutants that are not in the table yet, and print the score of each room and of all."""
+    parser = argparse.ArgumentParser(description=str(__doc__).partition("\n")[0])
+    parser.add_argument("--into", type=Path, required=True, help="table (*.csv) to write, and to go on with")
+    parser.add_argument("--rooms", nargs="+", default=ROOMS, help="folders of sasgeo_bench")
+    parser.add_argument("--mutants", type=int, default=MUTANTS, help="how many of all are drawn")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=1)
+    words = parser.parse_args()
+    every = list(mutants_of(words.rooms))
+    drawn = random.Random(words.seed).sample(every, words.mutants)  # noqa: S311 - a sample, no secret
+    known = _read(words.into)
+    left = [mutant for mutant in drawn if mutant not in known]
+    print(f"{len(every)} mutants, {len(drawn)} drawn, {len(left)} to be tried", file=sys.stderr, flush=True)
+    copies: SimpleQueue[Path] = SimpleQueue()
+    with tempfile.TemporaryDirectory(prefix="mutants-") as scratch, ThreadPoolExecutor(words.jobs) as pool:
+        for number in range(words.jobs):
+            (Path(scratch) / str(number)).mkdir()
+            copies.put(copied(Path(scratch) / str(number)))
+
+        every_test = list(dict.fromkeys(test for mutant in left for test in tests_of(mutant.module)))
+        if left and outcome_of(every_test, Path(scratch) / "0", longest_s=20 * LONGEST_S) != "left":
+            sys.exit("these tests fail without a mutant, so they tell nothing of one")
+
+        def one(mutant: Mutant) -> tuple[Mutant, str]:
+            copy = copies.get()
+            try:
+                return mutant, tried(mutant, copy)
+            finally:
+                copies.put(copy)
+
+        for mutant, outcome in pool.map(one, left):
+            known[mutant] = outcome
+            with words.into.open("a", newline="", encoding="utf-8") as file:
+                csv.writer(file).writerow([*mutant, outcome])
+    for room in (*words.rooms, ""):
+        outcomes = [known[each] for each in drawn if each.module.startswith(f"sasgeo_bench/{room}")]
+        tested = [each for each in outcomes if each != "none"]
+        score = wilson(sum(each != "left" for each in tested), len(tested))
+        print(f"{room or 'all':>8}: {score.value:.3f} [{score.lo:.3f} {score.hi:.3f}] of {len(tested)}")
+
+
+def _read(table: Path) -> dict[Mutant, str]:
+    if not table.is_file():
+        return {}
+    with table.open(newline="", encoding="utf-8") as file:
+        rows = list(csv.reader(file))
+    return {
+        Mutant(module, operator, int(occurrence), int(line)): found
+        for module, operator, occurrence, line, found in rows
+    }
+
+
+if __name__ == "__main__":
+    main()

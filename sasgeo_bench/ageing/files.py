@@ -2,10 +2,8 @@
 """Write `ageing.parquet`, `ageing.md`, `ageing.svg` of one place, and a table of several places."""
 
 import math
-import os
 from collections import Counter
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -15,7 +13,8 @@ from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, Ageing
 from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
 from sasgeo_bench.ageing.plots import draw_ageing
 from sasgeo_bench.ageing.ratebook import VERSION
-from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError
+from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.parquet import read_frame, write_frame
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -63,19 +62,8 @@ def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
 
 def replace_file(target: Path, write: Callable[[Path], object]) -> Path:
     """Let `write` fill a scratch file, then move it to the target; raise `StoreError` if it cannot be written."""
-    scratch = target.with_name(f".{target.name}.{os.getpid()}.partial")
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+    with fresh_file(target, mend="check the free space and the rights of its folder") as scratch:
         write(scratch)
-        scratch.replace(target)
-    except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
-        raise
-    except OSError as error:
-        message = f"{target} cannot be written ({error}): check the free space and the rights of its folder"
-        raise StoreError(message) from error
-    finally:
-        with suppress(OSError):  # where a file stands for a folder there is nothing to remove
-            scratch.unlink(missing_ok=True)
     return target
 
 

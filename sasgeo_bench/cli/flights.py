@@ -22,7 +22,7 @@ from sasgeo_bench.flights.drift_fit import fit_profile
 from sasgeo_bench.flights.drift_profile import write_drift_profile
 from sasgeo_bench.flights.log_points import FlightLog, steps_m
 from sasgeo_bench.flights.log_units import SPEED_MPS, AngleUnit, HeightUnit, LogFacts, PlaceUnit, TimeUnit
-from sasgeo_bench.flights.logs import is_tum, read_flight, read_log
+from sasgeo_bench.flights.logs import gaps_of, is_tum, read_flight, read_log, read_poses
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.flights.tum import read_tum, write_tum
@@ -42,9 +42,15 @@ class FlightOptions(Options):
     region: Annotated[Path | None, typer.Option(help="folder of a built region: cut the flight to it")] = None
     tum: Annotated[Path | None, typer.Option(help="TUM file to write the stretch over the region into")] = None
     height_m: Annotated[float | None, typer.Option(help="height above the ground to keep, instead of the log's")] = None
-    least_m: Annotated[float, typer.Option(min=1, help="shortest stretch that is taken, metres")] = SHORTEST_M
-    margin_m: Annotated[float, typer.Option(min=0, help="least distance from ground without a map")] = MARGIN_M
-    speed_mps: Annotated[float, typer.Option(min=0.1, help="even speed of a log without times, m/s")] = SPEED_MPS
+    least_m: Annotated[
+        float | None, typer.Option(help=f"shortest stretch that is taken, metres; default: {SHORTEST_M:g}")
+    ] = None
+    margin_m: Annotated[
+        float | None, typer.Option(help=f"least distance from ground without a map, metres; default: {MARGIN_M:g}")
+    ] = None
+    speed_mps: Annotated[
+        float | None, typer.Option(help=f"even speed of a log without times, m/s; default: {SPEED_MPS:g}")
+    ] = None
     time_unit: Annotated[
         TimeUnit | None, typer.Option(help="of times whose column does not name it; none: no column is the time")
     ] = None
@@ -63,7 +69,7 @@ class FlightOptions(Options):
         """Return what the file does not say."""
         return LogFacts(
             time_unit=self.time_unit,
-            height_unit=self.height_unit if self.height_m is None else "none",
+            height_unit=self.height_unit,
             angle_unit=self.angle_unit,
             place_unit=self.place_unit,
             axes=self.axes,
@@ -74,28 +80,31 @@ class FlightOptions(Options):
 def read_flight_command(flight: FlightOptions) -> None:
     """Read a flight log and print what was read, in which units; cut it to a region, and write that as TUM."""
     _check_outputs([flight.file], [flight.tum] if flight.tum else [])
-    if flight.tum is not None and flight.region is None:
-        message = "--tum needs --region: the stretch over a region is what is written"
-        raise FlightError(message)
     if flight.region is not None:
         region = read_region(flight.region)
         flown = read_flight(
             flight.file,
             region,
-            margin_m=flight.margin_m,
-            least_m=flight.least_m,
+            margin_m=MARGIN_M if flight.margin_m is None else flight.margin_m,
+            least_m=SHORTEST_M if flight.least_m is None else flight.least_m,
             height_m=flight.height_m,
             facts=flight.facts,
+            tell=tell,
         )
         say(f"over {region.manifest.id}: {_summary(flown)}")
         if flight.tum is not None:
             write_tum(flown, flight.tum)
             tell(f"wrote {flight.tum}")
-    elif is_tum(flight.file):
-        flight.facts.check_untold(flight.file)
-        say(_summary(read_tum(flight.file, axes=flight.axes)))
+        return
+    for name in ("tum", "least_m", "margin_m"):
+        if getattr(flight, name) is not None:
+            message = f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region"
+            raise FlightError(message)
+    if is_tum(flight.file):
+        flown = read_poses(flight.file, flight.facts, height_m=flight.height_m)
+        say("\n".join((_summary(flown), *gaps_of(flown.time_s))))
     else:
-        _show(read_log(flight.file, flight.facts), flight.height_m)
+        _show(read_log(flight.file, flight.facts, height_m=flight.height_m), flight.speed_mps or SPEED_MPS)
 
 
 def measure_drift_command(
@@ -135,20 +144,20 @@ def _summary(flown: Trajectory) -> str:
     )
 
 
-def _show(log: FlightLog, height_m: float | None) -> None:
+def _show(log: FlightLog, speed_mps: float) -> None:
     """Print what was read of a log."""
     way_m = float(steps_m(log.lon_deg, log.lat_deg).sum())
     lasts = "no times" if log.time_s is None else f"{log.time_s[-1]:.1f} s, {way_m / log.time_s[-1]:.2f} m/s on average"
     say(f"{counted(len(log), 'point')}, {way_m:.0f} m, {lasts}")
-    for line in log.told:
+    for line in (*gaps_of(log.time_s), *log.told):
         say(line)
     for name, unit in (("height_m", "m"), ("yaw_deg", "deg"), ("pitch_deg", "deg"), ("roll_deg", "deg")):
         values = getattr(log, name)
         if values is not None:
             say(f"{name.partition('_')[0]} from {values.min():.1f} to {values.max():.1f} {unit}")
     if log.time_s is None:
-        tell(f"no times: a flight has an even speed (--speed-mps, {SPEED_MPS:g} m/s)")
-    if log.height_m is None and height_m is None:
+        tell(f"no times: a flight has an even speed (--speed-mps, {speed_mps:g} m/s)")
+    if log.height_m is None:
         tell("no height above the ground: a flight needs --height-m")
 
 
@@ -187,6 +196,9 @@ def _check_outputs(inputs: list[Path], outputs: list[Path]) -> None:
     for at, path in enumerate(outputs):
         if path in outputs[:at] or any(_is_same(path, other) for other in inputs):
             message = f"{path} is named twice, to read from and to write to: name another file"
+            raise FlightError(message)
+        if path.is_dir():
+            message = f"{path} cannot be written (Is a directory): name another place"
             raise FlightError(message)
 
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write folders whole or not at all, by one run at a time; remove them; compare their files with listed hashes."""
 
+import errno
 import hashlib
 import os
 import stat
@@ -122,8 +123,9 @@ def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
 
     Raise `StoreError`, with the advice `mend`, if it cannot be written.
     """
-    scratch = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    scratch = path.parent / f".{path.name}.{os.getpid()}.partial"
     try:
+        check_no_folder(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
             yield scratch
@@ -137,6 +139,12 @@ def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
     except OSError as error:
         message = f"{path} cannot be written ({error.strerror or error}): {mend}"
         raise StoreError(message) from error
+
+
+def check_no_folder(path: Path) -> None:
+    """Raise `OSError` if a folder, "." included, has the path that a file is to get."""
+    if path.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
 
 
 @contextmanager

@@ -6,12 +6,12 @@ the units of a format come from: the table in `docs/concepts/flights.md`.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Final
 
-from sasgeo_bench.flights.log_points import LogSource, shown
+from sasgeo_bench.flights.log_points import LogSource, listed, shown
 from sasgeo_bench.flights.log_units import WORDS, LogFacts
 
 QUANTITIES: Final = MappingProxyType(
@@ -85,7 +85,6 @@ _GEODETIC: Final = re.compile(
 )
 _PARTS_OF_DAY: Final = re.compile(r"(?:(?:utc|gps|gnss|local|time)_)?(?:(hours?|hh)|minutes?|mins?|mm)")
 _OF_GPS: Final = frozenset({"status", "gms", "gwk", "n_sats", "nsats", "hdop", "h_dop", "gcrs", "g_crs", "spd"})
-_MOST_NAMES: Final = 12  # of columns in a message
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -408,10 +407,14 @@ def key_of(name: str) -> str:
     return re.sub(r"^time(?=[mu]s$)", "time_", re.sub(r"[^a-z0-9]+", "_", words).strip("_"))
 
 
-def listed(names: Sequence[str]) -> str:
-    """Return names as messages list them: the first twelve."""
-    more = ", ..." if len(names) > _MOST_NAMES else ""
-    return ", ".join(shown(name) for name in names[:_MOST_NAMES]) + more
+def unread(header: Sequence[str], layout: Layout, read: Collection[str], *, has_dates: bool) -> tuple[str, ...]:
+    """Return a line on the columns of a table that are not read, none if all are; `read` are fields."""
+    others = (layout.part, layout.receiver, layout.fix, layout.date if has_dates else None)
+    known = {column.at for name, column in layout.fields.items() if name in read}
+    known |= {column.at for column in (*others, *layout.hemispheres.values()) if column is not None}
+    left = [at for at, name in enumerate(header) if at not in known and name.strip()]
+    why = "; altitudes above the sea are no heights" if any(_is_altitude(layout.keys[at]) for at in left) else ""
+    return (f"not read: {listed([header[at] for at in left])}{why}",) if left else ()
 
 
 def _matches(name: str, header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format) -> list[Column]:
@@ -474,6 +477,8 @@ def _check_no_time(source: LogSource, header: Sequence[str], keys: Sequence[tupl
 
 
 def _is_no_time(both: tuple[str, str]) -> bool:
-    heights = (f"{base}_{word}" for base in ALTITUDES for word in WORDS["height"])
-    known = {*ALTITUDES, *heights}
-    return any(key in known or any(_unit_of(key, name)[0] for name in NAMES if name != "time") for key in both)
+    return any(_is_altitude(key) or any(_unit_of(key, name)[0] for name in NAMES if name != "time") for key in both)
+
+
+def _is_altitude(key: str) -> bool:
+    return key in ALTITUDES or _words_of(key, WORDS["height"])[0] in ALTITUDES

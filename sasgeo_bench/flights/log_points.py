@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Final, Self
 
 import numpy as np
@@ -14,20 +15,19 @@ import pyproj
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import FlightError, counted
+from sasgeo_bench.flights.log_units import FASTEST_MPS, HIGHEST_M
 from sasgeo_bench.texts import plain
 
 Floats = NDArray[np.float64]
 
 MOST_BYTES: Final = 64 * 2**20  # of a log
 MOST_POINTS: Final = 1_000_000
-FASTEST_MPS: Final = 100.0  # between two points: no drone of this benchmark is faster
-
 BEFORE_FIX: Final = "at 0, 0 before the first fix"
 
 _LARGEST: Final = 1e30  # a number beyond is a fault; times in ns are 2e18
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
-_HIGHEST_M: Final = 10_000.0
+_MOST_NAMES: Final = 12  # in a message
 _WGS84: Final = pyproj.Geod(ellps="WGS84")
 
 
@@ -40,7 +40,8 @@ class LogSource:
 
     def fault(self, text: str, number: int | None = None) -> FlightError:
         """Return the error of a line or point, or of the file."""
-        where = self.path.name if number is None else f"{self.path.name}, {self.unit} {number}"
+        name = self.path.name or str(self.path)
+        where = name if number is None else f"{name}, {self.unit} {number}"
         return FlightError(f"{where}: {text}")
 
     def warn(self, text: str) -> None:
@@ -102,7 +103,7 @@ class FlightLog:
     yaw_deg, pitch_deg, roll_deg : ndarray, shape (N,), optional
         Attitude of the body, degrees, yaw from true north; in the order of angles of `sensing.camera.Attitude`.
     told : tuple of str
-        Of a table: what was read of which column, in which unit.
+        What was read of which column of a table, in which unit; and what of the file was not read.
     """
 
     lon_deg: Floats
@@ -116,9 +117,17 @@ class FlightLog:
 
     @classmethod
     def of(
-        cls, source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats], *, told: tuple[str, ...] = ()
+        cls,
+        source: LogSource,
+        numbers: Sequence[int],
+        columns: Mapping[str, Floats],
+        *,
+        told: tuple[str, ...] = (),
+        names: Mapping[str, str] = MappingProxyType({}),
     ) -> Self:
         """Return a log of checked columns; `numbers` are the lines or points in the file, for messages.
+
+        `names` tell, for messages too, what the file calls a column, and in which unit.
 
         Points at 0, 0 before the first fix are left out, and so are points that repeat the time of the point before, or
         its place where there are no times. A warning counts them.
@@ -141,10 +150,9 @@ class FlightLog:
             message = f"a flight has two points at least, the log has {len(numbers)}: export more of it"
             raise source.fault(message)
         _check_times(source, numbers, columns)
-        for name, most in {**_ANGLES, "height_m": _HIGHEST_M}.items():
+        for name, most in {**_ANGLES, "height_m": HIGHEST_M}.items():
             if name in columns:
-                text = f"{name} lies beyond {most:g}: mend the value, or name the column by its unit"
-                _check(source, numbers, np.abs(columns[name]) <= most, text)
+                _check_size(source, numbers, columns[name], name, most, names.get(name, name.partition("_")[0]))
         return cls(
             lon_deg=columns["lon_deg"],
             lat_deg=columns["lat_deg"],
@@ -180,6 +188,12 @@ def shown(text: str) -> str:
     return repr(line if len(line) <= _MOST_SHOWN else line[: _MOST_SHOWN - 3] + "...")
 
 
+def listed(names: Sequence[str]) -> str:
+    """Return names as messages list them: the first twelve."""
+    more = f", and {len(names) - _MOST_NAMES} more" if len(names) > _MOST_NAMES else ""
+    return ", ".join(shown(name) for name in names[:_MOST_NAMES]) + more
+
+
 def _check(
     source: LogSource,
     numbers: Sequence[int],
@@ -193,6 +207,12 @@ def _check(
     if len(wrong):
         at = int(wrong[0])
         raise source.fault(text if isinstance(text, str) else text(at), numbers[at + later])
+
+
+def _check_size(source: LogSource, numbers: Sequence[int], values: Floats, name: str, most: float, called: str) -> None:
+    unit = "degrees" if name in _ANGLES else "m"
+    text = "{} is {:g} {}, beyond {:g}: mend the value, or its unit"
+    _check(source, numbers, np.abs(values) <= most, lambda at: text.format(called, values[at], unit, most))
 
 
 def _check_places(source: LogSource, numbers: Sequence[int], columns: Mapping[str, Floats]) -> None:

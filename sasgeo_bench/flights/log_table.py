@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.flights.log_clock import Clock, is_clock
-from sasgeo_bench.flights.log_formats import NUMBERING, PX4, QUANTITIES, Column, Format, Layout, find_layout
+from sasgeo_bench.flights.log_formats import NUMBERING, PX4, QUANTITIES, Column, Format, Layout, find_layout, unread
 from sasgeo_bench.flights.log_points import BEFORE_FIX, FlightLog, LogSource, shown, tell_left_out
 from sasgeo_bench.flights.log_rows import Lines, read_lines
 from sasgeo_bench.flights.log_units import UNITS, LogFacts, choices_of
@@ -91,7 +91,10 @@ def read_csv(path: Path, facts: LogFacts | None = None) -> FlightLog:
         order = np.argsort(columns["time_s"], kind="stable")
         numbers, columns = numbers[order], {name: column[order] for name, column in columns.items()}
         columns["time_s"] = columns["time_s"] - columns["time_s"][:1]
-    return FlightLog.of(source, numbers.tolist(), columns, told=told)
+    lines_of = {line.partition(":")[0]: line.replace(": ", ", column ", 1) + "," for line in told}
+    names = {{"height": "height_m"}.get(name, f"{name}_deg"): line for name, line in lines_of.items()}
+    told += unread(lines.header, layout, values, has_dates=table.has_dates)
+    return FlightLog.of(source, numbers.tolist(), columns, told=told, names=names)
 
 
 # Values
@@ -330,6 +333,10 @@ def _converted(
             continue
         if quantity == "place":
             unit = _place_unit(source, at, facts, values, counts=counts)
+            if unit == "e7" and (column != np.rint(column)).any():
+                mend = "say --place-unit deg" if at.unit is None else "name it by its unit"
+                message = f"column {shown(at.name)} has decimals, and is no count of 1e-7 degrees: {mend}, or mend it"
+                raise source.fault(message)
         else:
             # What is scaled of a message is scaled by its reader's taste.
             is_open = layout.format.counts and at.unit in ("mm", "cdeg") and not counts

@@ -17,6 +17,19 @@ AngleUnit = Literal["deg", "cdeg", "rad", "none"]
 PlaceUnit = Literal["deg", "rad", "e7"]
 
 SPEED_MPS: Final = 10.0  # of a log without times
+FASTEST_MPS: Final = 100.0  # between two points: no drone of this benchmark is faster
+LOWEST_M: Final = 5.0  # lower poses are of a drone that stands, takes off or lands
+HIGHEST_M: Final = 10_000.0
+
+# Option of the program, as a field or argument in Python -> least and most.
+RANGES: Final = MappingProxyType(
+    {
+        "--speed-mps": (0.1, FASTEST_MPS),
+        "--height-m": (LOWEST_M, HIGHEST_M),
+        "--least-m": (1.0, 1e6),
+        "--margin-m": (0.0, 1e6),
+    }
+)
 
 # Quantity -> unit -> factor to s, m or degrees.
 UNITS: Final = MappingProxyType(
@@ -67,13 +80,13 @@ class LogFacts:
         Unit of latitude and longitude (e7: 1e-7 degrees).
     axes : {"up", "camera"}, optional
         Axes of a TUM file (`sasgeo_bench.flights.axes`).
-    speed_mps : float
-        Even speed of a log without times, metres a second.
+    speed_mps : float, optional
+        Even speed of a log without times, 0.1 to 100 m/s; by default 10 m/s.
 
     Raises
     ------
     FlightError
-        If a unit or axes are none of these, or the speed is not positive.
+        If a unit or axes are none of these, or the speed is no speed of a drone.
     """
 
     time_unit: TimeUnit | None = None
@@ -81,7 +94,7 @@ class LogFacts:
     angle_unit: AngleUnit | None = None
     place_unit: PlaceUnit | None = None
     axes: Axes | None = None
-    speed_mps: float = SPEED_MPS
+    speed_mps: float | None = None
 
     def __post_init__(self) -> None:
         """Check the values."""
@@ -93,9 +106,7 @@ class LogFacts:
         if self.axes is not None and self.axes not in AXES:
             message = f"axes must be one of {', '.join(AXES)}, got {self.axes!r}"
             raise FlightError(message)
-        if not (math.isfinite(self.speed_mps) and self.speed_mps > 0):
-            message = f"speed_mps must be positive, got {self.speed_mps!r}"
-            raise FlightError(message)
+        check_within("--speed-mps", self.speed_mps)
 
     def unit(self, quantity: str) -> str | None:
         """Return the unit that is said of a quantity."""
@@ -110,9 +121,23 @@ class LogFacts:
     def check_untold(self, path: Path) -> None:
         """Raise `FlightError` if a unit is said of a file that is no table: its format states them all."""
         for quantity in UNITS:
-            if self.unit(quantity) not in (None, "none"):
+            if self.unit(quantity) is not None:
                 message = f"{plain(path.name)} is no table, and its units are known: leave out --{quantity}-unit"
                 raise FlightError(message)
+
+
+def check_within(option: str, value: float | None) -> None:
+    """Raise `FlightError` if a number that was given lies outside of what its option takes.
+
+    >>> check_within("--height-m", float("nan"))
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.FlightError: --height-m must be a number from 5 to 10000, got nan
+    """
+    least, most = RANGES[option]
+    if value is not None and not least <= value <= most:
+        message = f"{option} must be a number from {least:g} to {most:g}, got {value:g}"
+        raise FlightError(message)
 
 
 def choices_of(quantity: str) -> tuple[str, ...]:

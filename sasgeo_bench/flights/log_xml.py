@@ -36,6 +36,7 @@ class _Track:
     lat_deg: "array[float]" = field(default_factory=lambda: array("d"))
     moments: "array[float]" = field(default_factory=lambda: array("d"))
     heights_m: "array[float]" = field(default_factory=lambda: array("d"))
+    unread: list[str] = field(default_factory=list)
 
     def log(self) -> FlightLog:
         """Return the log; times are of all points or of none."""
@@ -48,7 +49,13 @@ class _Track:
             columns["time_s"] = (np.array(self.moments) - self.moments[0]).round(6)
         if self.heights_m:
             columns["height_m"] = np.array(self.heights_m)
-        return FlightLog.of(self.source, range(1, count + 1), columns)
+        told = (f"not read: {', '.join(self.unread)}",) if self.unread else ()
+        return FlightLog.of(self.source, range(1, count + 1), columns, told=told)
+
+    def leave(self, what: str) -> None:
+        """Note what is not read, once."""
+        if what not in self.unread:
+            self.unread.append(what)
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -69,6 +76,8 @@ def read_gpx(path: Path) -> FlightLog:
             _add_place(track if name == _POINTS[0] else route, [element.get("lon"), element.get("lat")])
         elif event == "end" and name == "time" and parent in _POINTS:
             _add_time(track if parent == _POINTS[0] else route, element.text)
+        elif event == "end" and name == "ele" and parent in _POINTS:
+            (track if parent == _POINTS[0] else route).leave("elevations, which are above the sea")
     kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
     if counts[kind] > 1:
         message = f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant"
@@ -98,6 +107,8 @@ def read_kml(path: Path) -> FlightLog:
             texts[name] = text
         elif parent == opened and name in ("when", "coord"):
             _add(lines[-1], name, text)
+        elif parent == opened and name == "angles":
+            lines[-1].leave("angles")
         elif name == opened:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
             opened = ""
@@ -120,6 +131,9 @@ def _close(line: _Track, coordinates: str, mode: str) -> None:
     for place in coordinates.split():
         _add_place(line, place.split(","))
     if mode != _ABOVE_GROUND or len(line.heights_m) != len(line):
+        if line.heights_m:
+            why = "not relative to the ground" if mode != _ABOVE_GROUND else "not those of all points"
+            line.leave(f"altitudes, which are {why}")
         del line.heights_m[:]
 
 

@@ -2,6 +2,7 @@
 """Flights out of files: GPX, KML, tables with latitude and longitude, TUM; brought onto a region and cut to it."""
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import FlightError
 from sasgeo_bench.flights.log_points import MOST_POINTS, FlightLog, steps_m
 from sasgeo_bench.flights.log_table import read_csv
-from sasgeo_bench.flights.log_units import LogFacts
+from sasgeo_bench.flights.log_units import LOWEST_M, SPEED_MPS, LogFacts, check_within
 from sasgeo_bench.flights.log_xml import read_gpx, read_kml
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory
@@ -30,16 +31,16 @@ SUFFIXES: Final = (".gpx", ".kml", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones nobody knows where the drone was
 
 _TUM: Final = SUFFIXES[4:]
-_LOWEST_M: Final = 5.0  # lower poses are of a drone that stands, takes off or lands
 _COURSE_S: Final = 1.0  # before and after a pose, over which its course is measured
 _HOVER_M: Final = 1.0  # a shorter way has no course
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
-def read_log(path: Path, facts: LogFacts | None = None) -> FlightLog:
+def read_log(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> FlightLog:
     """Read a log by its suffix (GPX, KML, CSV, .pos); raise `FlightError` if it is not sound, or of another kind.
 
-    `facts` say what a table does not. A line drawn in KML has no times: `read_flight` flies it at an even speed.
+    `facts` say what a table does not; what they say of a file without it is refused. A line drawn in KML has no times:
+    `read_flight` flies it at an even speed. A `height_m` replaces the log's heights.
 
     >>> import tempfile
     >>> line = "<coordinates>9.52,47.14,80 9.53,47.15,80</coordinates><altitudeMode>relativeToGround</altitudeMode>"
@@ -50,16 +51,48 @@ def read_log(path: Path, facts: LogFacts | None = None) -> FlightLog:
     >>> log.lat_deg.tolist(), log.height_m.tolist(), log.time_s
     ([47.14, 47.15], [80.0, 80.0], None)
     """
+    check_within("--height-m", height_m)
+    facts = facts or LogFacts()
+    log = _read(path, facts, has_height=height_m is not None)
+    if facts.speed_mps is not None and log.time_s is not None:
+        raise _meaningless(path, "has times", "--speed-mps")
+    if height_m is None:
+        return log
+    told = (*log.told, f"height: {height_m:g} m throughout, as --height-m says")
+    return replace(log, height_m=np.full(len(log), height_m), told=told)
+
+
+def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     suffix = path.suffix.lower()
-    if suffix in (".csv", ".pos"):
-        return read_csv(path, facts)
-    if facts is not None:
-        facts.check_untold(path)
+    is_table = suffix in (".csv", ".pos")
     reader = {".gpx": read_gpx, ".kml": read_kml}.get(suffix)
-    if reader is None:
-        message = f"{path.name} is no flight log that is read: {', '.join(SUFFIXES)} are (unzip a .kmz, export a .ulg)"
+    if reader is None and not is_table:
+        mend = "unzip a .kmz, export a .ulg by ulog2csv of pyulog"
+        message = f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are ({mend})"
         raise FlightError(message)
+    if facts.axes is not None:
+        raise _meaningless(path, "is no TUM file", "--axes")
+    if reader is None:
+        # What is not read has no unit to be asked for.
+        return read_csv(path, replace(facts, height_unit="none") if has_height else facts)
+    facts.check_untold(path)
     return reader(path)
+
+
+def _meaningless(path: Path, why: str, option: str) -> FlightError:
+    """Return the error of an option that says nothing of a file."""
+    return FlightError(f"{path.name} {why}: leave out {option}")
+
+
+def read_poses(path: Path, facts: LogFacts | None = None, *, height_m: float | None = None) -> Trajectory:
+    """Read a TUM file as `read_log` reads logs, with its axes and the height that is kept."""
+    check_within("--height-m", height_m)
+    facts = facts or LogFacts()
+    facts.check_untold(path)
+    if facts.speed_mps is not None:
+        raise _meaningless(path, "has times", "--speed-mps")
+    flown = read_tum(path, axes=facts.axes)
+    return flown if height_m is None else _at_height(flown, height_m)
 
 
 def is_tum(path: Path) -> bool:
@@ -67,7 +100,7 @@ def is_tum(path: Path) -> bool:
     return path.name.lower().endswith(_TUM)
 
 
-def read_flight(
+def read_flight(  # noqa: PLR0913 - each is a wish of its own
     path: Path,
     region: Region,
     *,
@@ -76,6 +109,7 @@ def read_flight(
     height_m: float | None = None,
     facts: LogFacts | None = None,
     step_s: float = 0.2,
+    tell: Callable[[str], None] = lambda _: None,
 ) -> Trajectory:
     r"""Read a flight log and return its longest stretch inside a region.
 
@@ -91,11 +125,13 @@ def read_flight(
     least_m : float
         Shortest stretch that is taken, metres.
     height_m : float, optional
-        Height above the ground that is kept throughout, metres; it replaces the heights in the log.
+        Height above the ground that is kept throughout, 5 to 10,000 m; it replaces the heights in the log.
     facts : LogFacts, optional
         What the file does not say: units of a table, axes of a TUM file, the speed of a log without times (10 m/s).
     step_s : float
         Seconds between poses.
+    tell : callable
+        Gets each line on what was read of a log, and what was not.
 
     Returns
     -------
@@ -132,21 +168,19 @@ def read_flight(
     >>> round(flown.distance_m[-1] / 100), round(np.mean(flown.yaw_deg))
     (8, 88)
     """
-    facts = facts or LogFacts()
-    wishes = {"least_m": least_m, "height_m": height_m, "step_s": step_s}
-    for name, value in wishes.items():
-        if value is not None and not (math.isfinite(value) and value > 0):
-            message = f"{name} must be positive, got {value!r}"
-            raise FlightError(message)
-    if height_m is not None:
-        facts = replace(facts, height_unit="none")  # what is not read has no unit to be asked for
-    log = None if is_tum(path) else read_log(path, facts)
+    check_within("--least-m", least_m)
+    check_within("--margin-m", margin_m)
+    if not (math.isfinite(step_s) and step_s > 0):
+        message = f"step_s must be positive, got {step_s!r}"
+        raise FlightError(message)
+    log = None if is_tum(path) else read_log(path, facts, height_m=height_m)
     if log is None:
-        facts.check_untold(path)
-        logged = read_tum(path, axes=facts.axes)
-        logged = logged if height_m is None else _at_height(logged, height_m)
+        logged = read_poses(path, facts, height_m=height_m)
     else:
-        logged = _on_grid(log, path, region.manifest.epsg, height_m, facts.speed_mps)
+        for line in (*log.told, *gaps_of(log.time_s)):
+            tell(line)
+        _check_near(log, path, region)
+        logged = _on_grid(log, path, region.manifest.epsg, (facts and facts.speed_mps) or SPEED_MPS)
     flown = _resampled(logged, path, step_s)
     is_known = np.ones(len(flown) - 1, dtype=bool)
     if log is None or log.time_s is not None:
@@ -156,11 +190,25 @@ def read_flight(
     return _longest_inside(flown, is_known, path, region, margin_m, least_m)
 
 
-def _on_grid(log: FlightLog, path: Path, epsg: int, height_m: float | None, speed_mps: float) -> Trajectory:
+def _check_near(log: FlightLog, path: Path, region: Region) -> None:
+    """Raise `FlightError` if a log lies all beside a region, on one side of it: far off a CRS tells no metres."""
+    west, south, east, north = region.manifest.bounds_lonlat
+    lon, lat = log.lon_deg, log.lat_deg
+    if lon.max() < west or lon.min() > east or lat.max() < south or lat.min() > north:
+        message = (
+            f"{path.name} lies elsewhere, at latitude {lat.min():.4f} to {lat.max():.4f}, longitude {lon.min():.4f} to "
+            f"{lon.max():.4f} degrees, and {region.manifest.id} at latitude {south:.4f} to {north:.4f}, longitude "
+            f"{west:.4f} to {east:.4f}: take another region"
+        )
+        raise FlightError(plain(message))
+
+
+def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Trajectory:
     """Return the points of a log in a projected CRS; without a heading yaw is 0."""
-    up_m = log.height_m if height_m is None else np.full(len(log), height_m)
+    up_m = log.height_m
     if up_m is None:
-        message = f"{path.name} has no height above the ground, and altitudes above the sea are not read: give height_m"
+        why = "has no height above the ground, and altitudes above the sea are not read"
+        message = f"{path.name} {why}: say one, as in --height-m 100"
         raise FlightError(message)
     to_grid = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
     en_m = np.stack(to_grid.transform(log.lon_deg, log.lat_deg), axis=1)
@@ -223,7 +271,7 @@ def _longest_inside(
     area = flight_area(region, margin_m)
     places_m = flown.position_m[:, :2]
     sides = shapely.linestrings(np.stack([places_m[:-1], places_m[1:]], axis=1))
-    is_up = flown.position_m[:, 2] >= _LOWEST_M
+    is_up = flown.position_m[:, 2] >= LOWEST_M
     is_inside = np.asarray(shapely.covers(area, sides), dtype=bool) & is_known & is_up[:-1] & is_up[1:]
     edges = np.diff(np.concatenate([[0], is_inside, [0]]))
     starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
@@ -235,12 +283,27 @@ def _longest_inside(
         message = (
             f"{path.name} leaves {region.manifest.id}: of {along_m[-1]:.0f} m the longest stretch over mapped ground, "
             f"{margin_m:g} m from its edge and in the air, has {longest_m:.0f} m, {least_m:g} m are needed: take "
-            "another region, or a smaller margin_m or least_m"
+            "another region, or a smaller --margin-m or --least-m"
         )
         raise FlightError(plain(message))
     run = slice(starts[best], ends[best] + 1)
     return Trajectory(
         time_s=flown.time_s[run], position_m=flown.position_m[run], quaternion_xyzw=flown.quaternion_xyzw[run]
+    )
+
+
+def gaps_of(time_s: Floats | None) -> tuple[str, ...]:
+    """Return a line on the gaps that end stretches, none if there are none.
+
+    >>> gaps_of(np.array([0.0, 1.0, 60.0, 61.0]))
+    ('2 stretches: a gap of more than 10 s ends one, the longest has 59.0 s',)
+    """
+    steps_s = np.diff(time_s if time_s is not None else [])
+    count = int((steps_s > MOST_GAP_S).sum())
+    if not count:
+        return ()
+    return (
+        f"{count + 1} stretches: a gap of more than {MOST_GAP_S:g} s ends one, the longest has {steps_s.max():.1f} s",
     )
 
 

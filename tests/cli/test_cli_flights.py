@@ -76,25 +76,18 @@ def test_figures_and_a_fitted_profile_are_written_where_asked(program, pairs, tm
         (("--truth", "loop", "--estimate", "truth-1.txt"), "loop cannot be read as a trajectory (Too many levels"),
         (("--results", "truth-1.txt"), "truth-1.txt is named twice, to read from and to write to: name another file"),
         (("--results", "new", "--profile", "new"), "new is named twice"),
+        (("--results", "."), ". cannot be written (Is a directory): name another place"),
+        (("--profile", ""), ". cannot be written (Is a directory): name another place"),
+        (("--profile", "folder"), "folder cannot be written (Is a directory): name another place"),
         (("--lost-s", "-1"), "lost-s"),
     ],
 )
 def test_a_mistake_gets_one_line(mistake, pairs, tmp_path, words, told) -> None:
     (tmp_path / "bad.txt").write_text("0 1 2\n")
     (tmp_path / "loop").symlink_to("loop")
+    (tmp_path / "folder").mkdir()
     (tmp_path / "late.txt").write_text("1e9 0 0 0 0 0 0 1\n1000000001 5 0 0 0 0 0 1\n")
     assert told in mistake("measure-drift", *pairs, *words)
-
-
-def test_results_that_cannot_be_written_leave_nothing_behind(program, pairs, tmp_path) -> None:
-    (tmp_path / "folder").mkdir()
-    before = sorted(tmp_path.iterdir())
-    code, _, err = program("measure-drift", *pairs, "--results", "folder")
-    assert code == 2
-    assert err.splitlines()[-1].startswith(
-        "sasgeo-bench: folder cannot be written (Is a directory): name another place"
-    )
-    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_a_profile_that_cannot_be_named_or_written_gets_one_line_after_the_table(program, pairs, tmp_path) -> None:
@@ -134,14 +127,63 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
         assert f"states no unit: say --{quantity}-unit" in mistake("read-flight", "log.csv", *words)
         words += [f"--{quantity}-unit", unit]
     assert "height from 100.0 to 100.0 m" in program("read-flight", "log.csv", *words)[1]
-    assert "heading" not in program("read-flight", "log.csv", *words)[1]
+    assert "yaw" not in program("read-flight", "log.csv", *words)[1]
     words[words.index("--height-unit") : words.index("--height-unit") + 2] = ["--height-m", "80"]
-    assert program("read-flight", "log.csv", *words)[2] == ""  # its heights are not asked for
+    _, out, err = program("read-flight", "log.csv", *words)
+    assert err == ""  # its heights are not asked for
+    assert out.splitlines()[-3:] == [
+        "not read: 'height', 'heading'",
+        "height: 80 m throughout, as --height-m says",
+        "height from 80.0 to 80.0 m",
+    ]
     (tmp_path / "line.csv").write_text("lat,lon\n49.005,11.001\n49.005,11.002\n")
     _, out, err = program("read-flight", "line.csv")
     assert out.startswith("2 points, 73 m, no times\n")
     assert "no times: a flight has an even speed (--speed-mps, 10 m/s)" in err
     assert "no height above the ground: a flight needs --height-m" in err
+    _, out, err = program("read-flight", "line.csv", "--height-m", "90", "--speed-mps", "25")
+    assert "height: 90 m throughout" in out
+    assert err == "no times: a flight has an even speed (--speed-mps, 25 m/s)\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("log.csv", "--height-m", "nan"), "--height-m must be a number from 5 to 10000, got nan"),
+        (("run.txt", "--height-m", "1e9"), "--height-m must be a number from 5 to 10000, got 1e+09"),
+        (("log.csv", "--speed-mps", "-1"), "--speed-mps must be a number from 0.1 to 100, got -1"),
+        (("log.csv", "--speed-mps", "9"), "log.csv has times: leave out --speed-mps"),
+        (("run.txt", "--speed-mps", "9"), "run.txt has times: leave out --speed-mps"),
+        (("log.csv", "--axes", "camera"), "log.csv is no TUM file: leave out --axes"),
+        (
+            ("line.kml", "--height-unit", "none"),
+            "line.kml is no table, and its units are known: leave out --height-unit",
+        ),
+        (
+            ("log.csv", "--place-unit", "e7"),
+            "'lat' has decimals, and is no count of 1e-7 degrees: say --place-unit deg",
+        ),
+        (("log.csv", "--least-m", "5"), "--least-m needs --region"),
+        (("log.csv", "--margin-m", "nan"), "--margin-m needs --region"),
+        (("log.csv", "--tum", "other.txt"), "--tum needs --region"),
+        (("log.csv", "--tum", "."), ". cannot be written (Is a directory): name another place"),
+        (("log.csv", "--tum", ".."), ".. cannot be written (Is a directory)"),
+        (("log.csv", "--tum", ""), ". cannot be written (Is a directory)"),
+        ((".",), "sasgeo-bench: . is no flight log"),
+    ],
+)
+def test_an_option_without_a_meaning_or_beyond_its_range_gets_one_line(mistake, tmp_path, words, told) -> None:
+    (tmp_path / "log.csv").write_text("time_ms,lat,lon,height_ft,heading_deg\n" + ROWS)
+    (tmp_path / "run.txt").write_text("0 0 0 80 0 0 0 1\n1 9 0 80 0 0 0 1\n")
+    (tmp_path / "line.kml").write_text("<kml><LineString><coordinates>9,47 9,48</coordinates></LineString></kml>")
+    assert told in mistake("read-flight", *words)
+
+
+def test_gaps_between_flights_are_told_with_their_number(program, tmp_path) -> None:
+    rows = "".join(f"{at + 90 * (at > 3)},49.005,{11.001 + at * 6.838e-5:.7f}\n" for at in range(6))
+    (tmp_path / "log.csv").write_text("time_s,lat,lon\n" + rows)
+    out = program("read-flight", "log.csv")[1].splitlines()
+    assert out[1].startswith("2 stretches: a gap of more than 10 s ends one, the longest has 91.0 s")
 
 
 def test_the_stretch_over_a_region_is_written_as_tum(program, mistake, lay_towns, tmp_path) -> None:
@@ -158,7 +200,6 @@ def test_the_stretch_over_a_region_is_written_as_tum(program, mistake, lay_towns
     cut = read_tum(tmp_path / "cut.txt")
     assert cut.position_m[[0, -1], 0] == pytest.approx([west + 100, east - 100], abs=3)
     assert program("read-flight", "cut.txt")[1] == out.removeprefix("over town-grid: ")
-    assert "--tum needs --region" in mistake("read-flight", "run.txt", "--tum", "other.txt")
     assert "run.txt is named twice" in mistake("read-flight", "run.txt", "--region", folder, "--tum", "run.txt")
 
 

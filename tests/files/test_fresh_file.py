@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A file is replaced whole or not at all, and nothing else is left beside it."""
 
+from pathlib import Path
+
 import pytest
 
+from sasgeo_bench.ageing.files import write_ratebook, write_summary
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import fresh_file
 
@@ -38,3 +41,13 @@ def test_a_refusal_of_the_disk_is_one_line_with_its_mend(tmp_path):
         fresh_file(tmp_path / "file" / "a.json", mend="run again"),
     ):
         pass
+
+
+@pytest.mark.parametrize("name", [".", "", "..", "folder"])
+@pytest.mark.parametrize("write", [write_summary, write_ratebook])
+def test_a_folder_is_no_file_to_write(tmp_path, monkeypatch, name, write):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "folder").mkdir()
+    with pytest.raises(StoreError, match=r"cannot be written \(Is a directory\): check"):
+        write(Path(name), [])
+    assert [path.name for path in tmp_path.iterdir()] == ["folder"]

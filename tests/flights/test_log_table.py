@@ -462,7 +462,7 @@ def test_what_contradicts_or_may_be_two_things_is_refused(
         ({"time_unit": "min"}, "time_unit must be one of s, ms, us, ns, none, got 'min'"),
         ({"place_unit": "none"}, "place_unit must be one of deg, rad, e7, got 'none'"),
         ({"axes": "ned"}, "axes must be one of up, camera, got 'ned'"),
-        ({"speed_mps": float("nan")}, "speed_mps must be positive, got nan"),
+        ({"speed_mps": float("nan")}, "--speed-mps must be a number from 0.1 to 100, got nan"),
     ],
 )
 def test_facts_that_cannot_be_are_refused(facts: dict, match: str) -> None:

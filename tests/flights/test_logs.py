@@ -107,6 +107,32 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(
     assert (None if log.height_m is None else log.height_m.tolist()) == heights
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "told"),
+    [
+        ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>"), "elevations, which are above the sea"),
+        ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"), "altitudes, which are not relative to the ground"),
+        ("a.csv", "lat,lon,height_furlong,heading_mil\n1,1,2,3\n1,2,2,3", "'height_furlong', 'heading_mil'"),
+        (
+            "b.csv",
+            "lat,lon,date,altitude_m,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
+            "'date', 'altitude_m'; altitudes above",
+        ),
+        ("c.csv", "lat,lon,pitch_deg,\x1b[31m\n1,1,2,3\n1,2,2,3", "'pitch_deg', '?[31m'"),
+        ("d.csv", "lat,lon," + ",".join(f"c{at:0>99}" for at in range(99)), "'c000"),
+    ],
+)
+def test_what_of_a_file_is_not_read_is_told_in_one_line(written: Callable, name: str, text: str, told: str) -> None:
+    if name == "d.csv":
+        text += "".join(f"\n1,{at + 1}" + ",5" * 99 for at in range(2))
+    last = read_log(
+        written(name, text), LogFacts(time_unit="none") if name in ("a.csv", "c.csv", "d.csv") else None
+    ).told[-1]
+    assert last.startswith(f"not read: {told}")
+    assert last.isprintable()
+    assert len(last) < 600
+
+
 def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(written: Callable) -> None:
     whens = "".join(f"<when>2025-05-01T10:00:0{at}Z</when>" for at in range(3))
     coords = "".join(f"<gx:coord>9.52 {47.14 + at / 1e4} 60</gx:coord>" for at in range(3))
@@ -179,8 +205,22 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
         (_csv("lat,lon,time_s", "47.14,9.52,3", "47.1401,9.52,"), "line 3: time is missing"),
         (_csv("lat,lon,time", "47.14,9.52,2025-05-01T10:00:00", "47.2,9.52,6"), "line 3: time is no date and time"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "48.14,9.52,4"), "line 3: moves at 111183 m/s since the point before"),
-        (_csv("lat,lon,hdg_cdeg", "47.14,9.52,65535", "47.15,9.52,9000"), "line 2: yaw_deg lies beyond 360"),
-        (_csv("lat,lon,height_m", "47.14,9.52,2e4", "47.15,9.52,80"), "line 2: height_m lies beyond 10000"),
+        (
+            _csv("lat,lon,hdg_cdeg", "47.14,9.52,65535", "47.15,9.52,9000"),
+            "line 2: yaw, column 'hdg_cdeg', cdeg, is 655.35 degrees, bey",
+        ),
+        (
+            _csv("lat,lon,yaw_rad", "47.14,9.52,1", "47.15,9.52,190"),
+            "line 3: yaw, column 'yaw_rad', rad, is 10886.2 deg",
+        ),
+        (
+            _csv("lat_e7,lon", "471400000.5,9.52", "47,9"),
+            "'lat_e7' has decimals, .* of 1e-7 degrees: name it by its unit",
+        ),
+        (
+            _csv("lat,lon,height_m", "47.14,9.52,2e4", "47.15,9.52,80"),
+            "line 2: height, column 'height_m', m, is 20000 m, beyond 10000",
+        ),
     ],
 )
 def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
@@ -221,7 +261,11 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
         ("a.kml", LINE.format("9,47 9,48").replace("</Document>", "<LineString/></Document>"), "2 lines or tracks"),
         ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
         ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
-        ("a.kmz", "PK", r"no flight log that is read: .gpx, .kml, .csv, .pos, .tum, .*\(unzip a .kmz, export a .ulg\)"),
+        (
+            "a.kmz",
+            "PK",
+            r"no flight log that is read: .gpx, .kml, .csv, .pos, .tum, .*\(unzip a .kmz, export a .ulg by ulog2csv",
+        ),
     ],
 )
 def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(
@@ -347,15 +391,25 @@ def test_a_log_is_cut_at_a_gap_unless_it_has_no_times(written: Callable, region:
 
 
 def test_a_log_that_leaves_is_refused_in_one_line_with_the_longest_stretch(written: Callable, region: Region) -> None:
-    away = written("a.csv", _csv("lat,lon,time_s", "47.14,9.52,0", "47.15,9.52,100"))
     near = written("b.csv", _table(region, _across(region)[:100]))
-    far = written("c.csv", _csv("lat,lon,time_s", "-47.14,-170.52,0", "-47.15,-170.52,100"))
-    for path, metres in ((away, r"0 m"), (near, r"40\d m"), (far, "0 m")):
-        with pytest.raises(
-            FlightError, match=rf"{path.name} leaves town-grid: of \d+ m .* has {metres}, 1000 m are needed"
-        ):
-            read_flight(path, region, height_m=100.0)
+    with pytest.raises(FlightError, match=r"leaves town-grid: of \d+ m .* has 40\d m, 1000 m are .* --margin-m or --l"):
+        read_flight(near, region, height_m=100.0)
     assert read_flight(near, region, height_m=100.0, least_m=400.0).distance_m[-1] > 400
+
+
+@pytest.mark.parametrize(
+    ("rows", "where"),
+    [
+        (["47.14,9.52,0", "47.15,9.52,100"], "at latitude 47.1400 to 47.1500, longitude 9.5200 to 9.5200"),
+        (["-47.14,-170.52,0", "-47.15,-170.52,100"], "at latitude -47.1500 to -47.1400, longitude -170.5200"),
+    ],
+)
+def test_a_log_beside_a_region_is_refused_by_where_both_lie(
+    written: Callable, region: Region, rows: list[str], where: str
+) -> None:
+    path = written("a.csv", _csv("lat,lon,time_s", *rows))
+    with pytest.raises(FlightError, match=rf"a\.csv lies elsewhere, {where} .*, and town-grid at latitude 48\.\d+ to"):
+        read_flight(path, region, height_m=100.0)
 
 
 def test_heights_come_from_the_log_or_are_given(written: Callable, region: Region) -> None:
@@ -363,7 +417,7 @@ def test_heights_come_from_the_log_or_are_given(written: Callable, region: Regio
     assert np.unique(read_flight(with_heights, region).position_m[:, 2]).tolist() == [70]
     assert np.unique(read_flight(with_heights, region, height_m=90.0).position_m[:, 2]).tolist() == [90]
     without = written("b.csv", _table(region, _across(region), more=",alt", cells=",470"))
-    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground, .*: give height_m"):
+    with pytest.raises(FlightError, match=r"b\.csv has no height above the ground, .*: say one, as in --height-m 100"):
         read_flight(without, region)
 
 
@@ -423,16 +477,17 @@ def test_a_tum_file_in_the_regions_frame_is_cut_alike(tmp_path: Path, region: Re
         {"step_s": 1e9},
         {"least_m": float("nan")},
         {"height_m": -1.0},
+        {"height_m": 1e9},
         {"margin_m": -1.0},
     ],
 )
 def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wish: dict) -> None:
     path = written("a.csv", _table(region, _across(region)))
-    with pytest.raises(FlightError, match=next(iter(wish))):
+    with pytest.raises(FlightError, match=next(iter(wish)).replace("_m", "-m")):
         read_flight(path, region, **({"height_m": 100.0} | wish))
 
 
 def test_a_log_of_days_is_refused_before_it_is_resampled(written: Callable, region: Region) -> None:
-    path = written("a.csv", _csv("time_s,lat,lon", "0,49.2,12.2", "300000,49.3,12.2"))
+    path = written("a.csv", _csv("time_s,lat,lon", "0,48.05,11.05", "300000,48.05,11.06"))
     with pytest.raises(FlightError, match=r"lasts 300000 s, more than 1000000 steps of 0\.2 s: cut it"):
         read_flight(path, region, height_m=80.0)

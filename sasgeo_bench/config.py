@@ -17,7 +17,8 @@ from sasgeo_bench.errors import ConfigError
 Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
-_FEW: Final = 8  # known names, or faults, that an error lists in full
+_FEW: Final = 8  # known names that an error lists in full
+_FAULTS: Final = 3  # of a file that an error tells
 _MOST_BYTES: Final = 10_000_000  # of a file that somebody writes by hand
 LONGEST_LINE: Final = 300
 
@@ -85,8 +86,8 @@ def check_document(content: object, model: type[Model], *, source: str) -> Model
     except ValidationError as error:
         faults = sorted((_fault(item, model) for item in error.errors()), key=lambda fault: "is missing" in fault)
         found = list(dict.fromkeys(faults))
-        more = [f"and {len(found) - _FEW} more"] if len(found) > _FEW else []
-        message = f"{source}: " + "; ".join([*found[:_FEW], *more])
+        more = [f"and {len(found) - _FAULTS} more"] if len(found) > _FAULTS else []
+        message = f"{source}: " + "; ".join([*found[:_FAULTS], *more])
         raise ConfigError(message) from error
 
 
@@ -97,9 +98,16 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         known = _known_keys(item["loc"], model)
         near = difflib.get_close_matches(str(item["loc"][-1]), known, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]!r}?" if near else f"known keys: {', '.join(known)}"
+        if len(item["loc"]) > 1 and not near and item["loc"][-1] in model.model_fields:
+            hint = "which belongs to the file itself: move it above the first [table]"
         return f"unknown key {where!r}, {hint}"
+    if item["type"] == "missing" and isinstance(item["loc"][-1], int):
+        parent = ".".join(map(str, item["loc"][:-1]))
+        return f"{parent!r} has too few values, got {_short(item['input'])}"
     if item["type"] == "missing":
         return f"{where!r} is missing"
+    if item["type"] == "tuple_type":
+        return f"{where!r} must be a list in brackets, [...], got {_short(item['input'])}"
     if item["type"] == "list_type":
         is_table = isinstance(item["input"], dict)
         more = (
@@ -111,6 +119,7 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
     if item["type"] == "model_type":
         return f"{where!r} is a table of keys, got {_short(item['input'])}"
     text = str(item["msg"]).removeprefix("Value error, ").replace(" after validation", "")
+    text = text.replace("Input should be ", "must be ").replace("must be a valid ", "must be a ")
     if not where or "got " in text:
         return text
     # A whole table says nothing of what is wrong in it.
@@ -220,6 +229,9 @@ def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[]
             raise ConfigError(message)
         return path
     files = list_known()
+    if id_or_path not in files and Path(id_or_path).is_dir():
+        message = f"{id_or_path} is a folder: name a {noun} file in it ({Path(id_or_path) / 'NAME.toml'}), or an id"
+        raise ConfigError(message)
     if id_or_path not in files:
         message = f"there is no {noun} {id_or_path!r}{_hint(id_or_path, dict(zip(files, files, strict=True)))} ({mend})"
         raise ConfigError(message)

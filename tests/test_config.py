@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Faults in TOML files, each in one line."""
 
-import pytest
+from typing import Annotated
 
-from sasgeo_bench.config import Document, parse_toml
+import pytest
+from pydantic import Field
+
+from sasgeo_bench.config import Document, find_document, parse_toml
 from sasgeo_bench.errors import ConfigError
 
 
@@ -47,9 +50,9 @@ def test_an_unknown_key_in_a_table_of_names_suggests_the_nearest():
 def test_a_file_full_of_faults_names_the_first_few():
     many = "".join(f"[by_name.n{at}]\ndepth_m = 'deep'\n" for at in range(12))
     found = fault(f'name = "x"\n{many}')
-    assert "n7.depth_m" in found
-    assert "n8.depth_m" not in found
-    assert found.endswith("; and 4 more")
+    assert "n2.depth_m" in found
+    assert "n3.depth_m" not in found
+    assert found.endswith("; and 9 more")
 
 
 def test_an_unknown_key_like_no_other_lists_the_known_ones():
@@ -68,6 +71,32 @@ def test_one_thing_where_a_list_is_wanted_is_shown_as_a_list():
         parse_toml("sizes = 192", Sizes, source="a.toml")
     with pytest.raises(ConfigError, match=r"'sizes' is a list: for a list of tables write \[\[sizes\]\]$"):
         parse_toml("[sizes]\nx = 1", Sizes, source="a.toml")
+
+
+class Shape(Document):
+    size: tuple[float, float] = Field(strict=False)
+    step: Annotated[float, Field(ge=0.1)] = 1.0
+    inner: list[Inner] = []
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("size = 5", "'size' must be a list in brackets, [...], got 5"),
+        ("size = [5.0]", "'size' has too few values, got [5.0]"),
+        ("size = [1, 1]\nstep = 0.01", "'step': must be greater than or equal to 0.1, got 0.01"),
+        ("[[inner]]\ndepth_m = 1.0\nsize = [1, 1]", "'inner.0.size', which belongs to the file itself: move it above"),
+    ],
+)
+def test_faults_are_told_in_plain_words(text, said):
+    with pytest.raises(ConfigError) as caught:
+        parse_toml(text, Shape, source="a.toml")
+    assert said in str(caught.value)
+
+
+def test_a_folder_in_place_of_a_file_is_called_one(tmp_path):
+    with pytest.raises(ConfigError, match=r"is a folder: name a region file in it \("):
+        find_document(str(tmp_path), "region", "list-regions shows all", dict)
 
 
 def test_a_number_where_a_table_is_wanted_is_shown():

@@ -29,6 +29,9 @@ def measure_ageing_command(
 ) -> None:
     """Measure what vanished and appeared between dated extracts: OUT/ageing.parquet, ageing.md and ageing.svg."""
     box = _read_box(bounds)
+    if out.exists() and not out.is_dir():
+        message = f"--out {out} is a file: name a folder"
+        raise ConfigError(message)
     dated = date_extracts(extract, at=[read_day(text, flag="--at") for text in at or ()])
     history = read_history(dated, bounds=box, margin_m=margin_m, tell=tell)
     name = place or extract[0].name.split(".")[0].split("-")[0]

@@ -38,7 +38,7 @@ class QueryOptions(Options):
     ] = None
     split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit"
     n: Annotated[int, typer.Option(help="sites in each region; each carries all the variants of a suite")] = 8
-    seed: Annotated[int | None, typer.Option(help="public seed, the root of all chance; default: 0")] = None
+    seed: Annotated[int | None, typer.Option(min=0, help="public seed, the root of all chance; default: 0")] = None
     seed_file: SeedFile = None
     prior: Annotated[str | None, typer.Option(help="prior group, as in r500-weak-s3; default: that of the suite")] = (
         None

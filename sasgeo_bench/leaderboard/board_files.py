@@ -177,6 +177,9 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         return dict(parse_json(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
     except StoreError:
         raise
+    except NotADirectoryError as error:
+        message = f"{folder} is a file: name the folder of a board"
+        raise StoreError(message) from error
     except FileNotFoundError as error:
         message = f"{folder} holds no board: score some runs first"
         raise StoreError(message) from error

@@ -312,7 +312,7 @@ def read_history(
     area = _projected_box(frame, epsg)
     for item in dated:
         with _one_state(item) as plain:
-            reading = read_extract(plain, grid)
+            reading = read_extract(plain, grid, at=item.on)
             with open_snapshot(plain) as snapshot:
                 lifecycle = read_lifecycle(snapshot.path, epsg=epsg)
         area = shapely.intersection(area, _inner(reading, grid, margin_m=0.0 if is_one_file else margin_m))

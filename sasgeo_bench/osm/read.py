@@ -28,6 +28,9 @@ from sasgeo_bench.osm.snapshot import Snapshot, open_snapshot, own_id
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
 
 _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium returns 1970-01-01 if a file has no timestamps
+_LATE_DAYS: Final = 2  # a file may hold objects that are so much younger than its date: zones, slow downloads
+_STALE_DAYS: Final = 366  # where so many features stand, some change within a year
+_ENOUGH: Final = 1000  # features
 MOST_LOST: Final = 0.5  # of the ways, may lack their nodes; of 198 real extracts the most is 0.3
 
 
@@ -69,7 +72,7 @@ def read_extract(
 ) -> Reading:
     """Read the features of one extract that touch a grid, in its CRS, with whole geometries, sorted by class and id.
 
-    `at` cuts a full history (.osh.pbf) at the end of a day. `stated_coverage` is the mapped area in longitude and
+    `at` cuts a full history (.osh.pbf) at the end of a day; any file is held against it (`misdated`). `stated_coverage` is the mapped area in longitude and
     latitude, if the user knows it. `classes` are those to keep, by default all. A node beyond the globe is removed from
     its ways and counted in `drops`.
 
@@ -89,7 +92,9 @@ def read_extract(
             is_cut_by_box=cuts_by_box(snapshot.path, scan, objects),
         )
     mapped = _mapped(path.name, scan, grid, area=area, source=source, frame=header or _frame(objects))
-    return _reading(path.name, scan, grid, mapped, objects=objects, classes=classes).dated(snapshot)
+    stated_at = snapshot.replicated_at
+    reading = _reading(path.name, scan, grid, mapped, objects=objects, classes=classes, at=at, header=stated_at)
+    return reading.dated(snapshot)
 
 
 def read_geojson(
@@ -98,6 +103,7 @@ def read_geojson(
     *,
     tags: Mapping[str, str],
     stated_coverage: shapely.Geometry,
+    at: dt.date | None = None,
     classes: Sequence[str] | None = None,
 ) -> Reading:
     """Read the features of GeoJSON files as `read_extract` reads an OSM file.
@@ -109,7 +115,32 @@ def read_geojson(
     objects = _objects(scan)
     mapped = _mapped(name, scan, grid, area=stated_coverage, source="region file", frame=_frame(objects))
     warning = classless(scan)
-    return _reading(name, scan, grid, mapped, objects=objects, classes=classes, warnings=(warning,) if warning else ())
+    warnings = (warning,) if warning else ()
+    return _reading(name, scan, grid, mapped, objects=objects, classes=classes, at=at, warnings=warnings)
+
+
+def misdated(
+    name: str, at: dt.date, *, newest: dt.date | None, header: dt.date | None = None, count: int = 0
+) -> str | None:
+    """Return a warning if a file cannot be of the day `at`; None if it can, or says nothing of its age.
+
+    `newest` is the day of its newest object, `header` that of its header, `count` the number of its objects: a few may
+    well stay as they are for more than a year.
+
+    >>> misdated("a.osm.pbf", dt.date(1999, 1, 1), newest=dt.date(2013, 7, 19))
+    'a.osm.pbf is dated 1999-01-01, and holds an object of 2013-07-19: state the day that it is of'
+    >>> misdated("a.osm.pbf", dt.date(2013, 7, 19), newest=dt.date(2013, 7, 19))
+    """
+    mend = "state the day that it is of"
+    today = dt.datetime.now(tz=dt.UTC).date()
+    if newest is not None and (newest - at).days > _LATE_DAYS:
+        return f"{name} is dated {at}, and holds an object of {newest}: {mend}"
+    last = max(filter(None, (newest, header)), default=None)
+    if last is not None and count >= _ENOUGH and (at - last).days > _STALE_DAYS:
+        return f"{name} is dated {at}, and nothing in it is younger than {last}: {mend}"
+    if (at - today).days > _LATE_DAYS:
+        return f"{name} is dated {at}, and today is {today}: {mend}"
+    return None
 
 
 def _objects(scan: Scan) -> NDArray[np.object_]:
@@ -155,6 +186,8 @@ def _reading(
     *,
     objects: NDArray[np.object_],
     classes: Sequence[str] | None,
+    at: dt.date | None = None,
+    header: dt.datetime | None = None,
     warnings: tuple[str, ...] = (),
 ) -> Reading:
     """Turn what one pass found into features."""
@@ -173,13 +206,16 @@ def _reading(
         raise CoverageError(message)
     kept = taxonomy.names if classes is None else classes
     built_up = project(shapely.from_wkb(np.array(scan.built_up, dtype=object)), grid.epsg)
-    warnings = (*warnings, missing_families(features, mapped.coverage, classes=kept, built_up=built_up))
     newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
+    newest = newest if newest > _EPOCH else None
+    days = {"newest": newest and newest.date(), "header": header and header.date()}
+    dated = None if at is None else misdated(name, at, count=len(scan.rows), **days)
+    warnings = (*warnings, dated, missing_families(features, mapped.coverage, classes=kept, built_up=built_up))
     return Reading(
         features=features,
         coverage=mapped.coverage,
         coverage_source=mapped.source,
-        osm_timestamp=newest if newest > _EPOCH else None,
+        osm_timestamp=newest,
         drops=dict(scan.tally.drops.most_common()),
         hidden=dict(scan.tally.hidden.most_common()),
         notes=dict(scan.tally.notes.most_common()),

@@ -132,8 +132,8 @@ class RegionFile(NamedDocument):
         is_labelled = any(item.format == "geojson" for item in self.extract)
         if is_labelled and (self.stated_coverage() is None or self.classes is None):
             message = (
-                "an extract of format 'geojson' holds some classes in some places: say which by classes and "
-                "coverage_parts_lonlat; all else is unknown"
+                "an extract of format 'geojson' holds some classes in some places: say which by classes and by "
+                "coverage_lonlat or coverage_parts_lonlat, above [[extract]]; all else is unknown"
             )
             raise ValueError(message)
         return self

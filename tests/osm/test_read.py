@@ -20,7 +20,7 @@ from sasgeo_bench.errors import CoverageError, ExtractError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import fingerprint
 from sasgeo_bench.osm.mapped import project
-from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.osm.read import misdated, read_extract
 from sasgeo_bench.osm.scan import Classifier, Scan, reaches
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -405,3 +405,27 @@ def test_the_same_features_have_one_fingerprint_in_any_order(reading):
     assert fingerprint(shuffled) == fingerprint(reading.features)
     assert re.fullmatch("[0-9a-f]{64}", fingerprint(shuffled))
     assert fingerprint(reading.features.iloc[1:]) != fingerprint(reading.features)
+
+
+@pytest.mark.parametrize(
+    ("at", "newest", "header", "count", "said"),
+    [
+        ((1999, 1, 1), (2013, 7, 19), None, 1, "holds an object of 2013-07-19"),
+        ((2013, 7, 17), (2013, 7, 19), None, 5000, None),
+        ((2024, 1, 1), (2013, 7, 18), (2013, 7, 19), 5000, "nothing in it is younger than 2013-07-19"),
+        ((2024, 1, 1), (2013, 7, 18), None, 500, None),  # few objects may stay as they are
+        ((2024, 1, 1), (2013, 7, 18), (2023, 12, 31), 5000, None),
+        ((2024, 1, 1), None, None, 5000, None),
+        ((9999, 12, 31), None, None, 1, "and today is"),
+    ],
+)
+def test_a_file_is_held_against_the_day_that_is_stated(at, newest, header, count, said):
+    days = [None if day is None else dt.date(*day) for day in (newest, header)]
+    told = misdated("a.osm", dt.date(*at), newest=days[0], header=days[1], count=count)
+    assert told is None if said is None else said in told
+
+
+@pytest.mark.parametrize(("year", "is_told"), [(1999, True), (None, False)])
+def test_a_wrong_date_of_an_extract_is_a_warning(toytown, toygrid, year, is_told):
+    at = None if year is None else dt.date(year, 1, 1)
+    assert any("state the day" in told for told in read_extract(toytown, toygrid, at=at).warnings) == is_told

@@ -101,29 +101,30 @@ def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic
         if len(item["loc"]) > 1 and not near and item["loc"][-1] in model.model_fields:
             hint = "which belongs to the file itself: move it above the first [table]"
         return f"unknown key {where!r}, {hint}"
-    if item["type"] == "missing" and isinstance(item["loc"][-1], int):
-        parent = ".".join(map(str, item["loc"][:-1]))
-        return f"{parent!r} has too few values, got {_short(item['input'])}"
-    if item["type"] == "missing":
-        return f"{where!r} is missing"
-    if item["type"] == "tuple_type":
-        return f"{where!r} must be a list in brackets, [...], got {_short(item['input'])}"
-    if item["type"] == "list_type":
-        is_table = isinstance(item["input"], dict)
-        more = (
-            f"for a list of tables write [[{where}]]"
-            if is_table
-            else f"write [{json.dumps(item['input'], default=str)}]"
-        )
-        return f"{where!r} is a list: {more}"
-    if item["type"] == "model_type":
-        return f"{where!r} is a table of keys, got {_short(item['input'])}"
+    shape = _wrong_shape(item, where)
+    if shape is not None:
+        return shape
     text = str(item["msg"]).removeprefix("Value error, ").replace(" after validation", "")
     text = text.replace("Input should be ", "must be ").replace("must be a valid ", "must be a ")
     if not where or "got " in text:
         return text
     # A whole table says nothing of what is wrong in it.
     return f"{where!r}: {text}" + ("" if isinstance(item["input"], dict) else f", got {_short(item['input'])}")
+
+
+def _wrong_shape(item: Any, where: str) -> str | None:  # noqa: ANN401 - pydantic's own error record
+    """Describe what is missing, or no list or table where one is wanted; None of any other fault."""
+    kind, given = item["type"], item["input"]
+    if kind == "missing" and isinstance(item["loc"][-1], int):
+        return f"{where.rpartition('.')[0]!r} has too few values, got {_short(given)}"
+    if kind == "missing":
+        return f"{where!r} is missing"
+    if kind == "tuple_type":
+        return f"{where!r} must be a list in brackets, [...], got {_short(given)}"
+    if kind == "list_type":
+        written = f"for a list of tables write [[{where}]]" if isinstance(given, dict) else f"write [{_json(given)}]"
+        return f"{where!r} is a list: {written}"
+    return f"{where!r} is a table of keys, got {_short(given)}" if kind == "model_type" else None
 
 
 def _json(value: object) -> str:

@@ -72,9 +72,9 @@ def read_extract(
 ) -> Reading:
     """Read the features of one extract that touch a grid, in its CRS, with whole geometries, sorted by class and id.
 
-    `at` cuts a full history (.osh.pbf) at the end of a day; any file is held against it (`misdated`). `stated_coverage` is the mapped area in longitude and
-    latitude, if the user knows it. `classes` are those to keep, by default all. A node beyond the globe is removed from
-    its ways and counted in `drops`.
+    `at` cuts a full history (.osh.pbf) at the end of a day; any file is held against it (`misdated`).
+    `stated_coverage` is the mapped area in longitude and latitude, if the user knows it. `classes` are those to keep,
+    by default all. A node beyond the globe is removed from its ways and counted in `drops`.
 
     Raise `ExtractError` if the file is missing, damaged or of an unknown format, or an id, date or coordinate is not a
     number; `CoverageError` if the grid lies outside the extract, or no element of any class lies in it.
@@ -92,9 +92,8 @@ def read_extract(
             is_cut_by_box=cuts_by_box(snapshot.path, scan, objects),
         )
     mapped = _mapped(path.name, scan, grid, area=area, source=source, frame=header or _frame(objects))
-    stated_at = snapshot.replicated_at
-    reading = _reading(path.name, scan, grid, mapped, objects=objects, classes=classes, at=at, header=stated_at)
-    return reading.dated(snapshot)
+    told = _held_against(at, path.name, scan, header=snapshot.replicated_at)
+    return _reading(path.name, scan, grid, mapped, objects=objects, classes=classes, warnings=told).dated(snapshot)
 
 
 def read_geojson(
@@ -115,8 +114,8 @@ def read_geojson(
     objects = _objects(scan)
     mapped = _mapped(name, scan, grid, area=stated_coverage, source="region file", frame=_frame(objects))
     warning = classless(scan)
-    warnings = (warning,) if warning else ()
-    return _reading(name, scan, grid, mapped, objects=objects, classes=classes, at=at, warnings=warnings)
+    told = (*([warning] if warning else []), *_held_against(at, name, scan))
+    return _reading(name, scan, grid, mapped, objects=objects, classes=classes, warnings=told)
 
 
 def misdated(
@@ -186,8 +185,6 @@ def _reading(
     *,
     objects: NDArray[np.object_],
     classes: Sequence[str] | None,
-    at: dt.date | None = None,
-    header: dt.datetime | None = None,
     warnings: tuple[str, ...] = (),
 ) -> Reading:
     """Turn what one pass found into features."""
@@ -206,23 +203,31 @@ def _reading(
         raise CoverageError(message)
     kept = taxonomy.names if classes is None else classes
     built_up = project(shapely.from_wkb(np.array(scan.built_up, dtype=object)), grid.epsg)
-    newest = max((row.timestamp for row in scan.rows), default=_EPOCH)
-    newest = newest if newest > _EPOCH else None
-    days = {"newest": newest and newest.date(), "header": header and header.date()}
-    dated = None if at is None else misdated(name, at, count=len(scan.rows), **days)
-    warnings = (*warnings, dated, missing_families(features, mapped.coverage, classes=kept, built_up=built_up))
+    missing = missing_families(features, mapped.coverage, classes=kept, built_up=built_up)
     return Reading(
         features=features,
         coverage=mapped.coverage,
         coverage_source=mapped.source,
-        osm_timestamp=newest,
+        osm_timestamp=_newest(scan),
         drops=dict(scan.tally.drops.most_common()),
         hidden=dict(scan.tally.hidden.most_common()),
         notes=dict(scan.tally.notes.most_common()),
-        warnings=tuple(filter(None, warnings)),
+        warnings=(*warnings, *([missing] if missing else [])),
         unknown_m2=mapped.unknown_m2,
         cuts=_cuts(scan),
     )
+
+
+def _newest(scan: Scan) -> dt.datetime | None:
+    return max((row.timestamp for row in scan.rows if row.timestamp > _EPOCH), default=None)
+
+
+def _held_against(at: dt.date | None, name: str, scan: Scan, *, header: dt.datetime | None = None) -> tuple[str, ...]:
+    """Return a warning if a file cannot be of the day `at`, as `misdated` says."""
+    newest = _newest(scan)
+    days = {"newest": newest and newest.date(), "header": header and header.date()}
+    told = None if at is None else misdated(name, at, count=len(scan.rows), **days)
+    return (told,) if told else ()
 
 
 def _cuts(scan: Scan) -> dict[str, int]:

@@ -340,7 +340,7 @@ def test_a_task_whose_truths_are_gone_is_not_up_to_date(made, tmp_path):
             r"a perfect order has an area of 0\.447, so the pilot's second cannot be 0\.3",
         ),
         ({"sites = 1": 'sites = 1\ntracks = ["retrieval"]'}, "is of localization, and no .* draws that track"),
-        ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "Input should be 'published', 'measured'"),
+        ({"sites = 1": 'sites = 1\ndetectors = ["mine"]'}, "must be 'published', 'measured'"),
         ({"sites = 1": 'sites = 1\ndetectors = ["profile"]'}, "'profile' needs the file of a perception profile"),
         ({"sites = 1": 'sites = 1\ndetectors = ["measured", "measured"]'}, "detector 'measured' is listed twice"),
         ({'suites = ["clean"]\nsites': 'suites = ["clean", "controls"]\nsites'}, "'controls' is drawn for every board"),

@@ -344,7 +344,7 @@ def test_a_region_of_geojson_must_say_its_classes_and_where_it_is_complete(tmp_p
     hamlet = make_hamlet(tmp_path)
     content = hamlet.spec().model_dump()
     for lacking in ("classes", "coverage_parts_lonlat"):
-        with pytest.raises(ValueError, match="say which by classes and coverage_parts_lonlat"):
+        with pytest.raises(ValueError, match="say which by classes and by coverage_lonlat or coverage_parts"):
             type(hamlet.spec())(**{name: value for name, value in content.items() if name != lacking})
 
 

@@ -405,7 +405,7 @@ def test_a_task_without_its_queries_has_that_one_fault(written):
         ('{"schema_version": 0}', "has schema version 0, this version reads 1"),
         ('{"schema_version": 1}', "is damaged (task.json: 'task_version' is missing; 'suite' is missing"),
         (json.dumps(SAID | {"files": {}}), "'files.queries.parquet' is missing"),
-        (json.dumps(SAID | {"files": {"queries.parquet": {"sha256": 5, "bytes": 1}}}), "should be a valid string"),
+        (json.dumps(SAID | {"files": {"queries.parquet": {"sha256": 5, "bytes": 1}}}), "must be a string"),
         (json.dumps(SAID | {"counts": {"retrieval": -1}}), "greater than or equal to 0, got -1"),
         (json.dumps(SAID | {"suite": "../../x"}), "'suite'"),
         (json.dumps(SAID | {"titel": "x"}), "unknown key 'titel', did you mean 'title'?"),

@@ -102,7 +102,6 @@ def read_geojson(
     *,
     tags: Mapping[str, str],
     stated_coverage: shapely.Geometry,
-    at: dt.date | None = None,
     classes: Sequence[str] | None = None,
 ) -> Reading:
     """Read the features of GeoJSON files as `read_extract` reads an OSM file.
@@ -114,7 +113,7 @@ def read_geojson(
     objects = _objects(scan)
     mapped = _mapped(name, scan, grid, area=stated_coverage, source="region file", frame=_frame(objects))
     warning = classless(scan)
-    told = (*([warning] if warning else []), *_held_against(at, name, scan))
+    told = (warning,) if warning else ()
     return _reading(name, scan, grid, mapped, objects=objects, classes=classes, warnings=told)
 
 
@@ -131,14 +130,11 @@ def misdated(
     >>> misdated("a.osm.pbf", dt.date(2013, 7, 19), newest=dt.date(2013, 7, 19))
     """
     mend = "state the day that it is of"
-    today = dt.datetime.now(tz=dt.UTC).date()
     if newest is not None and (newest - at).days > _LATE_DAYS:
         return f"{name} is dated {at}, and holds an object of {newest}: {mend}"
     last = max(filter(None, (newest, header)), default=None)
     if last is not None and count >= _ENOUGH and (at - last).days > _STALE_DAYS:
         return f"{name} is dated {at}, and nothing in it is younger than {last}: {mend}"
-    if (at - today).days > _LATE_DAYS:
-        return f"{name} is dated {at}, and today is {today}: {mend}"
     return None
 
 
@@ -222,7 +218,7 @@ def _newest(scan: Scan) -> dt.datetime | None:
     return max((row.timestamp for row in scan.rows if row.timestamp > _EPOCH), default=None)
 
 
-def _held_against(at: dt.date | None, name: str, scan: Scan, *, header: dt.datetime | None = None) -> tuple[str, ...]:
+def _held_against(at: dt.date | None, name: str, scan: Scan, *, header: dt.datetime | None) -> tuple[str, ...]:
     """Return a warning if a file cannot be of the day `at`, as `misdated` says."""
     newest = _newest(scan)
     days = {"newest": newest and newest.date(), "header": header and header.date()}

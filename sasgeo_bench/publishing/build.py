@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from itertools import chain, permutations
 from pathlib import Path
 from typing import Any, Final
 
@@ -66,7 +65,6 @@ from sasgeo_bench.tasks.task_files import PRIVATE
 from sasgeo_bench.texts import one_line
 
 _MAP: Final = "places.svg"
-_MOST_OTHERS: Final = 40  # entries beyond those of a pipeline among which the ones asked are looked for
 _RATES: Final = "ageing-rates.svg"
 _OF_SCENES: Final = (
     *(*GROUP, "kind_of_place", "matcher", "metric", "n", "blocks", "places"),
@@ -218,10 +216,7 @@ def _name_of(files: BoardFiles) -> str:
 
 
 def _pipeline_of(about: Mapping[str, Any]) -> PipelineFile | None:
-    """Return the shipped pipeline that a board was made by; None for any other, even of the same name.
-
-    Up to two more matchers may have been asked (`leaderboard --matcher`): the title names them.
-    """
+    """Return the shipped pipeline that a board was made by; None for any other, even of the same name."""
     pipeline = about.get("pipeline")
     if not pipeline:
         return None
@@ -229,12 +224,7 @@ def _pipeline_of(about: Mapping[str, Any]) -> PipelineFile | None:
         spec = read_pipeline_file(find_pipeline_file(str(pipeline["id"])))
     except ConfigError:
         return None
-    others = [name for name in (str(entry["name"]) for entry in about.get("entries", ())) if name not in spec.matchers]
-    for more in chain.from_iterable(permutations(others[:_MOST_OTHERS], count) for count in range(3)):
-        asked = spec.model_copy(update={"matchers": [*spec.matchers, *more]})
-        if asked.sha256 == pipeline["sha256"]:
-            return asked.model_copy(update={"title": f"{spec.title}, with {' and '.join(more)}"}) if more else spec
-    return None
+    return spec if spec.sha256 == pipeline["sha256"] else None
 
 
 def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast, ...]:

@@ -224,7 +224,6 @@ def _read(plan: BuildPlan, source: Path) -> Reading:
             plan.grid,
             tags=plan.extract.tags,
             stated_coverage=stated,
-            at=plan.extract.date,
             classes=plan.spec.class_names,
         )
     return read_extract(source, plan.grid, at=plan.extract.date, stated_coverage=stated, classes=plan.spec.classes)

@@ -416,7 +416,6 @@ def test_the_same_features_have_one_fingerprint_in_any_order(reading):
         ((2024, 1, 1), (2013, 7, 18), None, 200, None),  # few objects may stay as they are
         ((2024, 1, 1), (2013, 7, 18), (2023, 12, 31), 5000, None),
         ((2024, 1, 1), None, None, 5000, None),
-        ((9999, 12, 31), None, None, 1, "and today is"),
     ],
 )
 def test_a_file_is_held_against_the_day_that_is_stated(at, newest, header, count, said):

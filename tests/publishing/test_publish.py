@@ -17,9 +17,8 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.board_files import check_board
-from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.publishing import site_files
-from sasgeo_bench.publishing.build import _pipeline_of, publish
+from sasgeo_bench.publishing.build import publish
 from tests.handmade import (
     HOSTILE,
     MARKUP,
@@ -614,16 +613,3 @@ def test_the_command_ends_with_the_path_to_open(program, own):
     assert code == 0, err
     assert out.strip() == str(own / "site" / "index.html")
     assert re.search(r"site: \d+ pages, 0\.\d\d MB, 0\.\d\d MB of pictures, 0\.\d\d MB of downloads", err)
-
-
-@pytest.mark.parametrize(
-    ("more", "title"), [((), "{}"), (("mine",), "{}, with mine"), (("b", "a"), "{}, with b and a")]
-)
-def test_a_board_keeps_its_title_with_more_matchers(more, title):
-    spec = read_pipeline_file(find_pipeline_file("demo"))
-    asked = spec.model_copy(update={"matchers": [*spec.matchers, *more]})
-    entries = [{"name": name} for name in ("random", "a", "b", "mine")]
-    found = _pipeline_of({"pipeline": asked.identity, "entries": entries})
-    assert found is not None
-    assert found.title == title.format(spec.title)
-    assert _pipeline_of({"pipeline": asked.identity | {"sha256": "0" * 64}, "entries": entries}) is None

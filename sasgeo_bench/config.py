@@ -17,8 +17,7 @@ from sasgeo_bench.errors import ConfigError
 Model = TypeVar("Model", bound=BaseModel)
 
 _SHORT: Final = 60  # characters
-_FEW: Final = 8  # known names that an error lists in full
-_FAULTS: Final = 3  # of a file that an error tells
+_FEW: Final = 8  # known names, or faults, that an error lists in full
 _MOST_BYTES: Final = 10_000_000  # of a file that somebody writes by hand
 LONGEST_LINE: Final = 300
 
@@ -86,8 +85,8 @@ def check_document(content: object, model: type[Model], *, source: str) -> Model
     except ValidationError as error:
         faults = sorted((_fault(item, model) for item in error.errors()), key=lambda fault: "is missing" in fault)
         found = list(dict.fromkeys(faults))
-        more = [f"and {len(found) - _FAULTS} more"] if len(found) > _FAULTS else []
-        message = f"{source}: " + "; ".join([*found[:_FAULTS], *more])
+        more = [f"and {len(found) - _FEW} more"] if len(found) > _FEW else []
+        message = f"{source}: " + "; ".join([*found[:_FEW], *more])
         raise ConfigError(message) from error
 
 

@@ -21,6 +21,7 @@ from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M, flight_area
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.flights.tum import read_tum
 from sasgeo_bench.geometry.pose import bearing_deg
+from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.texts import plain
 
@@ -210,8 +211,7 @@ def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Traject
         why = "has no height above the ground, and altitudes above the sea are not read"
         message = f"{path.name} {why}: say one, as in --height-m 100"
         raise FlightError(message)
-    to_grid = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
-    en_m = np.stack(to_grid.transform(log.lon_deg, log.lat_deg), axis=1)
+    en_m = np.stack(from_lonlat(epsg).transform(log.lon_deg, log.lat_deg), axis=1)
     en_m = np.nan_to_num(en_m, nan=_FAR_M, posinf=_FAR_M, neginf=-_FAR_M)
     time_s = log.time_s
     if time_s is None:

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
-import pyproj
 import shapely
 from pydantic import Field
 from sklearn.cluster import DBSCAN  # type: ignore[import-untyped, unused-ignore]
 
 from sasgeo_bench.config import Document, Line, parse_toml
 from sasgeo_bench.errors import DatasetError
+from sasgeo_bench.geometry.projection import to_lonlat
 from sasgeo_bench.importers.items import Box, Dataset, Item
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 
@@ -144,5 +144,4 @@ def _ground(spec: RegionFile) -> shapely.Geometry:
     if spec.coverage_lonlat is not None:
         return shapely.Polygon(spec.coverage_lonlat)
     grid = spec.grid()
-    to_lonlat = pyproj.Transformer.from_crs(grid.epsg, 4326, always_xy=True)
-    return shapely.box(*to_lonlat.transform_bounds(*grid.bounds_m))
+    return shapely.box(*to_lonlat(grid.epsg).transform_bounds(*grid.bounds_m))

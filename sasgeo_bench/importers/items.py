@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import DatasetError
 from sasgeo_bench.geometry.grid import utm_epsg
+from sasgeo_bench.geometry.projection import from_lonlat
 
 Role = Literal["query", "gallery", "train", "unsplit"]
 MOST_ITEMS: Final = 1_000_000
 _LOWEST_M: Final = -1_000.0
 _HIGHEST_M: Final = 30_000.0
-_WGS84: Final = 4326
 _MAX_LATITUDE_DEG: Final = (-80.0, 84.0)  # of UTM
 
 
@@ -221,7 +221,7 @@ class UtmPlaces:
         for code in np.unique(epsg):
             here = epsg == code
             lon_deg, lat_deg = lonlat[here].T
-            found[:2, here] = pyproj.Transformer.from_crs(_WGS84, int(code), always_xy=True).transform(lon_deg, lat_deg)
+            found[:2, here] = from_lonlat(int(code)).transform(lon_deg, lat_deg)
             factors = pyproj.Proj(int(code)).get_factors(lon_deg, lat_deg)
             found[2, here] = factors.meridian_convergence
         return cls(epsg=epsg, easting_m=found[0], northing_m=found[1], convergence_deg=found[2])

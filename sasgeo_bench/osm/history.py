@@ -14,13 +14,13 @@ from typing import Any, Final, NamedTuple
 import geopandas as gpd
 import numpy as np
 import osmium
-import pyproj
 import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
+from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.osm.coverage import CLOSE_M
 from sasgeo_bench.osm.features import SEA
 from sasgeo_bench.osm.mapped import box_text, project
@@ -390,6 +390,5 @@ def _projected_box(frame: Box, epsg: int) -> shapely.Geometry:
 
 
 def _grid_around(frame: Box, epsg: int) -> Grid:
-    to_metres = pyproj.Transformer.from_crs(4326, epsg, always_xy=True)
-    west_m, south_m, east_m, north_m = to_metres.transform_bounds(*frame, densify_pts=21)
+    west_m, south_m, east_m, north_m = from_lonlat(epsg).transform_bounds(*frame, densify_pts=21)
     return Grid.from_bounds(west_m, south_m, east_m, north_m, cell_size_m=CELL_M, epsg=epsg)

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-import pyproj
 import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.coverage import ground_within_reach
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.osm.scan import Box
@@ -162,7 +162,6 @@ def _segments(lines: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats
 
 CUT: Final = "within reach of ways cut at the edge of the extract"
 OFFSHORE_M: Final = 1000.0  # sea mapped around whole islands: no view is wider, no strait much narrower
-_WGS84: Final = 4326
 _ANTIMERIDIAN_DEG: Final = 180.0
 _EDGE_POINTS: Final = 21  # along each edge of a box: its sides bend when projected
 _DECIMALS: Final = 3  # OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
@@ -243,7 +242,7 @@ def _islands(coast: Geometries, frame: shapely.Geometry) -> shapely.Geometry:
 
 def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
     """Project longitude and latitude to easting and northing, rounded to a millimetre; one geometry or an array."""
-    to_grid = pyproj.Transformer.from_crs(_WGS84, epsg, always_xy=True)
+    to_grid = from_lonlat(epsg)
 
     def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coordinates of shape (N, 2), degrees -> metres."""
@@ -257,12 +256,12 @@ def lonlat_box(grid: Grid) -> Box:
 
     Of a grid with an edge at the antimeridian, a bent corner may lie beyond: the box ends there.
     """
-    to_lonlat = pyproj.Transformer.from_crs(grid.epsg, _WGS84, always_xy=True)
-    bounds = to_lonlat.transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
+    change = to_lonlat(grid.epsg)
+    bounds = change.transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
     west, south, east, north = map(float, bounds)
     if west > east:
         left, low, right, high = grid.bounds_m
-        is_eastern = to_lonlat.transform((left + right) / 2, (low + high) / 2)[0] > 0
+        is_eastern = change.transform((left + right) / 2, (low + high) / 2)[0] > 0
         west, east = (west, _ANTIMERIDIAN_DEG) if is_eastern else (-_ANTIMERIDIAN_DEG, east)
     return (west, south, east, north)
 

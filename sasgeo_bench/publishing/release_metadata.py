@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 import pyarrow as pa
-import pyproj
 import shapely
 
 from sasgeo_bench.files.parquet import read_schema
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.projection import to_lonlat
 from sasgeo_bench.publishing.release_files import COPYRIGHT_URL, LICENCE_URL, TRUTHS, Release, ReleaseMap
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
@@ -324,7 +324,6 @@ def _type(kind: pa.DataType) -> str:
 
 STAC: Final = "stac"
 _COLLECTION: Final = "regions"
-_WGS84: Final = 4326
 _PARQUET: Final = "application/vnd.apache.parquet"
 _DECIMALS: Final = 7  # of a degree: a centimetre
 _SIDE_POINTS: Final = 8  # between the corners of a footprint: a straight side of the grid is none in degrees
@@ -478,6 +477,5 @@ def footprint(grid: Grid) -> shapely.Polygon:
     west, south, east, north = grid.bounds_m
     longest_m = max(east - west, north - south)
     outline = shapely.segmentize(shapely.box(west, south, east, north), longest_m / _SIDE_POINTS)
-    to_lonlat = pyproj.Transformer.from_crs(grid.epsg, _WGS84, always_xy=True)
-    corners = zip(*to_lonlat.transform(*shapely.get_coordinates(outline).T), strict=True)
+    corners = zip(*to_lonlat(grid.epsg).transform(*shapely.get_coordinates(outline).T), strict=True)
     return shapely.Polygon([(round(lon, _DECIMALS), round(lat, _DECIMALS)) for lon, lat in corners])

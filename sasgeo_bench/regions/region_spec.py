@@ -21,6 +21,7 @@ from pydantic import (
 from sasgeo_bench.config import Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.errors import ConfigError, GridError
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
+from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.imagery_files import ImageryEntry
@@ -165,8 +166,7 @@ class RegionFile(NamedDocument):
             grid = self.grid()
         except ConfigError:
             return  # said when the region is built
-        to_lonlat = pyproj.Transformer.from_crs(grid.epsg, 4326, always_xy=True)
-        grid_west, _, grid_east, _ = to_lonlat.transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
+        grid_west, _, grid_east, _ = to_lonlat(grid.epsg).transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
         if grid_west > grid_east:
             message = (
                 f"the region around {[west, south]!r} reaches over the antimeridian, from {grid_west:.4f} to "
@@ -217,7 +217,7 @@ class RegionFile(NamedDocument):
         """
         west, south, east, north = self.lonlat_box()
         epsg = self.epsg or utm_epsg((west + east) / 2, (south + north) / 2)
-        to_grid = pyproj.Transformer.from_crs(4326, epsg, always_xy=True)
+        to_grid = from_lonlat(epsg)
         try:
             if self.size_m is not None:
                 easting_m, northing_m = to_grid.transform(west, south, errcheck=True)

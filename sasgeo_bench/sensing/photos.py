@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import pyproj
 from PIL import ExifTags
 
 from sasgeo_bench.errors import CameraError, ImageError
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import bearing_deg
+from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
 from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.photo_angles import DJI, PIX4D, SKYDIO, altitude_m, body_angles, camera_angles, height_above_m
@@ -155,9 +155,8 @@ class Photo:
 
 def _to_grid(lon_deg: float, lat_deg: float, epsg: int) -> tuple[float, float, float]:
     """Return easting, northing and the bearing of true north in the grid, degrees."""
-    to_grid = pyproj.Transformer.from_crs("EPSG:4326", f"EPSG:{epsg}", always_xy=True)
     step_deg = -_STEP_DEG if lat_deg > 0 else _STEP_DEG  # never over a pole
-    (here_m, there_m), (low_m, high_m) = to_grid.transform([lon_deg, lon_deg], [lat_deg, lat_deg + step_deg])
+    (here_m, there_m), (low_m, high_m) = from_lonlat(epsg).transform([lon_deg, lon_deg], [lat_deg, lat_deg + step_deg])
     sign = math.copysign(1.0, step_deg)
     return here_m, low_m, float(bearing_deg(sign * (there_m - here_m), sign * (high_m - low_m)))
 

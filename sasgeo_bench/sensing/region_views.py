@@ -6,11 +6,11 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-import pyproj
 import shapely
 
 from sasgeo_bench.errors import ImageryError
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.imagery import Bounds, Imagery
 from sasgeo_bench.regions.layers import OUTSIDE, Paint, burn_layers, make_paint
@@ -22,7 +22,6 @@ from sasgeo_bench.sensing.intrinsics import Intrinsics
 
 LEAST_LABELLED: Final = 0.25  # fraction of a view; one that shows less of the mapped area is left out
 _FAR_M: Final = 1000.0  # height of the camera of a mosaic, in which nothing leans
-_WGS84: Final = 4326
 
 
 def part_bounds_m(spec: RegionFile, *, epsg: int) -> tuple[Bounds, ...]:
@@ -33,7 +32,7 @@ def part_bounds_m(spec: RegionFile, *, epsg: int) -> tuple[Bounds, ...]:
     >>> [round(end - start) for start, end in zip(north, north[2:])]  # metres
     [608, 302]
     """
-    to_map = pyproj.Transformer.from_crs(_WGS84, epsg, always_xy=True)
+    to_map = from_lonlat(epsg)
     rings = [spec.coverage_lonlat] if spec.coverage_lonlat is not None else spec.coverage_parts_lonlat or []
     corners = [np.column_stack(to_map.transform(*np.array(ring).T)) for ring in rings]
     return tuple(tuple(shapely.LinearRing(ring).bounds) for ring in corners)

@@ -17,13 +17,13 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from sasgeo_bench.config import Document, Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.projection import to_lonlat
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
 Part = Literal["train", "calibration", "test"]
 Half = Literal["a", "b"]
 HALVES: Final[tuple[Half, ...]] = ("a", "b")
 
-_WGS84: Final = 4326
 _LEAST_PLACES: Final = 2  # of a half: one is tested, and another one calibrates
 _GEOD: Final = pyproj.Geod(ellps="WGS84")
 
@@ -367,20 +367,21 @@ def nearest_blocks(parts: Mapping[str, Sequence[Block]], *, within_m: float = ma
 
 def _group_pairs(groups: Mapping[tuple[str, str], list[Block]]) -> Iterator[tuple[float, list[Block], list[Block]]]:
     """Yield pairs of groups of different parts with a lower bound of their distance, metres."""
-    centres = {key: _disc(blocks) for key, blocks in groups.items()}
-    for first, second in combinations(groups, 2):
-        if first[0] == second[0]:
-            continue
-        (lon_a, lat_a, radius_a), (lon_b, lat_b, radius_b) = centres[first], centres[second]
-        distance_m = _GEOD.inv(lon_a, lat_a, lon_b, lat_b)[2]
-        yield max(0.0, distance_m - 1.01 * (radius_a + radius_b)), groups[first], groups[second]
+    pairs = [(first, second) for first, second in combinations(groups, 2) if first[0] != second[0]]
+    if not pairs:
+        return
+    discs = {key: _disc(blocks) for key, blocks in groups.items()}
+    both = np.array([(discs[first], discs[second]) for first, second in pairs])
+    (lon_a, lat_a, radius_a), (lon_b, lat_b, radius_b) = np.moveaxis(both, 0, -1)
+    apart_m = _GEOD.inv(lon_a, lat_a, lon_b, lat_b)[2] - 1.01 * (radius_a + radius_b)
+    for (first, second), least_m in zip(pairs, np.maximum(apart_m, 0.0).tolist(), strict=True):
+        yield least_m, groups[first], groups[second]
 
 
 def _disc(blocks: list[Block]) -> tuple[float, float, float]:
     """Return longitude and latitude of a centre, and a radius in metres that holds all blocks of one region."""
     west, south, east, north = shapely.total_bounds([block.polygon() for block in blocks])
-    to_lonlat = pyproj.Transformer.from_crs(blocks[0].epsg, _WGS84, always_xy=True)
-    lon_deg, lat_deg = to_lonlat.transform((west + east) / 2, (south + north) / 2)
+    lon_deg, lat_deg = to_lonlat(blocks[0].epsg).transform((west + east) / 2, (south + north) / 2)
     return (lon_deg, lat_deg, math.hypot(east - west, north - south) / 2)
 
 

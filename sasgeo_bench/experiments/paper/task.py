@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-import pyproj
 import shapely
 
 from sasgeo_bench.errors import ConfigError, StoreError
@@ -34,6 +33,7 @@ from sasgeo_bench.experiments.paper.trials import (
     true_pose,
 )
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.geometry.projection import to_lonlat
 from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, Crop, paper_suite
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.osm.read import Reading
@@ -145,8 +145,7 @@ def _spec(seed: int) -> RegionFile:
     """Return the place of the mosaic as a region specification."""
     grid = mosaic_grid()
     west_m, south_m, east_m, north_m = grid.bounds_m
-    to_lonlat = pyproj.Transformer.from_crs(EPSG, 4326, always_xy=True)
-    center_lonlat = to_lonlat.transform((west_m + east_m) / 2, (south_m + north_m) / 2)
+    center_lonlat = to_lonlat(EPSG).transform((west_m + east_m) / 2, (south_m + north_m) / 2)
     generated = Extract(file=f"{region_name(seed)}.generated", date=DATE, sha256=("0" * 64,))
     return RegionFile(
         id=region_name(seed),

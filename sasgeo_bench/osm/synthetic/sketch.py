@@ -43,6 +43,7 @@ class Sketch:
     ways: list[Way] = field(default_factory=list)
     areas: list[Area] = field(default_factory=list)
     taken: list[shapely.Geometry] = field(default_factory=list)
+    _boxes: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 4)))  # of `taken`, with room for more
 
     @property
     def square(self) -> shapely.Polygon:
@@ -54,7 +55,7 @@ class Sketch:
         self.line(line, **tags)
         if tags.get("tunnel") is None:
             half_m = _STREET_HALF_M.get(tags.get("highway", ""), 4.0)
-            self.taken.append(shapely.buffer(shapely.linestrings(np.asarray(line, dtype=np.float64)), half_m))
+            self.keep_free(shapely.buffer(shapely.linestrings(np.asarray(line, dtype=np.float64)), half_m))
 
     def line(self, line: Sequence[Sequence[float]] | Line, **tags: str) -> None:
         """Draw a line that takes no ground: a hedge, a wall, a stream. The part beyond the town is cut off."""
@@ -84,17 +85,23 @@ class Sketch:
 
     def keep_free(self, polygon: shapely.Geometry) -> None:
         """Reserve ground, so that nothing is built there."""
+        if len(self.taken) == len(self._boxes):
+            self._boxes = np.concatenate((self._boxes, np.empty((len(self.taken) + 256, 4))))
+        self._boxes[len(self.taken)] = polygon.bounds
         self.taken.append(polygon)
 
     def is_taken(self, polygon: shapely.Geometry) -> bool:
         """Return whether the ground is taken already."""
-        return bool(shapely.intersects(np.array(self.taken, dtype=object), polygon).any()) if self.taken else False
+        west, south, east, north = polygon.bounds
+        low_x, low_y, high_x, high_y = self._boxes[: len(self.taken)].T
+        near = np.flatnonzero((low_x <= east) & (high_x >= west) & (low_y <= north) & (high_y >= south))
+        return any(shapely.intersects(self.taken[at], polygon) for at in near)
 
     def build(self, polygon: shapely.Geometry, **tags: str) -> bool:
         """Build a house if the ground is free and within the town."""
         if not self.square.contains(polygon) or not self.ground(polygon, is_free=True, **tags):
             return False
-        self.taken.append(shapely.buffer(polygon, 1.0))
+        self.keep_free(shapely.buffer(polygon, 1.0))
         return True
 
     def houses_along(

@@ -3,9 +3,10 @@
 
 import datetime as dt
 import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,10 +18,9 @@ from osmium.osm.mutable import Relation as OsmRelation
 from osmium.osm.mutable import Way as OsmWay
 
 from sasgeo_bench.errors import ExtractError, SasgeoError
+from sasgeo_bench.geometry.projection import WGS84
 from sasgeo_bench.osm.synthetic.morphology import Morphology, draw
 from sasgeo_bench.osm.synthetic.sketch import Line, Sketch, Tags, join_streets
-
-_ToLonLat = Callable[[float, float], tuple[float, float]]
 
 FIRST_DATE: Final = dt.date(2012, 1, 1)
 LAST_DATE: Final = dt.date(2026, 1, 1)
@@ -220,41 +220,33 @@ def _thing_elements(thing: _Thing, on: dt.date, own_base: int, network_ids: list
 
 def _write(elements: list[_Element], plan: TownPlan, path: Path) -> None:
     """Write sorted elements, each once: a shared node comes with every way that uses it."""
-    to_lonlat = _to_lonlat(plan)
     half_m = plan.size_m / 2
+    unique = list({element[:2]: element for element in reversed(elements)}.values())[::-1]
+    corners = [(-half_m, -half_m), (half_m, half_m)]
+    (west, south), (east, north), *places = _lonlat(plan, [*corners, *(one.xy_m for one in unique if one.rank == 0)])
     header = osmium.io.Header()
     header.set("generator", _GENERATOR)
     header.set("sorting", "Type_then_ID")
-    west, south = to_lonlat(-half_m, -half_m)
-    east, north = to_lonlat(half_m, half_m)
     header.add_box(osmium.osm.Box(west, south, east, north))
     path.unlink(missing_ok=True)
     target = osmium.io.File(str(path), "pbf,pbf_compression=none")
     with osmium.SimpleWriter(target, header=header) as writer:
-        previous: tuple[int, int] | None = None
-        for element in elements:
-            if element[:2] != previous:
-                _add(writer, element, to_lonlat)
-            previous = element[:2]
+        for element, place in zip_longest(unique, places):  # nodes come first
+            _add(writer, element, place)
 
 
-def _to_lonlat(plan: TownPlan) -> _ToLonLat:
-    """Return what converts metres from the centre to longitude and latitude, rounded as OSM stores them."""
+def _lonlat(plan: TownPlan, places_m: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return longitude and latitude of places in metres from the centre, rounded as OSM stores them."""
     longitude_deg, latitude_deg = plan.center_lonlat
     crs = pyproj.CRS.from_proj4(
         f"+proj=tmerc +lat_0={latitude_deg} +lon_0={longitude_deg} +k=1 +x_0=0 +y_0=0 +datum=WGS84"
     )
-    transformer = pyproj.Transformer.from_crs(crs, 4326, always_xy=True)
-
-    def to_lonlat(x_m: float, y_m: float) -> tuple[float, float]:
-        """Convert one place."""
-        lon_deg, lat_deg = transformer.transform(x_m, y_m)
-        return (round(lon_deg, 7), round(lat_deg, 7))
-
-    return to_lonlat
+    to_degrees = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True)
+    lon_deg, lat_deg = to_degrees.transform(*np.array(places_m).T)
+    return [(round(lon, 7), round(lat, 7)) for lon, lat in zip(lon_deg.tolist(), lat_deg.tolist(), strict=True)]
 
 
-def _add(writer: osmium.SimpleWriter, element: _Element, to_lonlat: _ToLonLat) -> None:
+def _add(writer: osmium.SimpleWriter, element: _Element, place: tuple[float, float] | None) -> None:
     common: dict[str, Any] = {
         "id": element.osm_id,
         "version": element.version,
@@ -263,7 +255,7 @@ def _add(writer: osmium.SimpleWriter, element: _Element, to_lonlat: _ToLonLat) -
         "visible": True,
     }
     if element.rank == 0:
-        writer.add_node(OsmNode(location=to_lonlat(*element.xy_m), **common))
+        writer.add_node(OsmNode(location=place, **common))
     elif element.rank == 1:
         writer.add_way(OsmWay(nodes=list(element.nodes), **common))
     else:

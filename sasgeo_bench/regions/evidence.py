@@ -108,9 +108,11 @@ class LayerBits:
             message = f"at most {_MOST_CLASSES} classes fit into the bits of one cell, got {len(layers)}"
             raise ShapeError(message)
         bits = np.zeros(layers.shape[1:], dtype=np.uint32)
+        is_unknown = np.zeros(layers.shape[1:], dtype=np.bool_)
         for index, layer in enumerate(layers):
-            bits |= (layer == PRESENT).astype(np.uint32) << np.uint32(index)
-            bits[layer > PRESENT] = _NOT_KNOWN
+            bits |= np.left_shift(layer, np.uint32(index), dtype=np.uint32)
+            is_unknown |= layer > PRESENT
+        bits[is_unknown] = _NOT_KNOWN
         bits.flags.writeable = False
         return cls(bits=bits, count=len(layers))
 
@@ -171,14 +173,15 @@ def observe(layers: LayerBits, grid: Grid, pose: Pose, *, size_cells: int, cell_
     height, width = layers.bits.shape
     at = rows * width + cols
     if rows.min() >= 0 and rows.max() < height and cols.min() >= 0 and cols.max() < width:
-        bits = layers.bits.ravel()[at]
+        bits = layers.bits.ravel().take(at)
     else:
         within = (rows >= 0) & (rows < height) & (cols >= 0) & (cols < width)
-        bits = np.where(within, layers.bits.ravel()[np.where(within, at, 0)], _NOT_KNOWN)
+        bits = np.where(within, layers.bits.ravel().take(np.where(within, at, 0)), _NOT_KNOWN)
     seen = np.empty((layers.count, *shape), dtype=np.uint8)
+    unknown = np.multiply(bits == _NOT_KNOWN, UNKNOWN, dtype=np.uint8)
     for index, layer in enumerate(seen):
-        np.bitwise_and(bits >> np.uint32(index), 1, out=layer, casting="unsafe")
-    seen[:, bits == _NOT_KNOWN] = UNKNOWN
+        np.not_equal(bits & np.uint32(1 << index), 0, out=layer.view(np.bool_))
+        np.bitwise_or(layer, unknown, out=layer)  # unknown cells have the bit of no class
     return seen
 
 

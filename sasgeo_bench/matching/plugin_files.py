@@ -24,7 +24,7 @@ from urllib.parse import unquote, urlsplit
 from sasgeo_bench.files.paths import plain_file
 
 SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
-_MODULES: Final = frozenset({"sasgeo_bench", "sasgeo_baselines"})  # theirs
+SHIPPED_MODULES: Final = ("sasgeo_bench", "sasgeo_baselines")  # theirs
 _SITE_NAMES: Final = ("site-packages", "dist-packages")
 _HERE: Final = Path(__file__).resolve().parents[1]
 
@@ -175,7 +175,22 @@ def is_shipped(module: str, paths: Sequence[str]) -> bool:
     >>> is_shipped("sasgeo_bench.matching.controls.blind", []), is_shipped("numpy", sys.path)
     (True, False)
     """
-    return module.partition(".")[0] in _MODULES and strange_file(module, paths) is None
+    return module.partition(".")[0] in SHIPPED_MODULES and strange_file(module, paths) is None
+
+
+def ships(path: Path) -> bool:
+    """Return whether a file, its links followed, lies in one of our packages, where these are installed.
+
+    >>> ships(Path(__file__).resolve()), ships(Path(os.__file__))
+    (True, False)
+    """
+    return any(path.is_relative_to(folder) for folder in _shipped_folders())
+
+
+@lru_cache(maxsize=1)
+def _shipped_folders() -> tuple[Path, ...]:
+    found = (file_of(find_module(name, [str(base) for base in _bases()])) for name in SHIPPED_MODULES)
+    return (_HERE, *(path.parent for path in found if path is not None))  # ours is imported already
 
 
 def strange_file(module: str, paths: Sequence[str]) -> Path | None:

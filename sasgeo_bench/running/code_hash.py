@@ -8,8 +8,9 @@ docstrings and positions, and alike by every version of Python.
 import ast
 import hashlib
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +19,7 @@ from sasgeo_bench.errors import MatchError, counted
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.card_file import CARD_FILE
 from sasgeo_bench.matching.plugin_files import (
+    SHIPPED_MODULES,
     Home,
     file_of,
     find_module,
@@ -25,6 +27,7 @@ from sasgeo_bench.matching.plugin_files import (
     import_paths,
     is_installed,
     is_shipped,
+    ships,
 )
 from sasgeo_bench.matching.plugins import MATCHERS, SEGMENTERS, TRACKERS, code_of
 
@@ -42,6 +45,7 @@ MOST_FILES: Final = 20_000  # of a plugin
 _MOST_STEPS: Final = 20  # from a name to where its class is
 _CACHES: Final = ("__pycache__",)
 _WORDS: Final = (CARD_FILE,)  # its version and places are told apart by themselves; all else in it is for readers
+_PYTHON: Final = ".py"
 _COMPILED: Final = ".pyc"
 _NO_CODE: Final = ("kind", "type_comment")  # fields of a syntax tree that change nothing
 _MOST_BITS: Final = 2000  # of a number that Python writes in decimal digits, however it is set up
@@ -80,32 +84,58 @@ def _code(spec: str, groups: Sequence[str]) -> str:
 
 
 def digest_of(files: Mapping[str, Path]) -> str:
-    """Return the SHA-256 of some files and the names they are known by."""
+    """Return the SHA-256 of some files and the names they are known by; of those that ship, modules have no names.
+
+    So code that ships can move to other files, and is the same code.
+    """
     digest = hashlib.sha256()
-    for shown, path in sorted(files.items()):
-        digest.update(shown.encode() + b"\0" + file_digest(path))
+    for part in sorted(_label(name, path).encode() + b"\0" + file_digest(path) for name, path in files.items()):
+        digest.update(part)
     return digest.hexdigest()
+
+
+def _label(name: str, path: Path) -> str:
+    if not ships(path):
+        return name
+    return "" if path.suffix == _PYTHON else path.name
 
 
 def file_digest(path: Path) -> bytes:
     """Return the SHA-256 of a file: of Python as its syntax tree; raise `MatchError` if it cannot be read."""
+    return _file_code(path).digest
+
+
+@dataclass(frozen=True, slots=True)
+class _Code:
+    """What is told of a file: its SHA-256, and the modules that it imports."""
+
+    digest: bytes
+    imports: frozenset[str] = frozenset()
+
+
+def _file_code(path: Path) -> _Code:
     try:
         about = path.stat()
-        return _file_digest(path, about.st_size, about.st_mtime_ns)
+        return _read(path, about.st_size, about.st_mtime_ns)
     except OSError as error:
         message = f"{path}, which is code of a plugin, cannot be read ({error.strerror}): check your rights"
         raise MatchError(message) from error
 
 
 @lru_cache(maxsize=4096)
-def _file_digest(path: Path, size: int, changed_ns: int) -> bytes:
+def _read(path: Path, size: int, changed_ns: int) -> _Code:
     del size, changed_ns
-    if path.suffix != ".py":
+    if path.suffix != _PYTHON:
         with plain_file(path).open("rb") as file:
-            return hashlib.file_digest(file, "sha256").digest()
+            return _Code(hashlib.file_digest(file, "sha256").digest())
     data = plain_file(path).read_bytes()
     tree = _tree(data)
-    return hashlib.sha256(data if tree is None else "".join(_shape(tree)).encode(errors="replace")).digest()
+    if tree is None:
+        return _Code(hashlib.sha256(data).digest())
+    imports = _imports(tree)
+    if ships(path):
+        _forget_modules(tree)
+    return _Code(hashlib.sha256(_shape(tree).encode(errors="replace")).digest(), imports)
 
 
 def _tree(data: bytes) -> ast.Module | None:
@@ -116,36 +146,48 @@ def _tree(data: bytes) -> ast.Module | None:
         return None
 
 
-def _shape(node: object) -> Iterator[str]:
-    """Yield what a syntax tree says: types, fields and values, without docstrings, and what is empty or no code.
+def _forget_modules(tree: ast.Module) -> None:
+    """Take out of a tree where the names of our own modules come from."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in SHIPPED_MODULES:
+            node.module = None
+
+
+def _shape(tree: ast.AST) -> str:
+    """Return what a syntax tree says: types, fields and values, without docstrings, and what is empty or no code.
 
     >>> one, two = (ast.parse(text) for text in ("def f(): 'Say.'; return 1", "def f(): return (1)  # one"))
-    >>> "".join(_shape(one)) == "".join(_shape(two))
+    >>> _shape(one) == _shape(two)
     True
     """
-    left: list[tuple[str, object]] = [("", node)]  # what is said already, or else is still to be said, last first
+    said: list[str] = []
+    left: list[Any] = [tree]  # what is still to be said, last first: trees and lists, or how the rest is said
     while left:
-        text, item = left.pop()
-        if text:
-            yield text
-        elif isinstance(item, ast.AST):
-            left.append((")", None))
-            left += reversed([part for field in ast.iter_fields(item) for part in _field(item, *field)])
-            yield f"{type(item).__name__}("
+        item = left.pop()
+        if isinstance(item, str):
+            said.append(item)
         elif isinstance(item, list):
-            left += [("]", None), *(("", one) for one in reversed(item))]
-            yield "["
+            said.append("[")
+            left.append("]")
+            left += [_part(one) for one in reversed(item)]
         else:
-            yield f"{hex(item) if isinstance(item, int) and item.bit_length() > _MOST_BITS else repr(item)};"
+            said.append(f"{type(item).__name__}(")
+            left.append(")")
+            for field in reversed(item._fields):
+                value = getattr(item, field, None)
+                if field in _NO_CODE or value == [] or (value is None and not isinstance(item, ast.Constant)):
+                    continue
+                if field == "body" and isinstance(value, list) and _has_docstring(item):
+                    value = value[1:]
+                left += [_part(value), f"{field}="]
+    return "".join(said)
 
 
-def _field(node: ast.AST, name: str, value: object) -> list[tuple[str, object]]:
-    """Return what a field says, in the order of saying; nothing if it is empty or no code."""
-    if name in _NO_CODE or value == [] or (value is None and not isinstance(node, ast.Constant)):
-        return []
-    if name == "body" and isinstance(value, list) and _has_docstring(node):
-        value = value[1:]
-    return [(f"{name}=", None), ("", value)]
+def _part(value: object) -> object:
+    """Return a tree or list as it is, and any other value as it is said."""
+    if isinstance(value, ast.AST | list):
+        return value
+    return f"{hex(value) if isinstance(value, int) and value.bit_length() > _MOST_BITS else repr(value)};"
 
 
 def _has_docstring(node: ast.AST) -> bool:
@@ -180,7 +222,7 @@ def _ways(module: str, name: str, paths: Sequence[str]) -> list[str]:
     ways, wanted = [module], name.partition(".")[0]
     for _ in range(_MOST_STEPS):
         path = file_of(find_module(ways[-1], paths))
-        tree = None if path is None or path.suffix != ".py" else _tree(plain_file(path).read_bytes())
+        tree = None if path is None or path.suffix != _PYTHON else _tree(plain_file(path).read_bytes())
         found = next(
             (
                 (_absolute(node, ways[-1], is_package=path is not None and path.name == "__init__.py"), alias.name)
@@ -230,18 +272,29 @@ def _beside(home: Home, paths: Sequence[str]) -> dict[str, Path]:
     if is_installed(root) or is_shipped(home.name, paths):
         return {}
     found: dict[str, Path] = {}
+    find = _finder(paths)
     seen, left = {home.path}, [home]
     while left:
         here = left.pop()
         own = _named(here.name, here.path).values()
-        names = {name for path in own if path.suffix == ".py" for name in _imported(path)}
+        names = {name for path in own if path.suffix == _PYTHON for name in _file_code(path).imports}
         package = here.name.rpartition(".")[0]
-        for other in (home_of(_resolved(name, package), paths) for name in names):
+        for other in {find(_resolved(name, package)) for name in names}:
             if other is not None and other.path not in seen and _root_of(other) == root:
                 seen.add(other.path)
                 found |= _named(other.name, other.path)
                 left.append(other)
     return found
+
+
+def _finder(paths: Sequence[str]) -> Callable[[str], Home | None]:
+    """Return `home_of` on some paths; each place is looked for once, for it is asked of every import of every file."""
+    find = lru_cache(maxsize=None)(partial(home_of, paths=paths))
+
+    def home(module: str) -> Home | None:
+        return find(module.partition(".")[0]) or find(module)  # most lie in a package, whose home is theirs
+
+    return home
 
 
 def _root_of(home: Home) -> Path:
@@ -265,9 +318,9 @@ def _resolved(name: str, package: str) -> str:
 def _rooms(files: Iterable[Path]) -> set[str]:
     """Return the tools that some files import, and those that these import."""
     rooms: set[str] = set()
-    left = [path for path in files if path.suffix == ".py"]
+    left = [path for path in files if path.suffix == _PYTHON]
     while left:
-        for name in _imported(left.pop()):
+        for name in _file_code(left.pop()).imports:
             module = _public().get(name.removeprefix(f"{_OURS}."), name).removeprefix(f"{_OURS}.")
             room = next((tool for tool in TOOLS if f"{module}.".startswith(f"{tool}.")), None)
             if room is not None and room not in rooms:
@@ -276,20 +329,12 @@ def _rooms(files: Iterable[Path]) -> set[str]:
     return rooms
 
 
-def _imported(path: Path) -> frozenset[str]:
-    about = path.stat()
-    return _imports_of(path, about.st_size, about.st_mtime_ns)
-
-
-@lru_cache(maxsize=4096)
-def _imports_of(path: Path, size: int, changed_ns: int) -> frozenset[str]:
+def _imports(tree: ast.Module) -> frozenset[str]:
     """Return the modules that a file imports anywhere, and names that it takes out of this package as a whole."""
-    del size, changed_ns
-    tree = _tree(plain_file(path).read_bytes())
-    nodes = [] if tree is None else list(ast.walk(tree))
     found: set[str] = set()
     known_as = set()
-    for node in nodes:
+    taken = []
+    for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
             known_as |= {alias.asname or _OURS for alias in node.names if alias.name == _OURS}
@@ -299,10 +344,9 @@ def _imports_of(path: Path, size: int, changed_ns: int) -> frozenset[str]:
         elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
             called = getattr(node.func, "attr", getattr(node.func, "id", ""))
             found |= {str(node.args[0].value)} - {""} if called in _IMPORTERS else set()
-    for node in nodes:
-        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id in known_as:
-            found.add(f"{_OURS}.{node.attr}")
-    return frozenset(found)
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            taken.append((node.value.id, node.attr))
+    return frozenset(found | {f"{_OURS}.{name}" for whole, name in taken if whole in known_as})
 
 
 def _absolute(node: ast.ImportFrom, module: str, *, is_package: bool) -> str:

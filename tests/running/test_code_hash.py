@@ -219,6 +219,24 @@ def test_names_are_part_of_a_hash_and_their_order_is_not(tmp_path):
     assert digest_of({"a": one, "b": two}) == digest_of({"b": two, "a": one}) != digest_of({"a": two, "b": one})
 
 
+def test_code_that_ships_may_move_and_is_the_same_code(tmp_path, monkeypatch):
+    """Whoever has answers would be asked anew for nothing. Code of others may be read by its name."""
+    texts = ("from sasgeo_bench.old.room import f", "from sasgeo_bench.new import f", "from sasgeo_bench.new import g")
+    old, new, other = (tmp_path / f"{name}.py" for name in ("old", "new", "other"))
+    for path, text in zip((old, new, other), texts, strict=True):
+        path.write_text(f"{text}\nx = 1")
+    assert digest_of({"a.py": old}) != digest_of({"a.py": new})
+    monkeypatch.setattr(code_hash, "ships", lambda path: path.parent == tmp_path)
+    code_hash._read.cache_clear()
+    assert digest_of({"room/a.py": old}) == digest_of({"hall/b.py": new}) != digest_of({"hall/b.py": other})
+    data = tmp_path / "weights.npz"
+    data.write_bytes(b"1")
+    renamed = data.with_name("others.npz")
+    renamed.write_bytes(b"1")
+    assert digest_of({"room/w": data}) == digest_of({"hall/w": data}) != digest_of({"hall/w": renamed})
+    code_hash._read.cache_clear()
+
+
 def test_what_ships_has_a_hash_by_its_folder():
     assert matcher_code("random") == matcher_code("prior_centre") != matcher_code("sasgeo")
     assert segmenter_code("colour_thresholds") != matcher_code("raster_uniform")

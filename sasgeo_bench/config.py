@@ -4,6 +4,7 @@
 import difflib
 import errno
 import json
+import stat
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
@@ -185,9 +186,10 @@ def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
 
 def _text_of(path: Path) -> str:
     """Read a file; raise `OSError` for a pipe, which would be waited for, and for what nobody writes by hand."""
-    if path.exists() and not path.is_file():
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
         raise OSError(errno.EINVAL, "it is no plain file", str(path))
-    if path.exists() and path.stat().st_size > _MOST_BYTES:
+    if about.st_size > _MOST_BYTES:
         raise OSError(errno.EFBIG, f"it has more than {_MOST_BYTES} bytes", str(path))
     return path.read_text(encoding="utf-8-sig")  # some editors write a byte order mark
 

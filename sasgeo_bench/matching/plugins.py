@@ -58,22 +58,21 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
     return dict(sorted(found.items()))
 
 
-def _installed(group: str) -> list[EntryPoint]:
+def _installed(group: str) -> tuple[EntryPoint, ...]:
     """Return the entry points of a group, our own first."""
     try:
-        installed = _read(group, tuple(sys.path))
+        return _read(group, tuple(sys.path))
     except Exception as error:
         message = (
             f"an installed package has entry points that cannot be read ({message_of(error)}): reinstall or remove it"
         )
         raise MatchError(message) from error
-    return sorted(installed, key=lambda point: (not is_ours(point), _home(point), point.value))
 
 
 @lru_cache(maxsize=8)
 def _read(group: str, _: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Read the entry points of a group once for each list of places that packages are imported from."""
-    return tuple(read_entry_points(group))
+    return tuple(sorted(read_entry_points(group), key=lambda point: (not is_ours(point), _home(point), point.value)))
 
 
 def _clash(first: EntryPoint, other: EntryPoint) -> str:

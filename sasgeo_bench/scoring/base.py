@@ -13,6 +13,8 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
+_MOST_GAPS = 4  # codes are numbered in place up to so many times their count; other numbers are sorted
+
 
 def check_column(values: ArrayLike, name: str, count: int | None = None) -> Floats:
     """Return the values of a column as floats, shape (N,); infinity is allowed.
@@ -76,6 +78,10 @@ def codes_of(names: ArrayLike) -> Ints:
     values = np.asarray(names)
     if values.dtype.kind != "i":
         values = values.astype(object)
+    elif values.size and values.min() >= 0 and values.max() <= _MOST_GAPS * values.size:  # codes, most of the time
+        is_there = np.zeros(values.max() + 1, dtype=np.int64)
+        is_there[values] = 1
+        return np.asarray((np.cumsum(is_there) - 1)[values], dtype=np.int64)
     return np.asarray(pd.factorize(values, sort=True)[0], dtype=np.int64)
 
 

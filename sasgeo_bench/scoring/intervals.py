@@ -224,13 +224,26 @@ def intervals_of_columns(
     >>> [round(found.lo, 2) for found in intervals_of_columns([0.25, 1.0], (draws, draws), 4.0)]
     [0.0, 0.51]
     """
-    places, blocks = (np.transpose(percentile_ends(one)).tolist() for one in drawn)
+    return widest_intervals(values, drawn, wilson_ends(values, trials))
+
+
+def wilson_ends(values: ArrayLike, trials: ArrayLike) -> Floats:
+    """Return the ends of Wilson's intervals of M shares, which may be NaN, shape (M, 2); `trials` as `share_interval`.
+
+    >>> wilson_ends([1.0, 0.0], 4.0).round(2).tolist()
+    [[0.51, 1.0], [0.0, 0.49]]
+    """
     figures = np.asarray(values, dtype=np.float64)
     counts = np.broadcast_to(np.asarray(trials, dtype=np.float64), figures.shape)
-    ends = _wilson_ends(np.clip(np.nan_to_num(figures), 0.0, 1.0), counts).tolist()
+    return _wilson_ends(np.clip(np.nan_to_num(figures), 0.0, 1.0), counts)
+
+
+def widest_intervals(values: ArrayLike, drawn: tuple[ArrayLike, ArrayLike], exact: Floats) -> list[BoardInterval]:
+    """Return `intervals_of_columns` where `wilson_ends` are known."""
+    places, blocks = (np.transpose(percentile_ends(one)).tolist() for one in drawn)
     return [
         BoardInterval(value=value) if math.isnan(value) else _outermost(value, *parts)
-        for value, *parts in zip(figures.tolist(), places, blocks, ends, strict=True)
+        for value, *parts in zip(np.asarray(values, np.float64).tolist(), places, blocks, exact.tolist(), strict=True)
     ]
 
 

@@ -17,7 +17,7 @@ from sasgeo_bench.scoring.base import Bools, Floats, Ints, codes_of, weighted_qu
 from sasgeo_bench.scoring.compare import RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
-from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, amount_interval, intervals_of_columns
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, amount_interval, widest_intervals, wilson_ends
 from sasgeo_bench.scoring.metric import MeanMetric, QuantileMetric
 from sasgeo_bench.scoring.metrics import COSTS, means_of, primary_of, quantiles_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, is_unranked, to_frame
@@ -206,10 +206,18 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
     table = np.column_stack((*columns, *(item.is_below for item in below)))
     names = (group.places[chosen], group.blocks[chosen], group.sites[chosen])
     drawn = BoardDraws.of(*names, seed=cell.seed, draws=cell.draws)
-    means = _Means(table=table, drawn=drawn.means(table), trials=drawn.trials, clusters=drawn.by_block.units_count)
+    means_of_all = [column.mean() for column in table.T[: len(metrics) * count]]
+    figures = np.array(means_of_all + [item.quantile.share for item in below])
+    means = _Means(
+        figures=figures,
+        table=table,
+        drawn=drawn.means(table),
+        exact=wilson_ends(figures, drawn.trials),
+        clusters=drawn.by_block.units_count,
+    )
     for number, metric in enumerate(metrics):
         yield from _ranked(cell, keys, metric, means.some(slice(number * count, (number + 1) * count)))
-    shares = means.some(slice(len(metrics) * count, None)).intervals([item.quantile.share for item in below])
+    shares = means.some(slice(len(metrics) * count, None)).intervals()
     for item, found in zip(below, shares, strict=True):
         errors = group.errors[item.quantile.column][chosen, item.matcher]
         yield keys[item.matcher].row(item.quantile, found.mapped(partial(_inverse, errors), item.value))
@@ -217,24 +225,35 @@ def _mean_rows(cell: _Cell, metrics: Sequence[MeanMetric]) -> Iterator[Row]:
 
 @dataclass(frozen=True, kw_only=True)
 class _Means:
-    """Columns of values, shape (N, M), and their means in draws by places and by blocks, shape (D, M)."""
+    """Columns of values, shape (N, M), with the means that rows state, shape (M,), and the ends of Wilson's intervals.
 
+    `drawn` are their means in draws by places and by blocks, shape (D, M).
+    """
+
+    figures: Floats
     table: Floats
     drawn: tuple[Floats, Floats]
-    trials: float
+    exact: Floats
     clusters: int
 
     def some(self, columns: slice) -> Self:
         """Return some columns."""
         by_place, by_block = (means[:, columns] for means in self.drawn)
-        return replace(self, table=self.table[:, columns], drawn=(by_place, by_block))
+        return replace(
+            self,
+            figures=self.figures[columns],
+            table=self.table[:, columns],
+            drawn=(by_place, by_block),
+            exact=self.exact[columns],
+        )
 
-    def intervals(self, values: Sequence[float], *, is_share: bool = True) -> list[BoardInterval]:
+    def intervals(self, *, is_share: bool = True) -> list[BoardInterval]:
         """Return the intervals of the means of all columns; values of a share lie in [0, 1]."""
         if is_share:
-            return intervals_of_columns(values, self.drawn, self.trials)
+            return widest_intervals(self.figures, self.drawn, self.exact)
         both = zip(*(means.T for means in self.drawn), strict=True)
-        return [amount_interval(value, one, self.clusters) for value, one in zip(values, both, strict=True)]
+        pairs = zip(self.figures.tolist(), both, strict=True)
+        return [amount_interval(figure, one, self.clusters) for figure, one in pairs]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -274,10 +293,9 @@ def _ranked(cell: _Cell, keys: Sequence[RowKey], metric: MeanMetric, means: _Mea
     """Yield the rows of one metric, with ranks for the primary one."""
     names, places, table = cell.group.names, cell.group.places[cell.chosen], means.table
     is_share = metric.bounds == (0.0, 1.0)
-    values = [float(table[:, at].mean()) for at in range(len(names))]
-    found = means.intervals(values, is_share=is_share)
+    found = means.intervals(is_share=is_share)
     is_decidable = metric.is_primary and keys[0].places >= LEAST_PLACES
-    ranks = _ranks(cell.group, values, means.drawn[0], metric) if is_decidable else {}
+    ranks = _ranks(cell.group, means.figures.tolist(), means.drawn[0], metric) if is_decidable else {}
     for at, name in enumerate(names):
         rank = ranks.get(name)
         detectable = _detectable(name, cell.group, table, places) if is_decidable else math.nan

@@ -426,8 +426,10 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
         If the file is missing or damaged, or lacks a column; older files may lack those of `task_rows.ADDED`.
     """
     with open_table(path, mend=_MEND, is_whole=False) as source:
-        there = [name for name in columns if name in source.schema_arrow.names or name not in ADDED]
-        _check_columns(path, source.schema_arrow, there)
+        schema = source.schema_arrow
+        known = set(schema.names)
+        there = [name for name in columns if name in known or name not in ADDED]
+        _check_columns(path, schema, there)
         for found in source.iter_batches(batch_size=_ROWS, columns=there):
             lost = [name for name in columns if name not in there]
             batch = with_added(found, lost).select(list(columns)) if lost else found

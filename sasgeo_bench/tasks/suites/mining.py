@@ -65,6 +65,7 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
     factor = max(1, round(_COARSE_M / state.grid.cell_size_m))
     grid = state.grid.coarsen(factor)
     known = _mean_blocks(state.known, factor)
+    shares = {name: _mean_blocks(state.has(name), factor) for name in state.classes}
     radius = side_m / 2 / grid.cell_size_m
     kernels = _rings(radius, RINGS)
     step = max(1, round(STRIDE_M / grid.cell_size_m))
@@ -77,16 +78,12 @@ def describe(state: State, *, side_m: float, clear_m: float) -> Windows:
     mapped = cv2.erode(whole, square, borderType=cv2.BORDER_CONSTANT, borderValue=0)[rows, cols] == 1
     cells = np.column_stack((rows[mapped], cols[mapped])).astype(np.int64)
     rings = np.stack(
-        [
-            _filtered(share, kernel)[cells[:, 0], cells[:, 1]]
-            for share in (_mean_blocks(state.has(name), factor) for name in state.classes)
-            for kernel in kernels
-        ],
+        [_filtered(share, kernel)[cells[:, 0], cells[:, 1]] for share in shares.values() for kernel in kernels],
         axis=1,
     ).reshape(len(cells), len(state.classes), RINGS)
     drawn = [index for index, name in enumerate(state.classes) if name in (*DRAWN_CLASSES, "water")]
     areas = np.array([kernel.size for kernel in kernels], dtype=np.float32)
-    polar = _polar(state, factor, cells, radius)
+    polar = _polar(shares, cells, radius)
     return Windows(
         points_m=grid.to_centres_m(cells),
         radius_m=side_m / 2,
@@ -127,7 +124,7 @@ def _filtered(share: Floats, kernel: Floats) -> Floats:
     return np.asarray(cv2.filter2D(share, -1, kernel, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
 
 
-def _polar(state: State, factor: int, cells: NDArray[np.int64], radius: float) -> Floats:
+def _polar(shares: dict[str, Floats], cells: NDArray[np.int64], radius: float) -> Floats:
     """Return clipped distances to thin classes on rings and sectors, shape (N, classes * rings, sectors), 0..1."""
     turns = np.arange(_SECTORS) * 2 * np.pi / _SECTORS
     reach = radius * (np.arange(RINGS) + 0.5) / RINGS
@@ -135,10 +132,9 @@ def _polar(state: State, factor: int, cells: NDArray[np.int64], radius: float) -
     right = np.rint(np.sin(turns)[None, :] * reach[:, None]).astype(int)
     found = []
     for name in _THIN:
-        if name not in state.classes:
+        if name not in shares:
             continue
-        share = _mean_blocks(state.has(name), factor)
-        distance = cv2.distanceTransform((share <= 0).astype(np.uint8), cv2.DIST_L2, 3)
+        distance = cv2.distanceTransform((shares[name] <= 0).astype(np.uint8), cv2.DIST_L2, 3)
         near = np.minimum(distance, _FAR_M / _COARSE_M) * (_COARSE_M / _FAR_M)
         rows = np.clip(cells[:, 0, None, None] + down, 0, near.shape[0] - 1)
         cols = np.clip(cells[:, 1, None, None] + right, 0, near.shape[1] - 1)

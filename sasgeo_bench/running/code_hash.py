@@ -267,7 +267,10 @@ def _named(label: str, path: Path) -> dict[str, Path]:
 
 
 def _beside(home: Home, paths: Sequence[str]) -> dict[str, Path]:
-    """Return the files of modules beside one of somebody's own, and that it imports; none of what is installed."""
+    """Return the files of modules beside one of somebody's own, and that it imports, but what is installed or ships.
+
+    In a checkout of ours, our own packages lie beside it; what counts of them are its tools, as everywhere.
+    """
     root = _root_of(home)
     if is_installed(root) or is_shipped(home.name, paths):
         return {}
@@ -280,8 +283,10 @@ def _beside(home: Home, paths: Sequence[str]) -> dict[str, Path]:
         names = {name for path in own if path.suffix == _PYTHON for name in _file_code(path).imports}
         package = here.name.rpartition(".")[0]
         for other in {find(_resolved(name, package)) for name in names}:
-            if other is not None and other.path not in seen and _root_of(other) == root:
-                seen.add(other.path)
+            if other is None or other.path in seen:
+                continue
+            seen.add(other.path)
+            if _root_of(other) == root and not ships(other.path):
                 found |= _named(other.name, other.path)
                 left.append(other)
     return found

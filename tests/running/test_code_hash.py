@@ -9,6 +9,7 @@ import pytest
 
 from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching import plugin_files
+from sasgeo_bench.matching.plugin_files import ships
 from sasgeo_bench.matching.plugins import MATCHERS
 from sasgeo_bench.running import code_hash
 from sasgeo_bench.running.code_hash import SEGMENTER_TOOLS, TOOLS, digest_of, matcher_code, segmenter_code
@@ -235,6 +236,14 @@ def test_code_that_ships_may_move_and_is_the_same_code(tmp_path, monkeypatch):
     renamed.write_bytes(b"1")
     assert digest_of({"room/w": data}) == digest_of({"hall/w": data}) != digest_of({"hall/w": renamed})
     code_hash._read.cache_clear()
+
+
+def test_in_a_checkout_of_ours_a_plugin_has_the_hash_that_it_has_elsewhere(lay, tmp_path, monkeypatch):
+    text = "from sasgeo_bench.search.find import score_at\n" + MODULE
+    elsewhere = lay({"plugin.py": text})
+    root_of = code_hash._root_of
+    monkeypatch.setattr(code_hash, "_root_of", lambda one: tmp_path if ships(one.path) else root_of(one))
+    assert lay({}) == elsewhere
 
 
 def test_what_ships_has_a_hash_by_its_folder():

@@ -108,6 +108,12 @@ def lay_towns(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
     return lay
 
 
+@pytest.fixture(scope="session")
+def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callable[[Path], None]], Path]:
+    """Make a root by its name, once for all processes that share the work; read it, do not write to it."""
+    return partial(_made_once, tmp_path_factory)
+
+
 def _build(out: Path, name: str) -> None:
     plan = plan_build(read_region_file(find_region_file(name)), out=out)
     build_region(plan, tell=lambda _: None)

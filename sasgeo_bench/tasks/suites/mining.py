@@ -121,6 +121,8 @@ def _rings(radius: float, count: int) -> list[Floats]:
 
 
 def _filtered(share: Floats, kernel: Floats) -> Floats:
+    if not share.any():  # as of most classes on most maps
+        return np.zeros_like(share)
     return np.asarray(cv2.filter2D(share, -1, kernel, borderType=cv2.BORDER_CONSTANT), dtype=np.float32)
 
 

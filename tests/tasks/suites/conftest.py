@@ -121,8 +121,8 @@ def root(request) -> int:
 
 
 @pytest.fixture(scope="session")
-def town(tmp_path_factory, lay_towns) -> TownOf:
-    """A town by its name, one of `SIDES_M` behind it for another size; each is built once."""
+def town(tmp_path_factory, lay_towns, made_once) -> TownOf:
+    """A town by its name, one of `SIDES_M` behind it for another size; each is built once for all processes."""
     out = tmp_path_factory.mktemp("towns")
 
     @cache
@@ -139,9 +139,11 @@ def town(tmp_path_factory, lay_towns) -> TownOf:
                 if item.town
             ]
             spec = spec.model_copy(update={"id": f"{spec.id}-{size}", "size_m": (side_m, side_m), "extract": extracts})
-        plan = plan_build(spec, out=out, date=date)
-        build_region(plan, tell=lambda _: None)
-        return read_region(plan.folder)
+        once = made_once(
+            f"{spec.id}-of-{date}",
+            lambda root: build_region(plan_build(spec, out=root, date=date), tell=lambda _: None),
+        )
+        return read_region(plan_build(spec, out=once, date=date).folder)
 
     return built
 

@@ -19,6 +19,7 @@ from sasgeo_bench.matching.tracker import check_fix
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.query import Query, Step
 from tests.baselines.conftest import region_of, textured, view_of
+from tests.slow import rest_slow
 
 FUSING = (EkfLoose, FoundlocRansac, SatlocLayers, Se2Trajectory)
 SIGMAS = (0.8, 0.8, 1.0)  # of an increment: metres, metres, degrees
@@ -156,7 +157,7 @@ def fused(kind, matcher, queries):
     return fly(tracker, matcher.poses, queries)
 
 
-@pytest.mark.parametrize("kind", FUSING)
+@pytest.mark.parametrize("kind", rest_slow(FUSING, but=2))
 def test_with_views_of_a_map_it_is_right_soon_and_its_covariance_holds(kind):
     region = region_of(textured(3))
     poses = winding(8, spacing_m=25.0, start_m=(1150.0, 8700.0))

@@ -19,6 +19,7 @@ from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
+from tests.slow import rest_slow
 
 ROOT = Path(__file__).parents[2]
 LIBRARY, BASELINES = (
@@ -173,7 +174,7 @@ def test_a_map_of_three_rows_is_borne(name, made, two) -> None:
     check_match(matcher.match(query, top_k=5), query, top_k=5)
 
 
-@pytest.mark.parametrize("name", DENSE)
+@pytest.mark.parametrize("name", rest_slow(DENSE, but=3))
 def test_dense_matchers_find_what_has_no_errors(name, prepared, queries, truths) -> None:
     asked = {
         query.track: (query, truths[query.query_id])

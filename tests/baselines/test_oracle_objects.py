@@ -16,6 +16,7 @@ from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
+from tests.slow import rest_slow
 
 SIZE_M = (192.0, 192.0)
 REPEATED = ("oracle_liu_object_graph", "oracle_road_2rit")  # to these, streets of a grid are alike
@@ -72,7 +73,7 @@ def test_each_yardstick_is_of_a_matcher_and_says_that_it_knows_too_much():
         assert made.card.source == made.inner.card.source
 
 
-@pytest.mark.parametrize("name", YARDSTICKS)
+@pytest.mark.parametrize("name", rest_slow(YARDSTICKS))
 def test_untaught_it_answers_as_its_matcher_and_a_damaged_text_is_refused(name, region, pairs):
     matcher, plain = YARDSTICKS[name](), YARDSTICKS[name].inner()
     with pytest.raises(RuntimeError, match="prepare"):
@@ -86,7 +87,7 @@ def test_untaught_it_answers_as_its_matcher_and_a_damaged_text_is_refused(name, 
             matcher.prepare(region, text)
 
 
-@pytest.mark.parametrize("name", YARDSTICKS)
+@pytest.mark.parametrize("name", rest_slow(YARDSTICKS, but=2))
 def test_taught_it_answers_where_nothing_was_perceived(name, region, pairs):
     query, _ = next((query, truth) for query, truth in pairs if query.track == "localization")
     west, south, east, north = region.grid.bounds_m

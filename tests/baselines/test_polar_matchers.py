@@ -20,6 +20,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.search.plan import Disc
 from tests.made_up import HERE, error_m
+from tests.slow import rest_slow
 
 MATCHERS = (PolarVsc, BrmGrid)
 PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
@@ -49,7 +50,7 @@ def seen(made, region):
     return made.view_of(region, HERE, size_cells=192)
 
 
-@pytest.mark.parametrize("prior", [PRIOR, ANYWHERE], ids=["disc", "anywhere"])
+@pytest.mark.parametrize("prior", rest_slow([PRIOR, ANYWHERE]), ids=["disc", "anywhere"])
 def test_a_view_is_found_on_the_map(made, matcher, seen, prior):
     query = made.query_of(seen, prior)
     answer = check_match(matcher.match(query, top_k=5), query, top_k=5)

@@ -16,6 +16,7 @@ from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import read_region_file
+from tests.slow import rest_slow
 
 PROGRAM = [sys.executable, "-c", "from sasgeo_bench.cli import main; main()"]
 
@@ -263,7 +264,7 @@ cli.main()
 """
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "status"), rest_slow([(signal.SIGTERM, 143), (signal.SIGINT, 130)]))
 def test_an_interrupt_leaves_nothing_half_written(tmp_path, number, status):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     program = INTERRUPTED.replace("NUMBER", str(int(number)))

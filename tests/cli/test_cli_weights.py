@@ -35,6 +35,7 @@ def test_fitted_stands_beside_hand_and_no_line_is_wider_than_a_terminal(program,
     assert max(map(len, (line for line in told.splitlines() if not line.startswith("weight of")))) <= 80
 
 
+@pytest.mark.slow
 def test_a_region_gets_a_picture_for_each_age(program, own_out):
     code, told, _ = program("weights", TOWN, "--age", "0", "--age", "10", "--season", "snow", "--out", own_out)
     assert code == 0

@@ -21,6 +21,7 @@ from sasgeo_bench.flights.odometry import LOST_M, Odometry, dead_reckon, draw_od
 from sasgeo_bench.flights.processes import draw_gauss_markov, heading_law, lattice_covariance, mean_variance
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import wrap_deg
+from tests.slow import rest_slow
 
 KINDS = {
     "scale": {"scale": ScaleDrift(bias_pct=1.0, wander_pct=1.0, length_m=100.0)},
@@ -89,7 +90,7 @@ def test_the_same_seed_gives_the_same_odometry_and_another_one_another() -> None
     assert first.up_m.tolist() != other.up_m.tolist()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", rest_slow(KINDS, but=2))
 def test_five_times_as_many_poses_have_the_same_drift_at_the_same_distance(kind) -> None:
     """The fault of white noise on each step: its drift after a distance depends on how often one looks."""
     fine, coarse = (

@@ -33,6 +33,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split
 from tests.plain_boards import plain_boards
+from tests.slow import rest_slow
 
 HASH = "0123456789ab"
 FEW = 6  # cases that are drawn
@@ -203,7 +204,7 @@ def case_at(root, suite, region, number=0, **changes):
     ("asked", "prediction"),
     [
         *((asked, "answer") for asked in EVERY),
-        *((asked, None) for asked in EVERY),
+        *rest_slow((asked, None) for asked in EVERY),
         (ASKED[0], Prediction(query_id="x", status="timeout")),
     ],
 )

@@ -154,6 +154,7 @@ def entry_of(folder):
     return entry
 
 
+@pytest.mark.slow
 @has_landlock
 @pytest.mark.usefixtures("plain_site")
 def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_board_says_so(made, tmp_path):

@@ -11,6 +11,7 @@ import pytest
 from benchmarks import cross_check_osm
 from benchmarks.cross_check_osm import check, main, read_ours
 from benchmarks.other_readings import Tags
+from tests.slow import rest_slow
 
 LON, LAT = 9.0, 47.0  # the middle of a UTM zone
 TRUNK = {"highway": "trunk"}
@@ -228,7 +229,7 @@ def cut(path: Path, middle: tuple[float, float], half: float, target: Path) -> P
 
 
 @pytest.mark.real
-@pytest.mark.parametrize(("name", "middle", "half"), REAL, ids=[name.split("-")[0] for name, *_ in REAL])
+@pytest.mark.parametrize(("name", "middle", "half"), rest_slow(REAL), ids=[name.split("-")[0] for name, *_ in REAL])
 def test_a_cut_of_a_real_map_is_read_as_gdal_and_osmium_read_it_but_for_rules(name, middle, half, tmp_path):
     whole = Path(os.environ["SASGEO_EXTRACTS"]) / name
     if not whole.exists():

@@ -24,6 +24,7 @@ from sasgeo_bench.osm.read import misdated, read_extract
 from sasgeo_bench.osm.scan import Classifier, Scan, reaches
 from sasgeo_bench.osm.snapshot import open_snapshot
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from tests.slow import rest_slow
 
 
 @pytest.fixture(scope="module")
@@ -361,9 +362,7 @@ def world_grid(path, epsg):
 
 
 @pytest.mark.real
-@pytest.mark.parametrize(
-    "name", [*SMALL, *(pytest.param(name, marks=pytest.mark.slow) for name in sorted(set(REAL) - set(SMALL)))]
-)
+@pytest.mark.parametrize("name", rest_slow([*SMALL, *sorted(set(REAL) - set(SMALL))]))
 def test_counts_agree_with_a_second_reader(name, real_extracts):
     path = real_extracts / name
     counting = Counting()

@@ -304,10 +304,9 @@ def test_the_mapped_ground_shown_is_counted(built):
     assert (record.rows, record.cols) == (2 * manifest.rows, 2 * manifest.cols)
 
 
+@pytest.mark.slow
 @pytest.mark.real
-@pytest.mark.parametrize(
-    ("name", "most_m", "tiles"), [("zanzibar", 0.3, 6), pytest.param("banepa", 0.1, 40, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("name", "most_m", "tiles"), [("zanzibar", 0.3, 6), ("banepa", 0.1, 40)])
 def test_a_real_mosaic_lies_on_its_map(name, most_m, tiles, tmp_path):
     spec = read_region_file(list_region_files()[name])
     if name == "zanzibar":  # its southern part is enough

@@ -16,6 +16,7 @@ from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.running.seedthief import SECRET
+from tests.slow import rest_slow
 
 pytestmark = pytest.mark.skipif(sandbox.landlock_version() == 0, reason="this kernel has no Landlock")
 RUN = """
@@ -53,7 +54,7 @@ def made(tmp_path_factory):
     return root
 
 
-@pytest.mark.parametrize("way", ["file", "environment"])
+@pytest.mark.parametrize("way", rest_slow(["file", "environment"]))
 def test_neither_file_nor_environment_gives_the_seed_to_a_matcher(made, tmp_path, way):
     root = Path(shutil.copytree(made, tmp_path / way))
     given = {"SASGEO_SEED": SECRET} if way == "environment" else {}

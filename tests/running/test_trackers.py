@@ -18,6 +18,7 @@ from sasgeo_bench.tasks import flight_choice, task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from tests.slow import rest_slow
 
 TOWN = "town-riverside"
 PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
@@ -134,9 +135,14 @@ def test_a_fix_is_stored_with_its_covariance_and_modes(counted):
     [
         ("hangs", "timeout", "no answer within"),
         ("dies", "crash", "exit status 3"),
-        ("raises", "crash", "no more today"),
-        ("singular", "invalid", "not symmetric and positive definite"),
-        ("text", "invalid", "step() returned str"),
+        *rest_slow(
+            [
+                ("raises", "crash", "no more today"),
+                ("singular", "invalid", "not symmetric and positive definite"),
+                ("text", "invalid", "step() returned str"),
+            ],
+            but=0,
+        ),
     ],
 )
 def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_path, request, way, status, told):

@@ -176,6 +176,7 @@ def test_one_class_alone_and_classes_that_one_side_lacks(tiny, whole):
         assert bool(match.poses) or classes == ("lava",)
 
 
+@pytest.mark.slow
 def test_a_prior_off_the_map_and_a_view_larger_than_it(tiny, whole):
     query = near(*first(tiny, "localization"))
     west_m, south_m, _, _ = tiny.region.grid.bounds_m
@@ -237,6 +238,7 @@ def drawn(tiny):
     return Training(regions={tiny.queries[0].region: tiny.region}, pairs=pairs)
 
 
+@pytest.mark.slow
 def test_the_whole_scorer_learns_weights_of_the_joint_score_from_views_with_vectors(training, drawn):
     hand = ScorerModel.by_hand(())
     assert ScorerModel.from_text(Sasgeo().learn(replace(training, pairs=training.pairs[:1]))).blend == hand.blend

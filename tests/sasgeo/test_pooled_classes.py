@@ -41,6 +41,7 @@ def models(tiny):
     return plain, mixed
 
 
+@pytest.mark.slow
 def test_all_classes_of_any_map_are_learned_in_their_order(tiny, models):
     assert models[1].classes == tiny.region.classes
 

@@ -77,6 +77,7 @@ def near(tiny, count=3):
     ][:count]
 
 
+@pytest.mark.slow
 def test_an_arm_that_learns_from_maps_of_the_day_keeps_the_rates_of_ageing_set_by_hand(tiny):
     name = tiny.queries[0].region
     regions = {name: tiny.region, f"{name}@2000-01-01": tiny.region}
@@ -94,6 +95,7 @@ def test_an_arm_that_learns_from_maps_of_the_day_keeps_the_rates_of_ageing_set_b
     assert one == other  # they differ only where a map is old
 
 
+@pytest.mark.slow
 def test_parts_of_a_large_map_teach_what_the_whole_map_does(tiny, monkeypatch):
     training = Training(regions={tiny.queries[0].region: tiny.region}, pairs=near(tiny, 2))
     whole = SasgeoNoGraph().learn(training)

@@ -56,6 +56,7 @@ def is_near(one, other):
     return apart_m < 10 and abs(wrap_deg(one.yaw_deg - other.yaw_deg)) < 8 and abs(one.scale - other.scale) < 0.08
 
 
+@pytest.mark.slow
 def test_most_places_are_proposed_with_heading_and_scale_unknown(views, mapped):
     found = [
         any(is_near(one.pose, pose) for one in proposals(seen, mapped, count=10, scales=(0.85, 1.15)))

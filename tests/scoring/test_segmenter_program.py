@@ -86,6 +86,7 @@ def test_pictures_of_another_number_are_not_taken_for_those_that_were_asked_for(
         program.files_of(tmp_path, lambda: iter(()), asked=4)
 
 
+@pytest.mark.slow
 def test_real_pictures_become_a_board(program, blocks, tmp_path):
     assert [len(block) > 0 for block in blocks] == [True, True]
     assert {one.place for one in LabelledFiles(blocks[0])} == {"hamlet-whole"}

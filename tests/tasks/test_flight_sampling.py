@@ -257,6 +257,7 @@ def test_a_drone_that_cannot_be_carried_so_far_is_left_out_with_its_control(airs
 # --- tasks on disk --------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_the_same_request_makes_the_same_bytes_and_more_sites_change_none_of_the_queries(own_out):
     found = []

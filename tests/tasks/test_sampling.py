@@ -164,6 +164,7 @@ def auc(ours, theirs):
     return float(stats.mannwhitneyu(ours, theirs).statistic) / (len(ours) * len(theirs))
 
 
+@pytest.mark.slow
 def test_how_much_of_a_disc_is_on_the_map_does_not_tell_whether_the_truth_is_in_it(wide, sites):
     """Of twice 360 discs of 500 m on 2.3 km, the share on the map tells them apart with an AUC of 0.46.
 

@@ -45,6 +45,7 @@ def described(region, drawer):
     return Described.of(region, drawer.windows)
 
 
+@pytest.mark.slow
 def test_one_reading_is_the_experiment_and_its_shares_rank_as_global_descriptor_does(region, drawer, described):
     found = draw_trials(drawer, described, EXPERIMENT, FEW)
     matcher = GlobalDescriptor()

@@ -19,6 +19,7 @@ from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
 from sasgeo_bench.tasks.suites.volatile_lure import STABLE, VOLATILE
 from sasgeo_bench.tasks.twin import around, paste
 from sasgeo_bench.tasks.vectors import as_features
+from tests.slow import rest_slow
 from tests.tasks.suites.conftest import ROOTS
 
 TWINS = ("topology-twins", "instance-twins", "grade-separation", "volatile-lure", "alias")
@@ -169,7 +170,7 @@ def lots(made, roots=24):
             yield before[site.index], site, edit
 
 
-@pytest.mark.parametrize("name", TWINS)
+@pytest.mark.parametrize("name", rest_slow(TWINS, but=2))
 def test_by_lot_the_true_place_is_any_of_the_places_that_look_alike(carried, name):
     made = carried(name)
     found = list(lots(made))
@@ -218,6 +219,7 @@ def rim_ends(features, place, suite, scene):
     return int((np.abs(off_m - suite.radius_m(scene)) < OFF_M).sum())
 
 
+@pytest.mark.slow
 def test_roads_that_go_on_across_the_rim_tell_the_original_but_not_the_truth(carried):
     made = carried("topology-twins")
     group, tells_original, tells_truth = made.suite.card.group, [], []

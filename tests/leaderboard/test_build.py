@@ -44,6 +44,7 @@ from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.plain_boards import plain_boards
+from tests.slow import rest_slow
 
 TOWNS = ("town-riverside", "town-suburb")
 
@@ -218,7 +219,7 @@ def moved(row, query):
     return replace(row, candidates=((next(others, away), score),))
 
 
-@pytest.mark.parametrize(("is_right", "confidence"), [(True, 0.5), (False, 0.5), (True, None)])
+@pytest.mark.parametrize(("is_right", "confidence"), rest_slow([(False, 0.5), (True, 0.5), (True, None)]))
 def test_a_board_of_equal_confidences_or_none_and_of_no_false_fix_or_nothing_else(
     out, tmp_path, split, confidence, is_right
 ):
@@ -865,6 +866,7 @@ def test_a_file_without_a_row_misses_everything_and_costs_nobody_else(out, both,
     pd.testing.assert_frame_equal(board.scores["good"], alone.scores["good"])
 
 
+@pytest.mark.slow
 def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out, both, split, monkeypatch):
     asked = {"split": split, "rejectors": (f"{__name__}:Doubt",)}
     whole = board_of(out, out / "runs", *both, **asked)

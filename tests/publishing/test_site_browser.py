@@ -17,6 +17,7 @@ import pytest
 from sasgeo_bench.publishing.build import publish
 from tests.browser import PATIENCE_S, browser, find_chromium
 from tests.handmade import HOSTILE, MARKUP, SHARES, card_of, full_board, put_pictures
+from tests.slow import rest_slow
 
 CHROMIUM = find_chromium()
 AXE = gzip.decompress((Path(__file__).parents[1] / "data" / "axe" / "axe.min.js.gz").read_bytes()).decode()  # MPL-2.0
@@ -69,7 +70,7 @@ def until(page, script):
         time.sleep(0.05)
 
 
-@pytest.mark.parametrize("width", [WIDE, 320])
+@pytest.mark.parametrize("width", rest_slow([320, WIDE]))
 def test_no_page_asks_another_host_nor_the_console_nor_scrolls_sideways(page, site, width):
     page.width(width)
     for path in sorted(site.glob("*.html")):

@@ -26,6 +26,7 @@ from sasgeo_bench.regions.evidence import PRESENT, LayerBits
 from sasgeo_bench.regions.layers import OUTSIDE, read_bits
 from sasgeo_bench.regions.region_files import differing_files, read_manifest, read_region
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from tests.slow import rest_slow
 
 TOWNS = ("town-grid", "town-old-town", "town-suburb", "town-industrial", "town-riverside", "town-agricultural")
 FILES = {"region.json", "layers.tif", "features.parquet", "nodes.parquet", "edges.parquet", "preview.png"}
@@ -61,7 +62,7 @@ def there(built_once, tmp_path):
     return plan, read_manifest(plan.folder)
 
 
-@pytest.mark.parametrize("town", TOWNS)
+@pytest.mark.parametrize("town", rest_slow(TOWNS, but=2))
 def test_a_town_becomes_a_whole_region(town, tmp_path, lay_towns):
     folder = lay_towns(tmp_path, town) / "regions" / town
     assert {path.name for path in folder.iterdir()} == FILES - {"preview.png"}

@@ -57,6 +57,7 @@ def ask(task):
     return plan.parts[0], sum(report.counts.values())
 
 
+@pytest.mark.slow
 def test_more_sites_fewer_sites_and_another_seed_ask_nothing_twice(draw):
     task = draw()
     few = set(task_files.read_ids(task))

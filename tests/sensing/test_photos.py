@@ -199,6 +199,7 @@ def brighton_beach() -> Path | None:
     return next((folder for folder in found if len(list(folder.glob("*.JPG"))) > 1), None)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(brighton_beach() is None, reason="real photos: SASGEO_IMAGERY names no folder with brighton_beach")
 def test_neighbouring_photos_of_a_real_flight_agree_on_the_ground():
     pairs = compare(brighton_beach())

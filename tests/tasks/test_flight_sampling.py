@@ -217,6 +217,7 @@ def test_no_flight_passes_from_one_part_of_a_split_to_another(airspace):
         assert flight.site.block in {block.id for block in at}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("short")
 def test_too_little_ground_or_too_little_on_it_gets_one_line(airspace):
     empty = replace(airspace, scene=replace(airspace.scene, blocks=()))

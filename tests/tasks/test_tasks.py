@@ -88,6 +88,7 @@ def test_the_same_request_makes_the_same_bytes(tasks, own_out):
     assert again == {name: data for name, data in content(tasks).items() if "/absent/" in name}
 
 
+@pytest.mark.slow
 def test_other_suites_and_regions_change_no_byte_of_a_task(tasks, own_out):
     make(own_out, suites=("synthetic-age", "absent"), regions=("town-grid", RIVERSIDE))
     mine, theirs = content(own_out), content(tasks)

@@ -39,6 +39,7 @@ def test_the_evidence_of_each_view_is_unknown_until_its_labels_show_the_map_at_i
             assert same[known].mean() > 0.85
 
 
+@pytest.mark.slow
 def test_light_and_season_last_for_a_flight_and_a_falsifier_has_other_noise_alone(flown):
     made = flown(NAME)
     control, falsifier, snow = made.of("control"), made.of("falsifier"), made.of("stress", "F9 snow")

@@ -13,6 +13,7 @@ from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import Seeds
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.suites.twins import OFF_M
+from tests.slow import rest_slow
 
 SEEDS = Seeds(root=3, names=("town", "sites"))
 ALL = 1000
@@ -78,7 +79,7 @@ def test_the_same_seed_gives_the_same_sites_and_another_one_others(quarters):
     assert not np.isin(places(other), places(chosen(quarters, "clean"))).any()
 
 
-@pytest.mark.parametrize("name", ["clean", "no-priors", "instance-twins"])
+@pytest.mark.parametrize("name", rest_slow(["instance-twins", "clean", "no-priors"]))
 def test_all_that_any_view_of_a_site_may_show_is_mapped(scene, name):
     town = scene("town-industrial short", name)  # its map ends short of its grid
     assert not town.map.known.all()

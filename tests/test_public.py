@@ -118,10 +118,13 @@ def test_a_dry_run_returns_the_folders_and_writes_none(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+SLOW = {"pandas", "geopandas", "rasterio", "pyproj", "pyarrow.compute", "pyarrow.parquet", "scipy", "matplotlib"}
+
+
 @pytest.mark.parametrize(
     ("code", "unused"),
     [
-        ("sasgeo_bench.running.serve", {"pandas", "geopandas", "rasterio", "pyproj", "scipy", "matplotlib"}),
+        ("sasgeo_bench.running.serve", SLOW),
         ("sasgeo_bench.cli.listing", {"numpy", "pandas", "pydantic"}),
         ("sasgeo_bench.cli.regions", {"matplotlib", "scipy.optimize"}),
         ("sasgeo_bench.tasks.build", {"matplotlib", "scipy.interpolate", "scipy.signal", "scipy.stats"}),

@@ -15,14 +15,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Final
 
 import pyarrow as pa
-import pyarrow.compute as pc
-import pyarrow.parquet as pq
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.paths import plain_file
 
+# Every process of a matcher imports this, and hardly one reads a file: what reading takes is imported where it is used.
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow.parquet as pq
 
 CHECKED: Final[Mapping[str, Any]] = {"compression": "zstd", "write_page_checksum": True}
 VERIFIED: Final[Mapping[str, Any]] = {"page_checksum_verification": True}
@@ -41,12 +41,14 @@ _MOST_QUOTED: Final = 200  # characters of a library's error
 
 
 @contextmanager
-def table_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator[pq.ParquetWriter]:  # noqa: ANN401
+def table_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator["pq.ParquetWriter"]:  # noqa: ANN401
     """Open a writer of a table with checksums; `options` are those of `pyarrow.parquet.ParquetWriter`.
 
     The table is complete when the block ends.
     """
     about = {key: value for key, value in (schema.metadata or {}).items() if key != _SEAL}
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
     with pq.ParquetWriter(path, schema.with_metadata(about), **{**CHECKED, **options}) as writer:
         writer.add_key_value_metadata({_SEAL.decode(): "0" * _DIGITS})
         yield writer
@@ -90,7 +92,7 @@ def open_table(
     most_rows: int = MOST_ROWS,
     is_whole: bool = True,
     **options: Any,  # noqa: ANN401
-) -> Iterator[pq.ParquetFile]:
+) -> Iterator["pq.ParquetFile"]:
     """Open a table of unknown origin: check its footer and bound its size before anything is read.
 
     A table that is not read whole (`is_whole`) is bounded by row group; a text that stands once in the file and in a
@@ -98,6 +100,8 @@ def open_table(
     checksum are verified as they are read. Raise `StoreError`, with the advice `mend`, if the file is missing, damaged,
     no table, or too large, or if reading fails while it is open.
     """
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
     try:
         _check_footer(path)
         with pq.ParquetFile(plain_file(path), **{**VERIFIED, **options}) as source:
@@ -141,7 +145,7 @@ def read_kept(
         return pa.concat_tables(kept) if kept else source.schema_arrow.empty_table()
 
 
-def _ranges(group: pq.RowGroupMetaData) -> dict[str, tuple[Any, Any]]:
+def _ranges(group: "pq.RowGroupMetaData") -> dict[str, tuple[Any, Any]]:
     """Return the least and the greatest value of each column of a row group that has them."""
     chunks = [(chunk.path_in_schema, chunk.statistics) for chunk in map(group.column, range(group.num_columns))]
     return {name: (known.min, known.max) for name, known in chunks if known is not None and known.has_min_max}
@@ -178,7 +182,7 @@ def _column_of(leaf: str) -> str:
     return leaf.partition(".")[0]
 
 
-def _texts_fault(about: pq.FileMetaData, texts: Collection[str], text_bytes: int) -> str | None:
+def _texts_fault(about: "pq.FileMetaData", texts: Collection[str], text_bytes: int) -> str | None:
     """Describe a column of texts that are too long on the average, by the footer, or return None."""
     for group in map(about.row_group, range(about.num_row_groups)):
         for chunk in map(group.column, range(about.num_columns)):
@@ -188,7 +192,7 @@ def _texts_fault(about: pq.FileMetaData, texts: Collection[str], text_bytes: int
     return None
 
 
-def _unpacked_fault(path: Path, about: pq.FileMetaData, *, is_whole: bool) -> str | None:
+def _unpacked_fault(path: Path, about: "pq.FileMetaData", *, is_whole: bool) -> str | None:
     """Describe texts that become too large when each of their rows gets its own, or return None.
 
     The footer does not tell. Columns that could are read as dictionaries first, which hold each distinct text once.
@@ -206,7 +210,7 @@ def _unpacked_fault(path: Path, about: pq.FileMetaData, *, is_whole: bool) -> st
     return None
 
 
-def _doubtful(about: pq.FileMetaData, groups: Iterable[int]) -> Iterator[tuple[int, list[str]]]:
+def _doubtful(about: "pq.FileMetaData", groups: Iterable[int]) -> Iterator[tuple[int, list[str]]]:
     """Yield row groups, and their columns of texts that may be too large, together or one text of them."""
     chunks = [(at, about.row_group(at).column(column)) for at in groups for column in range(about.num_columns)]
     texts = [(at, chunk) for at, chunk in chunks if chunk.physical_type == "BYTE_ARRAY"]
@@ -230,6 +234,9 @@ def _texts_of(path: Path, group: int, columns: Sequence[str]) -> Iterator[tuple[
     """Yield the bytes of some texts of a row group, all of them and the longest one, without unpacking them."""
     if not columns:
         return
+    import pyarrow.compute as pc  # noqa: PLC0415
+    import pyarrow.parquet as pq  # noqa: PLC0415
+
     with pq.ParquetFile(plain_file(path), **VERIFIED, read_dictionary=list(columns)) as source:
         for name in columns:
             for batch in source.iter_batches(_TEXTS_AT_ONCE, row_groups=[group], columns=[name]):
@@ -251,7 +258,7 @@ def _dictionaries(array: pa.Array) -> Iterator[pa.DictionaryArray]:
         yield from _dictionaries(array.flatten())
 
 
-def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True) -> str | None:
+def size_fault(about: "pq.FileMetaData", *, most_rows: int, is_whole: bool = True) -> str | None:
     """Describe what is too large about a table, by its footer, or return None."""
     groups = [about.row_group(at) for at in range(about.num_row_groups)]
     chunks = [[group.column(at) for at in range(about.num_columns)] for group in groups]
@@ -263,7 +270,7 @@ def size_fault(about: pq.FileMetaData, *, most_rows: int, is_whole: bool = True)
     return next((f"{count} {what}, {most} at most" for what, (count, most) in found.items() if count > most), None)
 
 
-def _size_of(chunk: pq.ColumnChunkMetaData, leaf: pq.ColumnSchema) -> int:
+def _size_of(chunk: "pq.ColumnChunkMetaData", leaf: "pq.ColumnSchema") -> int:
     """Return the bytes of a part of a column, also where a value of fixed length stands in the file but once."""
     fixed = chunk.num_values * leaf.length if chunk.physical_type == "FIXED_LEN_BYTE_ARRAY" else 0
     return max(int(chunk.total_uncompressed_size), int(fixed))

@@ -10,11 +10,9 @@ from typing import Any
 from sasgeo_bench.running import wire
 
 
-gc.disable()  # until all is imported, of which nothing is garbage: an eighth of the time that a process takes to start
-
-
 def main() -> None:
     """Serve the runner at the other end of the socket whose number is the only argument."""
+    gc.disable()  # until our own is imported, of which nothing is garbage: an eighth of what a process takes to start
     channel = socket.socket(fileno=int(sys.argv[1]))
     start, luggage = wire.receive(channel)
     os.chdir(start["scratch"])

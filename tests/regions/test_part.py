@@ -115,7 +115,7 @@ def test_of_a_small_part_few_row_groups_are_read(folder, whole, monkeypatch):
             read.append(at)
             return super().read_row_group(at, **options)
 
-    monkeypatch.setattr("sasgeo_bench.files.parquet.pq.ParquetFile", Counted)
+    monkeypatch.setattr("pyarrow.parquet.ParquetFile", Counted)
     part = read_region(folder, bounds_m=box_of(whole, 0.4, 0.4, 0.45, 0.45))
     assert 0 < len(part.features) < ROWS
     groups = pq.read_metadata(folder / region_files.FEATURES).num_row_groups

@@ -46,9 +46,9 @@ def table_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator["pq.
 
     The table is complete when the block ends.
     """
-    about = {key: value for key, value in (schema.metadata or {}).items() if key != _SEAL}
     import pyarrow.parquet as pq  # noqa: PLC0415
 
+    about = {key: value for key, value in (schema.metadata or {}).items() if key != _SEAL}
     with pq.ParquetWriter(path, schema.with_metadata(about), **{**CHECKED, **options}) as writer:
         writer.add_key_value_metadata({_SEAL.decode(): "0" * _DIGITS})
         yield writer

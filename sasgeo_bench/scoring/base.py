@@ -79,7 +79,7 @@ def codes_of(names: ArrayLike) -> Ints:
     if values.dtype.kind != "i":
         values = values.astype(object)
     elif values.size and values.min() >= 0 and values.max() <= _MOST_GAPS * values.size:  # codes, most of the time
-        is_there = np.zeros(values.max() + 1, dtype=np.int64)
+        is_there = np.zeros(int(values.max()) + 1, dtype=np.int64)
         is_there[values] = 1
         return np.asarray((np.cumsum(is_there) - 1)[values], dtype=np.int64)
     return np.asarray(pd.factorize(values, sort=True)[0], dtype=np.int64)

@@ -17,7 +17,7 @@ from pydantic import Field, SerializerFunctionWrapHandler, model_serializer, mod
 from sasgeo_bench.config import Document, Line, NamedDocument, find_document, list_documents, read_document
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.projection import to_lonlat
+from sasgeo_bench.geometry.projection import between, to_lonlat
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 
 Part = Literal["train", "calibration", "test"]
@@ -391,7 +391,7 @@ def _gaps(first: Iterable[Block], second: Iterable[Block]) -> Iterator[Pair]:
         for b in second:
             outline = b.polygon()
             if a.epsg != b.epsg:
-                change = pyproj.Transformer.from_crs(b.epsg, a.epsg, always_xy=True)
+                change = between(b.epsg, a.epsg)
                 fine = shapely.segmentize(outline, 100.0)
                 outline = shapely.transform(fine, lambda at, to=change: np.column_stack(to.transform(*at.T)))
             yield Pair(first=a.id, second=b.id, gap_m=float(shapely.distance(a.polygon(), outline)))

@@ -5,12 +5,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import pyproj
 import shapely
 from matplotlib.patches import Patch, Polygon
 from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import Page, page, panels, without_ticks
+from sasgeo_bench.geometry.projection import between
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks.split import HALVES, Block, Split
 
@@ -60,5 +60,5 @@ def _outline_m(block: Block, origin: Block) -> NDArray[np.float64]:
     corners = np.array(block.polygon().exterior.coords)[:-1]
     if block.epsg == origin.epsg:
         return corners
-    change = pyproj.Transformer.from_crs(block.epsg, origin.epsg, always_xy=True)
+    change = between(block.epsg, origin.epsg)
     return np.column_stack(change.transform(*corners.T))

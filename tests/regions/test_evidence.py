@@ -130,3 +130,8 @@ def test_evidence_cannot_be_changed_and_says_what_is_wrong_with_it():
 
 def test_the_states_are_those_of_the_layers():
     assert (ABSENT, PRESENT) == (0, 1)
+
+
+def test_a_cell_unknown_in_one_class_is_unknown_in_all_whatever_the_others_say():
+    layers = np.array([[[UNKNOWN, PRESENT, 0]], [[PRESENT, UNKNOWN, PRESENT]]], dtype=np.uint8)
+    assert LayerBits.of(layers).bits.tolist() == [[1 << 31, 1 << 31, 2]]

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import MetricError, SasgeoError
-from sasgeo_bench.scoring.base import block_codes, check_weights, weighted_mean, weighted_quantile
+from sasgeo_bench.scoring.base import block_codes, check_weights, codes_of, weighted_mean, weighted_quantile
 
 ROWS = st.lists(st.tuples(st.floats(-100, 100), st.integers(0, 4)), min_size=1, max_size=12)
 
@@ -66,3 +66,10 @@ def test_a_value_that_is_missing_is_refused() -> None:
         weighted_quantile([1.0], 0.0)
     with pytest.raises(MetricError, match="2 blocks for 1"):
         block_codes(["a", "b"], 1)
+
+
+@pytest.mark.parametrize("kind", [np.int8, np.int64])
+def test_codes_are_the_places_of_names_in_their_order_whatever_their_type_and_gaps(kind):
+    for names in ([7, 3, 7], [127, 0, 127], list(range(127, 0, -2)), [-2, 5, -2], [0], []):
+        expected = [sorted(set(names)).index(name) for name in names]
+        assert codes_of(np.array(names, dtype=kind)).tolist() == expected

@@ -194,8 +194,7 @@ def main() -> None:
     try:
         print("\n".join(lines(parsed())))
     except SasgeoError as error:
-        message = f"absent_places: {error}"
-        raise SystemExit(message) from error
+        raise SystemExit(f"absent_places: {error}") from error
 
 
 if __name__ == "__main__":

@@ -66,16 +66,14 @@ def cost_of(spec: str, region: Path, blobs: list[bytes]) -> Cost:
     with Worker(spec=spec, reach=Reach(readable=[region.resolve()], hidden=[]), limits=LIMITS) as worker:
         ready = worker.prepare(region)
         if ready.status != "ok":
-            message = f"{spec}: {ready.message}"
-            raise MatchError(message)
+            raise MatchError(f"{spec}: {ready.message}")
         worker.match(blobs[0], top_k=10)  # what is made at the first question
         before = read_joules()
         replies = [worker.match(blob, top_k=10) for blob in blobs]
         after = read_joules()
         failed = next((reply for reply in replies if reply.status != "ok"), None)
         if failed is not None:
-            message = f"{spec}: {failed.message}"
-            raise MatchError(message)
+            raise MatchError(f"{spec}: {failed.message}")
         is_counted = before is not None and after is not None and after >= before  # a counter begins again at 0
         return Cost(
             index_s=ready.seconds or 0.0,
@@ -116,8 +114,9 @@ def measure(out: Path, names: list[str]) -> None:
     check_names(matchers=names, rejectors=[])
     stray = next((name for name in names if name not in list_entry_points(MATCHERS)), None)
     if stray is not None:
-        message = f"{stray} is not among the matchers of list-matchers: name one of these, no tracker or module:Class"
-        raise MatchError(message)
+        raise MatchError(
+            f"{stray} is not among the matchers of list-matchers: name one of these, no tracker or module:Class"
+        )
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
     blobs = [query_bytes(query) for query, _ in drawn(out)[PLACE][:ASKED]]
     region = out / "regions" / PLACE

@@ -51,8 +51,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     region = sgb.read_region(said.region)
     if region.imagery is None:
-        message = f"{said.region} has no imagery: sasgeo-bench render-imagery makes some"
-        raise SystemExit(message)
+        raise SystemExit(f"{said.region} has no imagery: sasgeo-bench render-imagery makes some")
     print(f"{said.region.name}: {region.imagery.record.to_text()}", flush=True)
     near_m = NEAR_TASK_M if said.suite else NEAR_M
     asked = of_task(said.region, said.suite) if said.suite else of_imagery(region, said.radius, said.views)
@@ -125,8 +124,7 @@ def drawn(region: sgb.Region, radius_m: float, rng: np.random.Generator) -> tupl
         window = region.imagery.read((x - reach_m, y - reach_m, x + reach_m, y + reach_m), gsd_m=GSD_M)
         if window.is_known.all():
             return asked_of(window, pose, radius_m, rng), pose
-    message = "no view of 128 m lies wholly on the imagery: take a larger region"
-    raise SystemExit(message)
+    raise SystemExit("no view of 128 m lies wholly on the imagery: take a larger region")
 
 
 def asked_of(window: sgb.ImageryWindow, pose: sgb.Pose, radius_m: float, rng: np.random.Generator) -> sgb.Query:

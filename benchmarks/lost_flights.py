@@ -79,8 +79,7 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
     matchers = sorted(flown.loc[flown["suite"] == suite, "matcher"].unique())
     if not matchers:
         there = ", ".join(sorted(flown["suite"].unique())) or "no suite of flights"
-        message = f"{folder} has no flights of suite {suite!r}: it has {there}"
-        raise StoreError(message)
+        raise StoreError(f"{folder} has no flights of suite {suite!r}: it has {there}")
     with tempfile.TemporaryDirectory() as scratch:
         folders = [path for path in unpack_tasks(folder, Path(scratch)) if path.parent.name == suite]
         tasks = [read_scored_task(path, Path(scratch) / "truth") for path in folders]

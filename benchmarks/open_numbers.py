@@ -84,8 +84,9 @@ def systems(names: Sequence[str] = ()) -> dict[str, type[Tunable]]:
                 found[point.name] = kind
     stray = next((name for name in names if name not in found), None)
     if stray is not None:
-        message = f"{stray} is no installed matcher with open numbers: its class must be a Tunable that names some"
-        raise MatchError(message)
+        raise MatchError(
+            f"{stray} is no installed matcher with open numbers: its class must be a Tunable that names some"
+        )
     return dict(sorted((name, kind) for name, kind in found.items() if name in names or not names))
 
 
@@ -168,8 +169,7 @@ def read_trials(path: Path) -> list[Trial]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         is_whole = False
     if not is_whole:
-        message = f"{path} holds no trials, or is damaged: move it away, and run with --out"
-        raise StoreError(message)
+        raise StoreError(f"{path} holds no trials, or is damaged: move it away, and run with --out")
     return sorted_trials(found)
 
 

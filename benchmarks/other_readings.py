@@ -118,8 +118,7 @@ class Objects:
     def __post_init__(self) -> None:
         """Check that all have one length."""
         if not len(self.tags) == len(self.geometry) == len(self.shape) == len(self.identifier):
-            message = "tags, geometries, shapes and ids are not of one length"
-            raise ValueError(message)
+            raise ValueError("tags, geometries, shapes and ids are not of one length")
 
 
 @dataclass(frozen=True)

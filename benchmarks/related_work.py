@@ -102,8 +102,7 @@ def read_board(board: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     of_column = [(rows[list(wanted)] == pd.Series(wanted)).all(axis=1) for wanted in (DENSE, REJECTION)]
     found = rows[own & np.logical_or(*of_column)]
     if found.duplicated(["matcher", "metric", "rejector"]).any():
-        message = f"{board}: leaderboard.parquet says one figure twice: {MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{board}: leaderboard.parquet says one figure twice: {MEND}")
     return scores.assign(hit=hit, is_control=is_control), found
 
 
@@ -113,20 +112,17 @@ def check_columns(scores: pd.DataFrame) -> None:
     A missing number is no answer.
     """
     if scores.empty:
-        message = f"scores.parquet holds no view and no flight: {MEND}"
-        raise StoreError(message)
+        raise StoreError(f"scores.parquet holds no view and no flight: {MEND}")
     for name in (*TEXTS, *NUMBERS):
         if name not in scores:
-            message = f"scores.parquet has no column {name!r}: {MEND}"
-            raise StoreError(message)
+            raise StoreError(f"scores.parquet has no column {name!r}: {MEND}")
         values = scores[name]
         if name in TEXTS:
             is_right = values.map(lambda one: isinstance(one, str)).all()
         else:
             is_right = pd.api.types.is_numeric_dtype(values) and not ((values < 0) | (values > NUMBERS[name])).any()
         if not is_right:
-            message = f"scores.parquet: {name} holds something else than it should, or nothing: {MEND}"
-            raise StoreError(message)
+            raise StoreError(f"scores.parquet: {name} holds something else than it should, or nothing: {MEND}")
 
 
 def views_of(scores: pd.DataFrame, matcher: str, ability: Ability) -> pd.DataFrame:

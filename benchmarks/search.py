@@ -117,8 +117,7 @@ def places(state: State, ground: Grid, side_m: float, rng: np.random.Generator) 
     west, south, east, north = ground.bounds_m
     half, reach_m = int(side_m) // 2, side_m * math.sqrt(0.5) + ground.cell_size_m
     if min(east - west, north - south) <= 2 * reach_m:
-        message = f"a view of {side_m:g} m does not fit a map of {east - west:g} m: give a larger --size"
-        raise SystemExit(message)
+        raise SystemExit(f"a view of {side_m:g} m does not fit a map of {east - west:g} m: give a larger --size")
     while True:
         at = rng.uniform((west + reach_m, south + reach_m), (east - reach_m, north - reach_m))
         row, col = state.grid.to_cells(at[None])[0].tolist()

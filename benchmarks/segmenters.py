@@ -103,8 +103,9 @@ def files_of(folder: Path, make: Callable[[], Iterator[sgb.LabelledImage]], *, a
         print(f"{folder}: {count} pictures in {took:.0f} s", flush=True)
     made = json.loads(done.read_text(encoding="utf-8"))["asked"]
     if made != asked:
-        message = f"{folder} was made with --pictures {made}, not {asked}: pass that number, or remove the folder"
-        raise SystemExit(message)
+        raise SystemExit(
+            f"{folder} was made with --pictures {made}, not {asked}: pass that number, or remove the folder"
+        )
     return tuple(sorted(folder.glob(f"*{SUFFIX}")))
 
 

@@ -26,15 +26,13 @@ LONGEST_LINE: Final = 300
 def _printable(text: str) -> str:
     """Refuse text that cannot be shown on one line: breaks, controls, bidirectional marks."""
     if not text.isprintable():
-        message = "must be one line of printable characters"
-        raise ValueError(message)
+        raise ValueError("must be one line of printable characters")
     return text
 
 
 def _not_blank(text: str) -> str:
     if not text.strip():
-        message = "must be one line of printable characters"
-        raise ValueError(message)
+        raise ValueError("must be one line of printable characters")
     return text
 
 
@@ -74,8 +72,7 @@ def parse_toml(text: str, model: type[Model], *, source: str) -> Model:
     try:
         content = tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # too many digits or brackets raise other errors
-        message = f"{source}: not valid TOML: {error}"
-        raise ConfigError(message) from error
+        raise ConfigError(f"{source}: not valid TOML: {error}") from error
     return check_document(content, model, source=source)
 
 
@@ -87,8 +84,7 @@ def check_document(content: object, model: type[Model], *, source: str) -> Model
         faults = sorted((_fault(item, model) for item in error.errors()), key=lambda fault: "is missing" in fault)
         found = list(dict.fromkeys(faults))
         more = [f"and {len(found) - _FEW} more"] if len(found) > _FEW else []
-        message = f"{source}: " + "; ".join([*found[:_FEW], *more])
-        raise ConfigError(message) from error
+        raise ConfigError(f"{source}: " + "; ".join([*found[:_FEW], *more])) from error
 
 
 def _fault(item: Any, model: type[BaseModel]) -> str:  # noqa: ANN401 - pydantic's own error record
@@ -178,8 +174,9 @@ def read_document(path: Path, model: type[Model], kind: Kind) -> Model:
         text = _text_of(path)
     except (OSError, UnicodeDecodeError) as error:
         noun = kind.removesuffix("s")
-        message = f"{path} cannot be read as a {noun} file ({error}): name a .toml file, or the id of one that ships"
-        raise ConfigError(message) from error
+        raise ConfigError(
+            f"{path} cannot be read as a {noun} file ({error}): name a .toml file, or the id of one that ships"
+        ) from error
     parsed: Model = _parsed(text, model, str(path))
     return parsed
 
@@ -208,13 +205,13 @@ def list_documents(kind: Kind, model: type[NamedDocument], folders: Sequence[Pat
     found: dict[str, Path] = {}
     for folder in (*folders, shipped_dir(kind)):
         if not folder.is_dir():
-            message = f"there is no folder {folder} with {noun} files"
-            raise ConfigError(message)
+            raise ConfigError(f"there is no folder {folder} with {noun} files")
         for path in sorted(folder.glob("*.toml")):
             identifier = read_document(path, model, kind).id
             if identifier in found and not found[identifier].samefile(path):
-                message = f"two {noun} files have the id {identifier!r}: {found[identifier]} and {path}; rename one"
-                raise ConfigError(message)
+                raise ConfigError(
+                    f"two {noun} files have the id {identifier!r}: {found[identifier]} and {path}; rename one"
+                )
             found.setdefault(identifier, path)
     return found
 
@@ -227,16 +224,17 @@ def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[]
             known = {name: name for name in list_known()} | {
                 other.stem: str(other) for other in sorted(path.parent.glob("*.toml")) if other.is_file()
             }
-            message = f"there is no {noun} file {id_or_path}{_hint(path.stem, known)}: check the path"
-            raise ConfigError(message)
+            raise ConfigError(f"there is no {noun} file {id_or_path}{_hint(path.stem, known)}: check the path")
         return path
     files = list_known()
     if id_or_path not in files and Path(id_or_path).is_dir():
-        message = f"{id_or_path} is a folder: name a {noun} file in it ({Path(id_or_path) / 'NAME.toml'}), or an id"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{id_or_path} is a folder: name a {noun} file in it ({Path(id_or_path) / 'NAME.toml'}), or an id"
+        )
     if id_or_path not in files:
-        message = f"there is no {noun} {id_or_path!r}{_hint(id_or_path, dict(zip(files, files, strict=True)))} ({mend})"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"there is no {noun} {id_or_path!r}{_hint(id_or_path, dict(zip(files, files, strict=True)))} ({mend})"
+        )
     return files[id_or_path]
 
 

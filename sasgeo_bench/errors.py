@@ -38,8 +38,7 @@ def check_given(value: object, kind: type, how: str) -> None:
     sasgeo_bench.errors.ConfigError: expected a float, got '5': say it as a number
     """
     if not isinstance(value, kind):
-        message = f"expected a {kind.__name__}, got {plain(repr(value))[:_SHORT]}: {how}"
-        raise ConfigError(message)
+        raise ConfigError(f"expected a {kind.__name__}, got {plain(repr(value))[:_SHORT]}: {how}")
 
 
 class SasgeoError(Exception):

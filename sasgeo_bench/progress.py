@@ -118,8 +118,7 @@ Found = TypeVar("Found")
 def check_jobs(jobs: int) -> None:
     """Raise `ConfigError` for a number of processes that no computer starts."""
     if not 1 <= jobs <= MOST_PROCESSES:
-        message = f"--jobs must lie between 1 and {MOST_PROCESSES}, got {jobs}"
-        raise ConfigError(message)
+        raise ConfigError(f"--jobs must lie between 1 and {MOST_PROCESSES}, got {jobs}")
 
 
 @contextmanager
@@ -131,15 +130,13 @@ def connected(address: str) -> Iterator["Client"]:
     try:
         from distributed import Client, LocalCluster  # noqa: PLC0415 - an optional dependency
     except ImportError as error:
-        message = "--dask needs the package distributed: pip install 'sasgeo-bench[dask]'"
-        raise ConfigError(message) from error
+        raise ConfigError("--dask needs the package distributed: pip install 'sasgeo-bench[dask]'") from error
     kind, _, count = address.partition(":")
     if kind == "local":
         if not (count.isascii() and count.isdecimal() and len(count) <= _DIGITS and 1 <= int(count) <= MOST_PROCESSES):
-            message = (
+            raise ConfigError(
                 f"--dask must be local:N with N from 1 to {MOST_PROCESSES}, or a scheduler's address, got {address!r}"
             )
-            raise ConfigError(message)
         with ExitStack() as stack:
             try:
                 # One thread each: a chunk waits for one matcher's process. The page that dask serves anyway is for this
@@ -153,18 +150,19 @@ def connected(address: str) -> Iterator["Client"]:
                 )
                 client = stack.enter_context(Client(stack.enter_context(cluster)))
             except (OSError, RuntimeError) as error:  # TimeoutError is among them
-                message = f"{count} dask workers cannot be started here ({message_of(error)}): ask for fewer"
-                raise ConfigError(message) from error
+                raise ConfigError(
+                    f"{count} dask workers cannot be started here ({message_of(error)}): ask for fewer"
+                ) from error
             yield client
         return
     if not _ADDRESS.fullmatch(address):
-        message = f"--dask must be local:N, or a scheduler's address as tcp://host:port, got {address!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"--dask must be local:N, or a scheduler's address as tcp://host:port, got {address!r}")
     try:
         client = Client(address, timeout=_CONNECT_S)
     except (OSError, TimeoutError, ValueError, TypeError) as error:  # TypeError: of TLS without certificates
-        message = f"no dask scheduler answers at {address!r} within {_CONNECT_S:g} s: check the address, or use local:N"
-        raise ConfigError(message) from error
+        raise ConfigError(
+            f"no dask scheduler answers at {address!r} within {_CONNECT_S:g} s: check the address, or use local:N"
+        ) from error
     with client:
         yield client
 
@@ -189,8 +187,7 @@ def spread(
     """
     check_jobs(jobs)
     if dask is not None and jobs > 1:
-        message = f"--jobs {jobs} and --dask {dask} both share out the work: leave one of them out"
-        raise ConfigError(message)
+        raise ConfigError(f"--jobs {jobs} and --dask {dask} both share out the work: leave one of them out")
     if progress is not None:
         progress.begin(label, len(items))
     for found in _found(work, items, jobs) if dask is None else _found_on_cluster(work, items, dask):
@@ -214,11 +211,10 @@ def _found(work: Callable[[Item], Found], items: Sequence[Item], jobs: int) -> I
                 pool.shutdown(wait=False, cancel_futures=True)
                 raise
     except BrokenProcessPool as error:
-        message = (
+        raise StoreError(
             f"one of {jobs} processes died, by a signal or for want of memory: ask for fewer --jobs, and go on; "
             "what is written stays"
-        )
-        raise StoreError(message) from error
+        ) from error
 
 
 class _Tried(NamedTuple, Generic[Found]):
@@ -258,8 +254,9 @@ def done_on(client: "Client", work: Callable[[Item], Found], items: Sequence[Ite
         try:
             tried: _Tried[Found] = future.result()
         except KilledWorker as error:
-            message = "dask workers died over and over on the same item: give them more memory, and go on"
-            raise StoreError(message) from error
+            raise StoreError(
+                "dask workers died over and over on the same item: give them more memory, and go on"
+            ) from error
         if tried.error is None:
             yield number, cast("Found", tried.result)
             continue

@@ -150,8 +150,7 @@ class Pipe:
         while b"\0" not in self._rest:
             more = os.read(self._source, 2**16)
             if not more:
-                message = "the browser has gone"
-                raise EOFError(message)
+                raise EOFError("the browser has gone")
             self._rest += more
         text, _, self._rest = self._rest.partition(b"\0")
         said = dict(json.loads(text))

@@ -203,8 +203,7 @@ def _no_network() -> Iterator[None]:
 
         def connect_here_only(self: socket.socket, address: object) -> None:
             if self.family != socket.AF_UNIX and not str(address[0]).startswith(LOOPBACK):  # type: ignore[index]
-                message = f"a test tried to reach {address!r}: tests use no network"
-                raise RuntimeError(message)
+                raise RuntimeError(f"a test tried to reach {address!r}: tests use no network")
             connect(self, address)  # type: ignore[arg-type]
 
         patch.setattr(socket.socket, "connect", connect_here_only)

@@ -55,8 +55,7 @@ class NoCard(Good):
 
 class RaisesInPrepare(Good):
     def prepare(self, region, learned):
-        message = "no index today"
-        raise ValueError(message)
+        raise ValueError("no index today")
 
 
 class WantsImages(Good):
@@ -84,8 +83,7 @@ class WorstFirst(Good):
 class RaisesWithVectors(Good):
     def answer(self, query, top_k):
         if query.vectors is not None:
-            message = "what are\nthese?"
-            raise TypeError(message)
+            raise TypeError("what are\nthese?")
         return super().answer(query, top_k)
 
 
@@ -107,8 +105,7 @@ class FailsAgain(Good):
 
     def answer(self, query, top_k):
         if query.query_id == self.last:
-            message = "again?"
-            raise RuntimeError(message)
+            raise RuntimeError("again?")
         self.last = query.query_id
         return super().answer(query, top_k)
 
@@ -228,8 +225,7 @@ class LearnsByChance(Learns):
 
 class LearnsNothing(Learns):
     def learn(self, training):
-        message = "too hard"
-        raise ValueError(message)
+        raise ValueError("too hard")
 
 
 class CannotWithout(Learns):

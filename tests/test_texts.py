@@ -413,8 +413,7 @@ class Breaks(Doubter):
     card = RejectorCard(**SAID | {"name": "breaks"})
 
     def p_false(self, predictions):
-        message = f"{WORDS}\x1b[31m {len(predictions)}"
-        raise ValueError(message)
+        raise ValueError(f"{WORDS}\x1b[31m {len(predictions)}")
 
 
 @pytest.fixture(scope="module")

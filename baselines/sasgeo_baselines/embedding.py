@@ -327,8 +327,7 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
             lessons.extend(lesson.rows for lesson in seen)
             lessons.extend(self._of_others(ground, region.grid, others, errors, _rng(name)))
         if len(lessons) < 2:  # noqa: PLR2004 - two classes
-            message = f"{self.card.name}: training shows {len(lessons)} locations, expected two at least"
-            raise ValueError(message)
+            raise ValueError(f"{self.card.name}: training shows {len(lessons)} locations, expected two at least")
         return fitted(lessons, shrinkage=self.numbers["shrinkage"], size=int(self.numbers["size"])).to_text()
 
     def _of_views(self, ground: Ground, pairs: Sequence[tuple[Query, Truth]]) -> Iterator["Lesson"]:

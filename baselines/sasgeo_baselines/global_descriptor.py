@@ -140,8 +140,7 @@ class GlobalDescriptor:
     def match(self, query: Query, *, top_k: int) -> Match:
         """Rank candidates, or places of a lattice, by the distance of their shares from those of the view."""
         if self._sums is None:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         if is_blind(query):
             return WITHHELD
         diagnostics = {"known_share": 1.0 - query.evidence.unknown_share}

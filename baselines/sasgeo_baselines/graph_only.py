@@ -134,8 +134,7 @@ class GraphOnly:
     def match(self, query: Query, *, top_k: int) -> Match:
         """Rank candidates, or places of a lattice, by the distance of descriptors."""
         if self._chart is None:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         if is_blind(query) and (query.vectors is None or query.vectors.empty):
             return WITHHELD
         view = _ViewOnMap.of(query, self._chart, self._nodes, used=self._used)

@@ -21,8 +21,9 @@ def read_learned(name: str, learned: str, read: Callable[[Any], Value]) -> Value
     try:
         return read(json.loads(learned))
     except (ValueError, KeyError, TypeError, AttributeError, IndexError):
-        message = f"{name}: the learned text is damaged, or of another version of this matcher: learn again"
-        raise ValueError(message) from None
+        raise ValueError(
+            f"{name}: the learned text is damaged, or of another version of this matcher: learn again"
+        ) from None
 
 
 def sound(value: Value, *, is_sound: bool) -> Value:

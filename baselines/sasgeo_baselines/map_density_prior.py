@@ -42,8 +42,7 @@ class MapDensityPrior:
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return the fullest places."""
         if self._sums is None:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         if is_blind(query):
             return WITHHELD
         side_m = max(query.evidence.size_m)

@@ -321,8 +321,7 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
     def read(self, region: Region, learned: str | None) -> None:
         """Encode the map; raise one line without a sound learned text, or PyTorch."""
         if learned is None:
-            message = f"{self.card.name} needs training: learn from views with true poses first (run --train)"
-            raise ValueError(message)
+            raise ValueError(f"{self.card.name} needs training: learn from views with true poses first (run --train)")
         classes, weights = weights_of(learned)
         self._encoders = Encoders.of(torch_module(self.card.name), classes, weights)
         planes, has, grid = map_planes(region, classes)
@@ -400,8 +399,9 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
             for lesson in lessons_of(training.regions[name], list(some), classes)
         ]
         if not lessons:
-            message = f"{self.card.name}: no view of training lies on its map and knows a class of it: name other tasks"
-            raise ValueError(message)
+            raise ValueError(
+                f"{self.card.name}: no view of training lies on its map and knows a class of it: name other tasks"
+            )
         return weights_text(classes, fitted(torch, classes, lessons))
 
 

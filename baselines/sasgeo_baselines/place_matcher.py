@@ -82,8 +82,7 @@ class PlaceMatcher(Tunable, ABC, Generic[View]):
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return the best poses, or rank the candidates by the best pose near each."""
         if not self._is_ready:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         is_empty = is_blind(query) and (query.vectors is None or query.vectors.empty)
         view = None if is_empty else self.look(query)
         if view is None:

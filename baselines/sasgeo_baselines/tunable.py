@@ -45,8 +45,7 @@ class Tunable:
         unknown = sorted(numbers.keys() - self.open_numbers.keys())
         if unknown:
             known = ", ".join(self.open_numbers) or "none"
-            message = f"{type(self).__name__} has no open number {unknown[0]!r}, it has {known}"
-            raise TypeError(message)
+            raise TypeError(f"{type(self).__name__} has no open number {unknown[0]!r}, it has {known}")
         self.numbers: dict[str, float] = {**self.chosen, **numbers}
 
     @classmethod

@@ -85,8 +85,7 @@ def on_post_build(config: MkDocsConfig) -> None:
     for path in sorted(Path(config.site_dir).rglob("*.html")):
         found = _FOREIGN.search(path.read_text(encoding="utf-8"))
         if found:
-            message = f"{path.relative_to(config.site_dir)} asks another host for {found[1]}"
-            raise PluginError(message)
+            raise PluginError(f"{path.relative_to(config.site_dir)} asks another host for {found[1]}")
 
 
 def _written() -> Iterator[str]:

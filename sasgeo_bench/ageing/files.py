@@ -77,8 +77,7 @@ def read_ageing(folder: Path) -> Ageing:
     """
     path = folder / TABLE
     if not path.is_file():
-        message = f"{folder} holds no {TABLE}: run measure-ageing with --out {folder} first"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds no {TABLE}: run measure-ageing with --out {folder} first")
     try:
         table = read_frame(path, mend="measure it again")
         facts = table.attrs
@@ -86,8 +85,9 @@ def read_ageing(folder: Path) -> Ageing:
             place=facts["place"], sources=tuple(facts["sources"]), area_km2=facts["area_km2"], table=table[list(DTYPES)]
         )
     except (ValueError, KeyError, TypeError) as error:
-        message = f"{path} cannot be read as a table of ageing ({' '.join(str(error).split())[:120]}): measure it again"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{path} cannot be read as a table of ageing ({' '.join(str(error).split())[:120]}): measure it again"
+        ) from error
     return ageing
 
 
@@ -134,8 +134,7 @@ def check_names(places: Sequence[Ageing]) -> None:
     """Raise `ConfigError` if two places have one name."""
     twice = [name for name, count in Counter(place.place for place in places).items() if count > 1]
     if twice:
-        message = f"two tables are of {twice[0]!r}: measure one of them with another --place"
-        raise ConfigError(message)
+        raise ConfigError(f"two tables are of {twice[0]!r}: measure one of them with another --place")
 
 
 def _together(places: Sequence[Ageing]) -> pd.DataFrame:

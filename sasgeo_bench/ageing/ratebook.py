@@ -74,8 +74,9 @@ class RateBook(Document):
     @classmethod
     def _is_current(cls, version: int) -> int:
         if version != VERSION:
-            message = f"write the rate book anew with compare-ageing --rates: this program reads version {VERSION}"
-            raise ValueError(message)
+            raise ValueError(
+                f"write the rate book anew with compare-ageing --rates: this program reads version {VERSION}"
+            )
         return version
 
     @property
@@ -141,8 +142,9 @@ def pool_rates(book: RateBook, *, exclude: Collection[str] = ()) -> PooledRates:
     """
     unknown = sorted(set(exclude) - set(book.names))
     if unknown:
-        message = f"there is no place {unknown[0]!r} to leave out of the ageing rates; known: {', '.join(book.names)}"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"there is no place {unknown[0]!r} to leave out of the ageing rates; known: {', '.join(book.names)}"
+        )
     places = [place for place in book.places if place.name not in exclude]
     names = dict.fromkeys(name for place in places for name in place.classes)
     pooled = {name: _pooled([place.classes[name] for place in places if name in place.classes]) for name in names}

@@ -30,8 +30,7 @@ def measure_ageing_command(
     """Measure what vanished and appeared between dated extracts: OUT/ageing.parquet, ageing.md and ageing.svg."""
     box = _read_box(bounds)
     if out.exists() and not out.is_dir():
-        message = f"--out {out} is a file: name a folder"
-        raise ConfigError(message)
+        raise ConfigError(f"--out {out} is a file: name a folder")
     dated = date_extracts(extract, at=[read_day(text, flag="--at") for text in at or ()])
     history = read_history(dated, bounds=box, margin_m=margin_m, tell=tell)
     name = place or extract[0].name.split(".")[0].split("-")[0]
@@ -63,6 +62,7 @@ def _read_box(text: str | None) -> Box | None:
     except ValueError:
         west, south, east, north = 0.0, 0.0, 0.0, 0.0
     if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):  # noqa: PLR2004 - degrees on a sphere
-        message = f"--bounds must be west,south,east,north in degrees as in 9.47,47.05,9.64,47.27, got {text!r}"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"--bounds must be west,south,east,north in degrees as in 9.47,47.05,9.64,47.27, got {text!r}"
+        )
     return (west, south, east, north)

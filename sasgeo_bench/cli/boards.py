@@ -39,8 +39,7 @@ CONTROL_FAILED: Final = 3  # exit status
 def _folder(text: str) -> Path:
     """Refuse an empty name, which would be taken for the folder one is in."""
     if not text:
-        message = "--results names no folder: name one, as in docs/results"
-        raise StoreError(message)
+        raise StoreError("--results names no folder: name one, as in docs/results")
     return Path(text)
 
 
@@ -175,20 +174,17 @@ def score_command(options: ScoreOptions) -> None:
 
 def _check_names(name: str, truth: Path | None) -> None:
     if not BOARD_NAME.fullmatch(name):
-        message = f"--name must hold letters, digits, hyphens and underscores, 100 at most, got {name!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"--name must hold letters, digits, hyphens and underscores, 100 at most, got {name!r}")
     if truth is not None and not truth.is_dir():
-        message = f"--truth names {truth}, where there is no folder: name the one that holds the truths"
-        raise ConfigError(message)
+        raise ConfigError(f"--truth names {truth}, where there is no folder: name the one that holds the truths")
 
 
 def _check_truths(truth: Path) -> None:
     if next(truth.glob(f"*/*/{TRUTH}"), None) is None:
-        message = (
+        raise ConfigError(
             f"--truth names {truth}, which holds no truths (SUITE/REGION/{TRUTH}): "
             "name the folder that make-queries put them into, as out/truth"
         )
-        raise ConfigError(message)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -236,10 +232,9 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     plan = replace(plan, jobs=options.jobs, dask=options.dask)
     if opened is not None:
         if plan.seal is None or plan.seal.seed is None:
-            message = (
+            raise ConfigError(
                 "--opened is the day on which sealed places are opened: give --sealed-seed-file, too, or leave it out"
             )
-            raise ConfigError(message)
         check_day(opened, plan.seal, plan.seal.openings)
     if options.dry_run:
         tell(f"reading the cards of {counted(len(plan.matchers), 'matcher')}: a second or two each")

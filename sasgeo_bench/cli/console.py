@@ -100,8 +100,9 @@ def note(text: str) -> None:
             file.write("".join(f"{now} {plain(line)}\n" for line in text.splitlines()))
     except OSError as error:
         os.environ.pop(LOG, None)
-        message = f"--log {path} cannot be written ({error.strerror}): name a file in a folder of yours"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"--log {path} cannot be written ({error.strerror}): name a file in a folder of yours"
+        ) from error
 
 
 @contextmanager
@@ -153,8 +154,7 @@ def read_day(text: str, *, flag: str) -> dt.date:
     try:
         return dt.date.fromisoformat(text)
     except ValueError as error:
-        message = f"{flag} must be a date as in 2021-10-28, got {text!r}"
-        raise ConfigError(message) from error
+        raise ConfigError(f"{flag} must be a date as in 2021-10-28, got {text!r}") from error
 
 
 def tell(line: str) -> None:

@@ -98,8 +98,7 @@ def read_flight_command(flight: FlightOptions) -> None:
         return
     for name in ("tum", "least_m", "margin_m"):
         if getattr(flight, name) is not None:
-            message = f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region"
-            raise FlightError(message)
+            raise FlightError(f"--{name.replace('_', '-')} needs --region: it is about the stretch over a region")
     if is_tum(flight.file):
         flown = read_poses(flight.file, flight.facts, height_m=flight.height_m)
         say("\n".join((_summary(flown), *gaps_of(flown.time_s))))
@@ -168,16 +167,16 @@ def _read_lengths(text: str) -> list[float]:
     except ValueError:
         lengths = []
     if not lengths or not all(0 < length < math.inf for length in lengths):
-        message = f"--lengths-m must be positive metres as in 10,50, got {text!r}"
-        raise FlightError(message)
+        raise FlightError(f"--lengths-m must be positive metres as in 10,50, got {text!r}")
     return lengths
 
 
 def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float, axes: Axes | None) -> list[PairedRun]:
     """Read pairs of files; each truth is read once."""
     if len(truth) != len(estimate):
-        message = f"give one --estimate for each --truth, got {len(truth)} truths and {len(estimate)} estimates"
-        raise FlightError(message)
+        raise FlightError(
+            f"give one --estimate for each --truth, got {len(truth)} truths and {len(estimate)} estimates"
+        )
     truths = {path: read_tum(path, axes=axes) for path in dict.fromkeys(truth)}
     runs = []
     for true_path, path in zip(truth, estimate, strict=True):
@@ -185,8 +184,7 @@ def _read_runs(truth: list[Path], estimate: list[Path], lost_s: float, axes: Axe
         try:
             run = pair_run(truths[true_path], believed, sequence=str(true_path.resolve()), lost_s=lost_s)
         except FlightError as error:
-            message = f"{path} against {true_path}: {error}"
-            raise FlightError(message) from error
+            raise FlightError(f"{path} against {true_path}: {error}") from error
         runs.append(run)
     return runs
 
@@ -195,11 +193,9 @@ def _check_outputs(inputs: list[Path], outputs: list[Path]) -> None:
     """Refuse to write a file over an input, or two into one."""
     for at, path in enumerate(outputs):
         if path in outputs[:at] or any(_is_same(path, other) for other in inputs):
-            message = f"{path} is named twice, to read from and to write to: name another file"
-            raise FlightError(message)
+            raise FlightError(f"{path} is named twice, to read from and to write to: name another file")
         if path.is_dir():
-            message = f"{path} cannot be written (Is a directory): name another place"
-            raise FlightError(message)
+            raise FlightError(f"{path} cannot be written (Is a directory): name another place")
 
 
 def _is_same(path: Path, other: Path) -> bool:

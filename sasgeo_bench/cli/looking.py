@@ -92,10 +92,9 @@ def inspect_command(
         raise no_target(target, out, folders)
     _refuse_strip(target, options.strip)
     if query is not None:
-        message = (
+        raise ConfigError(
             f"--query draws a query of a task or a run, and {target} is neither: leave it out, or name one of these"
         )
-        raise ConfigError(message)
     if region_folder is None:
         _inspect_split(target, out, folders)
         return
@@ -122,8 +121,7 @@ def _preview(manifest: Manifest, folder: Path, out: Path) -> Path:
 def _refuse_strip(target: str, strip: int | None) -> None:
     """Refuse to draw a strip of something that holds no answers."""
     if strip is not None:
-        message = f"--strip draws queries with their answers, and {target} holds none: name a run or a board"
-        raise ConfigError(message)
+        raise ConfigError(f"--strip draws queries with their answers, and {target} holds none: name a run or a board")
 
 
 def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
@@ -171,8 +169,9 @@ def _best_run(board: Path, out: Path) -> Path:
     tasks = {(str(item["suite"]), str(item["region"])) for item in about["tasks"]}
     name = best_on_pictures(scores, {key for key in tasks if BY in key[0]})
     if name is None:
-        message = f"{board} holds no answers to queries with pictures: name a board of a suite such as aerial+..."
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{board} holds no answers to queries with pictures: name a board of a suite such as aerial+..."
+        )
     entry = next(item for item in about["entries"] if item["name"] == name)
     return out / "runs" / str(entry["card"]["name"]) / str(entry["hash"])
 
@@ -334,10 +333,9 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
     if missing:
         tell(f"not searched, for not built: {', '.join(missing)}")
     if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:  # noqa: PLR2004
-        message = (
+        raise ConfigError(
             f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
         )
-        raise ConfigError(message)
     with shown_progress() as progress:
         read = spread(
             lambda name: read_features(out / "regions" / name), built, label="regions read", progress=progress

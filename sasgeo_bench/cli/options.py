@@ -171,21 +171,18 @@ def _read(value: Any, name: str, kind: Any) -> Any:  # noqa: ANN401 - whatever t
     if value is None and type(None) in kinds:
         return None
     if value is None:
-        message = f"{name} is None, and must be given"
-        raise ConfigError(message)
+        raise ConfigError(f"{name} is None, and must be given")
     if is_list and isinstance(value, str | Path):
         value = [value]
     if is_list and not isinstance(value, Iterable):
-        message = f"{name} must be a list, got {one_line(repr(value))}"
-        raise ConfigError(message)
+        raise ConfigError(f"{name} must be a list, got {one_line(repr(value))}")
     if Path in kinds:
         value = [given_path(one) for one in value] if is_list else given_path(value)
     elif str in kinds:
         for one in value if is_list else [value]:
             check_given(one, str, f"{name} is made of texts")
     if isinstance(info, ParameterInfo) and info.min is not None and value < info.min:
-        message = f"{name} must be at least {info.min:g}, got {value:g}"
-        raise ConfigError(message)
+        raise ConfigError(f"{name} must be at least {info.min:g}, got {value:g}")
     return list(value) if is_list else value
 
 

@@ -137,8 +137,7 @@ def _detectors(names: Sequence[str] | None) -> tuple[Detector, ...]:
     known = get_args(Detector)
     for name in names or ():
         if name not in known:
-            message = f"--detector {name!r} is unknown: {' or '.join(known)}"
-            raise ConfigError(message)
+            raise ConfigError(f"--detector {name!r} is unknown: {' or '.join(known)}")
     return tuple(name for name in known if name in names) if names else Choice().detectors
 
 

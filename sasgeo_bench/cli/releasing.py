@@ -73,11 +73,10 @@ def release_command(options: ReleaseOptions) -> None:
 def _check_flags(options: ReleaseOptions) -> None:
     """Refuse flags that do not go together, before anything is drawn."""
     if (options.board is None) != bool(options.regions) or (options.board and (options.truth or options.suites)):
-        message = (
+        raise ConfigError(
             "release takes either --regions, with --suites and --truth, or --board: a board names its queries, and its "
             "truths are in its stored results"
         )
-        raise ConfigError(message)
 
 
 def _queries_of(options: ReleaseOptions, board: Path) -> BoardTasks:

@@ -142,8 +142,7 @@ def run_command(options: RunOptions) -> None:
 def _shard(text: str) -> tuple[int, int]:
     index, _, count = text.partition("/")
     if not SHARD.fullmatch(text):
-        message = f"--shard must be i/n, as in 1/2, got {text!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"--shard must be i/n, as in 1/2, got {text!r}")
     return int(index), int(count)
 
 

@@ -40,8 +40,7 @@ def private_seed(file: Path | None, *, tell: Tell, public: int | None = None) ->
     if seed is None:
         return None
     if public is not None:
-        message = "--seed is public and a private seed is given too: leave one of them out"
-        raise ConfigError(message)
+        raise ConfigError("--seed is public and a private seed is given too: leave one of them out")
     tell(f"drawing by a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}, into OUT/{PRIVATE_ROOT}")
     _warn_of_bits(seed, tell)
     if LEAST_BITS <= seed.bits < REPRODUCING_BITS:

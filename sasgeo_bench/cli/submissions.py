@@ -47,10 +47,9 @@ def submit_command(
     if predictions is None or card is None or board is None:
         needed = {"--predictions": predictions, "--card": card, "--for": board}
         lacking = [flag for flag, value in needed.items() if value is None]
-        message = (
+        raise ConfigError(
             f"submit needs {' and '.join(lacking)}: name the answers, the card and the stored results of the board"
         )
-        raise ConfigError(message)
     folder = make_submission(SubmitRequest(predictions=predictions, card=card, board=board, into=into), tell=tell)
     say(str(folder))
     tell(f"next: validate --predictions {folder} --for {board}; then open a pull request with the folder")
@@ -66,19 +65,16 @@ def validate_command(
         _validate_submission(predictions, tasks or [])
         return
     if not predictions.exists():
-        message = (
+        raise ConfigError(
             f"there is no file or folder {predictions}: name a predictions file, the folder of a run, or a submission"
         )
-        raise ConfigError(message)
     if not parts_of(predictions):
-        message = (
+        raise ConfigError(
             f"{predictions} holds neither a run (part-*.parquet) nor a submission ({SUBMISSION}): name the folder of "
             "one, a predictions file, or make a submission by 'submit'"
         )
-        raise ConfigError(message)
     if not tasks:
-        message = "validate needs --tasks: name task folders, or the stored results of a board"
-        raise ConfigError(message)
+        raise ConfigError("validate needs --tasks: name task folders, or the stored results of a board")
     with laid_tasks(tasks) as folders:
         _show(validate(predictions, folders), predictions)
         aside = set_aside(predictions, folders)

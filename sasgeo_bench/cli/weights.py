@@ -109,13 +109,11 @@ def read_model(path: Path | None) -> ScorerModel | None:
         return None
     text = read_learned(path)
     if text is None:
-        message = f"there is no file {path}: {WHERE}"
-        raise ConfigError(message)
+        raise ConfigError(f"there is no file {path}: {WHERE}")
     try:
         return check_classes(ScorerModel.from_text(text))
     except ConfigError as error:
-        message = f"{path} is no learned text of a sasgeo matcher, {WHERE}: {error}"
-        raise ConfigError(message) from error
+        raise ConfigError(f"{path} is no learned text of a sasgeo matcher, {WHERE}: {error}") from error
 
 
 def find_region(name: str, *, out: Path) -> Region:
@@ -125,13 +123,13 @@ def find_region(name: str, *, out: Path) -> Region:
         built = sorted(path.parent.name for path in (out / "regions").glob(f"*/{MANIFEST}"))
         near = difflib.get_close_matches(name, built, n=1)
         hint = f", did you mean {near[0]!r}?" if near else ": build-region it first"
-        message = f"{out / 'regions'} holds no region {name!r}{hint}"
-        raise ConfigError(message)
+        raise ConfigError(f"{out / 'regions'} holds no region {name!r}{hint}")
     region = read_region(folder)
     strange = [item for item in region.classes if item not in load_taxonomy().names]
     if strange:
-        message = f"{folder} has a class {strange[0]!r} that this version does not know: build the region again"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{folder} has a class {strange[0]!r} that this version does not know: build the region again"
+        )
     return region
 
 

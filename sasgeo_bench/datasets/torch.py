@@ -109,8 +109,9 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
         folder = given_path(task)
         about = task_files.read_task(folder)
         if region is not None and base_of(about["region"]) != base_of(region.manifest.id):
-            message = f"{folder} is about {about['region']!r}, the region is {region.manifest.id!r}: read the other one"
-            raise ConfigError(message)
+            raise ConfigError(
+                f"{folder} is about {about['region']!r}, the region is {region.manifest.id!r}: read the other one"
+            )
         self.view_cells, self.map_cells = sides_cells
         self._truths = None if truths is None else _read_truths(folder, Path(truths))
         self._rows = _rows_of(folder, track, seed)
@@ -124,8 +125,7 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
     def query(self, index: int) -> Query:
         """Return the query behind an item, for `plot_query` or a matcher."""
         if not 0 <= index < len(self):
-            message = f"there are {len(self)} queries, got index {index}"
-            raise IndexError(message)
+            raise IndexError(f"there are {len(self)} queries, got index {index}")
         return query_of(self._rows.slice(index, 1).to_pylist()[0])
 
     def __getitem__(self, index: int) -> Item:
@@ -189,8 +189,7 @@ class PictureDataset(Dataset):  # type: ignore[misc]  # as above
         _check_torch()
         if not len(pictures) or crop_px < 1 or crops_each < 1:
             got = f"{len(pictures)} pictures, {crop_px} and {crops_each}"
-            message = f"crops need pictures, a side of at least 1 and as many of each, got {got}"
-            raise ImageError(message)
+            raise ImageError(f"crops need pictures, a side of at least 1 and as many of each, got {got}")
         self.crop_px, self.crops_each, self.seed = crop_px, crops_each, seed
         self._pictures, self.classes = pictures, pictures[0].classes
 
@@ -201,8 +200,7 @@ class PictureDataset(Dataset):  # type: ignore[misc]  # as above
     def __getitem__(self, index: int) -> Item:
         """Return one crop and its mask as tensors."""
         if not 0 <= index < len(self):
-            message = f"there are {len(self)} crops, got index {index}"
-            raise IndexError(message)
+            raise IndexError(f"there are {len(self)} crops, got index {index}")
         at, number = divmod(index, self.crops_each)
         labelled = self._pictures[at]
         rng = np.random.default_rng(_hash_of(f"{self.seed}/{labelled.place}/{at}/{number}"))
@@ -248,8 +246,7 @@ def task_pictures(task: str | Path, truths: str | Path) -> Sequence[LabelledImag
     folder = given_path(task)
     about = task_files.read_task(folder)
     if not about.get("frames"):
-        message = f"{folder} has no pictures: name a task of a suite such as aerial"
-        raise ConfigError(message)
+        raise ConfigError(f"{folder} has no pictures: name a task of a suite such as aerial")
     task_files.check_truths(folder, Path(truths))
     frames = {query.query_id: query.frames for query in task_files.read_queries(folder)}
     pairs = [(frames[name][number], labels) for name, number, labels in read_labels(Path(truths))]
@@ -308,8 +305,7 @@ def _rows_of(folder: Path, track: Track, seed: int) -> pa.Table:
     kept = [at for at, name in enumerate(rows["track"].to_pylist()) if name == track]
     if not kept:
         known = ", ".join(sorted(set(rows["track"].to_pylist()))) or "none"
-        message = f"{folder} has no queries of the track {track!r}: it has {known}"
-        raise ConfigError(message)
+        raise ConfigError(f"{folder} has no queries of the track {track!r}: it has {known}")
     ids = rows["query_id"].to_pylist()
     return rows.take(sorted(kept, key=lambda at: _hash_of(f"{seed}/{ids[at]}"))).combine_chunks()
 

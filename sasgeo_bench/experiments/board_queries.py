@@ -70,20 +70,17 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
             else "name those of a board, as docs/results/systems-objects"
         )
         fault = "holds no stored results" if stored.is_dir() else "is no folder here"
-        message = f"{stored} {fault}: {mend}"
-        raise StoreError(message)
+        raise StoreError(f"{stored} {fault}: {mend}")
     _check_version(stored, tell)
     made_by = stored_settings([stored]).pipeline
     if not made_by.get("id"):
-        message = f"{stored} are stored results of no pipeline, so nobody knows how its queries are drawn"
-        raise ConfigError(message)
+        raise ConfigError(f"{stored} are stored results of no pipeline, so nobody knows how its queries are drawn")
     spec = read_pipeline_file(request.pipeline or find_pipeline_file(str(made_by["id"])))
     if spec.identity != dict(made_by):
-        message = (
+        raise ConfigError(
             f"{stored} was made by another text of the pipeline {made_by['id']!r} than this one: take the version of "
             f"the program that made it ({_version_of(read_board(stored)[0])}), or name the file by --pipeline"
         )
-        raise ConfigError(message)
     _check_seed(stored, request.sealed)
     plan = plan_pipeline(
         _asking(spec, matchers),
@@ -95,8 +92,7 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
     )
     unknown = sorted({*request.without} - {item.region.id for item in plan.requests})
     if unknown:
-        message = f"--without names {', '.join(unknown)}, and the board asks about no such region"
-        raise ConfigError(message)
+        raise ConfigError(f"--without names {', '.join(unknown)}, and the board asks about no such region")
     kept = tuple(item for item in plan.requests if item.region.id not in request.without)
     return replace(plan, requests=kept, jobs=request.jobs)
 
@@ -109,8 +105,7 @@ def draw_board(request: BoardRequest, *, tell: Tell, progress: Progress | None =
     plan = plan_board(request, tell=tell)
     if plan.split is None or any(item.suite in PICTURED for item in plan.requests):
         what = "has no split" if plan.split is None else "asks about pictures, which a release does not hold"
-        message = f"the board {plan.spec.id!r} {what}: its queries cannot be released so far"
-        raise ConfigError(message)
+        raise ConfigError(f"the board {plan.spec.id!r} {what}: its queries cannot be released so far")
     fetch_extracts(plan)
     tasks, controls = draw_all(plan, tell=tell, progress=progress)
     board = asked_tasks(request.stored)
@@ -139,11 +134,10 @@ def _check_version(stored: Path, tell: Tell) -> None:
         {"made_by": f"sasgeo-bench {package_version()}", "data_version": DATA_VERSION, "task_version": TASK_VERSION}
     )
     if about.get("data_version", DATA_VERSION) != DATA_VERSION:
-        message = (
+        raise ConfigError(
             f"{stored} was made by {_version_of(about)}, and this is {here}, which makes other maps: enter it with the "
             "version that made it, or enter a board of this one"
         )
-        raise ConfigError(message)
     if about.get("task_version", TASK_VERSION) != TASK_VERSION:
         tell(f"{stored} was made by {_version_of(about)}, this is {here}: queries are held against its hashes")
 
@@ -152,11 +146,10 @@ def _check_seed(stored: Path, seed: PrivateSeed | None) -> None:
     """Refuse a seed that did not draw the sealed places of the board: none of their queries would be the same."""
     opened = read_board(stored)[0].get("sealed", {})
     if seed is not None and all(one.get("drawn_by") != seed.commitment for one in opened.values()):
-        message = (
+        raise ConfigError(
             f"{stored} was not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}: take the "
             "seed that was published with the board, or none"
         )
-        raise ConfigError(message)
 
 
 def _asking(spec: PipelineFile, matchers: Sequence[str]) -> PipelineFile:
@@ -181,11 +174,10 @@ def same_queries(stored: Path, tasks: Sequence[Path], *, tell: Tell) -> dict[str
     same = {name: asked for name, asked in board.items() if drawn.get(name) == asked}
     if not same:
         made_by = _version_of(read_board(stored)[0])
-        message = (
+        raise ConfigError(
             f"none of the {len(board)} queries of {stored} is drawn here as it was: they were drawn by another "
             f"version of the program, or from other extracts; take the version that made the board ({made_by})"
         )
-        raise ConfigError(message)
     tell(f"{len(same)} of {counted(len(board), 'query', 'queries')} of the board are drawn as they were")
     if len(same) < len(board):
         other = len(drawn.keys() & board.keys() - same.keys())

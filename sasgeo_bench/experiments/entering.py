@@ -157,11 +157,10 @@ def _check_answered(plan: RunPlan, asked: Collection[str], folder: Path) -> None
     """Refuse to make a submission of failures alone: it would take the place of an earlier one."""
     answers = [item for item in read_predictions(plan.run_folder) if item.query_id in asked]
     if answers and all(item.status not in SOUND for item in answers):
-        message = (
+        raise MatchError(
             f"{plan.card.name} failed on all {counted(len(answers), 'query', 'queries')} "
             f"({'; '.join(failure_lines(answers))}): mend it, raise its version and enter again; {folder} is as it was"
         )
-        raise MatchError(message)
 
 
 def _changed(plan: RunPlan) -> Iterator[str]:
@@ -197,11 +196,10 @@ def _check_same_board(folder: Path, board: str) -> None:
     """Refuse to replace answers to another board."""
     other = read_submission(folder).board if is_submission(folder) else board
     if other != board:
-        message = (
+        raise StoreError(
             f"{folder} holds answers to the board {other!r}, which would be lost: name another folder, as in --into "
             f"submissions/{board}/{folder.name}"
         )
-        raise StoreError(message)
 
 
 def _line(text: str) -> str:
@@ -219,8 +217,9 @@ def _card_of(card: MatcherCard, runs: Sequence[Run], split: Split | None, *, sou
     own, others = ([name for name in card.trained_on if (name in known) == is_own] for is_own in (True, False))
     for name in others:
         for near in difflib.get_close_matches(name, known, n=1, cutoff=_LIKE):
-            message = f"the card of {source}: trained_on names {name!r}, no place of the split: did you mean {near!r}?"
-            raise ConfigError(message)
+            raise ConfigError(
+                f"the card of {source}: trained_on names {name!r}, no place of the split: did you mean {near!r}?"
+            )
     places = {run.name: run.plan.training_set.places if run.plan.training_set else () for run in runs}
     taught = {name: sorted({*some, *own}) for name, some in places.items()}
     by_half = {half: taught.get(f"half {half}", sorted(own)) for half in HALVES}

@@ -48,8 +48,7 @@ def head_start_of(pipeline_file: Path) -> Path | None:
     if archive.is_file():
         return archive
     if archive.is_symlink() or archive.exists():
-        message = f"{archive} is no file, and a head start of {pipeline_file.name} has this name: move it away"
-        raise StoreError(message)
+        raise StoreError(f"{archive} is no file, and a head start of {pipeline_file.name} has this name: move it away")
     return None
 
 
@@ -91,11 +90,10 @@ def unpack_head_start(pipeline_file: Path, stated: ArchiveSpec | None, out: Path
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:
-        message = (
+        raise StoreError(
             f"{out} cannot be written ({error.strerror or error}: {error.filename2 or error.filename}): check your "
             "rights and the free space, or name another folder by --out"
-        )
-        raise StoreError(message) from error
+        ) from error
     if laid:
         tell(f"answers to {counted(laid, 'task')} came packed in {archive.name}, are not asked again, and say so")
 
@@ -106,18 +104,15 @@ def _read(archive: Path, sha256: str, pipeline_file: Path) -> bytes:
         with plain_file(archive).open("rb") as file:
             data = file.read(MOST_PACKED + 1)
     except OSError as error:
-        message = f"{archive} cannot be read ({error.strerror or error}): check your rights"
-        raise StoreError(message) from error
+        raise StoreError(f"{archive} cannot be read ({error.strerror or error}): check your rights") from error
     if len(data) > MOST_PACKED:
-        message = f"{archive} is larger than {MOST_PACKED} bytes: pack less"
-        raise StoreError(message)
+        raise StoreError(f"{archive} is larger than {MOST_PACKED} bytes: pack less")
     found = hashlib.sha256(data).hexdigest()
     if found != sha256:
-        message = (
+        raise StoreError(
             f"{archive} is not the archive that {pipeline_file.name} states (its SHA-256 is {found[:12]}..., stated is "
             f"{sha256[:12]}...): fetch both again, or take the archive away, and all is asked here"
         )
-        raise StoreError(message)
     return data
 
 
@@ -132,8 +127,7 @@ def _unpack(archive: Path, data: bytes, scratch: Path) -> None:
                 path.write_bytes(b"" if file is None else file.read())
     except _DAMAGES as error:
         mend = "pack it again, or take it away, and all is asked here"
-        message = f"{archive} is damaged ({one_line(str(error)) or type(error).__name__}): {mend}"
-        raise StoreError(message) from error
+        raise StoreError(f"{archive} is damaged ({one_line(str(error)) or type(error).__name__}): {mend}") from error
     _check_runs(archive, scratch)
 
 
@@ -143,12 +137,10 @@ def _unpressed(data: bytes) -> bytes:
     found = bytearray(reader.decompress(data, _AT_ONCE))
     while not reader.eof:
         if len(found) > MOST_BYTES:
-            message = f"it holds more than {MOST_BYTES} bytes"
-            raise ValueError(message)
+            raise ValueError(f"it holds more than {MOST_BYTES} bytes")
         part = reader.decompress(b"", _AT_ONCE)
         if not part and reader.needs_input:
-            message = "it is cut"
-            raise EOFError(message)
+            raise EOFError("it is cut")
         found += part
     return bytes(found)
 
@@ -167,8 +159,7 @@ def _files(archive: Path, packed: tarfile.TarFile) -> Iterator[tuple[str, tarfil
         elif not _is_of_run(path, is_file=is_plain):
             fault = f"{one_line(member.name)[:80]!r}"
         if fault is not None:
-            message = f"{archive} holds {fault}: pack answers alone, the folder {FOLDER} as it lies below OUT"
-            raise StoreError(message)
+            raise StoreError(f"{archive} holds {fault}: pack answers alone, the folder {FOLDER} as it lies below OUT")
         if is_plain:
             seen.add(str(path))
             yield str(path), member
@@ -196,8 +187,9 @@ def _check_runs(archive: Path, scratch: Path) -> None:
             about = None
         if not isinstance(about, dict):
             where = folder.relative_to(scratch)
-            message = f"{archive} holds no sound {prediction_files.RUN} in {where}: pack each run with its record"
-            raise StoreError(message)
+            raise StoreError(
+                f"{archive} holds no sound {prediction_files.RUN} in {where}: pack each run with its record"
+            )
 
 
 def _lay_all(scratch: Path, out: Path, sha256: str) -> int:

@@ -76,8 +76,7 @@ def run_pipeline(
     tasks, controls = draw_all(plan, tell=tell, progress=progress)
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
     if not asked:
-        message = f"pipeline {plan.spec.id!r}: no region carries any of its suites"
-        raise ConfigError(message)
+        raise ConfigError(f"pipeline {plan.spec.id!r}: no region carries any of its suites")
     contrasts = tuple(contrast_of(item.model_dump(exclude={"why", "pilot"})) for item in plan.spec.contrast)
     _check_contrasts(plan, contrasts, asked, tell)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)

@@ -284,11 +284,9 @@ def plan_pipeline(
         try:
             requests += plan_requests(asked, tell=tell if number == 0 else silent)
         except ConfigError as error:
-            message = f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}"
-            raise ConfigError(message) from error
+            raise ConfigError(f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}") from error
     if spec.task and not requests:
-        message = f"pipeline {spec.id!r} has no region that can be built here: name --extracts"
-        raise ConfigError(message)
+        raise ConfigError(f"pipeline {spec.id!r} has no region that can be built here: name --extracts")
     _check_kinds(spec)
     _check_pictures(spec)
     _check_flights(spec)
@@ -316,8 +314,7 @@ def _check_pictures(spec: PipelineFile) -> None:
                 continue
             what = "draws pictures, and no segmenter sees them" if not task.segmenters else "draws no pictures"
             mend = "name segmenters" if not task.segmenters else "leave segmenters out, or name it in another [[task]]"
-            message = f"pipeline {spec.id!r}: suite {name!r} {what}: {mend}"
-            raise ConfigError(message)
+            raise ConfigError(f"pipeline {spec.id!r}: suite {name!r} {what}: {mend}")
 
 
 def _check_flights(spec: PipelineFile) -> None:
@@ -326,8 +323,7 @@ def _check_flights(spec: PipelineFile) -> None:
         odd = next((name for name in item.suites if _is_of_flights(name) != (item.track == SEQUENCE)), None)
         if odd is not None:
             what = f"is of flights, say track = {SEQUENCE!r}" if _is_of_flights(odd) else "has no flights"
-            message = f"contrast {item.name!r} has track {item.track!r}, and suite {odd!r} {what}"
-            raise ConfigError(message)
+            raise ConfigError(f"contrast {item.name!r} has track {item.track!r}, and suite {odd!r} {what}")
 
 
 def _is_of_flights(name: str) -> bool:
@@ -340,16 +336,14 @@ def _check_look(spec: PipelineFile, requests: Sequence[Request]) -> None:
         return
     pictured = [item for item in requests if item.suite in PICTURED]
     if not pictured:
-        message = f"pipeline {spec.id!r} has reference_imagery, and draws no suite of pictures: leave it out"
-        raise ConfigError(message)
+        raise ConfigError(f"pipeline {spec.id!r} has reference_imagery, and draws no suite of pictures: leave it out")
     family = spec.reference_imagery.family
     alike = next((item.region.id for item in pictured if family in _families(item)), None)
     if alike is not None:
-        message = (
+        raise ConfigError(
             f"pipeline {spec.id!r}: reference_imagery is of family {family!r}, and so are pictures of queries on "
             f"{alike}: take another of {', '.join(PALETTES)}"
         )
-        raise ConfigError(message)
 
 
 def _families(request: Request) -> set[str]:
@@ -373,8 +367,9 @@ def _check_kinds(spec: PipelineFile) -> None:
         }
         lost = next((kind for kind in kinds if not any(one.startswith(kind) for one in drawn)), None)
         if lost is not None:
-            message = f"{who} names the kind {lost!r}, which is not drawn: its suites have {', '.join(sorted(drawn))}"
-            raise ConfigError(message)
+            raise ConfigError(
+                f"{who} names the kind {lost!r}, which is not drawn: its suites have {', '.join(sorted(drawn))}"
+            )
 
 
 def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request, ...]:
@@ -386,8 +381,9 @@ def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request,
         towns = [name for name in made_up if specs[name].cell_size_m == CONTROL_CELL_M]
         regions = [name for name in towns if _may_control(name, split)][:1]
     if split is not None and not regions:
-        message = f"split {split.spec.id!r} trains on every embedded town or seals it, and controls need one: free one"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"split {split.spec.id!r} trains on every embedded town or seals it, and controls need one: free one"
+        )
     controls = Wanted(
         suites=(CONTROLS,),
         regions=tuple(regions),
@@ -451,11 +447,10 @@ def plan_runs(plan: PipelinePlan, spec: str, tasks: Sequence[Path]) -> list[Run]
         )
     )
     if is_oracle and not is_unranked(whole.card.name):
-        message = (
+        raise ConfigError(
             f"learning names {spec!r} among its oracles, and its card is named {whole.card.name!r}: the names of "
             f"oracles begin with {YARDSTICK}, so that no board ranks them"
         )
-        raise ConfigError(message)
     if groups is None or not whole.learns or not own:
         return [Run(name="", plan=whole)]
     learning = groups.learning

@@ -58,13 +58,13 @@ def seal_of(
     Raise `ConfigError` if their seed is given and nothing is sealed, or together with a private seed.
     """
     if seed is not None and private is not None:
-        message = "a private seed draws no sealed place: give --seed-file or --sealed-seed-file, not both"
-        raise ConfigError(message)
+        raise ConfigError("a private seed draws no sealed place: give --seed-file or --sealed-seed-file, not both")
     regions = dict.fromkeys(item.region.id for item in requests)
     drawn = tuple(dict.fromkeys(place for name in regions if (place := split.sealed_place(name)) is not None))
     if seed is not None and not drawn:
-        message = f"no region of the pipeline is of a sealed place of split {split.spec.id!r}: leave the seed out"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"no region of the pipeline is of a sealed place of split {split.spec.id!r}: leave the seed out"
+        )
     if not split.sealed:
         return None
     return Seal(split=split, drawn=drawn, seed=seed, openings=read_openings(out, split.spec.id), out=out)
@@ -82,11 +82,10 @@ def open_seal(
     split = seal.split
     places = {place for item in requests for place in split.places_in(item.region.id)}
     if split.spec.kind == "holdout" and not any(split.part_of(place) == "test" for place in places):
-        message = (
+        raise ConfigError(
             f"every test place of split {split.spec.id!r} is sealed, so that nothing can be ranked: --sealed-seed-file "
             "opens them"
         )
-        raise ConfigError(message)
     openings = seal.openings if stored is None else joined_openings(_stored_openings(stored), seal.openings)
     if seal.seed is not None:
         if opened is not None:
@@ -100,17 +99,15 @@ def open_seal(
 def check_day(opened: dt.date, seal: Seal, openings: Openings) -> None:
     """Raise `ConfigError` for a day to come, or before an opening by another seed: days are stated, records are not."""
     if opened > _today():
-        message = f"--opened {opened.isoformat()} has not come yet: leave it out, which takes today (UTC)"
-        raise ConfigError(message)
+        raise ConfigError(f"--opened {opened.isoformat()} has not come yet: leave it out, which takes today (UTC)")
     for place in seal.drawn:
         before = openings.get(place, ())
         is_known = seal.seed is not None and seal.seed.commitment in {item.commitment for item in before}
         if before and not is_known and opened < before[-1].opened:
-            message = (
+            raise ConfigError(
                 f"--opened {opened.isoformat()} is before the recorded opening of sealed place {place}, on "
                 f"{before[-1].to_text()}: leave it out, which takes today (UTC)"
             )
-            raise ConfigError(message)
 
 
 def _today() -> dt.date:

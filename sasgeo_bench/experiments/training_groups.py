@@ -118,28 +118,25 @@ def needed(requests: Sequence[Request], learning: LearningSpec | None) -> tuple[
     if learning is not None:
         _check_parts(requests, split)
     if not split.sealed and not _places_of("test", requests, split):
-        message = (
+        raise ConfigError(
             f"no region is of a test place of the hold-out {split.spec.id!r}, and a board ranks these alone: add one"
         )
-        raise ConfigError(message)
     return found
 
 
 def _check_parts(requests: Sequence[Request], split: Split) -> None:
     """Refuse learning from a hold-out without a train place, or with a region that is trained on and asked."""
     if not _places_of("train", requests, split):
-        message = (
+        raise ConfigError(
             f"[learning] has no region of a train place of the hold-out {split.spec.id!r}: add one, or leave it out"
         )
-        raise ConfigError(message)
     for region in dict.fromkeys(item.region.id for item in requests):
         parts = sorted({split.part_of(place) for place in split.places_in(region)})
         if "train" in parts and len(parts) > 1:
-            message = (
+            raise ConfigError(
                 f"region {region!r} has blocks of the parts {' and '.join(parts)} of split {split.spec.id!r}, and is "
                 "learned from: [learning] needs regions of one part each"
             )
-            raise ConfigError(message)
 
 
 def _places_of(part: str, requests: Sequence[Request], split: Split) -> tuple[str, ...]:

@@ -107,8 +107,9 @@ def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:
-        message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        ) from error
     try:
         yield
     finally:
@@ -137,8 +138,7 @@ def fresh_file(path: Path, *, mend: str) -> Iterator[Path]:
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:
-        message = f"{path} cannot be written ({error.strerror or error}): {mend}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be written ({error.strerror or error}): {mend}") from error
 
 
 def check_no_folder(path: Path) -> None:
@@ -232,8 +232,7 @@ def resolve_link(path: Path) -> Path:
     try:
         return path.resolve() if path.is_symlink() else path
     except (OSError, RuntimeError) as error:
-        message = f"{path} is a link that leads in a circle: name a folder"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} is a link that leads in a circle: name a folder") from error
 
 
 def absolute(path: Path) -> Path:
@@ -255,8 +254,9 @@ def _walk(folder: Path, without: Collection[str]) -> Iterator[tuple[str, Path]]:
         """Name the folder; of what is not there, or no folder, the caller speaks."""
         if isinstance(error, FileNotFoundError | NotADirectoryError):
             return
-        message = f"{error.filename} cannot be looked into ({error.strerror}): check your rights, or move it away"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{error.filename} cannot be looked into ({error.strerror}): check your rights, or move it away"
+        ) from error
 
     for parent, folders, files in os.walk(folder, onerror=refuse):
         if Path(parent) == folder:
@@ -275,8 +275,7 @@ def list_files(folder: Path, *, without: Collection[str] = ()) -> list[str]:
     found = []
     for name, path in _walk(folder, without):
         if not stat.S_ISREG(path.lstat().st_mode):
-            message = f"{path} is a link, or no file: put a plain file there, or remove it"
-            raise StoreError(message)
+            raise StoreError(f"{path} is a link, or no file: put a plain file there, or remove it")
         found.append(name)
     return sorted(found)
 
@@ -312,11 +311,10 @@ def check_known(
         if name not in known and not any(fnmatchcase(name, pattern) for pattern in patterns)
     )
     if other:
-        message = (
+        raise StoreError(
             f"{folder} holds {one_line(named(other, 'file'))} that would be lost and are not part of {what}: "
             "move that away, or name another folder"
         )
-        raise StoreError(message)
 
 
 def is_ours(record: Path) -> bool:
@@ -349,11 +347,9 @@ def check_room(folder: Path) -> None:
     folder = absolute(folder)
     there = next((path for path in folder.parents if path.exists()), folder)
     if not there.is_dir():
-        message = f"{folder} cannot be written, for {there} is a file: name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{folder} cannot be written, for {there} is a file: name another folder")
     if folder.is_mount():
-        message = f"{folder} is a mount point, which cannot be replaced as a whole: name a folder in it"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is a mount point, which cannot be replaced as a whole: name a folder in it")
     try:
         with tempfile.TemporaryDirectory(prefix=".sasgeo-bench-", dir=there):
             pass
@@ -362,5 +358,6 @@ def check_room(folder: Path) -> None:
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:
-        message = f"{folder} cannot be written ({error.strerror or error}): check your rights, or name another folder"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} cannot be written ({error.strerror or error}): check your rights, or name another folder"
+        ) from error

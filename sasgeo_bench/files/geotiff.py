@@ -30,8 +30,7 @@ def open_geotiff(path: Path, *, has_more: bool = False, **options: Any) -> Itera
     with rasterio.Env(**beside), rasterio.open(plain_file(path), driver="GTiff", **options) as source:
         stray = next((name for name in source.files if not _is_own(Path(name), path)), None) if has_more else None
         if stray is not None:
-            message = f"a file beside it reads {Path(stray).name}, which is none of its own"
-            raise RasterioIOError(message)
+            raise RasterioIOError(f"a file beside it reads {Path(stray).name}, which is none of its own")
         yield source
 
 

@@ -33,8 +33,7 @@ def parse_json(data: bytes | str) -> Any:  # noqa: ANN401 - any document
         )
         json.dumps(content, ensure_ascii=False).encode()  # "\ud800" is JSON, but no text
     except RecursionError as error:
-        message = "it is nested too deep"
-        raise ValueError(message) from error
+        raise ValueError("it is nested too deep") from error
     return content
 
 
@@ -47,34 +46,31 @@ def read_json(path: Path, *, mend: str, most_bytes: int = MOST_BYTES) -> Any:  #
         return parse_json(read_bounded(path, most_bytes))
     except (OSError, ValueError) as error:
         text = plain(getattr(error, "strerror", None) or str(error))[:_MOST_QUOTED]
-        message = f"{path} is damaged ({text}): {mend}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} is damaged ({text}): {mend}") from error
 
 
 def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content = dict(pairs)
     if len(content) < len(pairs):
         names = [name for name, _ in pairs]
-        message = f"the key {next(name for name in names if names.count(name) > 1)[:_MOST_QUOTED]!r} stands there twice"
-        raise ValueError(message)
+        raise ValueError(
+            f"the key {next(name for name in names if names.count(name) > 1)[:_MOST_QUOTED]!r} stands there twice"
+        )
     return content
 
 
 def _finite(text: str) -> float:
     value = float(text)
     if not math.isfinite(value):
-        message = f"{text[:_MOST_DIGITS]} is too large a number"
-        raise ValueError(message)
+        raise ValueError(f"{text[:_MOST_DIGITS]} is too large a number")
     return value
 
 
 def _short(text: str) -> int:
     if len(text) > _MOST_DIGITS:
-        message = f"{text[:_MOST_DIGITS]}... has too many digits"
-        raise ValueError(message)
+        raise ValueError(f"{text[:_MOST_DIGITS]}... has too many digits")
     return int(text)
 
 
 def _no_constant(name: str) -> float:
-    message = f"{name} is no number of JSON"
-    raise ValueError(message)
+    raise ValueError(f"{name} is no number of JSON")

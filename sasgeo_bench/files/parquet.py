@@ -79,8 +79,7 @@ def as_frame(table: pa.Table, path: Path, *, mend: str) -> "pd.DataFrame":
         frame: pd.DataFrame = table.to_pandas()
         frame.attrs = json.loads((table.schema.metadata or {}).get(_ATTRS, b"{}"))
     except (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError, pa.ArrowException) as error:
-        message = f"{path} cannot be read ({str(error)[:_MOST_QUOTED]}): {mend}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be read ({str(error)[:_MOST_QUOTED]}): {mend}") from error
     return frame
 
 
@@ -109,15 +108,13 @@ def open_table(
             if fault is None and not options.get("read_dictionary"):  # who reads so has bounds of its own
                 fault = _unpacked_fault(path, source.metadata, is_whole=is_whole)
             if fault is not None:
-                message = f"{path} holds {fault}: {mend}"
-                raise StoreError(message)
+                raise StoreError(f"{path} holds {fault}: {mend}")
             yield source
     except SasgeoError:
         raise
     except (OSError, pa.ArrowException, UnicodeDecodeError) as error:
         text = getattr(error, "strerror", None) or str(error)
-        message = f"{path} cannot be read ({text[:_MOST_QUOTED]}): {mend}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be read ({text[:_MOST_QUOTED]}): {mend}") from error
 
 
 def read_table(path: Path, *, mend: str, columns: Sequence[str] | None = None, most_rows: int = MOST_ROWS) -> pa.Table:
@@ -171,8 +168,7 @@ def read_batches(
         fault = _texts_fault(source.metadata, texts, text_bytes)
         found = [name for name in dict.fromkeys(source.schema_arrow.names) if name in columns]
     if fault is not None:
-        message = f"{path} holds {fault}: {mend}"
-        raise StoreError(message)
+        raise StoreError(f"{path} holds {fault}: {mend}")
     with open_table(path, mend=mend, read_dictionary=sorted(texts)) as source:
         for group in range(source.num_row_groups):  # Arrow cannot join the dictionaries of two inside a list
             yield from source.iter_batches(rows, row_groups=[group], columns=found)
@@ -291,8 +287,7 @@ def _check_footer(path: Path) -> None:
         footer = _read_footer(file)
     at = footer.find(_MARK) + len(_MARK)
     if at >= len(_MARK) and footer[at : at + _DIGITS] != _crc_of(footer, at):
-        message = "its footer is damaged"
-        raise pa.ArrowInvalid(message)
+        raise pa.ArrowInvalid("its footer is damaged")
 
 
 def _read_footer(file: BinaryIO) -> bytes:

@@ -29,8 +29,7 @@ def given_path(value: object) -> Path:
     sasgeo_bench.errors.StoreError: 5 is no path: name a folder or a file, as a text or a Path
     """
     if not isinstance(value, str | Path) or "\0" in str(value) or value == "":
-        message = f"{one_line(repr(value))} is no path: name a folder or a file, as a text or a Path"
-        raise StoreError(message)
+        raise StoreError(f"{one_line(repr(value))} is no path: name a folder or a file, as a text or a Path")
     return Path(value)
 
 

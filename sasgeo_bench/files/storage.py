@@ -87,11 +87,10 @@ def send(folder: str | Path, url: str) -> Moved:
         others += sorted(name for name in records if name in sizes and name not in known.names)
         _check_same(known.content, content, shown(url), "another place, or empty that one")
         if others:
-            message = (
+            raise StoreError(
                 f"{shown(url)} holds {one_line(named(others, 'file'))} of another folder, which would be lost: name "
                 "another place, or empty that one"
             )
-            raise StoreError(message)
         there = {
             name: one for name, one in records.items() if known.files.get(name) == one and sizes.get(name) == one.bytes
         }
@@ -118,16 +117,14 @@ def fetch(url: str, folder: str | Path) -> Moved:
     """
     target = absolute(given_path(folder))
     if target.is_symlink() or (target.exists() and not target.is_dir()):
-        message = f"{target} is a link, or no folder, and would be lost: name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{target} is a link, or no folder, and would be lost: name another folder")
     check_room(target)
     with _storage(url) as (system, root), locked(target, tell=lambda _: None):
         sent = _read_list(system, root, LIST, url)
         if sent is None:
             is_cut = _read_list(system, root, _SENDING, url) is not None
             cut, nothing = "was not sent to its end: send it again", "holds no folder that was sent: check the URL"
-            message = f"{shown(url)} {cut if is_cut else nothing}"
-            raise StoreError(message)
+            raise StoreError(f"{shown(url)} {cut if is_cut else nothing}")
         records = sent.files
         _check_same(_content_of(target), sent.content, str(target), "another folder")
         check_known(target, set(records), "the folder that was sent")
@@ -143,11 +140,10 @@ def fetch(url: str, folder: str | Path) -> Moved:
                     moved += 1
             if not _is_there(path, record):
                 path.unlink(missing_ok=True)
-                message = (
+                raise StoreError(
                     f"{shown(url)}/{one_line(name)} is not what was sent: remove that file there, and send the folder "
                     "again"
                 )
-                raise StoreError(message)
         whole = _whole(target)
         scratch.rename(whole)  # first, so that a folder without its list still tells by its name what it is
         (whole / LIST).unlink()
@@ -163,19 +159,16 @@ def _names_of(folder: Path) -> tuple[list[str], int]:
     """Return the files of a folder to send, and the number of hidden ones, which are not."""
     if not folder.is_dir():
         fault = "is no folder" if folder.exists() else "does not exist"
-        message = f"{folder} {fault}: name the folder of a region, a task, a run or a board"
-        raise StoreError(message)
+        raise StoreError(f"{folder} {fault}: name the folder of a region, a task, a run or a board")
     every = list_files(folder)
     names = [name for name in every if not any(part.startswith(".") for part in PurePosixPath(name).parts)]
     odd = next((name for name in names if not _is_within(name)), None)
     if odd is not None:
-        message = (
+        raise StoreError(
             f"{folder} holds {one_line(odd)!r}, a name that no storage keeps, or that this program needs: rename it"
         )
-        raise StoreError(message)
     if not names:
-        message = f"{folder} holds no file to send: name the folder of a region, a task, a run or a board"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds no file to send: name the folder of a region, a task, a run or a board")
     return names, len(every) - len(names)
 
 
@@ -185,8 +178,7 @@ def _check_apart(folder: Path, system: "AbstractFileSystem", root: str) -> None:
         return
     here, there = folder.resolve(), Path(root).resolve()
     if here.is_relative_to(there) or there.is_relative_to(here):
-        message = f"{folder} would be sent into itself: name a place outside of it"
-        raise StoreError(message)
+        raise StoreError(f"{folder} would be sent into itself: name a place outside of it")
 
 
 def _content_of(folder: Path) -> str:
@@ -205,8 +197,7 @@ def _content_of(folder: Path) -> str:
 def _check_same(there: str, content: str, where: str, elsewhere: str) -> None:
     """Refuse to put one region, task or run over another one: their files have the same names."""
     if there and content and there != content:
-        message = f"{where} holds {one_line(there)}, and {one_line(content)} would replace it: name {elsewhere}"
-        raise StoreError(message)
+        raise StoreError(f"{where} holds {one_line(there)}, and {one_line(content)} would replace it: name {elsewhere}")
 
 
 def _begun(target: Path, sent: "_Sent") -> Path:
@@ -228,8 +219,7 @@ def _begun(target: Path, sent: "_Sent") -> Path:
     try:
         scratch.mkdir()
     except FileExistsError as error:
-        message = f"{scratch} stands in the way, and is no fetch that was cut: move it away"
-        raise StoreError(message) from error
+        raise StoreError(f"{scratch} stands in the way, and is no fetch that was cut: move it away") from error
     mark.write_bytes(data)
     return scratch
 
@@ -259,27 +249,27 @@ def _storage(url: str) -> Iterator[tuple["AbstractFileSystem", str]]:
     try:
         import fsspec  # noqa: PLC0415 - an optional dependency
     except ImportError as error:
-        message = "object storage needs the package fsspec: pip install 'sasgeo-bench[storage]'"
-        raise ConfigError(message) from error
+        raise ConfigError("object storage needs the package fsspec: pip install 'sasgeo-bench[storage]'") from error
     try:
         system, root = fsspec.url_to_fs(url)
         yield system, _place(url, root)
     except SasgeoError:
         raise
     except ImportError as error:
-        message = f"{shown(url)} needs a package for such a storage ({one_line(str(error))}): install it"
-        raise ConfigError(message) from error
+        raise ConfigError(
+            f"{shown(url)} needs a package for such a storage ({one_line(str(error))}): install it"
+        ) from error
     except Exception as error:  # whatever the file system of others raises
         fault = one_line(str(error).replace(url, shown(url)) or repr(error))
-        message = f"{shown(url)} cannot be reached ({fault}): check the URL, your rights and the free space"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{shown(url)} cannot be reached ({fault}): check the URL, your rights and the free space"
+        ) from error
 
 
 def _place(url: str, root: str) -> str:
     """Return the path of a place in its storage; raise `ConfigError` if it is that of all of it."""
     if not (url.strip() and root.strip(":./")):
-        message = f"{shown(url)!r} names no place in a storage: give an URL, as s3://bucket/regions/vaduz"
-        raise ConfigError(message)
+        raise ConfigError(f"{shown(url)!r} names no place in a storage: give an URL, as s3://bucket/regions/vaduz")
     return re.sub("/{2,}", "/", root).rstrip("/")
 
 
@@ -296,8 +286,7 @@ def _put(system: "AbstractFileSystem", path: Path, there: str) -> None:
     except FileNotFoundError as error:
         if path.is_file():
             raise
-        message = f"{path} went away while its folder was sent: send the folder again"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} went away while its folder was sent: send the folder again") from error
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,13 +309,13 @@ def _read_list(system: "AbstractFileSystem", root: str, name: str, url: str) -> 
         names = frozenset(map(str, (*found, *content.get("begun", ()))))
         is_ours = content["made_by"] == _MADE_BY
     except (ValueError, ValidationError, TypeError, KeyError, AttributeError, RecursionError) as error:
-        message = f"{shown(url)}/{name} is no list of files that were sent: empty that place, and send the folder again"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{shown(url)}/{name} is no list of files that were sent: empty that place, and send the folder again"
+        ) from error
     odd = next((file for file in found if not _is_within(file)), _both(found))
     if odd is not None or not is_ours or (name == LIST and not found):
         what = "nothing that was sent" if odd is None else f"{one_line(odd)[:60]!r}, which is no file of a folder"
-        message = f"{shown(url)}/{name} lists {what}: empty that place, and send the folder again"
-        raise StoreError(message)
+        raise StoreError(f"{shown(url)}/{name} lists {what}: empty that place, and send the folder again")
     return _Sent(found, names, str(content.get("content", "")))
 
 

@@ -77,8 +77,7 @@ def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
     ([0.0, 2.0, 0.0], [0.0, 0.0])
     """
     if axes is not None and axes not in AXES:
-        message = f"axes must be one of {', '.join(AXES)}, got {axes!r}"
-        raise FlightError(message)
+        raise FlightError(f"axes must be one of {', '.join(AXES)}, got {axes!r}")
     if axes == "camera":
         flown = _out_of_camera(flown)
     if axes != "up" and len(flown) >= _LEAST_POSES:
@@ -136,11 +135,10 @@ def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
         if is_second and axes is None:
             mend = "say --axes camera (as of ORB-SLAM)"
         about = "the second axis" if is_second else f"an axis {off_deg:.0f} degrees off the third"
-        message = (
+        raise FlightError(
             f"{name}: the body turns about {about} of the frame, so its third axis does not point up: {mend}; "
             "quaternions are in the order qx qy qz qw"
         )
-        raise FlightError(message)
     is_flat = share >= _ALONG and spread_m[1] < _FLAT * np.linalg.norm(spread_m)
     if axes is None and ((is_flat and strength[2] > _STILL) or (loops and (is_flat or is_tilted))):
         message = (

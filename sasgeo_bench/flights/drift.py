@@ -56,11 +56,10 @@ class Stretch:
     def resampled(self, spacing_m: float) -> "Stretch":
         """Return the stretch at equal distances of path; raise `FlightError` if these are too many."""
         if not self.path_m[-1] <= _MOST_NODES * spacing_m:
-            message = (
+            raise FlightError(
                 f"a path of {self.path_m[-1]:g} m has more than {_MOST_NODES} steps of {spacing_m:g} m, a tenth of the "
                 "shortest segment: choose longer ones, and check that positions are in metres"
             )
-            raise FlightError(message)
         path_m = np.arange(0.0, self.path_m[-1] + 1e-9, spacing_m)
         return Stretch(
             flown=_between(path_m, self.path_m, self.flown),
@@ -107,20 +106,18 @@ def pair_run(truth: Trajectory, estimate: Trajectory, *, sequence: str, lost_s: 
     """
     is_timed = (estimate.time_s >= truth.time_s[0]) & (estimate.time_s <= truth.time_s[-1])
     if is_timed.sum() < 2:  # noqa: PLR2004 - one step
-        message = (
+        raise FlightError(
             f"{is_timed.sum()} of {counted(len(estimate), 'pose')} of the estimate ({estimate.span_text()}) within the "
             f"time of the truth ({truth.span_text()}), two are needed: give both one clock, in seconds"
         )
-        raise FlightError(message)
     true = truth.at(estimate.time_s[is_timed])
     difference = (estimate.rotation[is_timed] * true.rotation.inv()).as_matrix()
     tilt_deg = float(np.median(np.degrees(np.arccos(np.clip(difference[:, 2, 2], -1, 1)))))
     if tilt_deg > _MOST_TILT_DEG:
-        message = (
+        raise FlightError(
             f"estimate and truth differ by {tilt_deg:.0f} degrees of tilt, not by heading alone: "
             "give both the same axes of the body, and frames with their third axis up"
         )
-        raise FlightError(message)
     whole = Stretch(
         flown=_plane(true.position_m),
         believed=_plane(estimate.position_m[is_timed]),
@@ -165,8 +162,7 @@ def segment_errors(run: PairedRun, length_m: float, *, spacing_m: float) -> Segm
 def spacing_of(lengths_m: Sequence[float]) -> float:
     """Return the spacing of segments, a tenth of the shortest; raise `FlightError` if a length is not positive."""
     if not lengths_m or not all(0 < length < math.inf for length in lengths_m):
-        message = f"lengths of segments are positive metres, at least one, got {list(lengths_m)}"
-        raise FlightError(message)
+        raise FlightError(f"lengths of segments are positive metres, at least one, got {list(lengths_m)}")
     return min(lengths_m) / _NODES
 
 
@@ -217,8 +213,7 @@ def measure_drift(
     [['position_pct', 1.0], ['yaw_deg', 0.0], ['scale_pct', 0.995]]
     """
     if not runs:
-        message = "drift is measured on one run at least, got none"
-        raise FlightError(message)
+        raise FlightError("drift is measured on one run at least, got none")
     spacing_m = spacing_of(lengths_m)
     _warn_of_spacing(runs, spacing_m)
     rng = np.random.default_rng(seed)
@@ -333,11 +328,10 @@ def _cut(whole: Stretch, is_long: NDArray[np.bool_], sequence: str) -> PairedRun
     is_jump = error_m > _JUMP_M + _JUMP_SHARE * path_m
     is_jump |= np.abs(np.diff(whole.turn_rad)) > math.radians(_JUMP_DEG)
     if is_jump.sum() > max(_MOST_JUMPS, len(is_jump) / 2):
-        message = (
+        raise FlightError(
             f"{is_jump.sum()} of {len(is_jump)} steps are off by more than {_JUMP_M:g} m and a tenth of their length, "
             f"or {_JUMP_DEG:g} degrees: check that both files are of one flight, and positions are in metres"
         )
-        raise FlightError(message)
     ends = np.concatenate([[0], np.flatnonzero(is_lost | is_jump) + 1, [len(whole.flown)]])
     stretches = tuple(
         Stretch(

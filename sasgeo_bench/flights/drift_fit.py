@@ -101,8 +101,9 @@ def fit_profile(
     """
     squares, designs = _tables(runs, lengths_m)
     if len(squares) < 2:  # noqa: PLR2004 - to draw from
-        message = f"a profile needs whole segments of two sequences, got {len(squares)}: measure more or longer flights"
-        raise FlightError(message)
+        raise FlightError(
+            f"a profile needs whole segments of two sequences, got {len(squares)}: measure more or longer flights"
+        )
     (slip_m, heading_m), design = _best_lengths(designs, _mean(squares))
     picks = np.random.default_rng(seed).integers(0, len(squares), size=(draws, len(squares)))
     rest = (1 - LEVEL) / 2

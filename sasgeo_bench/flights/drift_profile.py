@@ -111,8 +111,7 @@ def list_profiles() -> list[str]:
 def load_profile(name: str) -> DriftProfile:
     """Return a profile that comes with the package; raise `ConfigError`, naming all, if there is none of this id."""
     if name not in list_profiles():
-        message = f"there is no drift profile {name!r}: choose of {', '.join(list_profiles())}"
-        raise ConfigError(message)
+        raise ConfigError(f"there is no drift profile {name!r}: choose of {', '.join(list_profiles())}")
     file = resources.files("sasgeo_bench.flights").joinpath(_FOLDER, f"{name}.toml")
     return parse_toml(file.read_text(encoding="utf-8"), DriftProfile, source=f"{name}.toml")
 
@@ -124,12 +123,12 @@ def read_drift_profile(path: Path) -> DriftProfile:
         with plain_file(path).open("rb") as source:
             content = source.read(_MOST_BYTES + 1)
         if len(content) > _MOST_BYTES:
-            message = f"{path} is no drift profile, it has more than {_MOST_BYTES} bytes: {mend}"
-            raise ConfigError(message)
+            raise ConfigError(f"{path} is no drift profile, it has more than {_MOST_BYTES} bytes: {mend}")
         text = content.decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
-        message = f"{path} cannot be read as a drift profile ({getattr(error, 'strerror', None) or error}): {mend}"
-        raise ConfigError(message) from error
+        raise ConfigError(
+            f"{path} cannot be read as a drift profile ({getattr(error, 'strerror', None) or error}): {mend}"
+        ) from error
     return parse_toml(text, DriftProfile, source=str(path))
 
 

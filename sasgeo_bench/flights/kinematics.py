@@ -77,14 +77,11 @@ class Limits:
         slow, fast = self.speed_mps
         values = (slow, self.corner_mps, self.turn_rate_deg_s, self.acceleration_mps2, self.climb_mps, self.tilt_deg)
         if not all(math.isfinite(value) and value > 0 for value in (*values, fast)):
-            message = f"limits of a flight are positive numbers, got {self!r}"
-            raise FlightError(message)
+            raise FlightError(f"limits of a flight are positive numbers, got {self!r}")
         if not self.corner_mps <= slow <= fast:
-            message = f"corner_mps, and the least and most of speed_mps must not fall, got {self!r}"
-            raise FlightError(message)
+            raise FlightError(f"corner_mps, and the least and most of speed_mps must not fall, got {self!r}")
         if not self.tilt_deg < 90:  # noqa: PLR2004 - level
-            message = f"tilt_deg is less than 90, got {self.tilt_deg!r}"
-            raise FlightError(message)
+            raise FlightError(f"tilt_deg is less than 90, got {self.tilt_deg!r}")
 
     @property
     def side_mps2(self) -> float:
@@ -182,11 +179,9 @@ def fly(
     (10.0, 3.0, True)
     """
     if not (math.isfinite(step_s) and step_s > 0):
-        message = f"step_s must be positive, got {step_s!r}"
-        raise FlightError(message)
+        raise FlightError(f"step_s must be positive, got {step_s!r}")
     if carriage not in get_args(Carriage):
-        message = f"carriage is one of {', '.join(get_args(Carriage))}, got {carriage!r}"
-        raise FlightError(message)
+        raise FlightError(f"carriage is one of {', '.join(get_args(Carriage))}, got {carriage!r}")
     path_m = _smooth(round_corners(polyline, limits.turn_radius_m))
     cruise_mps = rng.uniform(*limits.speed_mps)
     motion = _move(path_m, cruise_mps, limits, step_s)
@@ -220,8 +215,9 @@ def round_corners(polyline: ArrayLike, radius_m: float) -> Floats:
     turns = np.arctan2(_cross(ahead[:-1], ahead[1:]), (ahead[:-1] * ahead[1:]).sum(axis=1))
     back = np.flatnonzero(np.abs(turns) > math.radians(_SHARPEST_DEG))
     if len(back):
-        message = f"the path turns back on itself at point {back[0] + 2}: add points, so that it has room to turn"
-        raise FlightError(message)
+        raise FlightError(
+            f"the path turns back on itself at point {back[0] + 2}: add points, so that it has room to turn"
+        )
     parts = [line_m[:1]]
     for at, turn in enumerate(turns):
         corner_m, half_m = line_m[at + 1], min(lengths_m[at], lengths_m[at + 1]) / 2
@@ -269,16 +265,15 @@ def _checked(polyline: ArrayLike) -> Floats:
     """Return a polyline without repeated points."""
     line_m = np.asarray(polyline, dtype=np.float64)
     if line_m.ndim != 2 or line_m.shape[1:] != (2,) or not np.isfinite(line_m).all():  # noqa: PLR2004 - a table of pairs
-        message = f"a path has finite eastings and northings, shape (N, 2), got shape {line_m.shape}"
-        raise FlightError(message)
+        raise FlightError(f"a path has finite eastings and northings, shape (N, 2), got shape {line_m.shape}")
     kept = np.append(True, np.hypot(*np.diff(line_m, axis=0).T) > _SMALLEST_M)[: len(line_m)]
     line_m = np.asarray(line_m[kept])
     if len(line_m) < 2:  # noqa: PLR2004 - a side
-        message = f"a path has two distinct points at least, got {len(line_m)}"
-        raise FlightError(message)
+        raise FlightError(f"a path has two distinct points at least, got {len(line_m)}")
     if length_m(line_m) > _STEP_M * MOST_POINTS:
-        message = f"a path has {_STEP_M * MOST_POINTS / 1000:g} km at most, got {length_m(line_m) / 1000:g} km: cut it"
-        raise FlightError(message)
+        raise FlightError(
+            f"a path has {_STEP_M * MOST_POINTS / 1000:g} km at most, got {length_m(line_m) / 1000:g} km: cut it"
+        )
     return line_m
 
 
@@ -364,13 +359,13 @@ def _heights(height_m: float | tuple[float, float], time_s: Floats, limits: Limi
     """Return heights above the ground; the unsteadiness takes what the climb leaves of the limit."""
     first_m, last_m = height_m if isinstance(height_m, tuple) else (height_m, height_m)
     if not all(math.isfinite(value) and value > 0 for value in (first_m, last_m)):
-        message = f"height_m is above the ground, in metres, got {height_m!r}"
-        raise FlightError(message)
+        raise FlightError(f"height_m is above the ground, in metres, got {height_m!r}")
     climb_mps = abs(last_m - first_m) / time_s[-1]
     if climb_mps > limits.climb_mps:
         most_m = limits.climb_mps * time_s[-1]
-        message = f"from {first_m:g} to {last_m:g} m is too steep: this path leaves time for {most_m:.0f} m of climb"
-        raise FlightError(message)
+        raise FlightError(
+            f"from {first_m:g} to {last_m:g} m is too steep: this path leaves time for {most_m:.0f} m of climb"
+        )
     step_s = float(time_s[1] - time_s[0])
     wander_m = RIDE.height_sd_m * _wander(rng, len(time_s), step_s, RIDE.height_tau_s)
     fastest_mps = float(np.abs(np.diff(wander_m)).max()) / step_s

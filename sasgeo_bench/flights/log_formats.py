@@ -287,18 +287,18 @@ def find_layout(source: LogSource, header: Sequence[str], facts: LogFacts) -> La
             if len(matches) > 1:
                 matches = [column for column in matches if _topic(column) == topic] or matches
         if len(matches) > 1:
-            message = f"{name} is ambiguous, columns {listed([item.name for item in matches])}: keep one of them"
-            raise source.fault(message)
+            raise source.fault(
+                f"{name} is ambiguous, columns {listed([item.name for item in matches])}: keep one of them"
+            )
         if matches:
             found[name] = matches[0]
     _check_meaning(source, header, short, told, found, facts)
     lacking = [name for name in ("latitude", "longitude") if name not in found]
     if lacking:
-        message = (
+        raise source.fault(
             f"no column of {' and '.join(lacking)}, found {listed(header) if header else 'none'}: name "
             "them lat_deg and lon_deg"
         )
-        raise source.fault(message)
     fix = next((name for name in told.fix if name in names), "")
     topic = _topic(found["latitude"])
     if told.no_yaw == 0 and "yaw" in found and not _is_yaw_of_gps(found["yaw"], short):
@@ -331,18 +331,18 @@ def _check_meaning(
     parts = {bool(match[1]): header[at] for at, key in enumerate(short) if (match := _PARTS_OF_DAY.fullmatch(key))}
     if len(parts) > 1 and "time" in found and found["time"].unit == "s" and facts.time_unit is None:
         names = listed([parts[True], parts[False], found["time"].name])
-        message = f"the time is in parts, columns {names}: join them, as in 10:02:03.5, or say --time-unit none"
-        raise source.fault(message)
+        raise source.fault(
+            f"the time is in parts, columns {names}: join them, as in 10:02:03.5, or say --time-unit none"
+        )
     if "height" not in found or "height" in told.columns or facts.height_unit == "none":
         return
     height = found["height"]
     beside = next((header[at] for at, key in enumerate(short) if _GEODETIC.fullmatch(key)), "")
     if beside and _words_of(short[height.at], WORDS["height"])[0] == "height":
-        message = (
+        raise source.fault(
             f"column {shown(height.name)} may count from the ellipsoid, as {shown(beside)} beside it tells: say "
             "--height-unit none, or name it height_agl_m if it counts from the ground"
         )
-        raise source.fault(message)
 
 
 def _receiver(header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format, topic: str | None) -> Column | None:
@@ -469,11 +469,10 @@ def _check_no_time(source: LogSource, header: Sequence[str], keys: Sequence[tupl
         known.add(layout.receiver.at)
     open_ones = [header[at] for at, both in enumerate(keys) if at not in known and not _is_no_time(both)]
     if open_ones:
-        message = (
+        raise source.fault(
             f"no column of time is known, it may be one of {listed(open_ones)}: name it time_s, time_ms or time_us, or "
             "say --time-unit none if the log has no times"
         )
-        raise source.fault(message)
 
 
 def _is_no_time(both: tuple[str, str]) -> bool:

@@ -74,18 +74,15 @@ class LogSource:
     def check_size(self) -> None:
         """Raise `FlightError` if there is no such file, or if it is too large."""
         if not self.path.is_file():
-            message = f"there is no flight log {self.path}: check the path"
-            raise FlightError(message)
+            raise FlightError(f"there is no flight log {self.path}: check the path")
         size = self.path.stat().st_size
         if size > MOST_BYTES:
-            message = f"{size} bytes, at most {MOST_BYTES} are read: cut the log first"
-            raise self.fault(message)
+            raise self.fault(f"{size} bytes, at most {MOST_BYTES} are read: cut the log first")
 
     def check_count(self, count: int) -> None:
         """Raise `FlightError` for more points than are read."""
         if count > MOST_POINTS:
-            message = f"more than {MOST_POINTS} points: cut the log, or thin it out, first"
-            raise self.fault(message)
+            raise self.fault(f"more than {MOST_POINTS} points: cut the log, or thin it out, first")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -147,8 +144,7 @@ class FlightLog:
             tell_left_out(source, int((~is_new).sum()), f"with the {same} of the point before")
             numbers, columns = np.asarray(numbers)[is_new], {name: column[is_new] for name, column in columns.items()}
         if len(numbers) < 2:  # noqa: PLR2004 - a way
-            message = f"a flight has two points at least, the log has {len(numbers)}: export more of it"
-            raise source.fault(message)
+            raise source.fault(f"a flight has two points at least, the log has {len(numbers)}: export more of it")
         _check_times(source, numbers, columns)
         for name, most in {**_ANGLES, "height_m": HIGHEST_M}.items():
             if name in columns:

@@ -253,11 +253,10 @@ def _with_parts(source: LogSource, layout: Layout, values: dict[str, Floats], *,
         return values
     parts_s = part * UNITS["time"][layout.part.unit or "s"]
     if ((parts_s < 0) | (parts_s >= 1)).any():
-        message = (
+        raise source.fault(
             f"column {shown(layout.part.name)} is no part of a second, and {shown(time.name)} has whole seconds: "
             "keep the one that is the time"
         )
-        raise source.fault(message)
     return {**values, "time": whole - whole[:1] + parts_s}
 
 
@@ -335,8 +334,9 @@ def _converted(
             unit = _place_unit(source, at, facts, values, counts=counts)
             if unit == "e7" and (column != np.rint(column)).any():
                 mend = "say --place-unit deg" if at.unit is None else "name it by its unit"
-                message = f"column {shown(at.name)} has decimals, and is no count of 1e-7 degrees: {mend}, or mend it"
-                raise source.fault(message)
+                raise source.fault(
+                    f"column {shown(at.name)} has decimals, and is no count of 1e-7 degrees: {mend}, or mend it"
+                )
         else:
             # What is scaled of a message is scaled by its reader's taste.
             is_open = layout.format.counts and at.unit in ("mm", "cdeg") and not counts
@@ -358,10 +358,9 @@ def _place_unit(source: LogSource, at: Column, facts: LogFacts, values: dict[str
         if counts:
             return "e7"
         if _is_count(values):
-            message = (
+            raise source.fault(
                 f"column {shown(at.name)} holds whole numbers that are no degrees: say --place-unit e7, or mend them"
             )
-            raise source.fault(message)
         return "deg"
     return _unit(source, at, "place", facts)
 
@@ -376,12 +375,12 @@ def _unit(source: LogSource, at: Column, quantity: str, facts: LogFacts) -> str:
         choices = choices_of(quantity)
         said = f"{', '.join(choices[:-1])} or {choices[-1]}"
         example = {"time": "time_s", "height": "height_m", "angle": "yaw_deg"}.get(quantity, "lat_deg")
-        message = f"column {shown(at.name)} states no unit: say --{quantity}-unit {said}, or name it as in {example}"
-        raise source.fault(message)
+        raise source.fault(
+            f"column {shown(at.name)} states no unit: say --{quantity}-unit {said}, or name it as in {example}"
+        )
     return said
 
 
 def _check_said(source: LogSource, at: Column, unit: str, said: str | None, quantity: str) -> None:
     if said is not None and said != unit:
-        message = f"column {shown(at.name)} is in {unit}, not in {said}: leave out --{quantity}-unit"
-        raise source.fault(message)
+        raise source.fault(f"column {shown(at.name)} is in {unit}, not in {said}: leave out --{quantity}-unit")

@@ -101,11 +101,9 @@ class LogFacts:
         for quantity in UNITS:
             unit, choices = self.unit(quantity), choices_of(quantity)
             if unit is not None and unit not in choices:
-                message = f"{quantity}_unit must be one of {', '.join(choices)}, got {unit!r}"
-                raise FlightError(message)
+                raise FlightError(f"{quantity}_unit must be one of {', '.join(choices)}, got {unit!r}")
         if self.axes is not None and self.axes not in AXES:
-            message = f"axes must be one of {', '.join(AXES)}, got {self.axes!r}"
-            raise FlightError(message)
+            raise FlightError(f"axes must be one of {', '.join(AXES)}, got {self.axes!r}")
         check_within("--speed-mps", self.speed_mps)
 
     def unit(self, quantity: str) -> str | None:
@@ -122,8 +120,9 @@ class LogFacts:
         """Raise `FlightError` if a unit is said of a file that is no table: its format states them all."""
         for quantity in UNITS:
             if self.unit(quantity) is not None:
-                message = f"{plain(path.name)} is no table, and its units are known: leave out --{quantity}-unit"
-                raise FlightError(message)
+                raise FlightError(
+                    f"{plain(path.name)} is no table, and its units are known: leave out --{quantity}-unit"
+                )
 
 
 def check_within(option: str, value: float | None) -> None:
@@ -136,8 +135,7 @@ def check_within(option: str, value: float | None) -> None:
     """
     least, most = RANGES[option]
     if value is not None and not least <= value <= most:
-        message = f"{option} must be a number from {least:g} to {most:g}, got {value:g}"
-        raise FlightError(message)
+        raise FlightError(f"{option} must be a number from {least:g} to {most:g}, got {value:g}")
 
 
 def choices_of(quantity: str) -> tuple[str, ...]:

@@ -42,8 +42,7 @@ class _Track:
         """Return the log; times are of all points or of none."""
         count = len(self)
         if self.moments and len(self.moments) != count:
-            message = f"{len(self.moments)} of {count} points have a time: give each one, or none"
-            raise self.source.fault(message)
+            raise self.source.fault(f"{len(self.moments)} of {count} points have a time: give each one, or none")
         columns = {"lon_deg": np.array(self.lon_deg), "lat_deg": np.array(self.lat_deg)}
         if self.moments:
             columns["time_s"] = (np.array(self.moments) - self.moments[0]).round(6)
@@ -80,8 +79,7 @@ def read_gpx(path: Path) -> FlightLog:
             (track if parent == _POINTS[0] else route).leave("elevations, which are above the sea")
     kind, read = ("trk", track) if len(track) or not len(route) else ("rte", route)
     if counts[kind] > 1:
-        message = f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant"
-        raise track.source.fault(message)
+        raise track.source.fault(f"more than one {'track' if kind == 'trk' else 'route'}: keep the one that is meant")
     return read.log()
 
 
@@ -113,8 +111,7 @@ def read_kml(path: Path) -> FlightLog:
             _close(lines[-1], texts.get("coordinates", ""), texts.get("altitudeMode", "").strip())
             opened = ""
     if len(lines) != 1:
-        message = f"{len(lines)} lines or tracks, one is read: keep the one that is meant"
-        raise source.fault(message)
+        raise source.fault(f"{len(lines)} lines or tracks, one is read: keep the one that is meant")
     return lines[0].log()
 
 
@@ -176,16 +173,17 @@ def _elements(source: LogSource) -> Iterator[tuple[str, Element, str]]:
             elif open_ones:
                 open_ones[-1].remove(element)
             if len(open_ones) > _DEEPEST or count > _MOST_ELEMENTS:
-                message = f"more than {_MOST_ELEMENTS} elements, or {_DEEPEST} in each other: keep the track alone"
-                raise source.fault(message)
+                raise source.fault(
+                    f"more than {_MOST_ELEMENTS} elements, or {_DEEPEST} in each other: keep the track alone"
+                )
     except FlightError:
         raise
     except DefusedXmlException as error:
-        message = "has a document type or entities, which are not read: export it anew without them"
-        raise source.fault(message) from error
+        raise source.fault(
+            "has a document type or entities, which are not read: export it anew without them"
+        ) from error
     except (ParseError, ValueError, LookupError) as error:
-        message = f"no sound XML ({message_of(error)}): export it anew"
-        raise source.fault(message) from error
+        raise source.fault(f"no sound XML ({message_of(error)}): export it anew") from error
 
 
 def _content(source: LogSource) -> bytes:
@@ -193,11 +191,9 @@ def _content(source: LogSource) -> bytes:
     try:
         content = plain_file(source.path).read_bytes()
     except OSError as error:
-        message = f"cannot be read ({message_of(error)}): check its rights"
-        raise source.fault(message) from error
+        raise source.fault(f"cannot be read ({message_of(error)}): check its rights") from error
     if _LONG_TAG.search(content):
-        message = "a tag has more than 100000 characters: export it anew"
-        raise source.fault(message)
+        raise source.fault("a tag has more than 100000 characters: export it anew")
     return content
 
 

@@ -69,8 +69,7 @@ def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
     reader = {".gpx": read_gpx, ".kml": read_kml}.get(suffix)
     if reader is None and not is_table:
         mend = "unzip a .kmz, export a .ulg by ulog2csv of pyulog"
-        message = f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are ({mend})"
-        raise FlightError(message)
+        raise FlightError(f"{path.name or path} is no flight log that is read: {', '.join(SUFFIXES)} are ({mend})")
     if facts.axes is not None:
         raise _meaningless(path, "is no TUM file", "--axes")
     if reader is None:
@@ -172,8 +171,7 @@ def read_flight(  # noqa: PLR0913 - each is a wish of its own
     check_within("--least-m", least_m)
     check_within("--margin-m", margin_m)
     if not (math.isfinite(step_s) and step_s > 0):
-        message = f"step_s must be positive, got {step_s!r}"
-        raise FlightError(message)
+        raise FlightError(f"step_s must be positive, got {step_s!r}")
     log = None if is_tum(path) else read_log(path, facts, height_m=height_m)
     if log is None:
         logged = read_poses(path, facts, height_m=height_m)
@@ -209,8 +207,7 @@ def _on_grid(log: FlightLog, path: Path, epsg: int, speed_mps: float) -> Traject
     up_m = log.height_m
     if up_m is None:
         why = "has no height above the ground, and altitudes above the sea are not read"
-        message = f"{path.name} {why}: say one, as in --height-m 100"
-        raise FlightError(message)
+        raise FlightError(f"{path.name} {why}: say one, as in --height-m 100")
     en_m = np.stack(from_lonlat(epsg).transform(log.lon_deg, log.lat_deg), axis=1)
     en_m = np.nan_to_num(en_m, nan=_FAR_M, posinf=_FAR_M, neginf=-_FAR_M)
     time_s = log.time_s
@@ -236,17 +233,16 @@ def _at_height(flown: Trajectory, height_m: float) -> Trajectory:
 
 def _resampled(flown: Trajectory, path: Path, step_s: float) -> Trajectory:
     if len(flown) < 2:  # noqa: PLR2004 - a way
-        message = f"{path.name}: a flight has two poses at least, got {len(flown)}"
-        raise FlightError(message)
+        raise FlightError(f"{path.name}: a flight has two poses at least, got {len(flown)}")
     first_s, last_s = float(flown.time_s[0]), float(flown.time_s[-1])
     count = math.floor((last_s - first_s) / step_s) + 1
     if count < 2:  # noqa: PLR2004 - a way
-        message = f"{path.name} lasts {last_s - first_s:g} s, less than one step of {step_s:g} s: take a smaller step_s"
-        raise FlightError(message)
+        raise FlightError(
+            f"{path.name} lasts {last_s - first_s:g} s, less than one step of {step_s:g} s: take a smaller step_s"
+        )
     if count > MOST_POINTS:
         lasts = f"{path.name} lasts {last_s - first_s:.0f} s, more than {MOST_POINTS} steps of {step_s:g} s"
-        message = f"{lasts}: cut it, or take a larger step_s"
-        raise FlightError(message)
+        raise FlightError(f"{lasts}: cut it, or take a larger step_s")
     return flown.at(np.minimum(first_s + step_s * np.arange(count), last_s))
 
 

@@ -68,8 +68,7 @@ class Odometry:
         for name, rest in shapes.items():
             values = np.array(getattr(self, name))
             if values.shape != (count, *rest):
-                message = f"{name} of {count} increments has shape {values.shape}"
-                raise FlightError(message)
+                raise FlightError(f"{name} of {count} increments has shape {values.shape}")
             values.flags.writeable = False
             object.__setattr__(self, name, values)
 
@@ -129,8 +128,9 @@ def draw_odometry(
     [0.9, 359.3, 354.2]
     """
     if len(flown) == 1 or belief not in ("honest", "optimistic"):
-        message = f"odometry needs two poses and the belief 'honest' or 'optimistic', got {len(flown)} and {belief!r}"
-        raise FlightError(message)
+        raise FlightError(
+            f"odometry needs two poses and the belief 'honest' or 'optimistic', got {len(flown)} and {belief!r}"
+        )
     steps_m = path_steps_m(flown)
     step, law = _true_steps(flown), _Law(profile=profile, steps_m=steps_m)
     drift = law.draw(rng)

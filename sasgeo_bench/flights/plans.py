@@ -55,8 +55,7 @@ def flight_area(region: Region, margin_m: float = MARGIN_M) -> shapely.Geometry:
     Ground that the map does not know is outside, and the margin holds around it too.
     """
     if not (math.isfinite(margin_m) and margin_m >= 0):
-        message = f"margin_m is a distance in metres, got {margin_m!r}"
-        raise FlightError(message)
+        raise FlightError(f"margin_m is a distance in metres, got {margin_m!r}")
     area = region.coverage.intersection(shapely.box(*region.grid.bounds_m)).buffer(-margin_m)
     shapely.prepare(area)
     return area
@@ -118,14 +117,11 @@ def plan_flight(
     (2000, True)
     """
     if kind not in KINDS:
-        message = f"a flight is one of {', '.join(KINDS)}, got {kind!r}"
-        raise FlightError(message)
+        raise FlightError(f"a flight is one of {', '.join(KINDS)}, got {kind!r}")
     if along not in get_args(Ways):
-        message = f"a corridor lies along one of {', '.join(get_args(Ways))}, got {along!r}"
-        raise FlightError(message)
+        raise FlightError(f"a corridor lies along one of {', '.join(get_args(Ways))}, got {along!r}")
     if not SHORTEST_M <= length_m <= LONGEST_M:
-        message = f"length_m lies in {SHORTEST_M:g}..{LONGEST_M:g}, got {length_m!r}"
-        raise FlightError(message)
+        raise FlightError(f"length_m lies in {SHORTEST_M:g}..{LONGEST_M:g}, got {length_m!r}")
     area = flight_area(region, margin_m)
     corridors = Corridors.of(region.features, area, along) if kind == "corridor" else None
     wish = _Wish(area=area, length_m=float(length_m), limits=limits, corridors=corridors)

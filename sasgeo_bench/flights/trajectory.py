@@ -58,26 +58,25 @@ class Trajectory:
         for name, rest in shapes.items():
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != (len(self.time_s), *rest):
-                message = f"{name} of {len(self.time_s)} poses has shape {values.shape}"
-                raise FlightError(message)
+                raise FlightError(f"{name} of {len(self.time_s)} poses has shape {values.shape}")
             if not np.isfinite(values).all():
                 row = int(np.argwhere(~np.isfinite(values))[0, 0])
-                message = f"{name} of pose {row + 1} is not finite: leave that pose out"
-                raise FlightError(message)
+                raise FlightError(f"{name} of pose {row + 1} is not finite: leave that pose out")
             values.flags.writeable = False
             object.__setattr__(self, name, values)
         if not len(self.time_s):
-            message = "a trajectory has one pose at least, got none"
-            raise FlightError(message)
+            raise FlightError("a trajectory has one pose at least, got none")
         back = np.flatnonzero(np.diff(self.time_s) <= 0)
         if len(back):
-            message = f"time does not increase after pose {back[0] + 1}: sort the poses and keep one of each time"
-            raise FlightError(message)
+            raise FlightError(
+                f"time does not increase after pose {back[0] + 1}: sort the poses and keep one of each time"
+            )
         lengths = np.linalg.norm(self.quaternion_xyzw, axis=1)
         off = np.flatnonzero(np.abs(lengths - 1) > _UNIT)
         if len(off):
-            message = f"the quaternion of pose {off[0] + 1} has length {lengths[off[0]]:g}, not 1: order is x y z w"
-            raise FlightError(message)
+            raise FlightError(
+                f"the quaternion of pose {off[0] + 1} has length {lengths[off[0]]:g}, not 1: order is x y z w"
+            )
 
     @classmethod
     def of_angles(
@@ -128,8 +127,9 @@ class Trajectory:
         """
         times = np.asarray(time_s, dtype=np.float64)
         if times.size and (times.min() < self.time_s[0] or times.max() > self.time_s[-1]):
-            message = f"times from {times.min():.3f} to {times.max():.3f} s, the trajectory has {self.span_text()}"
-            raise FlightError(message)
+            raise FlightError(
+                f"times from {times.min():.3f} to {times.max():.3f} s, the trajectory has {self.span_text()}"
+            )
         position = np.stack([np.interp(times, self.time_s, axis) for axis in self.position_m.T], axis=1)
         turned = Slerp(self.time_s, self.rotation)(times) if len(self) > 1 else self.rotation
         return type(self)(time_s=times, position_m=position, quaternion_xyzw=turned.as_quat())

@@ -71,16 +71,17 @@ def read_tum(path: Path, *, axes: Axes | None = None) -> Trajectory:
             continue
         values = _pose(line, f"{path}, line {number}")
         if values[0] <= last_s:
-            message = f"{path}, line {number}: time {values[0]!r} does not increase: sort the lines, keep one of a time"
-            raise FlightError(message)
+            raise FlightError(
+                f"{path}, line {number}: time {values[0]!r} does not increase: sort the lines, keep one of a time"
+            )
         if len(table) == MOST_POSES * _COLUMNS:
-            message = f"{path}, line {number}: more than {MOST_POSES} poses: keep every second one, or cut the file"
-            raise FlightError(message)
+            raise FlightError(
+                f"{path}, line {number}: more than {MOST_POSES} poses: keep every second one, or cut the file"
+            )
         table.extend(values)
         last_s = values[0]
     if not table:
-        message = f"{path} holds no pose: {_FORM}"
-        raise FlightError(message)
+        raise FlightError(f"{path} holds no pose: {_FORM}")
     poses = np.frombuffer(table).reshape(-1, _COLUMNS)
     flown = Trajectory(time_s=poses[:, 0], position_m=poses[:, 1:4], quaternion_xyzw=poses[:, 4:])
     return in_axes(flown, axes, path)
@@ -102,11 +103,11 @@ def _content_of(path: Path) -> bytes:
             content = (gzip.GzipFile(fileobj=file) if is_packed else file).read(MOST_BYTES + 1)
     except (OSError, EOFError, zlib.error) as error:
         text = getattr(error, "strerror", None) or str(error)
-        message = f"{path} cannot be read as a trajectory ({text}): name a TUM file, plain or gzipped, that is whole"
-        raise FlightError(message) from error
+        raise FlightError(
+            f"{path} cannot be read as a trajectory ({text}): name a TUM file, plain or gzipped, that is whole"
+        ) from error
     if len(content) > MOST_BYTES:
-        message = f"{path} holds more than {MOST_BYTES} bytes of text: cut the file, or leave out poses"
-        raise FlightError(message)
+        raise FlightError(f"{path} holds more than {MOST_BYTES} bytes of text: cut the file, or leave out poses")
     return content
 
 
@@ -114,8 +115,7 @@ def _decoded(line: bytes, where: str) -> str:
     try:
         return line.decode("utf-8-sig")  # some editors write a byte order mark
     except UnicodeDecodeError as error:
-        message = f"{where}: no text: {_FORM}"
-        raise FlightError(message) from error
+        raise FlightError(f"{where}: no text: {_FORM}") from error
 
 
 def _pose(line: str, where: str) -> list[float]:
@@ -130,13 +130,10 @@ def _pose(line: str, where: str) -> list[float]:
         if len(words) == _KITTI:
             count = "12 numbers, a pose of KITTI without its time (join times.txt, then --axes camera)"
         found = count if len(words) != _COLUMNS else "words that are no finite numbers"
-        message = f"{where}: {found}: {_FORM}"
-        raise FlightError(message)
+        raise FlightError(f"{where}: {found}: {_FORM}")
     if max(map(abs, values)) >= _LARGEST:
-        message = f"{where}: a number of {max(map(abs, values)):g}: give times in seconds, positions in metres"
-        raise FlightError(message)
+        raise FlightError(f"{where}: a number of {max(map(abs, values)):g}: give times in seconds, positions in metres")
     length = math.hypot(*values[4:])
     if abs(length - 1) > _UNIT:
-        message = f"{where}: the quaternion has length {length:g}, not 1: the order is qx qy qz qw"
-        raise FlightError(message)
+        raise FlightError(f"{where}: the quaternion has length {length:g}, not 1: the order is qx qy qz qw")
     return values

@@ -25,16 +25,16 @@ def utm_epsg(lon_deg: float, lat_deg: float) -> int:
     """
     low, high = _MAX_UTM_DEG
     if not (-180 <= lon_deg <= 180 and low <= lat_deg <= high):  # noqa: PLR2004 - degrees of longitude
-        message = f"UTM covers longitudes -180..180 and latitudes {low:g}..{high:g}, got {lon_deg!r}, {lat_deg!r}"
-        raise GridError(message)
+        raise GridError(
+            f"UTM covers longitudes -180..180 and latitudes {low:g}..{high:g}, got {lon_deg!r}, {lat_deg!r}"
+        )
     zone = min(int((lon_deg + 180) // 6) + 1, 60)
     return (32600 if lat_deg >= 0 else 32700) + zone
 
 
 def _check_cell_size(cell_size_m: float) -> None:
     if not (math.isfinite(cell_size_m) and cell_size_m > 0):
-        message = f"cell_size_m must be positive and finite, got {cell_size_m!r}"
-        raise GridError(message)
+        raise GridError(f"cell_size_m must be positive and finite, got {cell_size_m!r}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,11 +60,9 @@ class Grid:
         """Check that the values define a lattice."""
         _check_cell_size(self.cell_size_m)
         if not (math.isfinite(self.west_m) and math.isfinite(self.north_m)):
-            message = f"west_m and north_m must be finite, got {self.west_m!r}, {self.north_m!r}"
-            raise GridError(message)
+            raise GridError(f"west_m and north_m must be finite, got {self.west_m!r}, {self.north_m!r}")
         if self.rows < 1 or self.cols < 1:
-            message = f"a grid has at least one row and one column, got {self.rows!r} x {self.cols!r}"
-            raise GridError(message)
+            raise GridError(f"a grid has at least one row and one column, got {self.rows!r} x {self.cols!r}")
 
     @classmethod
     def from_bounds(
@@ -77,10 +75,9 @@ class Grid:
         """
         _check_cell_size(cell_size_m)
         if not (west_m < east_m and south_m < north_m):
-            message = (
+            raise GridError(
                 f"bounds must grow from west to east and south to north, got {(west_m, south_m, east_m, north_m)!r}"
             )
-            raise GridError(message)
         left, top = math.floor(west_m / cell_size_m + _SNAP), math.ceil(north_m / cell_size_m - _SNAP)
         right, bottom = math.ceil(east_m / cell_size_m - _SNAP), math.floor(south_m / cell_size_m + _SNAP)
         return cls(

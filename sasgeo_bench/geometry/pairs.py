@@ -34,9 +34,8 @@ def overlapping(these: Shapes, others: Shapes, *, predicate: Predicate | None = 
         total += pairs.shape[1]
         found.append(pairs)
         if total > most:
-            message = (
+            raise ShapeError(
                 f"more than {most} pairs of {len(these)} and {len(others)} shapes overlap: is one thing drawn many "
                 "times over? Take it out of the map"
             )
-            raise ShapeError(message)
     return np.concatenate(found, axis=1)

@@ -67,15 +67,12 @@ class Pose:
     def __post_init__(self) -> None:
         """Check the values; bring yaw into its range."""
         if not all(map(math.isfinite, (self.easting_m, self.northing_m, self.yaw_deg, self.scale))):
-            message = f"a pose has finite values, got {self!r}"
-            raise PoseError(message)
+            raise PoseError(f"a pose has finite values, got {self!r}")
         if self.scale <= 0:
-            message = f"scale must be positive, got {self.scale!r}"
-            raise PoseError(message)
+            raise PoseError(f"scale must be positive, got {self.scale!r}")
         if type(self.yaw_deg) is not float or not 0.0 < self.yaw_deg < 360.0:  # noqa: PLR2004 - in its range already
             if not abs(self.yaw_deg) <= BOUNDS["yaw_deg"][1]:
-                message = f"yaw_deg must lie within {bounds_text('yaw_deg')}, got {self.yaw_deg!r}"
-                raise PoseError(message)
+                raise PoseError(f"yaw_deg must lie within {bounds_text('yaw_deg')}, got {self.yaw_deg!r}")
             object.__setattr__(self, "yaw_deg", float(normalize_deg(self.yaw_deg)))
 
     def to_map(self, offsets_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -105,13 +102,13 @@ class Prior:
     def __post_init__(self) -> None:
         """Refuse halves of pairs and impossible values."""
         if (self.center_m is None) != (self.radius_m is None) or (self.yaw_deg is None) != (self.yaw_sigma_deg is None):
-            message = f"a prior has center_m with radius_m and yaw_deg with yaw_sigma_deg, or neither, got {self!r}"
-            raise PoseError(message)
+            raise PoseError(
+                f"a prior has center_m with radius_m and yaw_deg with yaw_sigma_deg, or neither, got {self!r}"
+            )
         spreads = [value for value in (self.radius_m, self.yaw_sigma_deg) if value is not None]
         numbers = (*(self.center_m or ()), self.yaw_deg or 0.0, self.scale_sigma, *spreads)
         if not all(map(math.isfinite, numbers)) or min(spreads, default=1.0) <= 0 or self.scale_sigma < 0:
-            message = f"a prior has finite values, a positive radius and sigmas, got {self!r}"
-            raise PoseError(message)
+            raise PoseError(f"a prior has finite values, a positive radius and sigmas, got {self!r}")
 
     @property
     def has_place(self) -> bool:

@@ -50,8 +50,7 @@ def _view(name: str) -> str:
 def _placed(item: Item, positions: dict[str, Position]) -> Item:
     """Give an item the position of its label, and to a drone's image the nominal height of its name."""
     if item.label not in positions:
-        message = f"{POSITIONS} has no line for the label of {item.item_id}: copy the file again"
-        raise DatasetError(message)
+        raise DatasetError(f"{POSITIONS} has no line for the label of {item.item_id}: copy the file again")
     height = _HEIGHT.fullmatch(item.item_id.rsplit("/", maxsplit=1)[1])
     height_m = float(height[1]) if height and item.view == "drone" else None
     return replace(item, position=positions[item.label], height_m=height_m)
@@ -74,8 +73,7 @@ def read_positions(reader: FolderReader) -> tuple[dict[str, Position], tuple[str
                 apart.add(label)
         found[label] = position
     if not found:
-        message = f"{POSITIONS} is empty: copy it again"
-        raise DatasetError(message)
+        raise DatasetError(f"{POSITIONS} is empty: copy it again")
     note = (
         f"{counted(len(apart), 'label')} with lines in {POSITIONS} more than {_SAME_M:g} m apart: the last counts, as "
         "in the released code"
@@ -87,13 +85,13 @@ def _read_line(line: str, *, where: str) -> tuple[str, Position]:
     parts = _LINE.fullmatch(line)
     folders = parts["path"].replace("\\", "/").split("/") if parts else []
     if parts is None or len(folders) < 2:  # noqa: PLR2004 - the label is the folder of the image
-        message = f"{where}: expected '<folder>/<label>/<image> E<longitude> N<latitude> [height]', got {line[:80]!r}"
-        raise DatasetError(message)
+        raise DatasetError(
+            f"{where}: expected '<folder>/<label>/<image> E<longitude> N<latitude> [height]', got {line[:80]!r}"
+        )
     if parts["height"] is not None:
         to_number(parts["height"], where=f"{where}, height")
     longitude, latitude = (to_number(parts[name], where=f"{where}, {name}") for name in ("longitude", "latitude"))
     try:
         return folders[-2], Position(longitude_deg=longitude, latitude_deg=latitude)
     except DatasetError as error:
-        message = f"{where}: {error}"
-        raise DatasetError(message) from error
+        raise DatasetError(f"{where}: {error}") from error

@@ -84,8 +84,7 @@ def find_extents(dataset: Dataset, *, folders: Sequence[Path] = ()) -> tuple[Ext
     """
     placed = [item for item in dataset.items if item.position is not None]
     if not placed:
-        message = f"{dataset.card.title} has no coordinates: no extract can be named for it"
-        raise DatasetError(message)
+        raise DatasetError(f"{dataset.card.title} has no coordinates: no extract can be named for it")
     grounds = _region_grounds(folders)
     extents = [_extent(members, grounds) for members in _clusters(placed)]
     return tuple(sorted(extents, key=lambda extent: (extent.box.west_deg, extent.box.south_deg)))

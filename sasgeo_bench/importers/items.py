@@ -43,11 +43,10 @@ class Position:
             return
         is_swapped = low <= self.longitude_deg <= high < abs(self.latitude_deg) <= 180  # noqa: PLR2004 - as above
         hint = " (are the two swapped?)" if is_swapped else ""
-        message = (
+        raise DatasetError(
             f"longitude {self.longitude_deg!r}, latitude {self.latitude_deg!r} is no place: longitudes lie within "
             f"-180..180, latitudes within {low:g}..{high:g}{hint}"
         )
-        raise DatasetError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,11 +61,10 @@ class Box:
     def __post_init__(self) -> None:
         """Refuse a box that is turned over or not finite."""
         if not (self.west_deg < self.east_deg and self.south_deg < self.north_deg):
-            message = (
+            raise DatasetError(
                 f"a box grows from west to east and from south to north, got west {self.west_deg!r}, south "
                 f"{self.south_deg!r}, east {self.east_deg!r}, north {self.north_deg!r}"
             )
-            raise DatasetError(message)
 
     @property
     def centre(self) -> Position:
@@ -101,8 +99,7 @@ class Attitude:
         """Refuse angles that are not finite; bring the heading into its range."""
         given = [value for value in (self.heading_deg, self.pitch_deg, self.roll_deg) if value is not None]
         if not all(map(math.isfinite, given)):
-            message = f"angles must be finite, got {given!r}"
-            raise DatasetError(message)
+            raise DatasetError(f"angles must be finite, got {given!r}")
         if self.heading_deg is not None:
             object.__setattr__(self, "heading_deg", self.heading_deg % 360.0 % 360.0)
 
@@ -149,11 +146,11 @@ class Item:
     def __post_init__(self) -> None:
         """Refuse heights that no drone reaches, and names that are no printable line."""
         if not self.item_id.isprintable():
-            message = f"an item needs a name of one printable line, got {self.item_id!a}"
-            raise DatasetError(message)
+            raise DatasetError(f"an item needs a name of one printable line, got {self.item_id!a}")
         if self.height_m is not None and not _LOWEST_M <= self.height_m <= _HIGHEST_M:
-            message = f"{self.item_id}: heights lie within {_LOWEST_M:g}..{_HIGHEST_M:g} m, got {self.height_m!r}"
-            raise DatasetError(message)
+            raise DatasetError(
+                f"{self.item_id}: heights lie within {_LOWEST_M:g}..{_HIGHEST_M:g} m, got {self.height_m!r}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -178,13 +175,11 @@ class Dataset:
     def __post_init__(self) -> None:
         """Refuse an empty set, one that is too large, and two items of one name."""
         if not 0 < len(self.items) <= MOST_ITEMS:
-            message = f"a {self.card.title} folder holds 1 to {MOST_ITEMS} images, got {len(self.items)}"
-            raise DatasetError(message)
+            raise DatasetError(f"a {self.card.title} folder holds 1 to {MOST_ITEMS} images, got {len(self.items)}")
         seen: set[str] = set()
         for item in self.items:
             if item.item_id in seen:
-                message = f"two items are named {item.item_id!r}: rename one"
-                raise DatasetError(message)
+                raise DatasetError(f"two items are named {item.item_id!r}: rename one")
             seen.add(item.item_id)
 
     def count(self, role: Role) -> int:

@@ -49,7 +49,6 @@ def read_dataset(folder: Path, kind: str) -> Dataset:
     if kind not in IMPORTERS:
         near = difflib.get_close_matches(kind, IMPORTERS, n=1)
         hint = f", did you mean {near[0]!r}?" if near else "."
-        message = f"there is no kind of dataset {kind!r}{hint} There are {', '.join(IMPORTERS)}"
-        raise DatasetError(message)
+        raise DatasetError(f"there is no kind of dataset {kind!r}{hint} There are {', '.join(IMPORTERS)}")
     importer = IMPORTERS[kind]
     return importer.read(FolderReader(folder, layout=importer.layout))

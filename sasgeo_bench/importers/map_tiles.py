@@ -37,11 +37,9 @@ def read_size_px(path: Path, *, shown: str) -> tuple[int, int]:
             with open_geotiff(path, has_more=True) as source:
                 width, height = int(source.width), int(source.height)
     except (RasterioError, OSError) as error:
-        message = f"{shown} is no TIFF that can be read: copy it again"
-        raise DatasetError(message) from error
+        raise DatasetError(f"{shown} is no TIFF that can be read: copy it again") from error
     if not (0 < width <= _MOST_PX and 0 < height <= _MOST_PX):
-        message = f"{shown} has {width} x {height} pixels, {_MOST_PX} a side at most"
-        raise DatasetError(message)
+        raise DatasetError(f"{shown} has {width} x {height} pixels, {_MOST_PX} a side at most")
     return width, height
 
 

@@ -72,11 +72,9 @@ def _read_columns(path: Path, items: Sequence[Item]) -> tuple[Ints, Ints, Ints]:
     with open_table(path, mend=_MEND, most_rows=MOST_ROWS, read_dictionary=list(COLUMNS[:2])) as source:
         table = source.read(columns=list(COLUMNS))
     if table.num_rows == 0:
-        message = f"{path} has no row: {_MEND}"
-        raise DatasetError(message)
+        raise DatasetError(f"{path} has no row: {_MEND}")
     if table["rank"].null_count:
-        message = f"{path}, rank: expected whole numbers, found a missing value: {_MEND}"
-        raise DatasetError(message)
+        raise DatasetError(f"{path}, rank: expected whole numbers, found a missing value: {_MEND}")
     queries, answers = (_positions(path, table, name, items) for name in COLUMNS[:2])
     return queries, answers, table["rank"].to_numpy().astype(np.int64)
 
@@ -85,15 +83,13 @@ def _check_columns(path: Path, schema: pa.Schema) -> None:
     """Refuse a table without the columns of a ranking, or with other types."""
     for name in COLUMNS:
         if schema.names.count(name) != 1:
-            message = f"{path} has no column {name!r}, or more than one: {_MEND}"
-            raise DatasetError(message)
+            raise DatasetError(f"{path} has no column {name!r}, or more than one: {_MEND}")
         kind = schema.field(name).type
         kind = kind.value_type if pa.types.is_dictionary(kind) and name != "rank" else kind
         is_text = pa.types.is_string(kind) or pa.types.is_large_string(kind)
         if not (pa.types.is_integer(kind) if name == "rank" else is_text):
             expected = "whole numbers" if name == "rank" else "text"
-            message = f"{path}, {name}: expected {expected}, got {kind}: {_MEND}"
-            raise DatasetError(message)
+            raise DatasetError(f"{path}, {name}: expected {expected}, got {kind}: {_MEND}")
 
 
 def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) -> Ints:
@@ -107,8 +103,7 @@ def _positions(path: Path, table: pa.Table, column: str, items: Sequence[Item]) 
     if found.null_count:
         wrong = values.filter(pc.is_null(found))[:1].dictionary_decode().cast(pa.binary())[0].as_py()
         shown = "a missing value" if wrong is None else repr(wrong[:100].decode(errors="replace"))
-        message = f"{path}, {column}: {shown} is no {role} of the dataset: ids are those of items.parquet"
-        raise DatasetError(message)
+        raise DatasetError(f"{path}, {column}: {shown} is no {role} of the dataset: ids are those of items.parquet")
     return np.asarray(np.array(known, dtype=np.int64)[found.to_numpy()])
 
 
@@ -123,12 +118,12 @@ def _sorted(path: Path, items: Sequence[Item], columns: tuple[Ints, Ints, Ints])
     wrong = np.flatnonzero(ranks != ranking.ranks + 1)
     if len(wrong):
         shown = items[queries[wrong[0]]].item_id
-        message = f"{path}: the ranks of query {shown!r} do not run from 1 without a gap or a tie: {_MEND}"
-        raise DatasetError(message)
+        raise DatasetError(f"{path}: the ranks of query {shown!r} do not run from 1 without a gap or a tie: {_MEND}")
     pairs = np.sort(queries * len(items) + answers)
     twice = pairs[1:][pairs[1:] == pairs[:-1]]
     if len(twice):
         query, answer = divmod(int(twice[0]), len(items))
-        message = f"{path} ranks {items[answer].item_id!r} twice for query {items[query].item_id!r}: keep one of them"
-        raise DatasetError(message)
+        raise DatasetError(
+            f"{path} ranks {items[answer].item_id!r} twice for query {items[query].item_id!r}: keep one of them"
+        )
     return ranking

@@ -29,12 +29,10 @@ class FolderReader:
         self.layout = layout
         self.skipped: Counter[str] = Counter()
         if not root.is_dir():
-            message = f"there is no folder {root}: {layout}"
-            raise DatasetError(message)
+            raise DatasetError(f"there is no folder {root}: {layout}")
         self.root = root.resolve()
         if next(self.root.iterdir(), None) is None:
-            message = f"{root} is empty: {layout}"
-            raise DatasetError(message)
+            raise DatasetError(f"{root} is empty: {layout}")
 
     def has(self, relative: str) -> bool:
         """Return whether the folder holds a file or folder of a relative path."""
@@ -60,8 +58,7 @@ class FolderReader:
             elif path.suffix.lower() not in IMAGES:
                 self.skipped["file that is no image by its name"] += 1
             elif path.stat().st_size == 0:
-                message = f"{self._shown(relative, path.name)} is an empty file: copy it again"
-                raise DatasetError(message)
+                raise DatasetError(f"{self._shown(relative, path.name)} is an empty file: copy it again")
             else:
                 found.append(path.name)
         return found
@@ -78,13 +75,13 @@ class FolderReader:
         """Yield number and text of each line of a text file that is not blank; the first line is number 1."""
         path = self.file(relative)
         if path.stat().st_size > _MOST_BYTES:
-            message = f"{relative} has {path.stat().st_size} bytes, {_MOST_BYTES} at most: it is no table of this set"
-            raise DatasetError(message)
+            raise DatasetError(
+                f"{relative} has {path.stat().st_size} bytes, {_MOST_BYTES} at most: it is no table of this set"
+            )
         try:
             text = plain_file(path).read_text(encoding="utf-8-sig")
         except UnicodeDecodeError as error:
-            message = f"{relative} is no text in UTF-8 (byte {error.start}): copy it again"
-            raise DatasetError(message) from error
+            raise DatasetError(f"{relative} is no text in UTF-8 (byte {error.start}): copy it again") from error
         for number, line in enumerate(text.splitlines(), start=1):
             if line.strip():
                 yield number, line
@@ -97,13 +94,13 @@ class FolderReader:
         if lacking or len(set(head)) < len(head):
             shown = ", ".join(head)[:_MOST_QUOTED] or "nothing"
             fault = f"no column {lacking[0]!r}" if lacking else "two columns of one name"
-            message = f"{relative} has {fault} (its first line: {shown}): expected {','.join(columns)}"
-            raise DatasetError(message)
+            raise DatasetError(f"{relative} has {fault} (its first line: {shown}): expected {','.join(columns)}")
         for number, line in found:
             cells = _split(line, where=f"{relative} line {number}")
             if len(cells) != len(head):
-                message = f"{relative} line {number} has {counted(len(cells), 'cell')}, its first line {len(head)}"
-                raise DatasetError(message)
+                raise DatasetError(
+                    f"{relative} line {number} has {counted(len(cells), 'cell')}, its first line {len(head)}"
+                )
             cells = [cell.strip() for cell in cells]
             yield TableRow(where=f"{relative} line {number}", cells=dict(zip(head, cells, strict=True)))
 
@@ -124,8 +121,7 @@ class FolderReader:
         found = sorted(path for path in folder.iterdir() if not path.name.startswith("."))
         for path in found:
             if not path.name.isprintable():
-                message = f"{relative} holds a name that is no printable line, {path.name!a}: rename it"
-                raise DatasetError(message)
+                raise DatasetError(f"{relative} holds a name that is no printable line, {path.name!a}: rename it")
             if path.is_symlink():
                 self._refuse_way_out(path, self._shown(relative, path.name))
         return found
@@ -136,8 +132,7 @@ class FolderReader:
         except (OSError, RuntimeError):  # a circle of links
             is_inside = False
         if not is_inside:
-            message = f"{shown} is a link that leads out of {self.root}: put the file itself there"
-            raise DatasetError(message)
+            raise DatasetError(f"{shown} is a link that leads out of {self.root}: put the file itself there")
 
     @staticmethod
     def _shown(relative: str, name: str) -> str:
@@ -166,8 +161,7 @@ def to_number(text: str, *, where: str) -> float:
     """
     value = float(text) if _NUMBER.fullmatch(text) else float("inf")
     if abs(value) == float("inf"):
-        message = f"{where}: expected a number, got {text[:_MOST_QUOTED]!r}"
-        raise DatasetError(message)
+        raise DatasetError(f"{where}: expected a number, got {text[:_MOST_QUOTED]!r}")
     return value
 
 
@@ -175,8 +169,7 @@ def _split(line: str, *, where: str) -> list[str]:
     try:
         return next(csv.reader([line]), [])
     except csv.Error as error:
-        message = f"{where} is no row of a table ({error}): copy the file again"
-        raise DatasetError(message) from error
+        raise DatasetError(f"{where} is no row of a table ({error}): copy the file again") from error
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -200,12 +193,10 @@ def read_labels(reader: FolderReader, folder: LabelFolder, *, digits: int) -> li
     for label in reader.folders(folder.relative):
         path = f"{folder.relative}/{label}"
         if not re.fullmatch(rf"[0-9]{{{digits}}}", label):
-            message = f"{path} is not named by a label of {digits} digits: remove it or rename it"
-            raise DatasetError(message)
+            raise DatasetError(f"{path} is not named by a label of {digits} digits: remove it or rename it")
         names = reader.images(path)
         if not names:
-            message = f"{path} holds no image ({', '.join(IMAGES)}): copy the folder again"
-            raise DatasetError(message)
+            raise DatasetError(f"{path} holds no image ({', '.join(IMAGES)}): copy the folder again")
         items += [
             Item(
                 item_id=f"{path}/{name}",
@@ -218,9 +209,7 @@ def read_labels(reader: FolderReader, folder: LabelFolder, *, digits: int) -> li
             for name in names
         ]
         if len(items) > MOST_ITEMS:
-            message = f"{folder.relative} holds more than {MOST_ITEMS} images: name the folder of one dataset"
-            raise DatasetError(message)
+            raise DatasetError(f"{folder.relative} holds more than {MOST_ITEMS} images: name the folder of one dataset")
     if not items:
-        message = f"{folder.relative} holds no folder of a label: {reader.layout}"
-        raise DatasetError(message)
+        raise DatasetError(f"{folder.relative} holds no folder of a label: {reader.layout}")
     return items

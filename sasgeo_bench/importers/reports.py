@@ -155,8 +155,7 @@ def _keys(columns: _Columns, ranking: Ranking, *, by_height: bool) -> Ints:
         least, most = (part.reduceat(values, ranking.starts[:-1]) for part in (np.minimum, np.maximum))
         if (least != most).any():
             what = "views and heights" if by_height else "views"
-            message = f"the answers to one query are of several {what}: rank one gallery for each query"
-            raise DatasetError(message)
+            raise DatasetError(f"the answers to one query are of several {what}: rank one gallery for each query")
         found.append(least)
     return np.stack(found, axis=1)
 

@@ -66,8 +66,9 @@ def _raw_items(reader: FolderReader) -> list[Item]:
     items = read_labels(reader, satellite, digits=_DIGITS)
     drones = [name for name in reader.folders(".") if "drone" in name.lower()]
     if len(drones) != 1:
-        message = f"{reader.root} holds {len(drones)} folders with 'drone' in their names, expected one: {LAYOUT}"
-        raise DatasetError(message)
+        raise DatasetError(
+            f"{reader.root} holds {len(drones)} folders with 'drone' in their names, expected one: {LAYOUT}"
+        )
     for label in reader.folders(drones[0]):
         for height in reader.folders(f"{drones[0]}/{label}"):
             items += _raw_drone_items(reader, f"{drones[0]}/{label}/{height}", label=label, height=height)
@@ -76,7 +77,8 @@ def _raw_items(reader: FolderReader) -> list[Item]:
 
 def _raw_drone_items(reader: FolderReader, relative: str, *, label: str, height: str) -> list[Item]:
     if not (re.fullmatch(rf"[0-9]{{{_DIGITS}}}", label) and height in _HEIGHTS):
-        message = f"{relative} is no <4 digits>/<height> with a height of {', '.join(_HEIGHTS)}: remove it or rename it"
-        raise DatasetError(message)
+        raise DatasetError(
+            f"{relative} is no <4 digits>/<height> with a height of {', '.join(_HEIGHTS)}: remove it or rename it"
+        )
     about = {"role": "unsplit", "view": "drone", "label": label, "group": height, "height_m": float(height)}
     return [Item(item_id=f"{relative}/{name}", **about) for name in reader.images(relative)]  # type: ignore[arg-type]

@@ -124,8 +124,7 @@ def import_folder(out: Path, dataset: Dataset, *, source: Path) -> Path:
     """Return where an import is written; raise `DatasetError` if that lies in the folder that is read."""
     target = out / "datasets" / dataset.card.kind
     if target.resolve().is_relative_to(source.resolve()):
-        message = f"{target} lies in the folder that is read, {source}: name another --out"
-        raise DatasetError(message)
+        raise DatasetError(f"{target} lies in the folder that is read, {source}: name another --out")
     return target
 
 

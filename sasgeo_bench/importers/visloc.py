@@ -64,16 +64,16 @@ def _read_sheets(reader: FolderReader) -> Iterator[_Corners]:
     for row in reader.rows(table, columns=_MAP_COLUMNS):
         name = _MAP.fullmatch(row.cells["mapname"])
         if name is None:
-            message = f"{row.where}: expected a map named satelliteNN.tif, got {row.cells['mapname'][:60]!r}"
-            raise DatasetError(message)
+            raise DatasetError(f"{row.where}: expected a map named satelliteNN.tif, got {row.cells['mapname'][:60]!r}")
         north, west, south, east = (row.number(column) for column in _MAP_COLUMNS[1:])
         for longitude, latitude in ((west, north), (east, south)):
             _position(row, longitude, latitude)
         try:
             box = Box(west_deg=west, south_deg=south, east_deg=east, north_deg=north)
         except DatasetError as error:
-            message = f"{row.where}: LT is the north-west corner and RB the south-east one: {error}"
-            raise DatasetError(message) from error
+            raise DatasetError(
+                f"{row.where}: LT is the north-west corner and RB the south-east one: {error}"
+            ) from error
         yield _Corners(name=name[1], flight=name[2], box=box)
 
 
@@ -81,8 +81,7 @@ def _position(row: TableRow, longitude_deg: float, latitude_deg: float) -> Posit
     try:
         return Position(longitude_deg=longitude_deg, latitude_deg=latitude_deg)
     except DatasetError as error:
-        message = f"{row.where}: {error}"
-        raise DatasetError(message) from error
+        raise DatasetError(f"{row.where}: {error}") from error
 
 
 def _read_frames(reader: FolderReader, flight: str) -> Iterator[Item]:
@@ -93,16 +92,13 @@ def _read_frames(reader: FolderReader, flight: str) -> Iterator[Item]:
     for row in rows:
         name = row.cells["filename"]
         if name in named_rows:
-            message = f"{row.where}: {name[:60]!r} has a row already: remove one"
-            raise DatasetError(message)
+            raise DatasetError(f"{row.where}: {name[:60]!r} has a row already: remove one")
         if name not in there:
-            message = f"{flight}/drone holds no {name[:60]!r}, which {row.where} names: copy the images again"
-            raise DatasetError(message)
+            raise DatasetError(f"{flight}/drone holds no {name[:60]!r}, which {row.where} names: copy the images again")
         named_rows.add(name)
         yield _frame(row, flight)
     if not rows:
-        message = f"{table} names no frame: copy it again"
-        raise DatasetError(message)
+        raise DatasetError(f"{table} names no frame: copy it again")
     if len(named_rows) < len(there):
         reader.skipped[f"image of {flight}/drone without a row in {table}"] += len(there) - len(named_rows)
 
@@ -167,11 +163,9 @@ def _mosaic_px(parts: Mapping[tuple[int, int], tuple[int, int]], relative: str) 
     grid = [(row, col) for row in rows for col in cols]
     lacking = [f"_{row:02}-{col:02}" for row, col in grid if (row, col) not in parts]
     if lacking:
-        message = f"{relative} is in parts, and {named(lacking, 'part')} is missing: copy all of them"
-        raise DatasetError(message)
+        raise DatasetError(f"{relative} is in parts, and {named(lacking, 'part')} is missing: copy all of them")
     if any(parts[at][0] != parts[1, at[1]][0] or parts[at][1] != parts[at[0], 1][1] for at in grid):
-        message = f"{relative} is in parts of sizes that make no grid: copy them again"
-        raise DatasetError(message)
+        raise DatasetError(f"{relative} is in parts of sizes that make no grid: copy them again")
     return sum(parts[1, col][0] for col in cols), sum(parts[row, 1][1] for row in rows)
 
 

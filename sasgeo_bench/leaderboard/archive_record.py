@@ -283,5 +283,4 @@ def parse_record(data: bytes | str, model: type[Model]) -> Model:
         where = ".".join(map(str, first["loc"]))
         found = "" if not where or first["type"] == "missing" else f" is {first['input']!r}"[:80]
         fault = "Input should be an object" if first["type"] == "model_type" else first["msg"]
-        message = one_line(f"{where}{found}: {fault}" if where else fault)
-        raise ValueError(message) from error
+        raise ValueError(one_line(f"{where}{found}: {fault}" if where else fault)) from error

@@ -100,11 +100,10 @@ def write_board(
     except SasgeoError:
         raise
     except OSError as error:
-        message = (
+        raise StoreError(
             f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights, and score "
             "again; a board that was there is as it was"
-        )
-        raise StoreError(message) from error
+        ) from error
 
 
 def csv_text(table: pd.DataFrame) -> str:
@@ -138,12 +137,10 @@ def check_board(folder: Path, *, scorer_version: int) -> None:
     Raise StoreError if it holds a board of another scorer version, or something that is no part of a board.
     """
     if folder.exists() and not folder.is_dir():
-        message = f"{folder} is a file: move it away, a board goes there"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is a file: move it away, a board goes there")
     other = next((path for path in sorted(folder.glob("*")) if path.name not in _TOP), None)
     if other is not None:
-        message = f"{other} is no part of a board and would be lost: move it away, or name another board"
-        raise StoreError(message)
+        raise StoreError(f"{other} is no part of a board and would be lost: move it away, or name another board")
     drawn = (*FIGURE_FILES, f"{FIGURES}/*.png", *PICTURE_FILES)  # figures of the paper's experiment are PNG, too
     check_known(folder, BOARD_FILES, "a board", patterns=drawn, without=SITE_FOLDERS)
     check_site(folder / SITE)
@@ -151,11 +148,10 @@ def check_board(folder: Path, *, scorer_version: int) -> None:
     versions = ((path, _version(path)) for path in sorted(folder.glob("*.parquet")))
     found = next((version for path, version in versions if version != str(scorer_version) and path.exists()), None)
     if found is not None:
-        message = (
+        raise StoreError(
             f"{folder} holds rows of scorer version {found}, this one is {scorer_version}: figures of two never share "
             "a board; name another one, or move it away and score again"
         )
-        raise StoreError(message)
 
 
 def _version(path: Path) -> str:
@@ -178,14 +174,11 @@ def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     except StoreError:
         raise
     except NotADirectoryError as error:
-        message = f"{folder} is a file: name the folder of a board"
-        raise StoreError(message) from error
+        raise StoreError(f"{folder} is a file: name the folder of a board") from error
     except FileNotFoundError as error:
-        message = f"{folder} holds no board: score some runs first"
-        raise StoreError(message) from error
+        raise StoreError(f"{folder} holds no board: score some runs first") from error
     except (OSError, ValueError, TypeError, KeyError, MemoryError, pa.ArrowException) as error:
-        message = f"{folder} holds a damaged board ({one_line(str(error))}): score it again"
-        raise StoreError(message) from error
+        raise StoreError(f"{folder} holds a damaged board ({one_line(str(error))}): score it again") from error
 
 
 def read_scores(folder: Path) -> pd.DataFrame:
@@ -240,11 +233,11 @@ def check_shape(name: str, table: pd.DataFrame) -> None:
     for column, kind in _SHAPES[name].items():
         if list(table.columns).count(column) != 1:
             fault = "two columns" if column in table else "no column"
-            message = f"{name}.parquet has {fault} {column!r}: score it again"
-            raise StoreError(message)
+            raise StoreError(f"{name}.parquet has {fault} {column!r}: score it again")
         if len(table) and not _is_of(table[column], kind):
-            message = f"{name}.parquet: {column} holds something else than it should, or nothing: score it again"
-            raise StoreError(message)
+            raise StoreError(
+                f"{name}.parquet: {column} holds something else than it should, or nothing: score it again"
+            )
 
 
 def _is_of(values: "pd.Series[Any]", kind: object) -> bool:

@@ -55,8 +55,7 @@ def fitted(pixels: NDArray[np.uint8], most_bytes: int) -> bytes:
             data = _encoded(WEBP, smaller, [cv2.IMWRITE_WEBP_QUALITY, quality])
             if len(data) <= most_bytes:
                 return data
-    message = f"a picture of {pixels.shape[1]} x {pixels.shape[0]} pixels does not fit into {most_bytes} bytes"
-    raise StoreError(message)
+    raise StoreError(f"a picture of {pixels.shape[1]} x {pixels.shape[0]} pixels does not fit into {most_bytes} bytes")
 
 
 def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
@@ -72,15 +71,15 @@ def write_png(path: Path, pixels: NDArray[np.uint8]) -> None:
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:
-        message = f"{path} cannot be written ({error.strerror or error}): check the free space and your rights"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{path} cannot be written ({error.strerror or error}): check the free space and your rights"
+        ) from error
 
 
 def _encoded(kind: str, pixels: NDArray[np.uint8], settings: list[int]) -> bytes:
     is_done, data = cv2.imencode(kind, pixels, settings)
     if not is_done:
-        message = f"a picture cannot be written as {kind}"
-        raise StoreError(message)
+        raise StoreError(f"a picture cannot be written as {kind}")
     return bytes(data)
 
 

@@ -92,8 +92,7 @@ def flight_map_pixels(
                 chart.set_title(f"{names[number]}\n{facts}")
         pixels = cv2.imread(str(path))
     if pixels is None:
-        message = f"the map of flight {flight} cannot be drawn: free some space where temporary files lie"
-        raise StoreError(message)
+        raise StoreError(f"the map of flight {flight} cannot be drawn: free some space where temporary files lie")
     return np.asarray(pixels, dtype=np.uint8)
 
 

@@ -101,8 +101,9 @@ def find_pair(windows: Windows) -> Pair:
         if math.isfinite(distance) and (best is None or distance < best.distance):
             best = Pair(here_m=_place(points[rows[at]]), there_m=_place(points[other]), distance=distance)
     if best is None:
-        message = "the map has no two places far enough apart that hold roads, buildings or water: choose a larger one"
-        raise ConfigError(message)
+        raise ConfigError(
+            "the map has no two places far enough apart that hold roads, buildings or water: choose a larger one"
+        )
     return best
 
 
@@ -161,11 +162,13 @@ def check_dates(mapped: Region, world: Region) -> None:
     """Refuse two places, and a map that is younger than what is seen."""
     one, other = mapped.manifest, world.manifest
     if one.id != other.id or one.grid != other.grid:
-        message = f"{one.id} and {other.id} are not one region at two dates: name {one.id!r}, or {one.id}@<date>"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{one.id} and {other.id} are not one region at two dates: name {one.id!r}, or {one.id}@<date>"
+        )
     if one.extract.date > other.extract.date:
-        message = f"the map, of {one.extract.date}, is younger than what is seen, of {other.extract.date}: swap them"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"the map, of {one.extract.date}, is younger than what is seen, of {other.extract.date}: swap them"
+        )
 
 
 def best_poses(glance: Reading) -> tuple[Pose, ...]:

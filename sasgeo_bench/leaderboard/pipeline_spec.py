@@ -86,27 +86,23 @@ class ContrastSpec(Document):
     def _can_be_judged(self) -> Self:
         """Refuse a whole area of which nobody knows how much a perfect order has already."""
         if self.metric == "aurc" and (self.pilot is None or None in (self.pilot.second, self.pilot.false_share)):
-            message = (
+            raise ValueError(
                 f"contrast {self.name!r} by aurc needs a pilot with second and false_share, from train places: where "
                 'many answers are false a perfect order gains little; metric = "e_aurc" needs none'
             )
-            raise ValueError(message)
         if self.metric == "false_accepted" and self.track != "sequence":
-            message = f'contrast {self.name!r} by false_accepted is of flights: say track = "sequence"'
-            raise ValueError(message)
+            raise ValueError(f'contrast {self.name!r} by false_accepted is of flights: say track = "sequence"')
         pilot = self.pilot or PilotSpec()
         if self.metric not in LESS and (pilot.control is not None or (pilot.second or 0) < 0):
-            message = (
+            raise ValueError(
                 f"contrast {self.name!r}: a pilot with control, or second below 0, is for metric = "
                 '"interaction" or "shift"'
             )
-            raise ValueError(message)
         if self.metric == "shift" and (len(self.detectors) != 1 or PUBLISHED in self.detectors):
-            message = (
+            raise ValueError(
                 f"contrast {self.name!r} by shift compares one detector with {PUBLISHED!r}: name the other one alone, "
                 'such as detectors = ["measured"]'
             )
-            raise ValueError(message)
         if pilot.second is not None:
             self._check_reach(pilot, pilot.second)
         return self
@@ -115,11 +111,10 @@ class ContrastSpec(Document):
         """Refuse what no query could make reachable, and a pilot whose second side is better than the best."""
         best = best_value(self.metric, control=pilot.control, false_share=pilot.false_share)
         if self.metric == "aurc" and second < best:
-            message = (
+            raise ValueError(
                 f"contrast {self.name!r}: where {pilot.false_share} of the answers are false a perfect order has an "
                 f"area of {best:.3f}, so the pilot's second cannot be {second}"
             )
-            raise ValueError(message)
         gain = attainable(best, second, is_lower_better=self.metric in LOWER)
         least = self.min_effect * (second if self.metric in RELATIVE else 1.0)
         message = unreachable(self.name, self.metric, gain=gain, least=least) or ""
@@ -156,8 +151,9 @@ class TaskSpec(Document):
     @classmethod
     def _need_no_file(cls, detectors: list[Detector]) -> list[Detector]:
         if PROFILE in detectors:
-            message = "'profile' needs the file of a perception profile, which make-queries --profile alone takes"
-            raise ValueError(message)
+            raise ValueError(
+                "'profile' needs the file of a perception profile, which make-queries --profile alone takes"
+            )
         return detectors
 
     @property
@@ -306,17 +302,15 @@ class PipelineFile(NamedDocument):
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Self:
         if self.rejectors and (self.split is None or not self.task):
-            message = "rejectors are fitted on the calibration places of a split: name 'split' and a [[task]], or none"
-            raise ValueError(message)
+            raise ValueError(
+                "rejectors are fitted on the calibration places of a split: name 'split' and a [[task]], or none"
+            )
         if not self.task and self.paper is None:
-            message = "'task' is missing: draw suites by [[task]], or the paper's experiment by [paper]"
-            raise ValueError(message)
+            raise ValueError("'task' is missing: draw suites by [[task]], or the paper's experiment by [paper]")
         if self.task and self.split is None:
-            message = "'split' is missing: [[task]] is drawn on the regions of a split"
-            raise ValueError(message)
+            raise ValueError("'split' is missing: [[task]] is drawn on the regions of a split")
         if not self.task and (self.split is not None or self.regions):
-            message = "'split' and 'regions' are for [[task]], and there is none: leave them out"
-            raise ValueError(message)
+            raise ValueError("'split' and 'regions' are for [[task]], and there is none: leave them out")
         return self
 
     @model_validator(mode="after")
@@ -336,26 +330,23 @@ class PipelineFile(NamedDocument):
         ):
             twice = sorted({name for name in listed if listed.count(name) > 1})
             if twice:
-                message = f"{what} {twice[0]!r} is listed twice"
-                raise ValueError(message)
+                raise ValueError(f"{what} {twice[0]!r} is listed twice")
         if CONTROLS in suites:
-            message = f"suite {CONTROLS!r} is drawn for every board: leave it out"
-            raise ValueError(message)
+            raise ValueError(f"suite {CONTROLS!r} is drawn for every board: leave it out")
         drawn = [name for task in self.task for name in task.asked]
         lost = next((name for name in (self.learning.suites if self.learning else ()) if name not in drawn), None)
         if lost is not None:
-            message = f"learning names the suite {lost!r}, which no [[task]] draws: add it there, or leave it out"
-            raise ValueError(message)
+            raise ValueError(
+                f"learning names the suite {lost!r}, which no [[task]] draws: add it there, or leave it out"
+            )
         _check_apart(self.contrast)
         for item in self.contrast:
             lost = next((name for name in item.suites if name not in suites), None)
             if lost is not None:
-                message = f"contrast {item.name!r} names the suite {lost!r}, which is not drawn"
-                raise ValueError(message)
+                raise ValueError(f"contrast {item.name!r} names the suite {lost!r}, which is not drawn")
             of_paper = set() if self.paper is None else set(self.paper.crops)
             if set(item.suites) <= of_paper and item.track != "retrieval":
-                message = f'contrast {item.name!r}: the paper\'s trials are retrieval, say track = "retrieval"'
-                raise ValueError(message)
+                raise ValueError(f'contrast {item.name!r}: the paper\'s trials are retrieval, say track = "retrieval"')
             _check_methods(item, self.matchers, self.rejectors)
         return self
 
@@ -364,13 +355,11 @@ class PipelineFile(NamedDocument):
         named = [name for task in self.task for name in task.regions]
         strange = next((name for name in named if self.regions and name not in self.regions), None)
         if strange is not None:
-            message = f"a [[task]] draws {strange!r}, which is not among 'regions': name it there, too"
-            raise ValueError(message)
+            raise ValueError(f"a [[task]] draws {strange!r}, which is not among 'regions': name it there, too")
         is_all_drawn = any(not task.regions for task in self.task)
         idle = next((name for name in self.regions if self.task and not is_all_drawn and name not in named), None)
         if idle is not None:
-            message = f"region {idle!r} is drawn by no [[task]]: leave it out, or name it in one"
-            raise ValueError(message)
+            raise ValueError(f"region {idle!r} is drawn by no [[task]]: leave it out, or name it in one")
         return self
 
     @model_validator(mode="after")
@@ -380,21 +369,19 @@ class PipelineFile(NamedDocument):
                 PriorGroup.parse(task.prior)
             strange = next((name for name in task.matchers if name not in self.matchers), None)
             if strange is not None:
-                message = f"a [[task]] asks {strange!r}, which is not among 'matchers': name it there, too"
-                raise ValueError(message)
+                raise ValueError(f"a [[task]] asks {strange!r}, which is not among 'matchers': name it there, too")
         oracles = [] if self.learning is None else self.learning.oracles
         strange = next((name for name in oracles if name not in self.matchers), None)
         if strange is not None:
-            message = f"learning names the oracle {strange!r}, which is not among 'matchers': name it there, too"
-            raise ValueError(message)
+            raise ValueError(
+                f"learning names the oracle {strange!r}, which is not among 'matchers': name it there, too"
+            )
         plain = next((name for name in oracles if ":" not in name and not name.startswith(YARDSTICK)), None)
         if plain is not None:
-            message = f"learning names the oracle {plain!r}: names of oracles begin with {YARDSTICK}"
-            raise ValueError(message)
+            raise ValueError(f"learning names the oracle {plain!r}: names of oracles begin with {YARDSTICK}")
         idle = next((name for name in self.matchers if self.task and not self.suites_of(name)), None)
         if idle is not None and self.paper is None:
-            message = f"matcher {idle!r} is asked on no suite: leave it out, or name it in a [[task]]"
-            raise ValueError(message)
+            raise ValueError(f"matcher {idle!r} is asked on no suite: leave it out, or name it in a [[task]]")
         for item in self.contrast:
             _check_asked(item, self.task)
             _check_drawn(item, self.task)
@@ -421,31 +408,29 @@ def _check_drawn(contrast: ContrastSpec, tasks: list[TaskSpec]) -> None:
         return
     named, drawn = set(contrast.detectors), {name for task in own for name in task.looks}
     if named and not named & drawn:
-        message = (
+        raise ValueError(
             f"contrast {contrast.name!r} counts views of {' and '.join(sorted(named))} alone, and its suites are drawn "
             f"with {' and '.join(sorted(drawn))}: add the detector to their [[task]]"
         )
-        raise ValueError(message)
     if contrast.metric == "shift" and any(not {PUBLISHED, *named} <= set(task.looks) for task in own):
-        message = (
+        raise ValueError(
             f"contrast {contrast.name!r} by shift compares views of {PUBLISHED!r} and {contrast.detectors[0]!r}: name "
             f"both in detectors of the [[task]] of {' and '.join(contrast.suites)}"
         )
-        raise ValueError(message)
     if all(task.tracks and contrast.track not in task.tracks for task in own):
-        message = f"contrast {contrast.name!r} is of {contrast.track}, and no [[task]] of its suites draws that track"
-        raise ValueError(message)
+        raise ValueError(
+            f"contrast {contrast.name!r} is of {contrast.track}, and no [[task]] of its suites draws that track"
+        )
 
 
 def _check_learned(learning: LearningSpec, tasks: list[TaskSpec]) -> None:
     """Refuse a detector of learning with which no suite that is learned from is drawn."""
     drawn = {name for task in tasks if set(task.asked) & set(learning.suites) for name in task.looks}
     if learning.detector not in drawn:
-        message = (
+        raise ValueError(
             f"learning is from views of {learning.detector!r}, and its suites are drawn with "
             f"{' and '.join(sorted(drawn))}: add it to the detectors of their [[task]]"
         )
-        raise ValueError(message)
 
 
 def _check_apart(contrasts: list[ContrastSpec]) -> None:
@@ -453,13 +438,11 @@ def _check_apart(contrasts: list[ContrastSpec]) -> None:
     seen: dict[object, str] = {}
     for item in contrasts:
         if item.first == item.second:
-            message = f"contrast {item.name!r} holds {item.first!r} against itself: name two methods"
-            raise ValueError(message)
+            raise ValueError(f"contrast {item.name!r} holds {item.first!r} against itself: name two methods")
         queries = (frozenset(item.suites), frozenset(item.kinds), frozenset(item.detectors), item.track)
         before = seen.setdefault((frozenset((item.first, item.second)), *queries, item.metric), item.name)
         if before != item.name:
-            message = f"contrasts {before!r} and {item.name!r} compare the same: leave one out"
-            raise ValueError(message)
+            raise ValueError(f"contrasts {before!r} and {item.name!r} compare the same: leave one out")
 
 
 def _check_asked(item: ContrastSpec, tasks: list[TaskSpec]) -> None:
@@ -469,8 +452,7 @@ def _check_asked(item: ContrastSpec, tasks: list[TaskSpec]) -> None:
             suite = next((name for name in task.asked if name in item.suites), None)
             matcher = method.split(" x ")[0]
             if suite is not None and task.matchers and matcher not in task.matchers:
-                message = f"contrast {item.name!r} names {matcher!r}, which is not asked on {suite!r}"
-                raise ValueError(message)
+                raise ValueError(f"contrast {item.name!r} names {matcher!r}, which is not asked on {suite!r}")
 
 
 def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]) -> None:
@@ -478,16 +460,16 @@ def _check_methods(item: ContrastSpec, matchers: list[str], rejectors: list[str]
     is_of_rejectors = item.metric not in OF_MATCHERS
     plain = next((name for name in (item.first, item.second) if is_of_rejectors and " x " not in name), None)
     if plain is not None:
-        message = f"contrast {item.name!r} by {item.metric} is of rejectors: name {plain!r} as matcher x rejector"
-        raise ValueError(message)
+        raise ValueError(
+            f"contrast {item.name!r} by {item.metric} is of rejectors: name {plain!r} as matcher x rejector"
+        )
     known = {f"{one} x {two}" for one in matchers for two in rejectors} if is_of_rejectors else set(matchers)
     lost = next((name for name in (item.first, item.second) if name not in known), None)
     if lost is not None:
         where = "'matchers' x 'rejectors'" if is_of_rejectors else "'matchers'"
         near = difflib.get_close_matches(lost, sorted(known), n=1, cutoff=0.4)
         hint = f", did you mean {near[0]!r}?" if near else ""
-        message = f"contrast {item.name!r} names {lost!r}, which is not among {where}{hint}"
-        raise ValueError(message)
+        raise ValueError(f"contrast {item.name!r} names {lost!r}, which is not among {where}{hint}")
 
 
 def read_pipeline_file(path: Path) -> PipelineFile:

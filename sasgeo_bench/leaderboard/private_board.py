@@ -264,8 +264,9 @@ def seed_of(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     """
     seeds = [about.get(task_files.PRIVATE) for about in tasks]
     if any(seed != seeds[0] for seed in seeds):
-        message = "these tasks are drawn by several seeds, and one is private: draw them by one, and score those alone"
-        raise ConfigError(message)
+        raise ConfigError(
+            "these tasks are drawn by several seeds, and one is private: draw them by one, and score those alone"
+        )
     return seeds[0] if seeds else None
 
 
@@ -275,11 +276,10 @@ def check_public(seed: Mapping[str, Any] | None, what: str) -> None:
     Raise ConfigError that names `what`.
     """
     if seed is not None:
-        message = (
+        raise ConfigError(
             f"{what} is of a private seed, and holds queries, truths and answers: nothing of it is published but "
             "figures (score --private puts them on the public board)"
         )
-        raise ConfigError(message)
 
 
 def hold_private(
@@ -301,8 +301,9 @@ def hold_private(
     """
     about = read_private(folder, pipeline)
     if seed_of(tasks) is not None:
-        message = "the rows to be held against a private seed are of a private seed themselves: name a public board"
-        raise ConfigError(message)
+        raise ConfigError(
+            "the rows to be held against a private seed are of a private seed themselves: name a public board"
+        )
     both = {_task(item) for item in tasks} & {_task(item) for item in about["tasks"]}
     alone = len(tasks) - len(both)
     if alone:
@@ -330,17 +331,16 @@ def read_private(folder: Path, pipeline: Mapping[str, str]) -> dict[str, Any]:
     """Read the `board.json` of a private board that rows of a pipeline are compared with."""
     about, _ = read_board(folder)
     if not about.get(task_files.PRIVATE):
-        message = f"{folder} is a board of a public seed: name one that 'leaderboard --seed-file' has made"
-        raise ConfigError(message)
+        raise ConfigError(f"{folder} is a board of a public seed: name one that 'leaderboard --seed-file' has made")
     if not pipeline or about.get("pipeline") != dict(pipeline):
-        message = (
+        raise ConfigError(
             f"{folder} is of another pipeline file, or of other --matcher, than this board: run both with the same"
         )
-        raise ConfigError(message)
     stale = next((name for name, number in _VERSIONS.items() if about.get(name) != number), None)
     if stale is not None:
-        message = f"{folder} has {stale} {about.get(stale)}, this program {_VERSIONS[stale]}: run the seed again"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{folder} has {stale} {about.get(stale)}, this program {_VERSIONS[stale]}: run the seed again"
+        )
     return about
 
 

@@ -97,11 +97,11 @@ def _check(query: Query, region: Region, truth: Truth | None) -> None:
     """Refuse a map or a truth that is not the query's."""
     name = region.manifest.id
     if base_of(query.region) != base_of(name):
-        message = f"query {query.query_id!r} searches the map {query.region!r}, got {name!r}: read that region"
-        raise ConfigError(message)
+        raise ConfigError(f"query {query.query_id!r} searches the map {query.region!r}, got {name!r}: read that region")
     if truth is not None and truth.query_id != query.query_id:
-        message = f"the truth is of query {truth.query_id!r}, the query is {query.query_id!r}: give its own truth"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"the truth is of query {truth.query_id!r}, the query is {query.query_id!r}: give its own truth"
+        )
 
 
 def _content(query: Query, region: Region, truth: Truth | None) -> CasePicture:

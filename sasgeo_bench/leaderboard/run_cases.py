@@ -292,8 +292,7 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     entries = find_entries([run])
     if len(entries) > 1:
         names = ", ".join(f"{entry.version}: {entry.sources[0].parents[1]}" for entry in entries[:_NAMED])
-        message = f"{run} holds runs of {len(entries)} matchers or versions: name the folder of one ({names})"
-        raise ConfigError(message)
+        raise ConfigError(f"{run} holds runs of {len(entries)} matchers or versions: name the folder of one ({names})")
     (entry,), root = entries, root_of(run, out)
     predictions: dict[str, Prediction] = {}
     tasks: dict[tuple[str, str], ScoredTask] = {}
@@ -331,10 +330,9 @@ def _answers(source: Path, about: Mapping[str, Any], folder: Path) -> dict[str, 
     is_same = about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
     found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
     if not (found.found or is_same):
-        message = (
+        raise StoreError(
             f"{source} holds answers to other queries than {folder} does now: run again, or make the old ones again"
         )
-        raise StoreError(message)
     return found.found
 
 
@@ -394,12 +392,12 @@ def find_flight(cases: RunCases, query: str) -> str | None:
 def _beginning(cases: RunCases, known: Sequence[str], query: str) -> list[str]:
     """Return the one id that begins so, in a list, or none; raise ConfigError if there are several."""
     if not query:
-        message = f"--query is empty: name the beginning of an id, as 'inspect {cases.run}' lists some"
-        raise ConfigError(message)
+        raise ConfigError(f"--query is empty: name the beginning of an id, as 'inspect {cases.run}' lists some")
     found = [name for name in known if name.startswith(query)]
     if len(found) > 1:
-        message = f"{len(found)} ids begin with {query!r} ({', '.join(found[:_NAMED])}, ...): name more of the id"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{len(found)} ids begin with {query!r} ({', '.join(found[:_NAMED])}, ...): name more of the id"
+        )
     return found
 
 
@@ -410,13 +408,11 @@ def _find(cases: RunCases, query: str) -> str:
     answered = {tie.query_id for source in cases.entry.sources for tie in prediction_files.read_ties(source)}
     is_old = found and found[0] in answered and found[0] not in cases.predictions
     if is_old or (not found and any(name.startswith(query) for name in answered)):
-        message = (
+        raise StoreError(
             f"query {query!r} was drawn anew since {cases.run} answered it: run again, or make the old queries again"
         )
-        raise StoreError(message)
     if not found:
         near = difflib.get_close_matches(query, known, n=1)
         hint = f"did you mean {near[0]}?" if near else f"'inspect {cases.run}' lists some that went wrong"
-        message = f"{cases.run} was asked no query {query!r}; {hint}"
-        raise ConfigError(message)
+        raise ConfigError(f"{cases.run} was asked no query {query!r}; {hint}")
     return str(found[0])

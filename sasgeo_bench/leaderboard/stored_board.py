@@ -74,8 +74,9 @@ class StoredBoard:
         rows = rows[rows["latency_s"].notna()]
         if rows.empty:
             known = ", ".join(sorted(set(asked["suite"]))) or "none"
-            message = f"{self.folder} has no latencies of {chosen!r}, {track}: its suites of that track are {known}"
-            raise ConfigError(message)
+            raise ConfigError(
+                f"{self.folder} has no latencies of {chosen!r}, {track}: its suites of that track are {known}"
+            )
         return draw_tradeoff(None, rows, self._shown(rows["matcher"]))
 
     def plot_contrasts(self) -> Figure:
@@ -84,8 +85,7 @@ class StoredBoard:
         Raise `ConfigError` if none was registered.
         """
         if self.contrasts.empty:
-            message = f"{self.folder} has no registered contrasts: a pipeline file registers them"
-            raise ConfigError(message)
+            raise ConfigError(f"{self.folder} has no registered contrasts: a pipeline file registers them")
         return draw_contrasts(None, self.contrasts)
 
     def plot_risk(self, prior_group: str, *, suite: str = ALL_SUITES, track: str = "localization") -> Figure:
@@ -99,11 +99,10 @@ class StoredBoard:
         for column, value in (("suite", suite), ("track", track), ("prior_group", prior_group), ("mixture", AS_DRAWN)):
             rows = rows[rows[column] == value]
         if rows.empty:
-            message = (
+            raise ConfigError(
                 f"{self.folder} has no confidences on {suite!r}, {track}, {prior_group!r}: the columns suite, track "
                 "and prior_group of its leaderboard list what there is"
             )
-            raise ConfigError(message)
         return draw_risk(None, rows, shown)
 
     def _shown(self, matchers: "pd.Series[str]") -> tuple[str, ...]:

@@ -123,8 +123,9 @@ def strip_of(cases: RunCases, count: int) -> tuple[Strip, list[CasePicture]]:
     """
     strip = Strip.of(cases.scores, pictured_tasks(cases), count)
     if not strip.query_ids:
-        message = f"{cases.run} holds no answers to queries with pictures: name a run on a suite such as aerial+..."
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{cases.run} holds no answers to queries with pictures: name a run on a suite such as aerial+..."
+        )
     return strip, [picture_of(cases, name)[1] for name in strip.query_ids]
 
 

@@ -45,18 +45,16 @@ def read_card(module: str | Path) -> MatcherCard:
     path = given_path(module).with_name(CARD_FILE)
     found = read_card_file(path)
     if found.is_by_half:
-        message = (
+        raise MatchError(
             f"{path}: trained_on speaks of halves, and one class answers about both: list the places, or let the "
             "runner train it by a method 'learn'"
         )
-        raise MatchError(message)
     given = found.model_dump(exclude={"trained_on", "trained_elsewhere"})
     fields: dict[str, Any] = {name: tuple(one) if isinstance(one, list) else one or "" for name, one in given.items()}
     try:
         return MatcherCard(**fields, trained_on=(*found.places, *filter(None, [found.trained_elsewhere])))
     except MatchError as error:
-        message = f"{path}: {str(error).removeprefix('card: ')}"
-        raise MatchError(message) from error
+        raise MatchError(f"{path}: {str(error).removeprefix('card: ')}") from error
 
 
 def read_card_file(path: Path) -> Card:
@@ -66,21 +64,17 @@ def read_card_file(path: Path) -> Card:
     """
     noun = f"write a card there, or name one ({_EXAMPLE})"
     if path.exists() and not path.is_file():  # a pipe would be waited for
-        message = f"{path} is no plain file: {noun}"
-        raise StoreError(message)
+        raise StoreError(f"{path} is no plain file: {noun}")
     try:
         with plain_file(path).open("rb") as source:
             read = source.read(_MOST_BYTES + 1)
         text = read.decode("utf-8-sig")  # some editors write a byte order mark
     except (UnicodeDecodeError, OSError) as error:
         fault = error.strerror if isinstance(error, OSError) else "it is no UTF-8"
-        message = f"{path} cannot be read ({fault}): {noun}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be read ({fault}): {noun}") from error
     if len(read) > _MOST_BYTES:
-        message = f"{path} has more than {_MOST_BYTES} bytes: {noun}"
-        raise StoreError(message)
+        raise StoreError(f"{path} has more than {_MOST_BYTES} bytes: {noun}")
     try:
         return parse_toml(text, Card, source=str(path))
     except ConfigError as error:
-        message = f"{error}: correct it there ({_EXAMPLE})"
-        raise ConfigError(message) from error
+        raise ConfigError(f"{error}: correct it there ({_EXAMPLE})") from error

@@ -158,8 +158,7 @@ class Follower:
     def start(self, prior: Prior) -> None:
         """Begin with the middle of the prior."""
         if self._grid is None:
-            message = f"{self.card.name}: call prepare() with a region before start()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before start()")
         pose, covariance = start_of(prior, self._grid)
         self._limit_m = math.inf if prior.radius_m is None else prior.radius_m
         self._first = self._belief = Belief(pose=pose, covariance=covariance)
@@ -167,8 +166,7 @@ class Follower:
     def step(self, query: Query) -> Fix:
         """Ask the matcher about a view, and take its answer up or add the odometry up."""
         if self._belief is None or query.step is None:
-            message = f"{self.card.name}: call start() first, and step() with the views of a flight"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call start() first, and step() with the views of a flight")
         belief = _sound(self._widened(self.moved(self._belief, query.step)))
         asked = replace(query, track="localization", prior=self.prior_of(belief, query.prior), step=None)
         found = check_match(self.matcher.match(asked, top_k=self.plan.top_k), asked, top_k=self.plan.top_k)

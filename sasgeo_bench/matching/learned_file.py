@@ -49,8 +49,7 @@ class TrainingRecord:
             and type(record.get("pairs")) is int
         )
         if not is_sound:
-            message = f"learned is {one_line(repr(record))}, expected key, file, trained_on and pairs"
-            raise MatchError(message)
+            raise MatchError(f"learned is {one_line(repr(record))}, expected key, file, trained_on and pairs")
         return cls(key=record["key"], file=record["file"], trained_on=tuple(places or ()), pairs=record["pairs"])
 
 
@@ -65,8 +64,7 @@ def read_learned(path: Path) -> str | None:
     Only a file of a run is said to be damaged: advice to remove it must not reach any other file or folder.
     """
     if path.is_dir():
-        message = f"{path} is a folder, not a learned text: {WHERE}"
-        raise StoreError(message)
+        raise StoreError(f"{path} is a folder, not a learned text: {WHERE}")
     try:
         return check_learned(read_bounded(path, MOST_LEARNED_BYTES).decode())
     except FileNotFoundError:
@@ -75,8 +73,7 @@ def read_learned(path: Path) -> str | None:
         fault = one_line(str(getattr(error, "strerror", None) or error))
         is_of_run = path.absolute().parent.name == FOLDER
         advice = f"is damaged ({fault}): remove this file and run again, which trains anew"
-        message = f"{path} {advice if is_of_run else f'is no learned text ({fault}): {WHERE}'}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} {advice if is_of_run else f'is no learned text ({fault}): {WHERE}'}") from error
 
 
 def write_learned(path: Path, text: str) -> None:

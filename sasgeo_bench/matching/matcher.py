@@ -97,11 +97,9 @@ class MatcherCard:
         for name, known in (("tracks", get_args(Track)), ("needs", NEEDS)):
             wrong = next((item for item in getattr(self, name) if item not in known), None)
             if wrong is not None:
-                message = f"card: {name} holds {wrong!r}, known are {', '.join(known)}"
-                raise MatchError(message)
+                raise MatchError(f"card: {name} holds {wrong!r}, known are {', '.join(known)}")
         if not self.tracks:
-            message = "card: tracks is empty, name retrieval, localization or both"
-            raise MatchError(message)
+            raise MatchError("card: tracks is empty, name retrieval, localization or both")
         for name in ("trained_on", "uses", "authors"):
             for item in getattr(self, name):
                 check_line(name, item)
@@ -114,8 +112,7 @@ def check_said(card: object) -> None:
     for name in ("name", "version", "title", "source", "ours", "licence"):
         value = getattr(card, name)
         if not isinstance(value, str) or not value.strip():
-            message = f"card: {name} is empty, say it in one line"
-            raise MatchError(message)
+            raise MatchError(f"card: {name} is empty, say it in one line")
         check_line(name, value)
     check_line("limits", getattr(card, "limits"))  # noqa: B009 - of either kind of card
 
@@ -123,8 +120,7 @@ def check_said(card: object) -> None:
 def check_line(name: str, value: object) -> None:
     """Refuse a card on which a field is no line."""
     if not isinstance(value, str) or not value.isprintable() or len(value) > MOST_SAID:
-        message = f"card: {name} must be one line of at most {MOST_SAID} printable characters"
-        raise MatchError(message)
+        raise MatchError(f"card: {name} must be one line of at most {MOST_SAID} printable characters")
 
 
 def check_identity(name: str, version: str) -> None:
@@ -142,10 +138,9 @@ def check_identity(name: str, version: str) -> None:
         ("version", version, VERSION, "letters, digits, dots, hyphens, underscores and plus signs"),
     ):
         if not re.fullmatch(pattern, value):
-            message = (
+            raise MatchError(
                 f"card: {what} {value[:MOST_SHOWN]!r} may hold {letters} only, a letter or digit first, 60 at most"
             )
-            raise MatchError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,16 +222,15 @@ class Learner(Protocol):
 def check_learned(learned: object, *, most_bytes: int = MOST_LEARNED_BYTES) -> str:
     """Return a learned text, if it is one that can be stored; raise `MatchError` otherwise."""
     if not isinstance(learned, str):
-        message = f"learn() returned {type(learned).__name__}, expected a text: write it as JSON, say"
-        raise MatchError(message)
+        raise MatchError(f"learn() returned {type(learned).__name__}, expected a text: write it as JSON, say")
     try:
         size = len(learned.encode())
     except UnicodeEncodeError as error:
-        message = "learn() returned a text that is no UTF-8, expected characters alone: write bytes as base64, say"
-        raise MatchError(message) from error
+        raise MatchError(
+            "learn() returned a text that is no UTF-8, expected characters alone: write bytes as base64, say"
+        ) from error
     if not 0 < size <= most_bytes:  # a stored file of no bytes was emptied by somebody
-        message = f"learn() returned {size} bytes, expected {f'at most {most_bytes}' if size else 'a text'}"
-        raise MatchError(message)
+        raise MatchError(f"learn() returned {size} bytes, expected {f'at most {most_bytes}' if size else 'a text'}")
     return learned
 
 
@@ -253,24 +247,20 @@ def check_match(match: object, query: Query | Head | None, *, top_k: int) -> Mat
         is no line of at most `texts.MOST_NAME` characters.
     """
     if not isinstance(match, Match):
-        message = f"match() returned {type(match).__name__}, expected sasgeo_bench.matching.matcher.Match"
-        raise MatchError(message)
+        raise MatchError(f"match() returned {type(match).__name__}, expected sasgeo_bench.matching.matcher.Match")
     count = len(match.poses)
     if count > min(top_k, MOST_CANDIDATES):
-        message = f"match() returned {count} poses, expected at most top_k = {min(top_k, MOST_CANDIDATES)}"
-        raise MatchError(message)
+        raise MatchError(f"match() returned {count} poses, expected at most top_k = {min(top_k, MOST_CANDIDATES)}")
     # An object of some length may still yield more or fewer items.
     scores = [_number(score, "score") for score in islice(match.scores, MOST_CANDIDATES + 1)]
     poses = [_pose(pose) for pose in islice(match.poses, count)]
     if len(poses) != count or len(scores) != count:
-        message = f"match() returned {len(scores)} scores for {len(poses)} poses, expected one each"
-        raise MatchError(message)
+        raise MatchError(f"match() returned {len(scores)} scores for {len(poses)} poses, expected one each")
     fallen = next((at for at in range(1, count) if scores[at] > scores[at - 1]), None)
     if fallen is not None:
-        message = (
+        raise MatchError(
             f"scores rise from {scores[fallen - 1]:g} to {scores[fallen]:g} at place {fallen}, expected best first"
         )
-        raise MatchError(message)
     confidence = None if match.confidence is None else _number(match.confidence, "confidence")
     if query is not None and query.track == "retrieval":
         _check_candidates(poses, query.candidates)
@@ -284,19 +274,16 @@ def _number(value: object, name: str, *, shown: str = "") -> float:
             raise TypeError(value)  # noqa: TRY301 - Python reads "0.5" as a number, the door does not
         number = float(value)  # type: ignore[arg-type]
     except (TypeError, ValueError, OverflowError) as error:
-        message = f"{shown or name} is a {type(value).__name__}, expected a number"
-        raise MatchError(message) from error
+        raise MatchError(f"{shown or name} is a {type(value).__name__}, expected a number") from error
     least, most = BOUNDS[name]
     if not least <= number <= most:
-        message = f"{shown or name} is {number:g}, expected a finite number within {bounds_text(name)}"
-        raise MatchError(message)
+        raise MatchError(f"{shown or name} is {number:g}, expected a finite number within {bounds_text(name)}")
     return number
 
 
 def _pose(pose: object) -> Pose:
     if not isinstance(pose, Pose):
-        message = f"a pose is a {type(pose).__name__}, expected sasgeo_bench.geometry.pose.Pose"
-        raise MatchError(message)
+        raise MatchError(f"a pose is a {type(pose).__name__}, expected sasgeo_bench.geometry.pose.Pose")
     numbers = {name: _number(getattr(pose, name), name) for name in ("easting_m", "northing_m", "yaw_deg", "scale")}
     return Pose(**numbers)
 
@@ -309,11 +296,11 @@ def _check_candidates(poses: Sequence[Pose], candidates: Sequence[Pose]) -> None
         at = next((index for index in near if index not in given), near[0] if near else None)
         if at is None:
             place = f"({pose.easting_m:.2f}, {pose.northing_m:.2f})"
-            message = f"pose {place} is none of the {len(candidates)} candidates, expected one of query.candidates"
-            raise MatchError(message)
+            raise MatchError(
+                f"pose {place} is none of the {len(candidates)} candidates, expected one of query.candidates"
+            )
         if at in given:
-            message = f"candidate {at} is given twice, expected each at most once"
-            raise MatchError(message)
+            raise MatchError(f"candidate {at} is given twice, expected each at most once")
         given.add(at)
 
 
@@ -326,20 +313,18 @@ def candidates_at(pose: Pose, candidates: Sequence[Pose]) -> list[int]:
 
 def _diagnostics(given: object) -> dict[str, float]:
     if not isinstance(given, Mapping):
-        message = f"diagnostics is a {type(given).__name__}, expected a mapping of name to number"
-        raise MatchError(message)
+        raise MatchError(f"diagnostics is a {type(given).__name__}, expected a mapping of name to number")
     if len(given) > MOST_DIAGNOSTICS:
-        message = f"diagnostics holds {len(given)} entries, expected at most {MOST_DIAGNOSTICS}"
-        raise MatchError(message)
+        raise MatchError(f"diagnostics holds {len(given)} entries, expected at most {MOST_DIAGNOSTICS}")
     pairs = [(str(name), value) for name, value in islice(given.items(), MOST_DIAGNOSTICS + 1)]
     wrong = next((name for name, _ in pairs if not name or not is_line(name, MOST_NAME)), None)
     if wrong is not None:
-        message = f"diagnostics holds the name {wrong[:MOST_NAME]!r}, expected 1..{MOST_NAME} printable characters"
-        raise MatchError(message)
+        raise MatchError(
+            f"diagnostics holds the name {wrong[:MOST_NAME]!r}, expected 1..{MOST_NAME} printable characters"
+        )
     found = {name: _number(value, "diagnostics", shown=f"diagnostics[{name!r}]") for name, value in pairs}
     if len(found) != len(given):
-        message = f"diagnostics holds {len(given)} entries under {len(found)} names, expected each name once"
-        raise MatchError(message)
+        raise MatchError(f"diagnostics holds {len(given)} entries under {len(found)} names, expected each name once")
     return found
 
 
@@ -425,13 +410,10 @@ def check_p_false(found: object, count: int) -> NDArray[np.float64]:
     try:
         values = np.asarray(found, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        message = f"p_false() returned {type(found).__name__}, expected {count} numbers"
-        raise MatchError(message) from error
+        raise MatchError(f"p_false() returned {type(found).__name__}, expected {count} numbers") from error
     if values.shape != (count,):
-        message = f"p_false() returned shape {values.shape}, expected ({count},): one number for each answer"
-        raise MatchError(message)
+        raise MatchError(f"p_false() returned shape {values.shape}, expected ({count},): one number for each answer")
     wrong = np.flatnonzero(~((values >= 0) & (values <= 1)))
     if len(wrong):
-        message = f"p_false() returned {values[wrong[0]]:g} in place {wrong[0]}, expected 0..1"
-        raise MatchError(message)
+        raise MatchError(f"p_false() returned {values[wrong[0]]:g} in place {wrong[0]}, expected 0..1")
     return values

@@ -63,10 +63,9 @@ def _installed(group: str) -> tuple[EntryPoint, ...]:
     try:
         return _read(group, tuple(sys.path))
     except Exception as error:
-        message = (
+        raise MatchError(
             f"an installed package has entry points that cannot be read ({message_of(error)}): reinstall or remove it"
-        )
-        raise MatchError(message) from error
+        ) from error
 
 
 @lru_cache(maxsize=8)
@@ -106,14 +105,12 @@ def check_card_name(spec: str, name: str, *, is_oracle: bool = False, group: str
     module, is_class, _ = spec.partition(":")
     ships = is_shipped(module, import_paths(spec)) if is_class else spec in shipped
     if not ships and name in shipped:
-        message = f"{one_line(spec)}: its card is named {name!r}, as a {KINDS[group]} that ships: rename it"
-        raise MatchError(message)
+        raise MatchError(f"{one_line(spec)}: its card is named {name!r}, as a {KINDS[group]} that ships: rename it")
     if name.startswith(YARDSTICK) and not (ships or is_oracle):
-        message = (
+        raise MatchError(
             f"{one_line(spec)}: its card is named {name!r}, and names that begin with {YARDSTICK} are of oracles, "
             "which use the truth: rename it"
         )
-        raise MatchError(message)
 
 
 def _home(point: EntryPoint) -> str:
@@ -221,25 +218,24 @@ def _check(spec: str, plugin: object, card_type: type, group: str, verbs: Sequen
         card = getattr(plugin, "card", None)
         missing = [name for name in verbs if not callable(getattr(plugin, name, None))]
     except (Exception, SystemExit) as error:
-        message = f"{spec}: its card and verbs cannot be read ({message_of(error)})"
-        raise MatchError(message) from error
+        raise MatchError(f"{spec}: its card and verbs cannot be read ({message_of(error)})") from error
     if not isinstance(card, card_type):
         expected = f"{card_type.__module__}.{card_type.__name__}"
-        message = f"{spec}: card is a {type(card).__name__}, expected a {expected}"
-        raise MatchError(message)
+        raise MatchError(f"{spec}: card is a {type(card).__name__}, expected a {expected}")
     if missing:
-        message = f"{spec}: {type(plugin).__name__} is not a {KINDS[group]}, it has no {' and no '.join(missing)}"
-        raise MatchError(message)
+        raise MatchError(
+            f"{spec}: {type(plugin).__name__} is not a {KINDS[group]}, it has no {' and no '.join(missing)}"
+        )
     name = str(getattr(card, "name", ""))
     if ":" not in spec and name != spec:
-        message = (
+        raise MatchError(
             f"{spec}: its card is named {one_line(name)!r}, and rows are found by one name: give the entry "
             "point (pyproject.toml) and the card (card.toml) the same, and install it again"
         )
-        raise MatchError(message)
     if group == TRACKERS and "sequence" not in getattr(card, "tracks", ()):
-        message = f"{spec}: card: tracks lacks 'sequence', which is what a tracker follows: tracks=(\"sequence\",)"
-        raise MatchError(message)
+        raise MatchError(
+            f"{spec}: card: tracks lacks 'sequence', which is what a tracker follows: tracks=(\"sequence\",)"
+        )
 
 
 def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any plugin
@@ -253,8 +249,7 @@ def _made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any pl
 def _find(spec: str, group: str) -> Callable[[], Any]:
     """Return the class behind a name or module:Class."""
     if not isinstance(spec, str):
-        message = f"{one_line(repr(spec))} is no name of a {KINDS[group]}: name one as a text, or module:Class"
-        raise MatchError(message)
+        raise MatchError(f"{one_line(repr(spec))} is no name of a {KINDS[group]}: name one as a text, or module:Class")
     if ":" not in spec:
         return _from_entry_point(spec, group)
     module, _, name = spec.partition(":")
@@ -280,11 +275,10 @@ def _check_place(point: EntryPoint) -> None:
     """Refuse a plugin that ships where other code of its name would be imported: its rows would not be its own."""
     strange = strange_file(point.module, import_paths(point.name)) if is_ours(point) else None
     if strange is not None:
-        message = (
+        raise MatchError(
             f"{point.name}: {point.module} would be imported from {one_line(str(strange))}, and not from where "
             f"{_home(point)} is installed: take that folder off PYTHONPATH"
         )
-        raise MatchError(message)
 
 
 def code_of(spec: str, *groups: str) -> tuple[str, str]:
@@ -333,11 +327,10 @@ def check_registered(rejectors: Sequence[str], *, source: str) -> None:
     known = list_entry_points(REJECTORS) if rejectors else {}
     stray = next((name for name in rejectors if name not in known), None)
     if stray is not None:
-        message = (
+        raise MatchError(
             f"{source} names the rejector {one_line(stray)!r}, and data may name registered ones only (list-rejectors "
             "shows all): name each that is to judge with --rejector, and code only if you trust it"
         )
-        raise MatchError(message)
 
 
 def _from_entry_point(name: str, group: str) -> Callable[[], Any]:

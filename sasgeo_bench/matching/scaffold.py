@@ -175,17 +175,16 @@ def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, 
     kind = KINDS[group]
     module = name.replace("-", "_")
     if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
-        message = f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name"
-        raise ConfigError(message)
+        raise ConfigError(f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name")
     if not _NAME.fullmatch(name):
-        message = (
+        raise ConfigError(
             f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, a letter first, as in "
             f"my-{kind}; got {name!r}"
         )
-        raise ConfigError(message)
     if name in shipped_names(group):
-        message = f"{name!r} is a {kind} of sasgeo-bench itself, which would be used instead of yours; choose another"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{name!r} is a {kind} of sasgeo-bench itself, which would be used instead of yours; choose another"
+        )
     words = re.split(r"[-_]", name)
     own = "".join(word.capitalize() for word in words)
     return {
@@ -207,8 +206,7 @@ def _imported_names(text: str) -> frozenset[str]:
 def write_plugin(folder: Path, files: Mapping[str, str]) -> None:
     """Write all files of a package, or none; raise `StoreError` if the folder is not empty or cannot be written."""
     if not _is_free(folder):
-        message = f"{folder} is there already and not empty: name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is there already and not empty: name another folder")
     made: list[Path] = []
     try:
         for name, text in files.items():
@@ -223,13 +221,15 @@ def write_plugin(folder: Path, files: Mapping[str, str]) -> None:
         for path in reversed(made):
             with suppress(OSError):
                 path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
-        message = f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
+        ) from error
 
 
 def _is_free(folder: Path) -> bool:
     try:
         return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
     except OSError as error:
-        message = f"{folder} cannot be read ({error.strerror or error}): check your rights, or name another folder"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} cannot be read ({error.strerror or error}): check your rights, or name another folder"
+        ) from error

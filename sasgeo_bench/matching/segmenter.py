@@ -57,8 +57,7 @@ class SegmenterCard:
         for name, known in (("classes", load_taxonomy().names), ("needs", SEGMENTER_NEEDS)):
             wrong = next((item for item in getattr(self, name) if item not in known), None)
             if wrong is not None:
-                message = f"card: {name} holds {wrong!r}, known are {', '.join(known)}"
-                raise MatchError(message)
+                raise MatchError(f"card: {name} holds {wrong!r}, known are {', '.join(known)}")
         for place in self.trained_on:
             check_line("trained_on", place)
 
@@ -85,8 +84,7 @@ class ImageTraining:
     def __post_init__(self) -> None:
         """Refuse a training without images."""
         if not len(self.images):
-            message = "there is no image to learn from: name places that have labels"
-            raise ImageError(message)
+            raise ImageError("there is no image to learn from: name places that have labels")
 
     @property
     def classes(self) -> tuple[str, ...]:
@@ -156,15 +154,14 @@ def check_segmentation(found: object, image: AerialImage, *, classes: Sequence[s
     sasgeo_bench.errors.MatchError: segment() returned str, expected sasgeo_bench.sensing.segmentation.Segmentation
     """
     if not isinstance(found, Segmentation):
-        message = f"segment() returned {type(found).__name__}, expected sasgeo_bench.sensing.segmentation.Segmentation"
-        raise MatchError(message)
+        raise MatchError(
+            f"segment() returned {type(found).__name__}, expected sasgeo_bench.sensing.segmentation.Segmentation"
+        )
     if found.shape != image.shape:
-        message = f"segment() returned a segmentation of shape {found.shape}, the picture has {image.shape}"
-        raise MatchError(message)
+        raise MatchError(f"segment() returned a segmentation of shape {found.shape}, the picture has {image.shape}")
     known = tuple(classes) or load_taxonomy().names
     wrong = next((name for name in found.classes if name not in known), None)
     if wrong is not None:
         whose = "the card names" if classes else "the taxonomy has"
-        message = f"segment() told the class {wrong[:60]!r}, {whose} {', '.join(known)}"
-        raise MatchError(message)
+        raise MatchError(f"segment() told the class {wrong[:60]!r}, {whose} {', '.join(known)}")
     return found

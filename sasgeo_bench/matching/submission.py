@@ -28,11 +28,10 @@ def _trained(given: object) -> object:
         for item in lists
     )
     if given != NONE and (not is_sound or given == []):
-        message = (
+        raise ValueError(
             f'trained_on must be "{NONE}", places of the split as in ["porto"], or for each half of a cross-fit the '
             f"training places of the answers about it, as in {_EXAMPLE_BY_HALF}; got {repr(given)[:_SHORT]}"
         )
-        raise ValueError(message)
     return given
 
 

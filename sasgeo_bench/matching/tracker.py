@@ -83,18 +83,14 @@ def check_fix(fix: object, *, top_k: int) -> Fix:
     """
     if not isinstance(fix, Fix):
         given = "nothing" if fix is None else type(fix).__name__
-        message = f"step() returned {given}, expected a sasgeo_bench.Fix: without a pose where nothing is known"
-        raise MatchError(message)
+        raise MatchError(f"step() returned {given}, expected a sasgeo_bench.Fix: without a pose where nothing is known")
     if not isinstance(fix.is_accepted, bool | np.bool_):
-        message = f"is_accepted is a {type(fix.is_accepted).__name__}, expected True or False"
-        raise MatchError(message)
+        raise MatchError(f"is_accepted is a {type(fix.is_accepted).__name__}, expected True or False")
     if fix.pose is None and (fix.is_accepted or fix.modes):
-        message = "a fix without a pose is not accepted and has no modes: say is_accepted=False"
-        raise MatchError(message)
+        raise MatchError("a fix without a pose is not accepted and has no modes: say is_accepted=False")
     found = check_match(match_of(fix), None, top_k=top_k)
     if found.poses and not 0 <= found.scores[-1] <= found.scores[0] <= 1:
-        message = f"weights of modes lie in 0..1, got {found.scores[-1]:g}"
-        raise MatchError(message)
+        raise MatchError(f"weights of modes lie in 0..1, got {found.scores[-1]:g}")
     return replace(
         fix,
         pose=found.poses[0] if found.poses else None,
@@ -111,8 +107,7 @@ def match_of(fix: Fix) -> Match:
     try:
         modes = [(pose, weight) for pose, weight in fix.modes]
     except (TypeError, ValueError) as error:
-        message = "modes holds something else than pairs of a pose and a weight"
-        raise MatchError(message) from error
+        raise MatchError("modes holds something else than pairs of a pose and a weight") from error
     first = () if fix.pose is None else (fix.pose,)
     return Match(
         poses=(*first, *(pose for pose, _ in modes)),
@@ -140,16 +135,12 @@ def check_covariance(given: object) -> NDArray[np.float64]:
         found = np.array(given, dtype=np.float64)
         found = found.reshape(SIDE, SIDE) if found.shape == (SIDE**2,) else found
     except (TypeError, ValueError) as error:
-        message = f"covariance is a {type(given).__name__}, expected 3 x 3 numbers"
-        raise MatchError(message) from error
+        raise MatchError(f"covariance is a {type(given).__name__}, expected 3 x 3 numbers") from error
     if found.shape != (SIDE, SIDE):
-        message = f"covariance has shape {found.shape}, expected {SIDE} x {SIDE}: east, north, yaw"
-        raise MatchError(message)
+        raise MatchError(f"covariance has shape {found.shape}, expected {SIDE} x {SIDE}: east, north, yaw")
     if not (np.abs(found) <= MOST_VARIANCE).all():
         odd = found[~(np.abs(found) <= MOST_VARIANCE)][0]
-        message = f"covariance holds {odd:g}, expected numbers of {MOST_VARIANCE:g} at most; or give none"
-        raise MatchError(message)
+        raise MatchError(f"covariance holds {odd:g}, expected numbers of {MOST_VARIANCE:g} at most; or give none")
     if not are_covariances(found[None])[0]:
-        message = "covariance is not symmetric and positive definite: NEES needs its inverse; or give none"
-        raise MatchError(message)
+        raise MatchError("covariance is not symmetric and positive definite: NEES needs its inverse; or give none")
     return found

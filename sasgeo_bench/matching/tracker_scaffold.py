@@ -130,6 +130,5 @@ def tracker_files(name: str) -> dict[str, str]:
     ['src/my_tracker/tracker.py', 'tests/test_conforms.py']
     """
     if name in shipped_names(MATCHERS):
-        message = f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another"
-        raise ConfigError(message)
+        raise ConfigError(f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another")
     return package_files(name, group=TRACKERS, code=_TRACKER, readme=_README, card=_CARD)

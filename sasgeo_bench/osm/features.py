@@ -38,8 +38,7 @@ def make_features(columns: dict[str, object], *, epsg: int) -> "gpd.GeoDataFrame
 
     missing = [name for name in (*DTYPES, "geometry") if name not in columns]
     if missing:
-        message = f"a feature table needs the columns {missing!r} too"
-        raise ShapeError(message)
+        raise ShapeError(f"a feature table needs the columns {missing!r} too")
     times = pd.to_datetime(pd.Series(columns["timestamp"], dtype="datetime64[ms]"), utc=True)
     table = pd.DataFrame({name: columns[name] if name != "timestamp" else times for name in DTYPES})
     table = table.astype(dict(DTYPES))
@@ -50,17 +49,14 @@ def check_features(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
     """Return a feature table unchanged; raise `ShapeError` if columns, types or CRS (projected, metres) are wrong."""
     expected = [*DTYPES, "geometry"]
     if list(features.columns) != expected:
-        message = (
+        raise ShapeError(
             f"a feature table has the columns {expected!r}, got {list(features.columns)!r}: build it with make_features"
         )
-        raise ShapeError(message)
     wrong = {name: str(features[name].dtype) for name, kind in DTYPES.items() if str(features[name].dtype) != kind}
     if wrong:
-        message = f"columns of another type than the schema says: {wrong!r}; build the table with make_features"
-        raise ShapeError(message)
+        raise ShapeError(f"columns of another type than the schema says: {wrong!r}; build the table with make_features")
     if features.crs is None or not features.crs.is_projected:
-        message = f"features must lie in a projected CRS in metres, got {features.crs!r}"
-        raise ShapeError(message)
+        raise ShapeError(f"features must lie in a projected CRS in metres, got {features.crs!r}")
     return features
 
 

@@ -122,11 +122,10 @@ def _check_classed(scan: Scan, files: Sequence[Path], keys: Counter[str]) -> Non
         return
     names = ", ".join(key[:_MOST_NAME] for key, _ in keys.most_common(_MOST_NAMED)) or "none"
     more = ", ..." if len(keys) > _MOST_NAMED else ""
-    message = (
+    raise ExtractError(
         f"{named([path.name for path in files], 'file')}: none of {counted(unread.total(), 'feature')} in the region "
         f"has a class ({_reasons(unread)}); their properties are {names}{more}: {_ASK}"
     )
-    raise ExtractError(message)
 
 
 def _unread(scan: Scan) -> Counter[str]:
@@ -155,8 +154,7 @@ def classless(scan: Scan) -> str:
 def _features(path: Path) -> Iterator[Any]:
     """Yield the features of a file, after a check of its form and its coordinate reference system."""
     if path.stat().st_size > MOST_BYTES:
-        message = f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region"
-        raise ExtractError(message)
+        raise ExtractError(f"{path} has more than {MOST_BYTES / 1e6:.0f} MB: cut it to the region")
     text = b""
     try:
         text = plain_file(path).read_bytes().removeprefix(b"\xef\xbb\xbf")
@@ -168,22 +166,19 @@ def _features(path: Path) -> Iterator[Any]:
         raise ExtractError(message) from error
     features = content.get("features") if isinstance(content, dict) else None
     if not isinstance(features, list) or content.get("type") != "FeatureCollection":
-        message = f"{path} is no GeoJSON FeatureCollection: export the features of OpenStreetMap as one"
-        raise ExtractError(message)
+        raise ExtractError(f"{path} is no GeoJSON FeatureCollection: export the features of OpenStreetMap as one")
     crs = content.get("crs")
     if crs is not None and not _is_lonlat(crs):
-        message = (
+        raise ExtractError(
             f"{path} is in {json.dumps(crs)[:100]}, GeoJSON is in longitude and latitude: reproject it to EPSG:4326"
         )
-        raise ExtractError(message)
     for number, feature in enumerate(features):
         properties = feature.get("properties") if isinstance(feature, dict) else None
         if not isinstance(properties, dict | None):
-            message = (
+            raise ExtractError(
                 f"{path}: the properties of feature {number} are {json.dumps(properties)[:60]}, and no object "
                 "of keys and values: mend or remove it"
             )
-            raise ExtractError(message)
         yield feature
 
 
@@ -216,8 +211,7 @@ def _shape(feature: Any, path: Path, number: int) -> shapely.Geometry | None:  #
     except (ValueError, TypeError, AttributeError, KeyError, IndexError, shapely.errors.ShapelyError) as error:
         fault = str(error)[:200] or "no geometry"
     if fault:
-        message = f"{path}: feature {number} has a broken geometry ({fault}): remove or mend it"
-        raise ExtractError(message)
+        raise ExtractError(f"{path}: feature {number} has a broken geometry ({fault}): remove or mend it")
     if shape.is_empty:
         return None
     return shape if shape.is_valid else shapely.make_valid(shape, method="structure", keep_collapsed=False)

@@ -243,14 +243,14 @@ def date_extracts(paths: Sequence[Path], *, at: Sequence[dt.date] = ()) -> tuple
     histories = [path for path in paths if is_history(path)]
     if histories:
         if not at:
-            message = f"{histories[0].name} is a full history: give the dates to cut it at with --at"
-            raise ConfigError(message)
+            raise ConfigError(f"{histories[0].name} is a full history: give the dates to cut it at with --at")
         dated = [DatedExtract(path=path, on=day) for path in histories for day in at]
         dated += [DatedExtract(path=path, on=_own_date(path)) for path in paths if path not in histories]
     elif at:
         if len(at) != len(paths):
-            message = f"--at dates the extracts in their order: got {len(at)} for {len(paths)} extracts, give one each"
-            raise ConfigError(message)
+            raise ConfigError(
+                f"--at dates the extracts in their order: got {len(at)} for {len(paths)} extracts, give one each"
+            )
         dated = [DatedExtract(path=path, on=day) for path, day in zip(paths, at, strict=True)]
     else:
         dated = [DatedExtract(path=path, on=_own_date(path)) for path in paths]
@@ -259,13 +259,13 @@ def date_extracts(paths: Sequence[Path], *, at: Sequence[dt.date] = ()) -> tuple
 
 def _checked(dated: Sequence[DatedExtract]) -> tuple[DatedExtract, ...]:
     if len(dated) < _LEAST_STATES:
-        message = f"ageing needs at least {_LEAST_STATES} dated states, got {len(dated)}: name another with --extract"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"ageing needs at least {_LEAST_STATES} dated states, got {len(dated)}: name another with --extract"
+        )
     twice = [day for day, count in Counter(item.on for item in dated).items() if count > 1]
     if twice:
         names = ", ".join(sorted(item.path.name for item in dated if item.on == twice[0]))
-        message = f"two states have the date {twice[0]} ({names}): leave one out, or date them with --at"
-        raise ConfigError(message)
+        raise ConfigError(f"two states have the date {twice[0]} ({names}): leave one out, or date them with --at")
     return tuple(sorted(dated, key=lambda item: item.on))
 
 
@@ -283,8 +283,9 @@ def _own_date(path: Path) -> dt.date:
         every = elements(osmium.FileProcessor(str(snapshot.path), OBJECTS))
         newest = max((item.timestamp for item in every), default=None)
     if newest is None or newest.year <= 1970:  # noqa: PLR2004 - osmium returns 1970 if a file has no times
-        message = f"{path.name} does not say what day it is of: date it with --at, or put YYYY-MM-DD into its name"
-        raise ExtractError(message)
+        raise ExtractError(
+            f"{path.name} does not say what day it is of: date it with --at, or put YYYY-MM-DD into its name"
+        )
     return dt.date(newest.year, newest.month, newest.day)
 
 
@@ -321,11 +322,10 @@ def read_history(
         states.append(State(source=item.path.name, on=item.on, features=objects, lifecycle=lifecycle))
         tell(_line(item, reading))
     if shapely.area(area) <= 0:
-        message = (
+        raise CoverageError(
             f"the extracts map no area in common that lies {margin_m:g} m within their estimated edges: "
             "choose extracts of one place, other --bounds, or a smaller --margin-m"
         )
-        raise CoverageError(message)
     return History(states=tuple(states), area=area, epsg=epsg)
 
 
@@ -366,8 +366,7 @@ def _frame(path: Path) -> Box:
         nodes = elements(osmium.FileProcessor(str(snapshot.path), osmium.osm.NODE))
         places = np.array([(node.lon, node.lat) for node in nodes if node.location.valid()]).reshape(-1, 2)
     if len(places) == 0:
-        message = f"{path.name} holds no node: is it an extract of map data?"
-        raise CoverageError(message)
+        raise CoverageError(f"{path.name} holds no node: is it an extract of map data?")
     low, high = places.min(axis=0), places.max(axis=0)
     return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
@@ -378,10 +377,9 @@ def _common_frame(boxes: dict[Path, Box], bounds: Box | None) -> Box:
         frame = (max(frame[0], box[0]), max(frame[1], box[1]), min(frame[2], box[2]), min(frame[3], box[3]))
         if not (frame[0] < frame[2] and frame[1] < frame[3]):
             what = "the bounds" if bounds is not None and len(boxes) == 1 else "the other extracts or the bounds"
-            message = (
+            raise CoverageError(
                 f"{path.name} covers {box_text(box)} (west, south, east, north) and has nothing in common with {what}"
             )
-            raise CoverageError(message)
     return frame
 
 

@@ -49,8 +49,7 @@ class TownEntry(Document):
 def plain_name(file: str) -> str:
     """Return a file name; raise `ValueError` if it holds folders."""
     if Path(file).name != file:
-        message = f"file must be a plain file name without folders, got {file!r}"
-        raise ValueError(message)
+        raise ValueError(f"file must be a plain file name without folders, got {file!r}")
     return file
 
 
@@ -93,15 +92,15 @@ class Extract(Document):
     @model_validator(mode="after")
     def _has_only_keys_of_its_format(self) -> Self:
         if self.format == "osm" and (self.tags or self.also):
-            message = f"extract {self.file!r} has tags or also, which are for format = 'geojson': leave them out"
-            raise ValueError(message)
+            raise ValueError(
+                f"extract {self.file!r} has tags or also, which are for format = 'geojson': leave them out"
+            )
         return self
 
     @model_validator(mode="after")
     def _has_source(self) -> Self:
         if bool(self.sha256) == (self.town is not None):
-            message = f"extract {self.file!r} needs either sha256 = [...] or town = {{...}}"
-            raise ValueError(message)
+            raise ValueError(f"extract {self.file!r} needs either sha256 = [...] or town = {{...}}")
         return self
 
 
@@ -143,8 +142,7 @@ def find_extract(extract: Extract, *, folders: Sequence[Path] = ()) -> Path:
     holds the file and it cannot be downloaded; the message names the file, its SHA-256 and where to put it.
     """
     if not extract.sha256:
-        message = f"{extract.file} is an embedded town: it is made by the build, there is no file to find"
-        raise ExtractError(message)
+        raise ExtractError(f"{extract.file} is an embedded town: it is made by the build, there is no file to find")
     wrong: list[str] = []
     for path in _places(extract, folders):
         if path.is_file():
@@ -205,8 +203,7 @@ def _download(extract: Extract, url: str) -> Path:
     import pooch  # noqa: PLC0415 - only downloads need it
 
     if not answers(url):
-        message = f"{url} cannot be reached"
-        raise ExtractError(message)
+        raise ExtractError(f"{url} cannot be reached")
     folder = cache_folder()
     load = pooch.HTTPDownloader(timeout=_SILENT_S, progressbar=sys.stderr.isatty() and QUIET not in os.environ)
     pooch.get_logger().setLevel("WARNING")  # else it prints the path of its temporary file
@@ -218,13 +215,11 @@ def _download(extract: Extract, url: str) -> Path:
             found = sha256_of(got)
             if found in extract.sha256:
                 return got.replace(folder / extract.file)
-            message = f"{url} has SHA-256 {found}, which is none of those accepted"
-            raise ExtractError(message)  # noqa: TRY301 - an OSError too, and passed on as it is
+            raise ExtractError(f"{url} has SHA-256 {found}, which is none of those accepted")  # noqa: TRY301 - an OSError too, and passed on as it is
     except ExtractError:
         raise
     except OSError as error:  # requests' errors are OSErrors, too
-        message = f"{url} could not be downloaded: {_why(error)}"
-        raise ExtractError(message) from error
+        raise ExtractError(f"{url} could not be downloaded: {_why(error)}") from error
 
 
 def _why(error: OSError) -> str:

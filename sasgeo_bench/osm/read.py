@@ -166,10 +166,9 @@ def _mapped(
     )
     if mapped.coverage.is_empty and not mapped.unknown_m2:
         covered = box_text(shapely.bounds(area))
-        message = (
+        raise CoverageError(
             f"bounds {box_text(lonlat_box(grid))} lie outside {name}, which covers {covered} (west, south, east, north)"
         )
-        raise CoverageError(message)
     return mapped
 
 
@@ -238,11 +237,10 @@ def _check_nodes(name: str, scan: Scan) -> None:
     lost = len(scan.gaps.keys() - {row.osm_id for row in scan.rows if not row.is_relation})
     ways = lost + len(scan.rows) + len(scan.far)
     if lost > MOST_LOST * ways:
-        message = (
+        raise ExtractError(
             f"{name} lacks the nodes of {lost} of its {ways} ways: they were filtered away; filter again and keep the "
             "nodes that ways refer to (osmium tags-filter without -R; Overpass: (._;>;); out;)"
         )
-        raise ExtractError(message)
 
 
 def _meets(bounds: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:

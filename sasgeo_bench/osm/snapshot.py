@@ -86,8 +86,7 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
         survey = _survey(content)
         is_past, is_named = survey.is_history(path), path.name.endswith(_HISTORY_SUFFIXES)
         if is_past and at is None and (survey.is_flagged or is_named):
-            message = f"{path.name} is a full history: give the date to cut it at"
-            raise ExtractError(message)
+            raise ExtractError(f"{path.name} is a full history: give the date to cut it at")
         current, warnings = content, []
         if survey.repeated and not is_named:
             taken = "the newest was taken" if at is None else f"that of {at} was taken"
@@ -118,11 +117,11 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
 def _check_ids(path: Path, survey: "_Survey", *, at: dt.date | None) -> None:
     """Refuse a history that begins after the day `at`, and ids of objects beyond those of OpenStreetMap."""
     if at is not None and survey.largest_id == 0:
-        message = f"{path.name} holds nothing of {at} or before: choose a later date"
-        raise ExtractError(message)
+        raise ExtractError(f"{path.name} holds nothing of {at} or before: choose a later date")
     if survey.largest_id >= NEW_IDS:
-        message = f"{path.name} has ids of up to {survey.largest_id}, OpenStreetMap of 12 digits: use osmium renumber"
-        raise ExtractError(message)
+        raise ExtractError(
+            f"{path.name} has ids of up to {survey.largest_id}, OpenStreetMap of 12 digits: use osmium renumber"
+        )
 
 
 def is_history(path: Path) -> bool:
@@ -141,25 +140,23 @@ def is_history(path: Path) -> bool:
 
 def _check_file(path: Path) -> None:
     if not path.is_file():
-        message = f"no extract at {path}: check the path"
-        raise ExtractError(message)
+        raise ExtractError(f"no extract at {path}: check the path")
     if path.name.endswith(_CHANGE_SUFFIXES):
-        message = f"{path.name} is a change file: give the extract, with the changes applied (osmium apply-changes)"
-        raise ExtractError(message)
+        raise ExtractError(
+            f"{path.name} is a change file: give the extract, with the changes applied (osmium apply-changes)"
+        )
     if path.name.endswith(_OTHER_SUFFIXES):
-        message = f"{path.name} is not read in its format: convert it (osmium cat {path.name} -o NAME.osm.pbf)"
-        raise ExtractError(message)
+        raise ExtractError(
+            f"{path.name} is not read in its format: convert it (osmium cat {path.name} -o NAME.osm.pbf)"
+        )
     if path.name.endswith((".json", ".geojson")):
-        message = (
+        raise ExtractError(
             f"{path.name} is not read as an OSM file: say format = 'geojson' of a GeoJSON extract in its region file"
         )
-        raise ExtractError(message)
     if not path.name.endswith(SUFFIXES):
-        message = f"{path.name} is of no known format: unpack or convert it to {', '.join(SUFFIXES[:6])}"
-        raise ExtractError(message)
+        raise ExtractError(f"{path.name} is of no known format: unpack or convert it to {', '.join(SUFFIXES[:6])}")
     if path.stat().st_size == 0:
-        message = f"{path} is empty: copy or download it again"
-        raise ExtractError(message)
+        raise ExtractError(f"{path} is empty: copy or download it again")
 
 
 def _as_its_content(path: Path, scratch: Path) -> Path:
@@ -175,8 +172,7 @@ def _as_its_content(path: Path, scratch: Path) -> Path:
     elif start.lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<"):
         suffix = ".osm"
     else:
-        message = f"{path} holds no OSM data: it begins with {start!r}; get the extract again"
-        raise ExtractError(message)
+        raise ExtractError(f"{path} holds no OSM data: it begins with {start!r}; get the extract again")
     if suffix != ".osm.pbf" and needs_cleaning(path):
         clean(path, scratch / "clean.osm")
         return scratch / "clean.osm"
@@ -218,11 +214,10 @@ def _readable(path: Path) -> Iterator[None]:
     try:
         yield
     except (RuntimeError, UnicodeDecodeError) as error:  # text is decoded only when it is read
-        message = (
+        raise ExtractError(
             f"{path} cannot be read as OSM data ({str(error)[:_MOST_QUOTED]}): it is damaged, cut short or no OSM "
             "file; get it again"
-        )
-        raise ExtractError(message) from error
+        ) from error
 
 
 def _header_of(path: Path) -> osmium.io.Header:
@@ -233,8 +228,9 @@ def _header_of(path: Path) -> osmium.io.Header:
 def _header(path: Path, content: Path) -> Header:
     header = _header_of(content)
     if _is_xml(content) and header.has_multiple_object_versions:
-        message = f"{path.name} holds changes: give the extract, with the changes applied (osmium apply-changes)"
-        raise ExtractError(message)
+        raise ExtractError(
+            f"{path.name} holds changes: give the extract, with the changes applied (osmium apply-changes)"
+        )
     boxes = read_boxes(path) if _is_xml(content) else _header_boxes(header)  # osmium gives the first of several alone
     return Header(boxes_lonlat=boxes, replicated_at=_header_time(header))
 

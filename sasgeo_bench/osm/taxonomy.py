@@ -42,8 +42,9 @@ class Rule(Document):
     @model_validator(mode="after")
     def _has_values(self) -> Self:
         if bool(self.values) == bool(self.widths):
-            message = f"a rule needs either values or widths, got values={self.values!r} and widths={self.widths!r}"
-            raise ValueError(message)
+            raise ValueError(
+                f"a rule needs either values or widths, got values={self.values!r} and widths={self.widths!r}"
+            )
         return self
 
     def takes(self, value: str) -> bool:
@@ -82,14 +83,11 @@ class Taxonomy(Document):
     def _ids_count_up(self) -> Self:
         ids = [item.id for item in self.classes]
         if ids != list(range(len(ids))):
-            message = f"class ids must count up from 0 without a gap, got {ids!r}"
-            raise ValueError(message)
+            raise ValueError(f"class ids must count up from 0 without a gap, got {ids!r}")
         if len(set(self.names)) != len(ids):
-            message = f"class names must be unique, got {self.names!r}"
-            raise ValueError(message)
+            raise ValueError(f"class names must be unique, got {self.names!r}")
         if strange := [item.covered_by for item in self.classes if item.covered_by not in (None, *self.names)]:
-            message = f"covered_by names a class, got {strange!r}"
-            raise ValueError(message)
+            raise ValueError(f"covered_by names a class, got {strange!r}")
         return self
 
     @cached_property

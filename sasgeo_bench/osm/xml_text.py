@@ -165,8 +165,7 @@ class _Cleaner:
 
     def _read_remark(self, text: str) -> None:
         if self._open[-1:] == ["remark"] and any(word in text for word in _FAILED):
-            message = f"its last line says: {text.strip()}"
-            raise RuntimeError(message)
+            raise RuntimeError(f"its last line says: {text.strip()}")
 
     def _write_described(self) -> None:
         """Write the ways that only members describe; a place is one node, and each that was cut off one of its own."""
@@ -188,5 +187,4 @@ def _attributes(values: dict[str, str]) -> str:
 
 
 def _refuse_entities(*_: object) -> None:
-    message = "XML entities are not supported"
-    raise RuntimeError(message)
+    raise RuntimeError("XML entities are not supported")

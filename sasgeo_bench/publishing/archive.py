@@ -68,8 +68,7 @@ def pack_board(
     """
     submitted = next((entry.name for entry in board.everyone if not entry.runs), None)
     if submitted is not None:
-        message = f"{submitted} is a file of predictions: only boards of runs are stored"
-        raise ConfigError(message)
+        raise ConfigError(f"{submitted} is a file of predictions: only boards of runs are stored")
     check_public(seed_of(board.tasks), str(request.board))
     truth = request.truth or request.root / "truth"
     names = [(str(about["suite"]), str(about["region"])) for about in board.tasks]
@@ -139,8 +138,9 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
     """
     stored = [path for path in predictions if is_pack(path)]
     if len(stored) > 1:
-        message = f"{stored[0]} and {stored[1]} are both stored results: name one, and runs and files of your own"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{stored[0]} and {stored[1]} are both stored results: name one, and runs and files of your own"
+        )
     if not stored:
         return Settings()
     record = read_settings(stored[0])
@@ -236,15 +236,12 @@ def score_all(
 def _check_whole(request: ScoreRequest) -> None:
     """Refuse, before scoring, a request whose board cannot be stored: of some queries, or not of runs alone."""
     if request.without:
-        message = "a board without some regions is not stored: leave --without or --results away"
-        raise ConfigError(message)
+        raise ConfigError("a board without some regions is not stored: leave --without or --results away")
     if request.submissions:
-        message = "the results of a board hold no submissions: leave --submissions or --results away"
-        raise ConfigError(message)
+        raise ConfigError("the results of a board hold no submissions: leave --submissions or --results away")
     submitted = next((path for path in request.predictions if path.is_file()), None)
     if submitted is not None:
-        message = f"{submitted} is a file of predictions: only boards of runs are stored"
-        raise ConfigError(message)
+        raise ConfigError(f"{submitted} is a file of predictions: only boards of runs are stored")
 
 
 def stored_among(predictions: Sequence[Path]) -> Path | None:
@@ -264,8 +261,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
         yield request
         return
     if request.tasks:
-        message = f"{stored} are stored results, which hold their own tasks: leave --tasks away"
-        raise ConfigError(message)
+        raise ConfigError(f"{stored} are stored results, which hold their own tasks: leave --tasks away")
     with scratch_folder("answers") as folder:
         found = unpack(stored, folder)
         others = [path for path in request.predictions if path != stored]
@@ -288,8 +284,7 @@ def _attributed(stored: Path, root: Path) -> Iterator[None]:
         if str(root) not in str(error):
             raise
         fault = one_line(str(error).replace(f"{root}/", ""))
-        message = f"{stored} holds no sound stored results ({fault}): fetch them again"
-        raise StoreError(message) from error
+        raise StoreError(f"{stored} holds no sound stored results ({fault}): fetch them again") from error
 
 
 @contextmanager

@@ -140,11 +140,10 @@ def write_pack(
     except SasgeoError:
         raise
     except OSError as error:
-        message = (
+        raise StoreError(
             f"{folder} cannot be written ({one_line(str(error.strerror or error))}): check the free space and your "
             "rights; results that were there are as they were"
-        )
-        raise StoreError(message) from error
+        ) from error
     count = sum(len(run.predictions) for listed in runs.values() for run in listed)
     return Packed(total_bytes=total, prediction_bytes=found, predictions=count, dropped=dropped)
 
@@ -182,11 +181,10 @@ def _write_settings(folder: Path, settings: Mapping[str, Any], dropped: str) -> 
 
 def _check_size(folder: Path, total: int, predictions: int, most: int) -> None:
     if total > most:
-        message = (
+        raise StoreError(
             f"{folder} would hold {total / 1e6:.1f} MB ({predictions / 1e6:.1f} MB of predictions), {most / 1e6:g} MB "
             "at most: store a pipeline of fewer matchers or sites, or of a smaller top_k; nothing was written"
         )
-        raise StoreError(message)
 
 
 def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TEXTS, split: Sequence[str] = ()) -> None:
@@ -321,8 +319,7 @@ def read_stored_predictions(folder: Path, matcher: str, *, queries: Collection[s
         check_predictions(table)
         found = predictions_of(table)
     if not found:
-        message = f"{folder} holds no answer of {matcher!r}: board.json names its matchers"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds no answer of {matcher!r}: board.json names its matchers")
     return found
 
 
@@ -373,8 +370,7 @@ def _parts_of(table: pa.Table) -> dict[int, pa.Table]:
 
 def _folder_name(name: str) -> str:
     if not re.fullmatch(FOLDER, name):
-        message = f"{name!r} is no name of a folder"
-        raise ValueError(message)
+        raise ValueError(f"{name!r} is no name of a folder")
     return name
 
 
@@ -413,8 +409,7 @@ def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
         table = pa.concat_tables(tables).append_column(MATCHER, pa.array(matchers, pa.string()))
     is_whole = sum(row["rows"] for row in rows) == len(table)  # first: anybody may say how many there are
     if not is_whole or table[MATCHER].to_pylist() != [row["contestant"] for row in rows for _ in range(row["rows"])]:
-        message = f"{RUNS} does not tell the {len(table)} answers of {PREDICTIONS}"
-        raise ValueError(message)
+        raise ValueError(f"{RUNS} does not tell the {len(table)} answers of {PREDICTIONS}")
     return table
 
 

@@ -62,20 +62,19 @@ def read_settings(folder: Path) -> dict[str, Any]:
         data = read_bounded(folder / PACK, MOST_BYTES)
         found = parse_record(data, VersionRecord).schema_version
         if found not in _READ:
-            message = f"{folder} has schema version {found!r}, this version reads {SCHEMA_VERSION}: fetch them again"
-            raise StoreError(message)
+            raise StoreError(
+                f"{folder} has schema version {found!r}, this version reads {SCHEMA_VERSION}: fetch them again"
+            )
         record = parse_record(data, ArchiveRecord)
         if record.files is None and found != _WITHOUT_HASHES:
-            message = f"{PACK} lists no files"
-            raise ValueError(message)
+            raise ValueError(f"{PACK} lists no files")
         if record.files is None:
             list_files(folder, without=SITE_FOLDERS)
             return record.model_dump()
         files = {**record.files, PACK: sha256_of(folder / PACK)}
         fault = first_difference(folder, files, without=SITE_FOLDERS)
         if fault is not None:
-            message = f"{folder} differs from what {PACK} says ({one_line(fault)}): fetch the results again"
-            raise StoreError(message)
+            raise StoreError(f"{folder} differs from what {PACK} says ({one_line(fault)}): fetch the results again")
         return record.model_dump()
 
 
@@ -91,8 +90,7 @@ def sound(folder: Path) -> Iterator[None]:
         *(MemoryError, pa.ArrowException),
     ) as error:
         text = one_line(str(error) if isinstance(error, ValueError) else repr(error))
-        message = f"{folder} holds no sound stored results ({text}): fetch them again"
-        raise StoreError(message) from error
+        raise StoreError(f"{folder} holds no sound stored results ({text}): fetch them again") from error
 
 
 def check_results(folder: Path, board: Path) -> None:
@@ -106,20 +104,18 @@ def check_results(folder: Path, board: Path) -> None:
     target, other = target.parent.resolve() / target.name, other.parent.resolve() / other.name
     around = next((one for one in target.parents if one == other or (one / BOARD).is_file()), None)
     if around is not None or target == other or target in other.parents:
-        message = (
+        raise StoreError(
             f"{folder} would lie in the board {around}: name another folder"
             if around is not None
             else f"{folder} would take the place of the board {board}: name another folder"
         )
-        raise StoreError(message)
     check_room(resolve_link(folder))
 
 
 def check_replaced(folder: Path) -> None:
     """Raise `StoreError` if a folder holds anything but stored results, naming the file that would be lost."""
     if folder.exists() and not is_pack(folder) and (not folder.is_dir() or any(folder.iterdir())):
-        message = f"{folder} holds something else than stored results, which would be lost: name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds something else than stored results, which would be lost: name another folder")
     if is_pack(folder):
         try:
             listed = parse_record(read_bounded(folder / PACK, MOST_BYTES), ArchiveRecord).files
@@ -168,11 +164,9 @@ def check_tables(tables: Mapping[str, pa.Table]) -> None:
         number = _numbers(tables[name][TASK])
         _refuse(name, TASK, (number < 0) | (number >= len(tables["tasks"])) | (np.diff(number, prepend=0) < 0))
     if queries["query_id"].combine_chunks() != truths["query_id"].combine_chunks():
-        message = "truths.parquet: its rows are not those of queries.parquet"
-        raise ValueError(message)
+        raise ValueError("truths.parquet: its rows are not those of queries.parquet")
     if pc.count_distinct(queries["query_id"]).as_py() != len(queries):
-        message = "queries.parquet: a query_id is there twice"
-        raise ValueError(message)
+        raise ValueError("queries.parquet: a query_id is there twice")
     _check_queries(queries)
     _check_truths(truths, queries)
 
@@ -184,20 +178,17 @@ def _numbers(column: pa.ChunkedArray) -> np.ndarray:
 def _refuse(name: str, column: str, is_wrong: np.ndarray) -> None:
     """Refuse a column with a wrong value, naming the first row that has one."""
     if is_wrong.any():
-        message = f"{name}.parquet, row {int(np.argmax(is_wrong))}: {column} holds no such value"
-        raise ValueError(message)
+        raise ValueError(f"{name}.parquet, row {int(np.argmax(is_wrong))}: {column} holds no such value")
 
 
 def _check_columns(name: str, table: pa.Table) -> None:
     """Refuse columns that are missing, there twice, of another type, or null where none may be."""
     for field in _SCHEMAS[name]:
         if table.column_names.count(field.name) != 1:
-            message = f"{name}.parquet holds no column {field.name!r}, or two"
-            raise ValueError(message)
+            raise ValueError(f"{name}.parquet holds no column {field.name!r}, or two")
         column = table[field.name]
         if not any(kind(field.type) and kind(column.type) for kind in _KINDS):
-            message = f"{name}.parquet: {field.name} is of type {column.type}"
-            raise ValueError(message)
+            raise ValueError(f"{name}.parquet: {field.name} is of type {column.type}")
         if field.name not in _MAY_BE_NULL:
             _refuse(name, field.name, _numbers(column.is_null()))
 
@@ -211,8 +202,7 @@ def _check_queries(queries: pa.Table) -> None:
         for prior_group in queries["prior_group"].unique().to_pylist():
             PriorGroup.parse(prior_group)
     except ConfigError as error:
-        message = f"queries.parquet: {error}"
-        raise ValueError(message) from error
+        raise ValueError(f"queries.parquet: {error}") from error
     _check_poses("queries", _listed(queries["candidates"]))
 
 
@@ -236,12 +226,10 @@ def _check_truths(truths: pa.Table, queries: pa.Table) -> None:
 def check_predictions(table: pa.Table) -> None:
     """Raise `ValueError`, naming the column, if no runner has written such answers."""
     for column, found, expected in differing_columns(table):
-        message = f"predictions.parquet: {column}: found {found}, expected {expected}"
-        raise ValueError(message)
+        raise ValueError(f"predictions.parquet: {column}: found {found}, expected {expected}")
     for wrong in row_faults(table):
         place = f"predictions.parquet, row {wrong.row}, {wrong.column}"
-        message = f"{place}: found {wrong.found}, expected {wrong.expected}"
-        raise ValueError(message)
+        raise ValueError(f"{place}: found {wrong.found}, expected {wrong.expected}")
 
 
 def _listed(column: pa.ChunkedArray) -> pa.Table:

@@ -89,13 +89,13 @@ def publish(
     written, and an older site then stays as it was; `ConfigError` if the board is of a private seed.
     """
     if into is None and (board / SITE).is_symlink():
-        message = f"{board / SITE} is a link: name where it leads with --into"
-        raise StoreError(message)
+        raise StoreError(f"{board / SITE} is a link: name where it leads with --into")
     target = board / SITE if into is None else resolve_link(into)
     place, whole = Path(os.path.realpath(absolute(target).parent)) / absolute(target).name, board.resolve()
     if place == whole or (place.is_relative_to(whole) and place != whole / SITE):
-        message = f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
-        raise StoreError(message)
+        raise StoreError(
+            f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
+        )
     with held(board, target, root=root, tell=tell), _with_figures(board, root, jobs, tell, progress) as folder:
         files = read_board_files(folder)
         check_public(files.about.get(PRIVATE), str(board))
@@ -144,12 +144,12 @@ def _sound(board: Path) -> Iterator[None]:
     try:
         yield
     except StoreError as error:
-        message = str(error) if str(board) in str(error) else f"{board} holds a damaged board: {error}"
-        raise StoreError(message) from error
+        raise StoreError(
+            str(error) if str(board) in str(error) else f"{board} holds a damaged board: {error}"
+        ) from error
     except (LookupError, ValueError, TypeError, AttributeError, ArithmeticError, RecursionError) as error:
         text = one_line(repr(error))
-        message = f"{board} holds a board that no page can be made of ({text}): score it again"
-        raise StoreError(message) from error
+        raise StoreError(f"{board} holds a board that no page can be made of ({text}): score it again") from error
 
 
 def _source(files: BoardFiles, tell: Tell) -> SiteSource:
@@ -235,8 +235,9 @@ def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast,
     try:
         return tuple(map(contrast_of, records))
     except (KeyError, TypeError) as error:
-        message = f"{files.folder} does not state which contrasts were registered ({error!r}): score again"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{files.folder} does not state which contrasts were registered ({error!r}): score again"
+        ) from error
 
 
 def _spots() -> dict[str, Spot]:

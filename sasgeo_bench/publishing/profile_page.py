@@ -63,8 +63,7 @@ def _megabytes(value: float) -> str:
 def check_profile(folder: Path) -> None:
     """Raise `StoreError` if a profile could not be written there, or would replace something else."""
     if folder.exists() and not folder.is_dir():
-        message = f"{folder} is no folder: name another one"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is no folder: name another one")
     check_known(folder, _FILES if is_ours(folder / RECORD) else (), "a profile")
     check_room(folder)
 
@@ -89,8 +88,9 @@ def write_profile(of: Profile, folder: Path, *, tell: Tell) -> None:
     except StoreError:
         raise
     except OSError as error:
-        message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        ) from error
 
 
 def _draw(of: Profile, path: Path) -> None:

@@ -132,8 +132,7 @@ def check_installed() -> None:
     """Raise `ConfigError` where the packages that describe a release are not installed."""
     missing = [shown for module, shown in _EXTRA.items() if find_spec(module) is None]
     if missing:
-        message = f"a release needs {', '.join(missing)}: pip install 'sasgeo-bench[publish]'"
-        raise ConfigError(message)
+        raise ConfigError(f"a release needs {', '.join(missing)}: pip install 'sasgeo-bench[publish]'")
 
 
 def check_place(into: Path, out: Path, *, url: str | None = None) -> None:
@@ -148,22 +147,22 @@ def check_place(into: Path, out: Path, *, url: str | None = None) -> None:
     others = (out / name for name in ("regions", "tasks", "truth", "runs", "boards", "segmenters", "private"))
     inside = next((folder for folder in others if place.is_relative_to(folder.resolve())), None)
     if inside is not None:
-        message = f"{into} lies inside {inside}, which others read: name another folder with --into"
-        raise ConfigError(message)
+        raise ConfigError(f"{into} lies inside {inside}, which others read: name another folder with --into")
     check_target(into)
 
 
 def _check_region(name: str, split: SplitFile, out: Path) -> None:
     if not is_of_region(name, name):
-        message = f"--regions takes ids as in 'vaduz', got {name!r}: maps that queries need are added automatically"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"--regions takes ids as in 'vaduz', got {name!r}: maps that queries need are added automatically"
+        )
     if not (out / "regions" / name / region_files.MANIFEST).is_file():
         find_region_file(name)  # an unknown one is named with the nearest there is
-        message = f"{out / 'regions'} holds no map of {name}: sasgeo-bench build-region {name}"
-        raise StoreError(message)
+        raise StoreError(f"{out / 'regions'} holds no map of {name}: sasgeo-bench build-region {name}")
     if name not in split.region_ids:
-        message = f"split {split.id!r} does not speak of region {name!r}: name the split of its queries with --split"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"split {split.id!r} does not speak of region {name!r}: name the split of its queries with --split"
+        )
 
 
 def _tasks(regions: Sequence[str], request: ReleaseRequest, tell: Tell) -> tuple[ReleaseTask, ...]:
@@ -208,8 +207,9 @@ def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
     about, parts = task_files.read_task(folder), count_parts(folder)
     odd = next((name for name in (folder.name, *parts) if not re.fullmatch(FOLDER, name)), None)
     if odd is not None:
-        message = f"{folder} speaks of {odd[:80]!r}, which cannot be part of a file's name: make the queries again"
-        raise StoreError(message)
+        raise StoreError(
+            f"{folder} speaks of {odd[:80]!r}, which cannot be part of a file's name: make the queries again"
+        )
     released = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
     truth = request.out / "truth" / str(about["suite"]) / str(about["region"])
     return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, released=released)
@@ -221,20 +221,18 @@ def _map(folder: Path) -> ReleaseMap:
     path = folder / region_files.MANIFEST
     stray = next((name for name in manifest.files if Path(name).name != name), None)
     if stray is not None:
-        message = f"{path} is damaged (it names the file {stray!r}): build the region again"
-        raise StoreError(message)
+        raise StoreError(f"{path} is damaged (it names the file {stray!r}): build the region again")
     if not manifest.licence.strip() or not manifest.attribution.strip():
-        message = f"{path} says no licence or no attribution, and a release must: build the region again"
-        raise StoreError(message)
+        raise StoreError(f"{path} says no licence or no attribution, and a release must: build the region again")
     if manifest.licence != LICENCE:
-        message = f"{path} says licence {manifest.licence!r}: a release holds data under {LICENCE} alone, leave it out"
-        raise StoreError(message)
+        raise StoreError(
+            f"{path} says licence {manifest.licence!r}: a release holds data under {LICENCE} alone, leave it out"
+        )
     region_files.check_publishable(folder, manifest)
     for name in (region_files.LAYERS, *([ORTHO] if manifest.imagery else [])):
         faults = cog_faults(folder / name)
         if faults:
-            message = f"{folder / name} is no cloud-optimized GeoTIFF ({faults[0]}): build the region again"
-            raise StoreError(message)
+            raise StoreError(f"{folder / name} is no cloud-optimized GeoTIFF ({faults[0]}): build the region again")
     return ReleaseMap(folder=folder, manifest=manifest)
 
 
@@ -243,17 +241,15 @@ def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None
     if not task_files.is_of_map(task.about, manifest):
         raise StoreError(built_anew(task.map_name))
     if task.about.get("split") != split.id and task.suite != CONTROLS:  # controls of every board have a split of theirs
-        message = (
+        raise StoreError(
             f"{task.folder} was drawn by split {task.about.get('split')!r}, not by {split.id!r}: name it with --split, "
             "or make the queries again"
         )
-        raise StoreError(message)
     if has_images(task.folder):
-        message = (
+        raise StoreError(
             f"{task.folder} holds pictures, and a release holds none so far: name the other suites with --suites, and "
             "pass this folder on by itself if the licence of its pictures allows it (rendered ones have the map's)"
         )
-        raise StoreError(message)
     if task.released:
         task_files.check_truths(task.folder, task.truth)
 
@@ -272,11 +268,10 @@ def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
 
 def _check_address(url: str | None) -> None:
     if url is not None and not _ADDRESS.fullmatch(url):
-        message = (
+        raise ConfigError(
             f"--url is {one_line(url)[:80]!r}: the address of a release begins with https:// or http://, and holds "
             "letters, digits and the signs of addresses alone"
         )
-        raise ConfigError(message)
 
 
 def _published(published: str | None, maps: Sequence[ReleaseMap]) -> str:

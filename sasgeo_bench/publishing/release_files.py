@@ -240,18 +240,16 @@ def has_images(task_folder: Path) -> bool:
 def check_target(folder: Path) -> None:
     """Raise `StoreError`, naming a file, if a folder holds what no release has written, or what was changed since."""
     if folder.is_symlink() or (folder.exists() and not folder.is_dir()):
-        message = f"{folder} is a file or a link: move it away, a release goes there"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is a file or a link: move it away, a release goes there")
     check_room(folder)
     sums = _sums_of(folder)
     check_known(folder, {SUMS, *sums} if sums else (), "a release")
     changed = next((name for name, each in sums.items() if not _is_same(folder / name, each)), None)
     if changed is not None:
-        message = (
+        raise StoreError(
             f"{folder / changed} was changed since it was released, which would be lost: move the folder away, or name "
             "another one"
         )
-        raise StoreError(message)
 
 
 def _is_same(path: Path, sha256: str) -> bool:
@@ -281,11 +279,10 @@ def open_release(folder: Path, *, tell: Callable[[str], None]) -> Iterator[Path]
     except SasgeoError:
         raise
     except OSError as error:
-        message = (
+        raise StoreError(
             f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights, and "
             "release again; a release that was there is as it was"
-        )
-        raise StoreError(message) from error
+        ) from error
 
 
 def copy_data(folder: Path, release: Release) -> None:
@@ -308,8 +305,7 @@ def _copy(source: Path, target: Path) -> None:
     try:
         shutil.copyfile(source, target)
     except FileNotFoundError as error:
-        message = f"{source} is missing: build the region, or make the queries, again"
-        raise StoreError(message) from error
+        raise StoreError(f"{source} is missing: build the region, or make the queries, again") from error
 
 
 def _copy_queries(folder: Path, task: ReleaseTask) -> None:
@@ -363,13 +359,13 @@ def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:
     for item in release.maps:
         for name, record in item.manifest.files.items():
             if found[f"regions/{item.name}/{name}"] != record:
-                message = f"{item.folder / name} is not what {MANIFEST} says: build the region again"
-                raise StoreError(message)
+                raise StoreError(f"{item.folder / name} is not what {MANIFEST} says: build the region again")
     for task in (one for one in release.tasks if one.is_whole):
         part = next(iter(task.parts))
         if found[task.file_of(part)].sha256 != task.about["files"][task_files.QUERIES]["sha256"]:
-            message = f"{task.folder / task_files.QUERIES} is not what {task_files.TASK} says: make the queries again"
-            raise StoreError(message)
+            raise StoreError(
+                f"{task.folder / task_files.QUERIES} is not what {task_files.TASK} says: make the queries again"
+            )
     return found
 
 

@@ -73,8 +73,7 @@ def svg_fault(text: str) -> str | None:
     try:
         root = ET.fromstring(text)  # noqa: S314 - what could grow without end is refused above
     except ET.ParseError as error:
-        message = f"it is no XML: {error}"
-        raise ValueError(message) from error
+        raise ValueError(f"it is no XML: {error}") from error
     inert = {id(item) for metadata in root.iter(_INERT) for item in metadata.iter()}
     drawn = (item for item in root.iter() if id(item) not in inert or item.tag == _INERT)
     return next((fault for item in drawn if (fault := _fault_of(item))), None)
@@ -168,8 +167,9 @@ def _sound(folder: Path) -> Iterator[None]:
         *(zlib.error, RecursionError, MemoryError),
     ) as error:
         text = one_line(str(error))
-        message = f"{folder} holds a damaged board ({text}): score it again, or fetch the results again"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} holds a damaged board ({text}): score it again, or fetch the results again"
+        ) from error
 
 
 def _read_table(path: Path) -> pd.DataFrame:
@@ -190,11 +190,9 @@ def _unpacked(path: Path) -> bytes:
         with gzip.open(plain_file(path)) as source:
             data = source.read(_MOST_UNPACKED + 1)
     except (OSError, EOFError, zlib.error) as error:
-        message = f"{path.name} cannot be unpacked: {error}"
-        raise ValueError(message) from error
+        raise ValueError(f"{path.name} cannot be unpacked: {error}") from error
     if len(data) > _MOST_UNPACKED:
-        message = f"{path.name} unpacks to more than {_MOST_UNPACKED / 1e6:g} MB"
-        raise ValueError(message)
+        raise ValueError(f"{path.name} unpacks to more than {_MOST_UNPACKED / 1e6:g} MB")
     return data
 
 
@@ -208,11 +206,11 @@ def _read_figures(folder: Path) -> Iterator[SiteFigure]:
             text = data.decode()
             fault = svg_fault(text)
         except ValueError as error:
-            message = f"{name}: {error}"
-            raise ValueError(message) from error
+            raise ValueError(f"{name}: {error}") from error
         if fault is not None:
-            message = f"{folder / name} holds {fault}, as no figure of a board does: score it again, or remove the file"
-            raise StoreError(message)
+            raise StoreError(
+                f"{folder / name} holds {fault}, as no figure of a board does: score it again, or remove the file"
+            )
         yield SiteFigure.of(name, text)
 
 
@@ -243,8 +241,7 @@ def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
         raise
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         text = one_line(str(error))
-        message = f"{path} is damaged ({text}): make the pictures again, or move the folder away"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} is damaged ({text}): make the pictures again, or move the folder away") from error
     return found
 
 
@@ -253,11 +250,10 @@ def _check_picture(folder: Path, name: str) -> None:
     path = folder / name
     is_inside = path.resolve().is_relative_to(folder.resolve()) and not Path(name).is_absolute()
     if not is_inside or path.suffix.lower() not in IMAGES or not path.is_file():
-        message = (
+        raise StoreError(
             f"{folder / PICTURES}.json names {name!r}, which is no picture in {folder}: "
             "make the pictures again, or move the folder away"
         )
-        raise StoreError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -289,8 +285,7 @@ def held(folder: Path, target: Path, *, root: Path, tell: Callable[[str], None])
         near = difflib.get_close_matches(folder.name, boards, n=1)
         some = ", ".join(map(str, list(boards.values())[:_NAMED])) or "out/boards/demo"
         hint = f"did you mean {boards[near[0]]}?" if near else f"name the folder of one, as {some}"
-        message = f"{folder} holds no board ({BOARD}): {hint}"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds no board ({BOARD}): {hint}")
     check_target(target)
     with locked(folder, tell=tell):
         yield
@@ -307,11 +302,9 @@ def site_lock(folder: Path, target: Path, *, tell: Callable[[str], None]) -> Abs
 def check_target(target: Path) -> None:
     """Raise `StoreError` if a site cannot replace a folder: a file, no site, or one with foreign files."""
     if target.exists() and not target.is_dir():
-        message = f"{target} is a file: move it away, or name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{target} is a file: move it away, or name another folder")
     if target.is_dir() and any(target.iterdir()) and not (target / MANIFEST).is_file():
-        message = f"{target} holds something else than a site, which would be lost: name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{target} holds something else than a site, which would be lost: name another folder")
     check_site(target)
 
 
@@ -348,11 +341,10 @@ def write_site(
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except OSError as error:
-        message = (
+        raise StoreError(
             f"{target} cannot be written ({error.strerror or error}): check the free space and your rights, and "
             "publish again; a site that was there is as it was"
-        )
-        raise StoreError(message) from error
+        ) from error
     return Written(
         folder=target,
         site_bytes=sum(len(data) for name, data in files.items() if not name.startswith((f"{FILES}/", f"{MAPS}/"))),

@@ -97,8 +97,7 @@ def _check(answers: pd.DataFrame) -> None:
         is_sound &= np.isnan(pose).all(axis=1) | (np.abs(pose) < _MOST_M).all(axis=1)
     if not is_sound.all():
         row = int(np.argmin(is_sound))
-        message = f"answers.parquet holds a view or a pose that lies nowhere, in row {row}: score it again"
-        raise StoreError(message)
+        raise StoreError(f"answers.parquet holds a view or a pose that lies nowhere, in row {row}: score it again")
 
 
 def _script(place: PlaceMap, item: RegionMap, answers: pd.DataFrame, cases: Mapping[str, int]) -> str:

@@ -57,8 +57,9 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
     """
     card = request.card if isinstance(request.card, Card) else read_card_file(request.card)
     if not is_pack(request.board):
-        message = f"{request.board} holds no stored results: name those of the board, as in --for docs/results/demo"
-        raise StoreError(message)
+        raise StoreError(
+            f"{request.board} holds no stored results: name those of the board, as in --for docs/results/demo"
+        )
     split = check_card(card, request.board, source="the card" if isinstance(request.card, Card) else str(request.card))
     with laid_tasks([request.board]) as folders:
         tasks = [AskedTask.of(folder) for folder in folders]
@@ -117,19 +118,18 @@ def _names_on(board: Path) -> set[str]:
 
 def _check_places(card: Card, board: Path, split: Split | None, source: str) -> None:
     if not board_of([board]):
-        message = f"{board} are stored results of no pipeline: name those of a board that one has made"
-        raise ConfigError(message)
+        raise ConfigError(f"{board} are stored results of no pipeline: name those of a board that one has made")
     known = () if split is None else tuple(split.blocks)
     unknown = next((place for place in card.places if place not in known), None)
     if unknown is not None:
-        message = (
+        raise ConfigError(
             f"{source}: trained_on names {unknown!r}, {_hint(unknown, split)}; what is no place of the split goes into "
             "trained_elsewhere"
         )
-        raise ConfigError(message)
     if card.is_by_half and (split is None or not split.half_of):
-        message = f"{source}: trained_on speaks of halves, and the split of this board has none: list the places"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{source}: trained_on speaks of halves, and the split of this board has none: list the places"
+        )
 
 
 def _hint(unknown: str, split: Split | None) -> str:
@@ -150,12 +150,11 @@ def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Seque
         matcher = about.get("matcher")
         found = {name: matcher.get(name) for name in ("name", "version")} if isinstance(matcher, dict) else {}
         if found != {"name": card.name, "version": card.version}:
-            message = (
+            raise ConfigError(
                 f"the card is of {card.name!r} {card.version}, {predictions} holds runs of {found.get('name')!r} "
                 f"{found.get('version')}: make them agree, or name the folder of the runs that the card is of, as in "
                 f"{predictions / str(about.get('hash', '<hash>'))}"
             )
-            raise ConfigError(message)
         if (about.get("suite"), about.get("region")) in named:
             _check_taught(card, about, split)
 
@@ -176,21 +175,19 @@ def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> 
     half = split.half_of.get(places[0]) if split is not None and places else None
     lost = sorted(set(places_trained) - set(card.taught(half)))
     if lost:
-        message = (
+        raise ConfigError(
             f"the runs on {about['suite']}/{about['region']} were trained on {lost[0]}, which trained_on of the card "
             f"does not name{'' if half is None else f' for half {half}'}: add it"
         )
-        raise ConfigError(message)
 
 
 def _check_rows(predictions: Path, folders: Sequence[Path]) -> None:
     faults = [fault for fault in validate(predictions, folders) if not fault.is_missing_row]
     if faults:
-        message = (
+        raise ConfigError(
             f"{predictions} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all); "
             "nothing was written"
         )
-        raise ConfigError(message)
 
 
 def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Prediction]:
@@ -206,8 +203,9 @@ def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predic
     counts = [(task, sum(name in rows for name in task.asked)) for task in tasks]
     suites = {task.about["suite"] for task, count in counts if count}
     if not suites:
-        message = f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/howto/matcher.md)"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/howto/matcher.md)"
+        )
     return [
         TaskManifest(
             suite=task.about["suite"],
@@ -248,11 +246,10 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
         return submission, tuple(submission_faults(folder, submission, None, split))
     board = board_of(tasks)
     if board and board != submission.board:
-        message = (
+        raise ConfigError(
             f"{folder} answers the board {submission.board!r}, and {board!r} is the board of {tasks[0]}: name the "
             f"results of {submission.board!r} by --for"
         )
-        raise ConfigError(message)
     with laid_tasks(tasks) as folders:
         return submission, tuple(submission_faults(folder, submission, folders, split))
 
@@ -264,8 +261,7 @@ def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[P
     submission nor a folder of them, and `ConfigError` if `board` is empty.
     """
     if not board:
-        message = "submissions are scored with the stored results of a board: name them with --predictions"
-        raise ConfigError(message)
+        raise ConfigError("submissions are scored with the stored results of a board: name them with --predictions")
     listed = (folder for path in paths for folder in list_submissions(path))
     found = {folder.parent.resolve() / folder.name: folder for folder in listed}  # a link may lead to itself
     boards = {folder: _board_named(folder, board) for folder in found.values()}
@@ -301,8 +297,7 @@ def _request(
     stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell, root: Path, jobs: int
 ) -> ScoreRequest:
     if not is_pack(stored):
-        message = f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written"
-        raise StoreError(message)
+        raise StoreError(f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written")
     found = submissions_for(board_of([stored]), submissions, tell=tell)
     return replace(request_of([stored], board=board, root=root), submissions=found, jobs=jobs)
 

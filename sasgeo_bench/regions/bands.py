@@ -54,16 +54,16 @@ def find_bands(path: Path, source: rasterio.io.DatasetReader) -> Bands:
     alphas = [band for band, is_what in enumerate(source.colorinterp, start=1) if is_what is ColorInterp.alpha]
     kinds = {source.dtypes[band - 1] for band in colours.rgb or ()} or set(source.dtypes)
     if not colours.rgb or kinds != {"uint8"} or len(alphas) > 1:
-        message = (
+        raise ImageryError(
             f"{path} has {source.count} band(s) of {source.dtypes[0]}, imagery is 8-bit red, green and blue: convert "
             "it (gdal_translate -ot Byte -scale, -expand rgb for a palette, -b for the bands, -colorinterp for their "
             f"colours); {colours.fault or 'its bands are ' + _names(source.colorinterp)}"
         )
-        raise ImageryError(message)
     bits = source.tags(colours.rgb[0], ns="IMAGE_STRUCTURE").get("NBITS", str(_BITS))
     if bits != str(_BITS):
-        message = f"{path} has colours of {bits} bits, imagery has 8: convert it (gdal_translate -ot Byte -scale)"
-        raise ImageryError(message)
+        raise ImageryError(
+            f"{path} has colours of {bits} bits, imagery has 8: convert it (gdal_translate -ot Byte -scale)"
+        )
     alpha, notes = alphas[0] if alphas else None, [colours.note] if colours.note else []
     if alpha is not None and not _is_mask(source, alpha):
         notes.append(f"its band {alpha} calls itself alpha and holds a picture, such as infrared: it hides nothing")

@@ -191,8 +191,7 @@ def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
 def _build_into(scratch: Path, plan: BuildPlan, tell: Tell) -> Manifest:
     name = plan.folder.name
     if len(plan.pictures) < len(plan.spec.imagery):
-        message = f"{plan.folder} was changed after it was found up to date: build it again"
-        raise StoreError(message)
+        raise StoreError(f"{plan.folder} was changed after it was found up to date: build it again")
     with _source(plan) as source:
         tell(f"{name}: reading {source.name}")
         reading = _read(plan, source)
@@ -372,8 +371,9 @@ def _write_unless_current(plan: BuildPlan, tell: Tell, write: Callable[[Path], M
     except SasgeoError:
         raise
     except OSError as error:
-        message = f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{plan.folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        ) from error
 
 
 @contextmanager
@@ -384,8 +384,7 @@ def _source(plan: BuildPlan) -> Iterator[Path]:
         return
     town = plan.extract.town
     if town is None or plan.spec.center_lonlat is None:
-        message = f"{plan.spec.id}: an embedded town needs center_lonlat in its region file"
-        raise StoreError(message)
+        raise StoreError(f"{plan.spec.id}: an embedded town needs center_lonlat in its region file")
     with scratch_folder("town") as folder:
         path = folder / plan.extract.file
         longitude_deg, latitude_deg = plan.spec.center_lonlat

@@ -43,22 +43,18 @@ class Evidence:
     def __post_init__(self) -> None:
         """Check shapes, types and values; lock the arrays."""
         if self.cells.dtype != np.uint8 or self.cells.ndim != 3 or len(self.cells) != len(self.classes):  # noqa: PLR2004
-            message = (
+            raise ShapeError(
                 f"evidence for {len(self.classes)} classes is uint8 of shape (C, rows, cols), "
                 f"got {self.cells.dtype} of shape {self.cells.shape}"
             )
-            raise ShapeError(message)
         if self.cells.size == 0 or self.cells.max() >= _STATES:
-            message = "evidence cells are 0 absent, 1 present or 2 unknown, and there is at least one"
-            raise ShapeError(message)
+            raise ShapeError("evidence cells are 0 absent, 1 present or 2 unknown, and there is at least one")
         if not (np.isfinite(self.cell_size_m) and self.cell_size_m > 0):
-            message = f"cell_size_m must be positive and finite, got {self.cell_size_m!r}"
-            raise ShapeError(message)
+            raise ShapeError(f"cell_size_m must be positive and finite, got {self.cell_size_m!r}")
         if self.confidence is not None:
             if self.confidence.dtype != np.uint8 or self.confidence.shape != self.cells.shape:
                 found = f"{self.confidence.dtype} of shape {self.confidence.shape}"
-                message = f"confidence is uint8 of shape {self.cells.shape}, got {found}"
-                raise ShapeError(message)
+                raise ShapeError(f"confidence is uint8 of shape {self.cells.shape}, got {found}")
             self.confidence.flags.writeable = False
         self.cells.flags.writeable = False
 
@@ -105,8 +101,7 @@ class LayerBits:
         [[3, 2, 2147483648]]
         """
         if len(layers) > _MOST_CLASSES:
-            message = f"at most {_MOST_CLASSES} classes fit into the bits of one cell, got {len(layers)}"
-            raise ShapeError(message)
+            raise ShapeError(f"at most {_MOST_CLASSES} classes fit into the bits of one cell, got {len(layers)}")
         bits = np.zeros(layers.shape[1:], dtype=np.uint32)
         is_unknown = np.zeros(layers.shape[1:], dtype=np.bool_)
         for index, layer in enumerate(layers):
@@ -135,15 +130,15 @@ def unpack(packed: bytes, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """Unpack bytes of `pack` into cells of a known shape; raise `ShapeError` if their number or a state is wrong."""
     count = int(np.prod(shape))
     if len(packed) != -(-count // CELLS_PER_BYTE):
-        message = (
+        raise ShapeError(
             f"{count} cells of shape {shape} take {-(-count // CELLS_PER_BYTE)} bytes, got {len(packed)}: "
             "rows, cols or classes do not belong to this evidence"
         )
-        raise ShapeError(message)
     cells = _CELLS.take(np.frombuffer(packed, dtype=np.uint8), axis=0).ravel()
     if cells.max(initial=0) >= _STATES:
-        message = "packed evidence holds a state that is neither absent, present nor unknown: the bytes are damaged"
-        raise ShapeError(message)
+        raise ShapeError(
+            "packed evidence holds a state that is neither absent, present nor unknown: the bytes are damaged"
+        )
     return np.asarray(cells[:count].reshape(shape), dtype=np.uint8)
 
 

@@ -192,8 +192,7 @@ class Imagery:
     def check(self) -> None:
         """Raise `StoreError` if the file is missing or differs from its record in `region.json`."""
         if not self.path.is_file() or file_record(self.path) != self.file:
-            message = f"{self.path} is missing, or not what region.json says: build the region again"
-            raise StoreError(message)
+            raise StoreError(f"{self.path} is missing, or not what region.json says: build the region again")
 
     def read(self, bounds_m: Bounds, *, gsd_m: float | None = None) -> ImageryWindow:
         """Read the smallest window that covers west, south, east, north, metres in the region's CRS.
@@ -212,11 +211,10 @@ class Imagery:
         """
         grid = Grid.from_bounds(*bounds_m, cell_size_m=gsd_m or self.record.gsd_m, epsg=self.epsg)
         if grid.rows * grid.cols > MOST_WINDOW_PIXELS:
-            message = (
+            raise ImageryError(
                 f"a window of {grid.rows} x {grid.cols} pixels is too large, the most is {MOST_WINDOW_PIXELS:,}: read "
                 "a smaller one, or a coarser gsd_m"
             )
-            raise ImageryError(message)
         return read_window(self.path, grid, is_coarser=grid.cell_size_m > self.record.gsd_m)
 
 
@@ -245,8 +243,7 @@ def read_window(path: Path, grid: Grid, *, is_coarser: bool) -> ImageryWindow:
         ):
             bands = view.read()  # at once: each call warps anew
     except (RasterioError, OSError) as error:
-        message = f"{path} cannot be read ({error}): build the region again"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be read ({error}): build the region again") from error
     rgb, is_known = bands[:-1], np.asarray(bands[-1] > 0)
     return ImageryWindow(
         grid=grid, rgb=np.moveaxis(rgb, 0, -1) * is_known[..., None].astype(np.uint8), is_known=is_known

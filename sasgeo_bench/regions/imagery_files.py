@@ -62,8 +62,7 @@ def find_imagery(entry: ImageryEntry, *, folders: Sequence[Path] = (), extracts:
         wrong.append(f"{path} has SHA-256 {found}, which is none of those accepted")
     because = f" ({'; '.join(wrong)})" if wrong else ""
     where = ", ".join(map(str, dict.fromkeys(places))) or "a folder"
-    message = (
+    raise ImageryError(
         f"{entry.file} (SHA-256 {' or '.join(entry.sha256)}) was not found{because}: put it into {where}, or name its "
         f"folder with {_FLAG} or {IMAGERY_VARIABLE}"
     )
-    raise ImageryError(message)

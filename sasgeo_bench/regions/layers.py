@@ -252,8 +252,9 @@ def write_layers(path: Path, grid: Grid, classes: tuple[str, ...], paint: Callab
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except (RasterioError, OSError) as error:
-        message = f"{path} cannot be written ({error}): check the free space and the rights of its folder"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{path} cannot be written ({error}): check the free space and the rights of its folder"
+        ) from error
 
 
 def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence[int]) -> None:
@@ -385,8 +386,7 @@ def check_shape(path: Path, shape: tuple[int, int, int]) -> None:
     except (RasterioError, OSError) as error:
         raise _unreadable(path, error) from error
     if found != shape:
-        message = f"{path} has layers, rows and columns {found}, its region {shape}: build the region again"
-        raise StoreError(message)
+        raise StoreError(f"{path} has layers, rows and columns {found}, its region {shape}: build the region again")
 
 
 def _unreadable(path: Path, error: Exception) -> StoreError:

@@ -85,18 +85,17 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
             bands = find_bands(path, source)
             gsd_m = max(_ground_resolution_m(source, to_grid), entry.gsd_m or 0.0)
     except (CRSError, ProjError) as error:
-        message = f"{path} cannot be projected to EPSG:{grid.epsg} ({error}): check its coordinate reference system"
-        raise ImageryError(message) from error
+        raise ImageryError(
+            f"{path} cannot be projected to EPSG:{grid.epsg} ({error}): check its coordinate reference system"
+        ) from error
     if not FINEST_M <= gsd_m <= COARSEST_M:
-        message = (
+        raise ImageryError(
             f"{path} has pixels of {gsd_m:.3g} m, imagery has {FINEST_M:g} to {COARSEST_M:g} m: check its georeference"
         )
-        raise ImageryError(message)
     if not _overlaps(bounds_m, grid.bounds_m):
-        message = (
+        raise ImageryError(
             f"{path} shows {_text(bounds_m)}, the region is {_text(grid.bounds_m)} (EPSG:{grid.epsg}): leave it out"
         )
-        raise ImageryError(message)
     return Picture(path=path, entry=entry, bounds_m=bounds_m, gsd_m=gsd_m, bands=bands)
 
 
@@ -109,32 +108,28 @@ def _opened(path: Path) -> Iterator[rasterio.io.DatasetReader]:
     except (RasterioError, OSError) as error:
         if isinstance(error, ImageryError | CRSError):
             raise
-        message = (
+        raise ImageryError(
             f"{path} cannot be read as a GeoTIFF ({str(error)[:200]}): it is damaged (get it again) or of another kind "
             "(make it one with gdal_translate)"
-        )
-        raise ImageryError(message) from error
+        ) from error
 
 
 def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
     if source.crs is None or source.transform.is_identity:
-        message = (
+        raise ImageryError(
             f"{path} says no place (a CRS and a transform): get a georeferenced one, write them (gdal_edit), or warp "
             "by its control points (gdalwarp)"
         )
-        raise ImageryError(message)
     crs = CRS.from_wkt(source.crs.to_wkt())
     if not (crs.is_geographic or crs.is_projected):
-        message = (
+        raise ImageryError(
             f"{path} has the coordinate reference system {one_line(crs.name)[:60]!r}, which is neither geographic nor "
             "projected, as that of a building site: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
         )
-        raise ImageryError(message)
     if source.width * source.height > MOST_PIXELS:
-        message = (
+        raise ImageryError(
             f"{path} has {source.width} x {source.height} pixels, the most is {MOST_PIXELS:,}: cut it to the region"
         )
-        raise ImageryError(message)
 
 
 def _box(source: rasterio.io.DatasetReader) -> tuple[float, float, float, float]:
@@ -191,11 +186,10 @@ def lattice_within(bounds: NDArray[np.float64], region: Grid, *, finest_m: float
     west, south, east, north = cells.bounds_m
     rows, cols = round((north - south) / gsd_m), round((east - west) / gsd_m)
     if rows * cols > MOST_ORTHO_PIXELS:
-        message = (
+        raise ImageryError(
             f"the imagery of the region has {cols:,} x {rows:,} pixels of {gsd_m:.3g} m, the most is "
             f"{MOST_ORTHO_PIXELS:,}: make the region smaller, or its gsd_m coarser"
         )
-        raise ImageryError(message)
     return Grid(epsg=region.epsg, west_m=west, north_m=north, cell_size_m=gsd_m, rows=rows, cols=cols)
 
 
@@ -207,8 +201,9 @@ def write_ortho(path: Path, pictures: Sequence[Picture], grid: Grid) -> None:
     who = "; ".join(dict.fromkeys(item.entry.attribution for item in pictures))
     licence = "; ".join(dict.fromkeys(item.entry.licence for item in pictures))
     if not write_tiles(path, grid, _warped_tiles(pictures, grid), attribution=who, licence=licence):
-        message = f"{', '.join(item.entry.file for item in pictures)}: no pixel lies in the region: leave it out"
-        raise ImageryError(message)
+        raise ImageryError(
+            f"{', '.join(item.entry.file for item in pictures)}: no pixel lies in the region: leave it out"
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -246,8 +241,9 @@ def write_tiles(path: Path, grid: Grid, tiles: Generator[OrthoTile], *, attribut
     except (RasterioError, OSError, GridError) as error:
         if isinstance(error, ImageryError):
             raise
-        message = f"{path} cannot be written ({str(error)[:200]}): check the free space and the pictures"
-        raise ImageryError(message) from error
+        raise ImageryError(
+            f"{path} cannot be written ({str(error)[:200]}): check the free space and the pictures"
+        ) from error
     finally:
         draft.unlink(missing_ok=True)
 
@@ -345,8 +341,7 @@ class _Warped:
         try:
             bands = self._view.read((*BANDS, self._alpha), window=wide)  # at once: each call warps anew
         except RasterioError as error:
-            message = f"{self._picture.path} is damaged ({str(error)[:200]}): get it again"
-            raise ImageryError(message) from error
+            raise ImageryError(f"{self._picture.path} is damaged ({str(error)[:200]}): get it again") from error
         colours, mask = bands[:3], bands[3] > 0
         if empty is not None:
             mask = mask & ~is_empty(colours, empty, diameter_px=margin)

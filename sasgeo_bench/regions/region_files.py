@@ -93,25 +93,21 @@ def read_manifest(folder: Path) -> Manifest:
 
     path = folder / MANIFEST
     if not path.is_file():
-        message = f"{folder} holds no {MANIFEST}: build the region first"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds no {MANIFEST}: build the region first")
     content = read_json(path, mend=_MEND)
     found = content.get("schema_version") if isinstance(content, dict) else None
     if found != SCHEMA_VERSION:
         stated = "states no schema version" if found is None else f"has schema version {found!r}"
-        message = f"{path} {stated}, this version reads {SCHEMA_VERSION}: {_MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{path} {stated}, this version reads {SCHEMA_VERSION}: {_MEND}")
     try:
         manifest = check_document(content, Manifest, source=MANIFEST)
         _ = shapely.from_wkt(manifest.coverage.wkt), CRS.from_epsg(manifest.epsg)
         _check_bounds(manifest)
     except (ConfigError, GridError, CRSError, shapely.errors.ShapelyError) as error:
-        message = f"{path} is damaged ({str(error)[:200]}): {_MEND}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} is damaged ({str(error)[:200]}): {_MEND}") from error
     lost = [name for name in (LAYERS, FEATURES, NODES, EDGES) if name not in manifest.files]
     if lost:
-        message = f"{path} is damaged (its files lack {lost[0]}): {_MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{path} is damaged (its files lack {lost[0]}): {_MEND}")
     return manifest
 
 
@@ -120,8 +116,7 @@ def _check_bounds(manifest: Manifest) -> None:
     grid, (west_m, south_m, east_m, north_m) = manifest.grid, manifest.bounds_m
     rows, cols = (north_m - south_m) / grid.cell_size_m, (east_m - west_m) / grid.cell_size_m
     if not (abs(rows - grid.rows) < 0.5 and abs(cols - grid.cols) < 0.5):  # noqa: PLR2004 - of a cell
-        message = f"it has {grid.rows} x {grid.cols} cells, its bounds hold {rows:.0f} x {cols:.0f}"
-        raise GridError(message)
+        raise GridError(f"it has {grid.rows} x {grid.cols} cells, its bounds hold {rows:.0f} x {cols:.0f}")
 
 
 def read_region(
@@ -214,8 +209,7 @@ def _window(grid: Grid, bounds_m: Bounds) -> tuple[int, int, int, int]:
     except (TypeError, ValueError):
         west_m = south_m = east_m = north_m = math.nan
     if not all(map(math.isfinite, (west_m, south_m, east_m, north_m))):
-        message = f"bounds_m are west, south, east, north, finite metres in the CRS of the map, got {bounds_m!r}"
-        raise GridError(message)
+        raise GridError(f"bounds_m are west, south, east, north, finite metres in the CRS of the map, got {bounds_m!r}")
     part = Grid.from_bounds(west_m, south_m, east_m, north_m, cell_size_m=grid.cell_size_m, epsg=grid.epsg)
     top, left = (
         round(shift_m / grid.cell_size_m) for shift_m in (grid.north_m - part.north_m, part.west_m - grid.west_m)
@@ -223,11 +217,10 @@ def _window(grid: Grid, bounds_m: Bounds) -> tuple[int, int, int, int]:
     row, col = max(top, 0), max(left, 0)
     rows, cols = min(top + part.rows, grid.rows) - row, min(left + part.cols, grid.cols) - col
     if rows < 1 or cols < 1:
-        message = (
+        raise GridError(
             f"the bounds {tuple(bounds_m)} lie beyond the map: it has {grid.bounds_m} (west, south, east, north, "
             f"metres in EPSG:{grid.epsg})"
         )
-        raise GridError(message)
     return row, col, rows, cols
 
 
@@ -259,11 +252,10 @@ def check_publishable(folder: Path, manifest: Manifest) -> None:
     if manifest.imagery is None or manifest.imagery.is_publishable:
         return
     kept = next(item for item in manifest.imagery.pictures if not item.publish)
-    message = (
+    raise StoreError(
         f"{folder / ORTHO} holds {kept.file}, whose region file says publish = false (licence: {kept.licence}): leave "
         f"{manifest.id} out, or build it from a region file without [[imagery]]"
     )
-    raise StoreError(message)
 
 
 def _imagery(folder: Path, manifest: Manifest) -> Imagery | None:
@@ -271,8 +263,7 @@ def _imagery(folder: Path, manifest: Manifest) -> Imagery | None:
     if manifest.imagery is None:
         return None
     if ORTHO not in manifest.files:
-        message = f"{folder / MANIFEST} is damaged (its files lack {ORTHO}): {_MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{folder / MANIFEST} is damaged (its files lack {ORTHO}): {_MEND}")
     return Imagery(path=folder / ORTHO, file=manifest.files[ORTHO], record=manifest.imagery, epsg=manifest.epsg)
 
 
@@ -292,8 +283,7 @@ def check_files(folder: Path) -> None:
 def _check_file(path: Path, record: FileRecord) -> None:
     """Refuse a file that differs from its record: nothing else protects a raster, or the footer of a GeoParquet."""
     if not path.is_file() or path.stat().st_size != record.bytes or file_record(path) != record:
-        message = f"{path} is missing, or not what {MANIFEST} says: {_MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{path} is missing, or not what {MANIFEST} says: {_MEND}")
 
 
 def _read_geometry(path: Path, box: Bounds | None = None) -> "gpd.GeoDataFrame":
@@ -322,8 +312,7 @@ def _read_geometry(path: Path, box: Bounds | None = None) -> "gpd.GeoDataFrame":
         *(OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError),
         *(pa.ArrowException, CRSError, shapely.errors.ShapelyError),
     ) as error:
-        message = f"{path} cannot be read ({str(error)[:200]}): {_MEND}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be read ({str(error)[:200]}): {_MEND}") from error
 
 
 def _read_near(path: Path, box: Bounds) -> pa.Table:

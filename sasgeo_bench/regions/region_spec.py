@@ -86,8 +86,7 @@ class RegionFile(NamedDocument):
     def _cell_size_is_sane(cls, cell_size_m: float) -> float:
         low, high = 0.1, 100.0
         if not (math.isfinite(cell_size_m) and low <= cell_size_m <= high):
-            message = f"cell_size_m must lie between {low} and {high} metres, got {cell_size_m!r}"
-            raise ValueError(message)
+            raise ValueError(f"cell_size_m must lie between {low} and {high} metres, got {cell_size_m!r}")
         return cell_size_m
 
     @field_validator("epsg")
@@ -98,11 +97,11 @@ class RegionFile(NamedDocument):
         try:
             crs = pyproj.CRS.from_epsg(epsg)
         except pyproj.exceptions.CRSError as error:
-            message = f"epsg {epsg!r} is unknown: leave it out for the UTM zone of the centre"
-            raise ValueError(message) from error
+            raise ValueError(f"epsg {epsg!r} is unknown: leave it out for the UTM zone of the centre") from error
         if not crs.is_projected or {axis.unit_name for axis in crs.axis_info} != {"metre"}:
-            message = f"epsg {epsg!r} ({crs.name}) is not a projected CRS in metres: leave it out for the UTM zone"
-            raise ValueError(message)
+            raise ValueError(
+                f"epsg {epsg!r} ({crs.name}) is not a projected CRS in metres: leave it out for the UTM zone"
+            )
         return epsg
 
     @field_validator("coverage_lonlat")
@@ -121,22 +120,19 @@ class RegionFile(NamedDocument):
         known = load_taxonomy().names
         strange = next((name for name in names or () if name not in known), None)
         if strange is not None:
-            message = f"classes has {strange!r}, which is no class: there are {', '.join(known)}"
-            raise ValueError(message)
+            raise ValueError(f"classes has {strange!r}, which is no class: there are {', '.join(known)}")
         return names
 
     @model_validator(mode="after")
     def _coverage_is_stated_once(self) -> Self:
         if self.coverage_lonlat is not None and self.coverage_parts_lonlat is not None:
-            message = "the mapped area is given twice: keep coverage_lonlat or coverage_parts_lonlat"
-            raise ValueError(message)
+            raise ValueError("the mapped area is given twice: keep coverage_lonlat or coverage_parts_lonlat")
         is_labelled = any(item.format == "geojson" for item in self.extract)
         if is_labelled and (self.stated_coverage() is None or self.classes is None):
-            message = (
+            raise ValueError(
                 "an extract of format 'geojson' holds some classes in some places: say which by classes and by "
                 "coverage_lonlat or coverage_parts_lonlat, above [[extract]]; all else is unknown"
             )
-            raise ValueError(message)
         return self
 
     @model_validator(mode="after")
@@ -145,12 +141,10 @@ class RegionFile(NamedDocument):
         has_centre = self.center_lonlat is not None and self.size_m is not None
         has_half = (self.center_lonlat is None) != (self.size_m is None)
         if has_box == has_centre or has_half or (has_box and self.size_m is not None):
-            message = "say where the region lies either by center_lonlat and size_m, or by bounds_lonlat"
-            raise ValueError(message)
+            raise ValueError("say where the region lies either by center_lonlat and size_m, or by bounds_lonlat")
         _check_lonlat(self.lonlat_box())
         if self.size_m is not None and not all(math.isfinite(side) and side > 0 for side in self.size_m):
-            message = f"size_m must be two positive lengths, got {list(self.size_m)!r}"
-            raise ValueError(message)
+            raise ValueError(f"size_m must be two positive lengths, got {list(self.size_m)!r}")
         _check_size(*self._size_estimate_m(), self.cell_size_m)
         self._check_antimeridian()
         return self
@@ -168,19 +162,17 @@ class RegionFile(NamedDocument):
             return  # said when the region is built
         grid_west, _, grid_east, _ = to_lonlat(grid.epsg).transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
         if grid_west > grid_east:
-            message = (
+            raise ValueError(
                 f"the region around {[west, south]!r} reaches over the antimeridian, from {grid_west:.4f} to "
                 f"{grid_east:.4f} degrees: a box over the antimeridian must be split in two"
             )
-            raise ValueError(message)
 
     @model_validator(mode="after")
     def _dates_differ(self) -> Self:
         dates = [item.date for item in self.extract]
         twice = sorted({date.isoformat() for date in dates if dates.count(date) > 1})
         if twice:
-            message = f"two extracts have the date {twice[0]}: keep one of them"
-            raise ValueError(message)
+            raise ValueError(f"two extracts have the date {twice[0]}: keep one of them")
         return self
 
     @property
@@ -225,8 +217,9 @@ class RegionFile(NamedDocument):
             bounds_m = to_grid.transform_bounds(west, south, east, north, densify_pts=_EDGE_POINTS, errcheck=True)
             return Grid.from_bounds(*bounds_m, cell_size_m=self.cell_size_m, epsg=epsg)
         except (pyproj.exceptions.ProjError, GridError) as error:
-            message = f"{self.id}: the place cannot be projected to EPSG:{epsg} ({error}): leave epsg out, or fix it"
-            raise ConfigError(message) from error
+            raise ConfigError(
+                f"{self.id}: the place cannot be projected to EPSG:{epsg} ({error}): leave epsg out, or fix it"
+            ) from error
 
     def pick(self, date: dt.date | None) -> Extract:
         """Return the extract of a date, or the newest; raise `ConfigError`, which lists the dates, if there is none."""
@@ -236,16 +229,14 @@ class RegionFile(NamedDocument):
         found = next((item for item in self.extract if item.date == date), None)
         if found is None:
             known = ", ".join(sorted(item.date.isoformat() for item in self.extract))
-            message = f"{self.id} has no extract of {date.isoformat()}; there are {known}"
-            raise ConfigError(message)
+            raise ConfigError(f"{self.id} has no extract of {date.isoformat()}; there are {known}")
         return found
 
 
 def _checked_ring(ring: list[Corner], key: str) -> list[Corner]:
     least = 3
     if len(set(ring)) < least:
-        message = f"{key} needs at least {least} different corners [lon, lat], got {len(set(ring))}"
-        raise ValueError(message)
+        raise ValueError(f"{key} needs at least {least} different corners [lon, lat], got {len(set(ring))}")
     return ring
 
 
@@ -253,36 +244,30 @@ def _check_lonlat(box: tuple[float, float, float, float]) -> None:
     west, south, east, north = box
     written = list(box)
     if not all(math.isfinite(value) for value in box) or max(abs(west), abs(east)) > MAX_LONGITUDE_DEG:
-        message = f"longitudes lie within -180..180 and latitudes within -90..90, got {written!r}"
-        raise ValueError(message)
+        raise ValueError(f"longitudes lie within -180..180 and latitudes within -90..90, got {written!r}")
     if max(abs(south), abs(north)) > MAX_LATITUDE_DEG:
-        message = (
+        raise ValueError(
             f"UTM ends at {MAX_LATITUDE_DEG:g} degrees of latitude, got {written!r}: choose a place nearer the equator"
         )
-        raise ValueError(message)
     if west > east:
-        message = (
+        raise ValueError(
             f"bounds_lonlat is [west, south, east, north], got west {west} > east {east}: swap them; "
             "a box over the antimeridian must be split in two"
         )
-        raise ValueError(message)
     if south > north:
-        message = f"bounds_lonlat is [west, south, east, north], got south {south} > north {north}: swap them"
-        raise ValueError(message)
+        raise ValueError(f"bounds_lonlat is [west, south, east, north], got south {south} > north {north}: swap them")
 
 
 def _check_size(width_m: float, height_m: float, cell_size_m: float) -> None:
     """Refuse a region that is empty or too large, before anything is allocated."""
     if width_m <= 0 or height_m <= 0:
-        message = f"the region is {width_m:.0f} m by {height_m:.0f} m: give it a positive size"
-        raise ValueError(message)
+        raise ValueError(f"the region is {width_m:.0f} m by {height_m:.0f} m: give it a positive size")
     area_km2, cells = width_m * height_m / 1e6, width_m * height_m / cell_size_m**2
     if area_km2 > MAX_AREA_KM2 or cells > MAX_CELLS:
-        message = (
+        raise ValueError(
             f"the region has {area_km2:,.0f} km2 or {cells:,.0f} cells a class, {cells / 1e9:,.1f} GB each; "
             f"the most is {MAX_AREA_KM2:,.0f} km2 and {MAX_CELLS:,.0f} cells: make it smaller or its cells larger"
         )
-        raise ValueError(message)
 
 
 def read_region_file(path: Path) -> RegionFile:

@@ -274,8 +274,9 @@ class _Map:
             writer.begin()
             for query, blob, asked in task_files.read_some(writer.part.task, frozenset(writer.part.left)):
                 if writer.part.asked[query.query_id] != asked_under(asked, writer.part.key):
-                    message = f"{writer.part.task} was made anew while it was asked: run again, answers are kept"
-                    raise StoreError(message)
+                    raise StoreError(
+                        f"{writer.part.task} was made anew while it was asked: run again, answers are kept"
+                    )
                 yield writer, query, blob
 
     def ask(self, schedule: Schedule[Question], number: int) -> None:
@@ -364,8 +365,7 @@ class _Map:
         """Refuse a map that was replaced meanwhile, or is damaged: the matcher is not at fault."""
         part = self._writers[0].part
         if not task_files.is_of_map(part.about, read_manifest(part.region)):
-            message = f"{part.region} was built anew while it was searched: run again, answers are kept"
-            raise StoreError(message)
+            raise StoreError(f"{part.region} was built anew while it was searched: run again, answers are kept")
         if ready.status != "ok":
             check_files(part.region)
 

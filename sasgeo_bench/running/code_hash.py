@@ -118,8 +118,9 @@ def _file_code(path: Path) -> _Code:
         about = path.stat()
         return _read(path, about.st_size, about.st_mtime_ns)
     except OSError as error:
-        message = f"{path}, which is code of a plugin, cannot be read ({error.strerror}): check your rights"
-        raise MatchError(message) from error
+        raise MatchError(
+            f"{path}, which is code of a plugin, cannot be read ({error.strerror}): check your rights"
+        ) from error
 
 
 @lru_cache(maxsize=4096)
@@ -209,11 +210,11 @@ def _own_files(spec: str, module: str, name: str, paths: Sequence[str]) -> dict[
         if home is not None:
             found |= _named(home.name, home.path) | _beside(home, paths)
     if not found:
-        message = f"{spec}: no file of {module} can be found: rows are kept by its code, so it must lie on the disk"
-        raise MatchError(message)
+        raise MatchError(
+            f"{spec}: no file of {module} can be found: rows are kept by its code, so it must lie on the disk"
+        )
     if len(found) > MOST_FILES:
-        message = f"{spec}: the package of {module} holds {counted(len(found), 'file')}, {MOST_FILES} at most"
-        raise MatchError(message)
+        raise MatchError(f"{spec}: the package of {module} holds {counted(len(found), 'file')}, {MOST_FILES} at most")
     return found
 
 

@@ -38,8 +38,9 @@ def guard(ask: Callable[[], Item], failed: Callable[[Exception], Item]) -> Item:
         raise
     except Exception as error:
         if stops_all(error):
-            message = f"no process of a plugin can be started ({message_of(error)}): free some space and run again"
-            raise StoreError(message) from error
+            raise StoreError(
+                f"no process of a plugin can be started ({message_of(error)}): free some space and run again"
+            ) from error
         return failed(error)
 
 

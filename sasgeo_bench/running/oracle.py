@@ -53,8 +53,7 @@ class Oracle:
         """Read the truths; raise `StoreError` if they are missing."""
         del region, learned
         if not (self._folder / task_files.TRUTH).is_file():
-            message = f"{self._folder} holds no truths, and {ORACLE} answers with them: run it where they are"
-            raise StoreError(message)
+            raise StoreError(f"{self._folder} holds no truths, and {ORACLE} answers with them: run it where they are")
         start = time.perf_counter()
         self._truths = {truth.query_id: truth for truth in task_files.read_truths(self._folder)}
         seconds = time.perf_counter() - start
@@ -67,8 +66,7 @@ class Oracle:
         asked = task_rows.query_from(query)
         truth = self._truths.get(asked.query_id)
         if truth is None:
-            message = f"{self._folder} holds no truth of query {asked.query_id}: make the queries again"
-            raise StoreError(message)
+            raise StoreError(f"{self._folder} holds no truth of query {asked.query_id}: make the queries again")
         found = right_answer(asked, truth)
         reply = Reply(status="ok", seconds=time.perf_counter() - start, match=found)
         return reply if asked.step is None else replace(reply, is_accepted=truth.is_present, covariance=_SURE)

@@ -43,8 +43,7 @@ def right_segmentation(labelled: LabelledImage) -> Segmentation:
 def oracle_reply(image: AerialImage | LabelledImage) -> SegmenterReply:
     """Return the reply of the control; raise `MatchError` if an image has no labels."""
     if not isinstance(image, LabelledImage):
-        message = f"{ORACLE_SEGMENTER} answers with labels, and this image has none: name images with labels"
-        raise MatchError(message)
+        raise MatchError(f"{ORACLE_SEGMENTER} answers with labels, and this image has none: name images with labels")
     start = time.perf_counter()
     found = right_segmentation(image)
     seconds = time.perf_counter() - start

@@ -239,11 +239,10 @@ def _check_seen(abouts: Mapping[Path, Mapping[str, Any]], card: MatcherCard) -> 
     """Refuse tasks of pictures that nothing has made evidence of, unless the matcher looks at pictures itself."""
     unseen = next((task for task, about in abouts.items() if about.get("frames") and not about.get("segmenter")), None)
     if unseen is not None and "image" not in card.needs:
-        message = (
+        raise StoreError(
             f"{unseen} holds pictures and no evidence, and {card.name!r} reads evidence: run sasgeo-bench segment "
             f"--task {unseen} first"
         )
-        raise StoreError(message)
 
 
 def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
@@ -275,42 +274,34 @@ def _check(request: RunRequest) -> None:
     """Refuse numbers out of range."""
     index, count = request.shard
     if not 1 <= index <= count:
-        message = f"--shard must be i/n with 1 <= i <= n, got {index}/{count}"
-        raise ConfigError(message)
+        raise ConfigError(f"--shard must be i/n with 1 <= i <= n, got {index}/{count}")
     limits = request.limits
     check_jobs(request.jobs)
     numbers = (("--top-k", request.top_k), ("--limit", request.limit))
     for name, value in numbers:
         if value is not None and value < 1:
-            message = f"{name} must be at least 1, got {value}"
-            raise ConfigError(message)
+            raise ConfigError(f"{name} must be at least 1, got {value}")
     if not 1 <= request.most_trained <= MOST_TRAINED:
-        message = f"--most-trained must lie between 1 and {MOST_TRAINED}, got {request.most_trained}"
-        raise ConfigError(message)
+        raise ConfigError(f"--most-trained must lie between 1 and {MOST_TRAINED}, got {request.most_trained}")
     times = (("--match-s", limits.match_s), ("--prepare-s", limits.prepare_s), ("--learn-s", limits.learn_s))
     for name, seconds in times:
         if not 0 < seconds <= _MOST_S:
-            message = f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}"
-            raise ConfigError(message)
+            raise ConfigError(f"{name} must be seconds between 0 and {_MOST_S:.0f}, got {seconds:g}")
     _check_sizes(limits)
     if request.top_k > MOST_CANDIDATES:
-        message = f"--top-k must be at most {MOST_CANDIDATES}, the bound of an answer, got {request.top_k}"
-        raise ConfigError(message)
+        raise ConfigError(f"--top-k must be at most {MOST_CANDIDATES}, the bound of an answer, got {request.top_k}")
     strange = next((status for status in request.again if status not in STATUSES), None)
     if strange is not None:
-        message = f"--again must be one of {', '.join(STATUSES)}, got {strange!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"--again must be one of {', '.join(STATUSES)}, got {strange!r}")
     if request.dask is not None and request.jobs != 1:
-        message = "--jobs and --dask both set the number of processes: leave one of them out"
-        raise ConfigError(message)
+        raise ConfigError("--jobs and --dask both set the number of processes: leave one of them out")
 
 
 def _check_sizes(limits: Limits) -> None:
     sizes = (("--memory-mb", limits.memory_bytes, _LEAST_MB), ("--scratch-mb", limits.scratch_bytes, 1))
     for name, size_bytes, least_mb in sizes:
         if not least_mb <= size_bytes // _BYTES_PER_MB <= _MOST_MB:
-            message = f"{name} must lie between {least_mb} and {_MOST_MB}, got {size_bytes // _BYTES_PER_MB}"
-            raise ConfigError(message)
+            raise ConfigError(f"{name} must lie between {least_mb} and {_MOST_MB}, got {size_bytes // _BYTES_PER_MB}")
 
 
 def _card(request: RunRequest) -> tuple[MatcherCard, str, bool]:
@@ -362,12 +353,12 @@ def _part(
     folder = _run_folder(request, card, found) / about["suite"] / about["region"]
     before = prediction_files.read_run(folder)
     if before is not None and before.get("hash") != found:
-        message = f"{folder} holds answers of {before.get('hash')}, not of {found}: move it away"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds answers of {before.get('hash')}, not of {found}: move it away")
     task_files.check_queries(task)
     if task_files.PRIVATE in about and request.out.resolve() != root_of(task):
-        message = f"{task} is of a private seed, whose answers stay with it: say --out {task.parent.parent.parent}"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{task} is of a private seed, whose answers stay with it: say --out {task.parent.parent.parent}"
+        )
     region = map_of(task, about)
     imagery = _rendered_imagery(card, region)
     follower = follower_record(card) if _is_of_flights(about) else None
@@ -377,11 +368,10 @@ def _part(
     ties = prediction_files.read_ties(folder, since_ns=request.since_ns) if folder.is_dir() else []
     is_same_task = (before or {}).get("queries_sha256") == about["files"][task_files.QUERIES]["sha256"]
     if not (is_same_task or all(tie.asked for tie in ties)):  # rows of older versions lack the hash of their query
-        message = (
+        raise StoreError(
             f"{folder} holds answers of an older version, and not to the queries that {task} holds now: "
             "move it away and run again"
         )
-        raise StoreError(message)
     index, count = request.shard
     unit_of = unit_of_task(about)
     other = (

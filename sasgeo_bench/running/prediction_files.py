@@ -92,8 +92,7 @@ def open_round(run: Path) -> int:
     content = read_json(path, mend=_MEND_ROUND)
     since_ns = content.get("since_ns") if isinstance(content, dict) else None
     if not isinstance(since_ns, int):
-        message = f"{path} is damaged (since_ns is {since_ns!r}): {_MEND_ROUND}"
-        raise StoreError(message)
+        raise StoreError(f"{path} is damaged (since_ns is {since_ns!r}): {_MEND_ROUND}")
     return since_ns
 
 
@@ -207,8 +206,7 @@ def read_key(folder: Path) -> str | None:
     try:
         return key_of(read_run(folder) or {})
     except MatchError as error:
-        message = f"{folder / RUN} is damaged ({error}): {_MEND_RUN}"
-        raise StoreError(message) from error
+        raise StoreError(f"{folder / RUN} is damaged ({error}): {_MEND_RUN}") from error
 
 
 def key_of(about: Mapping[str, Any]) -> str | None:
@@ -221,13 +219,11 @@ def key_of(about: Mapping[str, Any]) -> str | None:
     """
     record, imagery = TrainingRecord.of(about), about.get("rendered_imagery")
     if imagery is not None and not isinstance(imagery, str):
-        message = f"rendered_imagery is {imagery!r}, expected a hash"
-        raise MatchError(message)
+        raise MatchError(f"rendered_imagery is {imagery!r}, expected a hash")
     follower = about.get("follower")
     follows = follower.get("hash") if isinstance(follower, dict) else None
     if follower is not None and not isinstance(follows, str):
-        message = f"follower is {one_line(repr(follower))}, expected settings with a hash"
-        raise MatchError(message)
+        raise MatchError(f"follower is {one_line(repr(follower))}, expected settings with a hash")
     return tie_key(None if record is None else record.key, imagery, follows)
 
 
@@ -253,8 +249,7 @@ def read_rows(path: Path) -> pa.Table:
 def _tables_of(path: Path) -> Iterator[pa.Table]:
     parts = parts_of(path)
     if not parts:
-        message = f"{path} holds no predictions: run a matcher first, or name a predictions file"
-        raise StoreError(message)
+        raise StoreError(f"{path} holds no predictions: run a matcher first, or name a predictions file")
     seen: set[str] = set()
     for part in reversed(parts):
         table = _checked(part, is_own=part != path)
@@ -266,12 +261,10 @@ def _checked(part: Path, *, is_own: bool) -> pa.Table:
     table = read_part(part, is_own=is_own)
     for name, found, expected in differing_columns(table):
         fault = f"{name}: found {found}, expected {expected}"[:200]
-        message = f"{part} holds no predictions ({fault}): 'validate' lists all that is missing"
-        raise StoreError(message)
+        raise StoreError(f"{part} holds no predictions ({fault}): 'validate' lists all that is missing")
     for wrong in row_faults(table):
         fault = one_line(f"{wrong.column}: found {wrong.found}, expected {wrong.expected}")
-        message = f"{part}, row {wrong.row}, is no prediction ({fault}): 'validate' says all that is wrong"
-        raise StoreError(message)
+        raise StoreError(f"{part}, row {wrong.row}, is no prediction ({fault}): 'validate' says all that is wrong")
     return table
 
 
@@ -287,8 +280,7 @@ def read_part(path: Path, *, is_own: bool) -> pa.Table:
     try:
         table.validate(full=True)  # offsets, and texts that are no UTF-8, which Arrow reads unchecked
     except pa.ArrowException as error:
-        message = f"{path} cannot be read ({one_line(str(error))}): {_MEND}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be read ({one_line(str(error))}): {_MEND}") from error
     return table
 
 
@@ -305,8 +297,7 @@ def check_lengths(path: Path, *, mend: str) -> None:
         far = far_fault(batch)
         if far is not None:
             fault = f"{far.column}: found {far.found}, expected {far.expected}"
-            message = f"{path}, row {before + far.row}, is no prediction ({fault}): {mend}"
-            raise StoreError(message)
+            raise StoreError(f"{path}, row {before + far.row}, is no prediction ({fault}): {mend}")
         before += len(batch)
 
 
@@ -333,8 +324,7 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
     if asked is None:
         _check_one_query(runs)
     if into.exists() and not _is_ours(into):
-        message = f"{into} is no predictions file and would be lost: name another one"
-        raise StoreError(message)
+        raise StoreError(f"{into} is no predictions file and would be lost: name another one")
     found: dict[str, Prediction] = {}
     for path in runs:
         for prediction in _to_merge(path, asked):
@@ -360,11 +350,10 @@ def check_one_matcher(runs: Sequence[Path]) -> None:
     for path, about in known[1:]:
         first, other = known[0]
         if about.get("hash") != other.get("hash"):
-            message = (
+            raise StoreError(
                 f"{path} holds answers of {_who(about)}, {first} those of {_who(other)}: "
                 "two matchers, versions or settings are never mixed, name the folder of one"
             )
-            raise StoreError(message)
 
 
 def _check_one_query(runs: Sequence[Path]) -> None:
@@ -373,11 +362,10 @@ def _check_one_query(runs: Sequence[Path]) -> None:
     for path in runs:
         for tie in read_ties(path) if path.is_dir() else []:
             if tie.asked and found.setdefault(tie.query_id, tie.asked) != tie.asked:
-                message = (
+                raise StoreError(
                     f"{path} holds answers to query {tie.query_id} and to an earlier version of it: "
                     "name the tasks with --tasks"
                 )
-                raise StoreError(message)
 
 
 def _who(about: Mapping[str, Any]) -> str:
@@ -405,8 +393,7 @@ def read_ties(folder: Path, *, since_ns: int = 0) -> list[Tie]:
             continue
         table = read_part(part, is_own=True)
         if differing_columns(table):
-            message = f"{part} holds no predictions: move it out of the run's folder"
-            raise StoreError(message)
+            raise StoreError(f"{part} holds no predictions: move it out of the run's folder")
         found += _ties_of(table)
     return found
 
@@ -447,8 +434,7 @@ def read_run(folder: Path) -> dict[str, Any] | None:
         return None
     content = read_json(path, mend=_MEND_RUN)
     if not isinstance(content, dict):
-        message = f"{path} is damaged (it holds {str(content)[:40]!r}): {_MEND_RUN}"
-        raise StoreError(message)
+        raise StoreError(f"{path} is damaged (it holds {str(content)[:40]!r}): {_MEND_RUN}")
     mark = folder / PACKED
     if mark.exists():
         content["packed"] = True

@@ -176,8 +176,7 @@ def profile(
         plan = trained(plan, tell=tell)
         result = plan.training_result
         if result is not None and result.text is None:
-            message = f"{plan.card.name} learned nothing: {result.status}: {result.message}"
-            raise MatchError(message)
+            raise MatchError(f"{plan.card.name} learned nothing: {result.status}: {result.message}")
         asked, count = _asked(plan, request, is_pictured=manifest.imagery is not None)
         queries = counted(len(asked), "query", "queries") + (f", the first of {count}," if count > len(asked) else "")
         tell(f"{plan.card.name}: {queries} on {region.name}, again and again for {request.sustain_s:g} s")
@@ -188,8 +187,7 @@ def profile(
             start_s = time.perf_counter() - begun
             ready = worker.prepare(region, None if result is None else result.text)
             if ready.status != "ok":
-                message = f"{plan.card.name} cannot prepare {region.name}: {ready.status}: {ready.message}"
-                raise MatchError(message)
+                raise MatchError(f"{plan.card.name} cannot prepare {region.name}: {ready.status}: {ready.message}")
             first = worker.match(asked[0], top_k=request.top_k)
             meter = EnergyMeter()
             fixes, readings = _sustained(worker, asked, request, meter=meter, progress=progress)
@@ -219,14 +217,11 @@ def profile(
 def plan_profile(request: ProfileRequest) -> RunPlan:
     """Plan to ask everything, in a folder that nothing is written to; raise as `profile` does."""
     if request.spec == ORACLE:
-        message = f"{ORACLE} has no process that could be measured: name another matcher"
-        raise ConfigError(message)
+        raise ConfigError(f"{ORACLE} has no process that could be measured: name another matcher")
     if not 0 < request.sustain_s < math.inf:
-        message = f"the time must be positive seconds, got {request.sustain_s!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"the time must be positive seconds, got {request.sustain_s!r}")
     if request.radius_m is not None and not request.radius_m > 0:
-        message = f"the radius must be positive metres, got {request.radius_m!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"the radius must be positive metres, got {request.radius_m!r}")
     limits = Limits(memory_bytes=request.memory_bytes)
     plan = plan_run(
         RunRequest(
@@ -241,8 +236,7 @@ def plan_profile(request: ProfileRequest) -> RunPlan:
     )
     maps = dict.fromkeys(part.region.name for part in plan.parts)
     if len(maps) != 1:
-        message = f"the tasks are of {len(maps)} maps ({', '.join(maps)}): profile one map at a time"
-        raise ConfigError(message)
+        raise ConfigError(f"the tasks are of {len(maps)} maps ({', '.join(maps)}): profile one map at a time")
     return plan
 
 
@@ -260,8 +254,9 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tupl
             reasons[reason or ""] += 1
     if not found:
         why = " and ".join(f"{reason} ({count})" for reason, count in reasons.most_common())
-        message = f"{plan.card.name} can be asked none of the {counted(reasons.total(), 'query', 'queries')}: {why}"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{plan.card.name} can be asked none of the {counted(reasons.total(), 'query', 'queries')}: {why}"
+        )
     return found, reasons[""]
 
 
@@ -277,8 +272,7 @@ def _pinned(cores: int) -> Iterator[list[int]]:
     """Keep this thread, and the processes that it starts, on some processors."""
     before = sorted(os.sched_getaffinity(0))
     if not 0 < cores <= len(before):
-        message = f"this computer gives us {counted(len(before), 'core')}, not {cores}"
-        raise ConfigError(message)
+        raise ConfigError(f"this computer gives us {counted(len(before), 'core')}, not {cores}")
     os.sched_setaffinity(0, before[:cores])
     try:
         yield before[:cores]
@@ -319,8 +313,7 @@ def _sustained(
         )
         if len(fixes) == LEAST_FIXES and not any(fix.status == "ok" for fix in fixes):
             why = f"{reply.status}: {reply.message}" if reply.message else reply.status
-            message = f"{request.spec}: none of the first {LEAST_FIXES} fixes is an answer ({why})"
-            raise MatchError(message)
+            raise MatchError(f"{request.spec}: none of the first {LEAST_FIXES} fixes is an answer ({why})")
         if progress is not None:
             done = min(round(since_s + taken_s), round(request.sustain_s))
             progress.advance(label, done - told)

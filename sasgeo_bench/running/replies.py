@@ -63,8 +63,7 @@ class Reply(PluginReply):
 
 def _line(text: str) -> str:
     if not is_line(text, MOST_SAID):
-        message = f"must be one line of at most {MOST_SAID} printable characters"
-        raise ValueError(message)
+        raise ValueError(f"must be one line of at most {MOST_SAID} printable characters")
     return text
 
 
@@ -97,8 +96,7 @@ Seconds = Annotated[float, Field(ge=0, le=MOST_S)]
 
 def _once(pairs: list[tuple[str, float]]) -> list[tuple[str, float]]:
     if len(dict(pairs)) != len(pairs):
-        message = "a name is there twice"
-        raise ValueError(message)
+        raise ValueError("a name is there twice")
     return pairs
 
 
@@ -226,8 +224,7 @@ def read_answer(model: type[Model], given: Mapping[str, Any], *, nonce: str) -> 
     """
     content = dict(given)
     if content.pop("nonce", None) != nonce:
-        message = "it was not made for this question"
-        raise MatchError(message)
+        raise MatchError("it was not made for this question")
     return Failed.model_validate(content) if content.get("status") != "ok" else model.model_validate(content)
 
 
@@ -239,5 +236,4 @@ def in_one_line() -> Iterator[None]:
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"]))[:_SHOWN]
-        message = one_line(f"{where}: {first['msg']}" if where else first["msg"])
-        raise MatchError(message) from error
+        raise MatchError(one_line(f"{where}: {first['msg']}" if where else first["msg"])) from error

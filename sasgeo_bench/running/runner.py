@@ -233,8 +233,7 @@ def _begin(plan: RunPlan, part: RunPart) -> Cost:
     wrong = next((name for name in _COSTS if not isinstance(recorded.get(name), int | float | None)), None)
     if wrong is not None:
         path = part.folder / prediction_files.RUN
-        message = f"{path} is damaged ({wrong} is no number): remove it and run again, its parts are kept"
-        raise StoreError(message)
+        raise StoreError(f"{path} is damaged ({wrong} is no number): remove it and run again, its parts are kept")
     before = Cost(
         prepare_s=recorded.get("prepare_s"),
         index_bytes=recorded.get("index_bytes"),

@@ -89,8 +89,7 @@ class _Walls:
 def enter(policy: Policy) -> Isolation:
     """Isolate the process; return in a child, in its own process namespace where the system allows one."""
     if os.path.realpath(policy.scratch) != policy.scratch:  # mounts are known by their resolved paths
-        message = f"{policy.scratch} leads elsewhere, expected a resolved folder"
-        raise OSError(message)
+        raise OSError(f"{policy.scratch} leads elsewhere, expected a resolved folder")
     hidden = outermost(policy.hidden)
     spaces = _enter_namespaces()
     is_apart = bool(spaces & CLONE_NEWPID)

@@ -168,11 +168,9 @@ def _pictured(folder: Path) -> dict[str, Any]:
     """Read a task's description; refuse a task without pictures, or with evidence already."""
     about = task_files.read_task(folder)
     if not about.get("frames"):
-        message = f"{folder} holds no pictures: draw a suite that has some, as in make-queries --suite aerial"
-        raise ConfigError(message)
+        raise ConfigError(f"{folder} holds no pictures: draw a suite that has some, as in make-queries --suite aerial")
     if about.get("segmenter"):
-        message = f"{folder} has its evidence from a segmenter: name the task of the pictures, without '+'"
-        raise ConfigError(message)
+        raise ConfigError(f"{folder} has its evidence from a segmenter: name the task of the pictures, without '+'")
     return about
 
 
@@ -182,8 +180,9 @@ def _groups(wanted: SegmentTasks, abouts: Mapping[Path, Mapping[str, Any]]) -> l
     group = {task: _group_of(_region(about), split) for task, about in abouts.items()}
     strange = next((task for task, name in group.items() if name is None), None)
     if strange is not None:
-        message = f"{strange}: split {split.spec.id!r} does not hold its region: name one that does with --split"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{strange}: split {split.spec.id!r} does not hold its region: name one that does with --split"
+        )
     names: tuple[str, ...] = HALVES if split.half_of else ("held out", _TRAIN)
     found = []
     for name in names:
@@ -211,11 +210,10 @@ def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell:
     """Return what a segmenter learned for a group, out of its file or by training; None with nothing to learn from."""
     if not group.train:
         if "training" in loaded.card.needs:
-            message = (
+            raise ConfigError(
                 f"{loaded.card.name} needs training, and all tasks are of one half or part of split "
                 f"{wanted.split.spec.id!r}: name tasks of the other one, too"
             )
-            raise ConfigError(message)
         return None
     chosen = plan_training(
         group.train, asked=group.asked, split=wanted.split, most=wanted.most, lessons=Lessons(detector=RENDERED)
@@ -228,8 +226,9 @@ def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell:
         return _kept_text(kept)
     result = train_segmenter(wanted.request, _lessons_of(chosen))
     if result.text is None:
-        message = f"{loaded.card.name} could not learn from {chosen.to_text()}: {result.message} ({result.status})"
-        raise StoreError(message)
+        raise StoreError(
+            f"{loaded.card.name} could not learn from {chosen.to_text()}: {result.message} ({result.status})"
+        )
     path = folder / f"{chosen.sha256}-{_digest(result.text)}.txt"
     write_learned(path, result.text)
     tell(f"{loaded.card.name}: trained on the pictures of {chosen.to_text()}, {path}")
@@ -247,8 +246,7 @@ def _kept_text(path: Path) -> str:
     except (OSError, UnicodeDecodeError):
         text = ""
     if path.stem.rpartition("-")[2] != _digest(text):
-        message = f"{path} is damaged: remove this file and segment again, which learns anew"
-        raise StoreError(message)
+        raise StoreError(f"{path} is damaged: remove this file and segment again, which learns anew")
     return check_text(text)
 
 
@@ -352,8 +350,7 @@ def _next_labels(rows: Iterator[tuple[str, int, FrameLabels]], query_id: str, nu
     """Return the labels of a frame, which are the next ones of the file; raise `StoreError` if they are not."""
     found = next(rows, None)
     if found is None or found[:2] != (query_id, number):
-        message = f"the labels of query {query_id} are missing or out of order: make the queries again"
-        raise StoreError(message)
+        raise StoreError(f"the labels of query {query_id} are missing or out of order: make the queries again")
     return found[2]
 
 

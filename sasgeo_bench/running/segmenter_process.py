@@ -70,8 +70,7 @@ class _Trained(Strictly):
         try:
             text = data.decode()
         except UnicodeDecodeError as error:
-            message = "the learned text is no UTF-8"
-            raise MatchError(message) from error
+            raise MatchError("the learned text is no UTF-8") from error
         return SegmenterReply(status="ok", own_s=self.seconds, learned=check_text(text))
 
 
@@ -126,8 +125,7 @@ class SegmenterProcess(PluginProcess[SegmenterReply]):
     def _segmented(self, found: _Segmented, data: bytes) -> SegmenterReply:
         """Return the reply with the segmentation that the bytes are, of the image that was asked about."""
         if self._asked is None:
-            message = "nobody asked about an image"
-            raise MatchError(message)
+            raise MatchError("nobody asked about an image")
         image, classes = self._asked
         try:
             segmentation = Segmentation.from_bytes(data, shape=image.shape)

@@ -115,8 +115,9 @@ def plan_training(
     pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split, chosen_by)]
     if not pairs:
         first = next(iter(tasks.values()))
-        message = f"{first}, to learn from, holds no queries {chosen_by.to_text()}: there is nothing to learn from"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{first}, to learn from, holds no queries {chosen_by.to_text()}: there is nothing to learn from"
+        )
     chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
     order = sorted({pair.task for pair in chosen}, key=lambda task: (abouts[task]["region"], abouts[task]["suite"]))
     ids = {folder: tuple(sorted(pair.query_id for pair in chosen if pair.task == folder)) for folder in order}
@@ -143,31 +144,29 @@ def check_apart(train: Mapping[str, Path], asked: Mapping[str, Path], split: Spl
     both = next((name for name in train if name in asked), None)
     if both is not None:
         folders = f"{train[both]}, to learn from, is of region {both!r}, and so is {asked[both]}"
-        message = f"{folders}, which is asked: leave one out"
-        raise ConfigError(message)
+        raise ConfigError(f"{folders}, which is asked: leave one out")
     if split is None:
         return
     sealed = next((name for name in train if split.sealed_place(name)), None)
     if sealed is not None:
         place = split.sealed_place(sealed)
-        message = f"{train[sealed]}, to learn from, is of the sealed place {place!r}, which never trains: leave it out"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{train[sealed]}, to learn from, is of the sealed place {place!r}, which never trains: leave it out"
+        )
     places = {place: name for name in train for place in split.places_in(name)}
     shared = next(((place, name) for name in asked for place in split.places_in(name) if place in places), None)
     if shared is not None:
         place, name = shared
         folders = f"{train[places[place]]}, to learn from, is of place {place!r}, and so is {asked[name]}"
-        message = f"{folders}, which is asked: leave one out"
-        raise ConfigError(message)
+        raise ConfigError(f"{folders}, which is asked: leave one out")
     parts = {part: _blocks_of(names, split) for part, names in (("train", train), ("asked", asked))}
     least_m = split.spec.buffer_m + 2 * split.spec.reach_m
     near = nearest_blocks(parts, within_m=least_m)
     if near is not None and near.gap_m < least_m:
-        message = (
+        raise ConfigError(
             f"blocks {near.first} and {near.second}, one for training and one that is asked, are "
             f"{near.gap_m:.0f} m apart, split {split.spec.id!r} needs {least_m:.0f} m: leave one of the regions out"
         )
-        raise ConfigError(message)
 
 
 def _blocks_of(regions: Mapping[str, Path], split: Split) -> list[Block]:
@@ -188,8 +187,7 @@ def map_of(task: Path, about: Mapping[str, Any]) -> Path:
     """Return the map of a task; refuse one that was built anew since."""
     region: Path = root_of(task) / "regions" / str(about["region"])
     if not task_files.is_of_map(about, read_manifest(region)):
-        message = f"{region} was built anew since the queries of {task} were made: make them again"
-        raise StoreError(message)
+        raise StoreError(f"{region} was built anew since the queries of {task} were made: make them again")
     return region
 
 
@@ -198,18 +196,18 @@ def _check_names(maps: Mapping[Path, Path]) -> None:
     seen: dict[str, Path] = {}
     for task, region in maps.items():
         if seen.setdefault(region.name, region) != region:
-            message = (
+            raise ConfigError(
                 f"{task}, to learn from, lies on {region}, another task on {seen[region.name]}: leave one of them out"
             )
-            raise ConfigError(message)
 
 
 def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None, lessons: Lessons) -> Iterator[_Pair]:
     """Yield every query of a task that may be learned from, with what decides whether it is used."""
     truth = truth_of(task, about)
     if not (truth / task_files.TRUTH).is_file():
-        message = f"{truth} holds no truths of {task}, which training needs: make the queries here, or leave it out"
-        raise StoreError(message)
+        raise StoreError(
+            f"{truth} holds no truths of {task}, which training needs: make the queries here, or leave it out"
+        )
     task_files.check_queries(task)
     task_files.check_truths(task, truth)
     asked, place_of = task_files.read_asked(task), {} if split is None else split.place_of
@@ -255,6 +253,7 @@ def read_pairs(training_set: TrainingSet) -> list[tuple[bytes, Truth]]:
                 found.append((blob, truths[query.query_id]))
                 hashes.append((asked, truth_sha256(truths[query.query_id])))
     if _hash_of(hashes) != training_set.sha256:
-        message = f"{training_set.taken[0].task} or another task to learn from was made anew meanwhile: run again"
-        raise StoreError(message)
+        raise StoreError(
+            f"{training_set.taken[0].task} or another task to learn from was made anew meanwhile: run again"
+        )
     return found

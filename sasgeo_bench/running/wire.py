@@ -69,18 +69,15 @@ def receive(
     """
     text_bytes, blob_bytes = _HEAD.unpack(_exactly(channel, _HEAD.size, deadline))
     if most_bytes is not None and text_bytes + blob_bytes > most_bytes:
-        message = f"an answer of {text_bytes + blob_bytes} bytes, at most {most_bytes} are read"
-        raise TooLong(message)
+        raise TooLong(f"an answer of {text_bytes + blob_bytes} bytes, at most {most_bytes} are read")
     text = _exactly(channel, text_bytes, deadline)
     blob = _exactly(channel, blob_bytes, deadline)
     try:
         found = json.loads(text, object_pairs_hook=_once, parse_constant=_refused)
     except (ValueError, RecursionError) as error:
-        message = f"no JSON ({error})"
-        raise Garbled(message) from error
+        raise Garbled(f"no JSON ({error})") from error
     if not isinstance(found, dict):
-        message = "no JSON object"
-        raise Garbled(message)
+        raise Garbled("no JSON object")
     return found, blob
 
 
@@ -88,15 +85,13 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """Return an object without repeated names: two readers might take different values."""
     found = dict(pairs)
     if len(found) != len(pairs):
-        message = "a name is there twice"
-        raise ValueError(message)
+        raise ValueError("a name is there twice")
     return found
 
 
 def _refused(name: str) -> float:
     """Refuse NaN and Infinity, which Python reads and JSON does not have."""
-    message = f"{name} is no number"
-    raise ValueError(message)
+    raise ValueError(f"{name} is no number")
 
 
 def _exactly(channel: socket.socket, count: int, deadline: float | None) -> bytes:
@@ -111,8 +106,7 @@ def _exactly(channel: socket.socket, count: int, deadline: float | None) -> byte
         except OSError as error:
             raise Closed(str(error)) from error
         if not part:
-            message = "closed its connection to the runner without an answer"
-            raise Closed(message)
+            raise Closed("closed its connection to the runner without an answer")
         parts.append(part)
         count -= len(part)
     return b"".join(parts)

@@ -200,8 +200,9 @@ class PluginProcess(ABC, Generic[AnyReply]):
         try:
             return wire.receive(channel, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)[0]
         except wire.Late:
-            message = f"the sandbox did not stand within {_START_S:g} s: is a folder of sys.path very large?"
-            raise wire.Late(message) from None
+            raise wire.Late(
+                f"the sandbox did not stand within {_START_S:g} s: is a folder of sys.path very large?"
+            ) from None
 
     def _begin_watch(self, process: subprocess.Popen[bytes], scratch: Path) -> None:
         """Put the process into a control group if possible, and measure its memory in any case."""

@@ -163,8 +163,7 @@ GAINS: Final = ("agree", "extra", "missed", "quiet")
 def check_age(age_years: float) -> float:
     """Return the age of a map, or raise ConfigError if it is negative or not finite."""
     if not (math.isfinite(age_years) and age_years >= 0):
-        message = f"the age of a map is at least 0 years and finite, got {age_years!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"the age of a map is at least 0 years and finite, got {age_years!r}")
     return age_years
 
 
@@ -173,8 +172,7 @@ def check_season(season: str) -> str:
     if season and season not in SEASONS:
         near = difflib.get_close_matches(season, SEASONS, n=1)
         hint = f", did you mean {near[0]!r}?" if near else ""
-        message = f"there is no season {season!r}{hint} ({', '.join(SEASONS)})"
-        raise ConfigError(message)
+        raise ConfigError(f"there is no season {season!r}{hint} ({', '.join(SEASONS)})")
     return season
 
 
@@ -188,12 +186,10 @@ def check_classes(model: ScorerModel, classes: Sequence[str] = ()) -> ScorerMode
     """
     strange = [name for name in (*model.classes, *classes) if name not in load_taxonomy().names]
     if strange:
-        message = f"this version has no class {strange[0]!r}: use one taxonomy for map, learning and program"
-        raise ConfigError(message)
+        raise ConfigError(f"this version has no class {strange[0]!r}: use one taxonomy for map, learning and program")
     lacking = [name for name in classes if name not in model.classes]
     if lacking:
-        message = f"the model lacks the map's class {lacking[0]!r}: train it on maps that have it"
-        raise ConfigError(message)
+        raise ConfigError(f"the model lacks the map's class {lacking[0]!r}: train it on maps that have it")
     return model.of_classes(classes) if classes else model
 
 

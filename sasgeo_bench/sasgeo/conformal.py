@@ -43,8 +43,9 @@ def upper_rate(failures: float, trials: float, *, confidence: float = 0.95) -> f
     (0.01, 1.0)
     """
     if not (0 <= failures <= trials < math.inf and 0 < confidence < 1):
-        message = f"0 <= failures <= trials and 0 < confidence < 1, got {failures!r}, {trials!r} and {confidence!r}"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"0 <= failures <= trials and 0 < confidence < 1, got {failures!r}, {trials!r} and {confidence!r}"
+        )
     return 1.0 if failures == trials else float(scipy.stats.beta.ppf(confidence, failures + 1.0, trials - failures))
 
 
@@ -135,14 +136,13 @@ def _checked(
     chance, false = np.asarray(p_false, dtype=np.float64), np.asarray(is_false, dtype=np.float64)
     if chance.ndim != 1 or false.shape != chance.shape or (blocks is not None and len(blocks) != len(chance)):
         given = "none" if blocks is None else len(blocks)
-        message = f"p_false has shape {chance.shape}, is_false {false.shape}, blocks {given}: one of each for an answer"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"p_false has shape {chance.shape}, is_false {false.shape}, blocks {given}: one of each for an answer"
+        )
     if not ((chance >= 0) & (chance <= 1)).all():
-        message = "p_false holds numbers that are no probabilities: give 1 where there is none"
-        raise ConfigError(message)
+        raise ConfigError("p_false holds numbers that are no probabilities: give 1 where there is none")
     if not (0 < alpha < 1 and 0 < delta < 1):
-        message = f"alpha and delta must lie in (0, 1), got {alpha!r} and {delta!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"alpha and delta must lie in (0, 1), got {alpha!r} and {delta!r}")
     return chance, false
 
 
@@ -210,8 +210,7 @@ def sigmas(risk: float) -> float:
         If the risk is not within (0, 1).
     """
     if not 0 < risk < 1:
-        message = f"risk must lie in (0, 1), got {risk!r}"
-        raise ShapeError(message)
+        raise ShapeError(f"risk must lie in (0, 1), got {risk!r}")
     return math.sqrt(-2.0 * math.log(risk))
 
 

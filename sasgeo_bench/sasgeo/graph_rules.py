@@ -82,11 +82,9 @@ class GraphRules:
             if item.name in (*_OF_KINDS, "wander"):
                 fits &= values < 1
             if not fits.all():
-                message = f"{item.name} of the graph is out of range: {getattr(self, item.name)!r}"
-                raise ConfigError(message)
+                raise ConfigError(f"{item.name} of the graph is out of range: {getattr(self, item.name)!r}")
         if (len(self.degrees), len(self.hit), len(self.extra)) != (DEGREES, len(NODE_KINDS), len(NODE_KINDS)):
-            message = f"the graph has {DEGREES} ratios of degrees and {len(NODE_KINDS)} kinds of nodes"
-            raise ConfigError(message)
+            raise ConfigError(f"the graph has {DEGREES} ratios of degrees and {len(NODE_KINDS)} kinds of nodes")
 
     def to_stored(self) -> dict[str, Any]:
         """Return the numbers for JSON, those of kinds by name."""

@@ -123,19 +123,16 @@ class Modes:
         count = len(self.positions_m)
         shapes = (np.shape(self.positions_m), np.shape(self.by_class)[:1])
         if not count or shapes != ((count, 2), (count,)) or np.ndim(self.by_class) != 2:  # noqa: PLR2004 - (M, C)
-            message = (
+            raise ShapeError(
                 f"positions_m has shape {np.shape(self.positions_m)} and by_class {np.shape(self.by_class)}, expected "
                 "(M, 2) and (M, C) with at least one mode: an answer without a mode is withheld"
             )
-            raise ShapeError(message)
         if not (np.isfinite(self.positions_m).all() and np.isfinite(self.by_class).all()):
-            message = "positions_m or by_class holds a number that is not finite: leave that mode or class out"
-            raise ShapeError(message)
+            raise ShapeError("positions_m or by_class holds a number that is not finite: leave that mode or class out")
         if not (np.isfinite(self.none_nats) and 0 < self.sigma_m < np.inf):
-            message = (
+            raise ShapeError(
                 f"none_nats is {self.none_nats!r}, sigma_m {self.sigma_m!r}, expected finite, and sigma_m positive"
             )
-            raise ShapeError(message)
 
     @cached_property
     def scores(self) -> NDArray[np.float64]:
@@ -171,8 +168,9 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **given: float | None
     """
     foreign = next((name for name in given if name not in _FROM_MATCHER), None)
     if foreign is not None:
-        message = f"{foreign!r} is no evidence that a matcher supplies, known are {', '.join(sorted(_FROM_MATCHER))}"
-        raise ShapeError(message)
+        raise ShapeError(
+            f"{foreign!r} is no evidence that a matcher supplies, known are {', '.join(sorted(_FROM_MATCHER))}"
+        )
     rivals = np.flatnonzero(modes.away_m >= APART_M)
     rival = rivals[np.argmax(modes.scores[rivals])] if len(rivals) else None
     against = modes.none_nats if rival is None else modes.scores[rival]

@@ -31,8 +31,7 @@ class Blend:
         for name in ("alpha", "beta", "eta"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                message = f"{name} of the joint score is at least 0 and finite, got {value!r}"
-                raise ConfigError(message)
+                raise ConfigError(f"{name} of the joint score is at least 0 and finite, got {value!r}")
 
 
 def contradiction(by_class: NDArray[np.float64]) -> NDArray[np.float64]:

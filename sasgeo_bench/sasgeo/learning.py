@@ -58,8 +58,9 @@ def views_by_map(training: Training) -> ViewsByMap:
         if truth.is_present and truth.pose is not None and query.track == "localization":
             found.setdefault(query.region, []).append((query, truth))
     if not found:
-        message = "no view of the training part lies on its map: name suites whose places are present, such as clean"
-        raise ConfigError(message)
+        raise ConfigError(
+            "no view of the training part lies on its map: name suites whose places are present, such as clean"
+        )
     return found
 
 
@@ -83,8 +84,7 @@ def on_maps_of_the_day(views: ViewsByMap, regions: Mapping[str, Region]) -> View
             if fresh is not None:
                 found.setdefault(fresh, []).append((replace(query, region=fresh), truth))
     if not found:
-        message = "no training view has a map of its own day: name suites such as clean beside real-age"
-        raise ConfigError(message)
+        raise ConfigError("no training view has a map of its own day: name suites such as clean beside real-age")
     return found
 
 
@@ -251,8 +251,7 @@ def _fit_blend(lists: Sequence[_ScoredModes], model: ScorerModel, regions: Mappi
 def _pose(truth: Truth) -> Pose:
     """Return the place of a training view, or raise ConfigError."""
     if truth.pose is None:
-        message = f"the training view {truth.query_id} has no place: give views of present places to the fit"
-        raise ConfigError(message)
+        raise ConfigError(f"the training view {truth.query_id} has no place: give views of present places to the fit")
     return truth.pose
 
 

@@ -53,16 +53,13 @@ class ClassRates:
         """Check ranges."""
         for name in _SHARES:
             if not 0 <= getattr(self, name) <= 1:
-                message = f"{name} is a share within 0..1, got {getattr(self, name)!r}"
-                raise ConfigError(message)
+                raise ConfigError(f"{name} is a share within 0..1, got {getattr(self, name)!r}")
         for name in _YEARLY:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                message = f"{name} is a rate of at least 0 a year, got {value!r}"
-                raise ConfigError(message)
+                raise ConfigError(f"{name} is a rate of at least 0 a year, got {value!r}")
         if self.hit < self.false_alarm:
-            message = f"a hit cannot be rarer than a false alarm, got {self.hit!r} and {self.false_alarm!r}"
-            raise ConfigError(message)
+            raise ConfigError(f"a hit cannot be rarer than a false alarm, got {self.hit!r} and {self.false_alarm!r}")
 
     def survival(self, age_years: float) -> float:
         """Return the probability that a mapped cell still holds the class."""
@@ -206,12 +203,10 @@ def fit_rates(tallies: Sequence[Tally]) -> dict[str, ClassRates]:
         If there is no tally, or their classes differ.
     """
     if not tallies:
-        message = "no views to fit rates to: the train part is empty; choose another split, or weights by hand"
-        raise ConfigError(message)
+        raise ConfigError("no views to fit rates to: the train part is empty; choose another split, or weights by hand")
     classes = tallies[0].classes
     if any(other.classes != classes for other in tallies):
-        message = "views to fit rates to have different classes: build their regions with one taxonomy"
-        raise ConfigError(message)
+        raise ConfigError("views to fit rates to have different classes: build their regions with one taxonomy")
     ages_years, age = np.unique([one.age_years for one in tallies], return_inverse=True)
     blocks, block = np.unique([one.block for one in tallies], return_inverse=True)
     counts = np.array([(t.seen[:, 0], t.missed[:, 0], t.seen[:, FAR], t.missed[:, FAR]) for t in tallies])

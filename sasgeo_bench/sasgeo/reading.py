@@ -65,8 +65,7 @@ def proposals(
         If the scales are not positive, finite and in order.
     """
     if not 0 < scales[0] <= scales[1] < math.inf:
-        message = f"scales are the least and the greatest scale, both positive and finite, got {scales!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"scales are the least and the greatest scale, both positive and finite, got {scales!r}")
     cast = np.concatenate([np.zeros((0, 6)), *(_votes(seen.nodes, mapped, kind, scales) for kind in JUNCTIONS)])
     if prior is not None:
         cast = cast[_may_be(cast, prior)]

@@ -150,8 +150,7 @@ class _Fitted(ABC):
     def p_false(self, predictions: Sequence[Prediction]) -> NDArray[np.float64]:
         """Return the probability of a false fix, shape (N,); 1 where there is no answer."""
         if self._rule is None:
-            message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call fit() with answers of calibration blocks before p_false()")
         found = np.ones(len(predictions))
         at = [index for index, item in enumerate(predictions) if not is_none(item)]
         if at:

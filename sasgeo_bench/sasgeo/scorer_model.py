@@ -52,11 +52,9 @@ def fit_scaling(
     True
     """
     if not choices:
-        message = "no searches to fit exponents to: the training part is empty; choose another split"
-        raise ConfigError(message)
+        raise ConfigError("no searches to fit exponents to: the training part is empty; choose another split")
     if len({one.shape[1] for one in choices}) > 1:
-        message = "searches to fit exponents to have different classes: build their regions with one taxonomy"
-        raise ConfigError(message)
+        raise ConfigError("searches to fit exponents to have different classes: build their regions with one taxonomy")
     rows = np.concatenate([one - one[:1] for one in choices])
     starts = np.cumsum([0, *(len(one) for one in choices[:-1])])
     owner = np.repeat(np.arange(len(choices)), [len(one) for one in choices])
@@ -214,8 +212,7 @@ class ScorerModel:
         try:
             stored = json.loads(text)
             if stored["version"] != VERSION:
-                message = f"it is of version {stored['version']}, this program reads {VERSION}"
-                raise ConfigError(message)
+                raise ConfigError(f"it is of version {stored['version']}, this program reads {VERSION}")
             rows: dict[str, dict[str, Any]] = stored["classes"]
             arrays = {
                 name: np.array([row.pop(name) for row in rows.values()], dtype=np.float64).reshape(-1, *shape)
@@ -235,19 +232,16 @@ class ScorerModel:
                 blocks=int(stored["blocks"]),
             )
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
-            message = f"the trained model cannot be read ({error}): train it again"
-            raise ConfigError(message) from error
+            raise ConfigError(f"the trained model cannot be read ({error}): train it again") from error
 
 
 def _check(scaling: NDArray[np.float64], shares: Mapping[str, NDArray[np.float64]]) -> None:
     """Raise ValueError for numbers out of range."""
     if not (np.isfinite(scaling).all() and (scaling >= 0).all()):
-        message = "an exponent is negative or not finite"
-        raise ValueError(message)
+        raise ValueError("an exponent is negative or not finite")
     for name, values in shares.items():
         if not ((values >= 0) & (values <= 1)).all():
-            message = f"{name} is not within 0..1"
-            raise ValueError(message)
+            raise ValueError(f"{name} is not within 0..1")
 
 
 def _rounded(values: dict[str, Any]) -> dict[str, Any]:

@@ -180,15 +180,13 @@ class SasgeoTrack:
     def belief(self) -> GridBelief:
         """Return the belief after the last view."""
         if self._belief is None:
-            message = f"{self.card.name}: call start() first, and step() with the views of a flight"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call start() first, and step() with the views of a flight")
         return self._belief
 
     @property
     def _map(self) -> Reader:
         if self._reader is None:
-            message = f"{self.card.name}: call prepare() with a region before start()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before start()")
         return self._reader
 
     def start(self, prior: Prior) -> None:
@@ -204,8 +202,7 @@ class SasgeoTrack:
     def step(self, query: Query) -> Fix:
         """Move the belief by the odometer, weigh it by the view, and say where its mass is."""
         if query.step is None:
-            message = f"{self.card.name}: step() needs the views of a flight"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: step() needs the views of a flight")
         belief = self._moved(self.belief, query.step)
         if self._rival is not None:
             self._rival = replace(self._rival, belief=self._moved(self._rival.belief, query.step))

@@ -53,8 +53,7 @@ class SasgeoMatcher:
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return the best modes, or rank the candidates by the best pose near each."""
         if self._reader is None:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         if bool((query.evidence.cells == UNKNOWN).all()):
             return WITHHELD
         reading = self._reader.read(query)

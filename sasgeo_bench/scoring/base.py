@@ -28,11 +28,11 @@ def check_column(values: ArrayLike, name: str, count: int | None = None) -> Floa
     column = np.asarray(values, dtype=np.float64)
     if column.ndim != 1 or (count is not None and len(column) != count):
         expected = "(N,)" if count is None else f"({count},)"
-        message = f"{name} has shape {column.shape}, expected {expected}: one value for each query"
-        raise MetricError(message)
+        raise MetricError(f"{name} has shape {column.shape}, expected {expected}: one value for each query")
     if np.isnan(column).any():
-        message = f"{name} holds NaN at place {int(np.isnan(column).argmax())}: a query without a value is a miss"
-        raise MetricError(message)
+        raise MetricError(
+            f"{name} holds NaN at place {int(np.isnan(column).argmax())}: a query without a value is a miss"
+        )
     return column
 
 
@@ -47,8 +47,7 @@ def check_weights(weights: ArrayLike | None, count: int) -> Floats:
     column = check_column(weights, "weights", count)
     wrong = ~(np.isfinite(column) & (column >= 0))
     if wrong.any():
-        message = f"weights holds {column[wrong][0]:g}, expected finite numbers that are not negative"
-        raise MetricError(message)
+        raise MetricError(f"weights holds {column[wrong][0]:g}, expected finite numbers that are not negative")
     return column
 
 
@@ -63,8 +62,7 @@ def block_codes(blocks: Sequence[str] | Ints, count: int) -> tuple[Ints, Ints]:
     ([1, 2], [1, 0, 1])
     """
     if len(blocks) != count:
-        message = f"{len(blocks)} blocks for {count} queries, expected one each"
-        raise MetricError(message)
+        raise MetricError(f"{len(blocks)} blocks for {count} queries, expected one each")
     code = codes_of(blocks)
     return np.bincount(code), code
 
@@ -114,8 +112,7 @@ def weighted_quantile(values: ArrayLike, share: float, weights: ArrayLike | None
     2.0
     """
     if not 0 < share <= 1:
-        message = f"share must lie in (0, 1], got {share!r}"
-        raise MetricError(message)
+        raise MetricError(f"share must lie in (0, 1], got {share!r}")
     column = check_column(values, "values")
     mass = check_weights(weights, len(column))
     if not (mass > 0).any():

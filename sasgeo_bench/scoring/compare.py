@@ -36,10 +36,9 @@ class PairedTest:
 def _pairs(first: ArrayLike, second: ArrayLike) -> tuple[Bools, Bools]:
     ours, theirs = check_column(first, "first"), check_column(second, "second", np.size(first))
     if not (np.isin(ours, (0, 1)).all() and np.isin(theirs, (0, 1)).all()):
-        message = (
+        raise MetricError(
             "McNemar's test takes hits that are 0 or 1: decide ties first, as by `hits == 1`, or use the bootstrap"
         )
-        raise MetricError(message)
     return ours > 0, theirs > 0
 
 
@@ -181,8 +180,7 @@ def holm(p_values: Mapping[str, float]) -> dict[str, float]:
     """
     wrong = next((name for name, value in p_values.items() if not 0 <= value <= 1), None)
     if wrong is not None:
-        message = f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; an untested contrast has 1"
-        raise MetricError(message)
+        raise MetricError(f"p-value of {wrong!r} is {p_values[wrong]!r}, expected 0..1; an untested contrast has 1")
     adjusted = multipletests(list(p_values.values()), method="holm")[1] if p_values else ()
     return dict(zip(p_values, map(float, adjusted), strict=True))
 
@@ -204,12 +202,10 @@ def distinguishable(values: ArrayLike, draws: ArrayLike, *, better: Literal["hig
     """
     figures, table = np.asarray(values, dtype=np.float64), np.asarray(draws, dtype=np.float64)
     if figures.ndim != 1 or table.ndim != 2 or table.shape[1:] != figures.shape or not len(table):  # noqa: PLR2004
-        message = f"values have shape {figures.shape} and draws {table.shape}, expected (M,) and (D, M)"
-        raise MetricError(message)
+        raise MetricError(f"values have shape {figures.shape} and draws {table.shape}, expected (M,) and (D, M)")
     table = table[~np.isnan(table).any(axis=1)]
     if not (np.isfinite(figures).all() and np.isfinite(table).all() and len(table)):
-        message = "a figure or a draw is not finite: ranks are for figures that every method has"
-        raise MetricError(message)
+        raise MetricError("a figure or a draw is not finite: ranks are for figures that every method has")
     sign = 1.0 if better == "higher" else -1.0
     found = np.zeros((len(figures), len(figures)), dtype=bool)
     rows, cols = np.triu_indices(len(figures), 1)
@@ -258,8 +254,9 @@ def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
     """
     table = np.asarray(is_better, dtype=bool)
     if table.ndim != 2 or table.shape[0] != table.shape[1] or (table & table.T).any():  # noqa: PLR2004 - a table
-        message = f"is_better has shape {table.shape}, expected (M, M) with no two methods better than each other"
-        raise MetricError(message)
+        raise MetricError(
+            f"is_better has shape {table.shape}, expected (M, M) with no two methods better than each other"
+        )
     above, below = table.sum(axis=0), table.sum(axis=1)
     return tuple(
         RankInterval(best=1 + int(up), worst=len(table) - int(down)) for up, down in zip(above, below, strict=True)
@@ -285,8 +282,7 @@ def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> f
     """
     column = check_column(values, "values")
     if not np.isfinite(column).all():
-        message = "values holds infinity: correlate hits or differences of hits"
-        raise MetricError(message)
+        raise MetricError("values holds infinity: correlate hits or differences of hits")
     sizes, code = block_codes(blocks, len(column))
     count, total = len(sizes), len(column)
     if count < 2 or total == count:  # noqa: PLR2004 - nothing within or nothing between
@@ -313,8 +309,7 @@ def design_effect(sizes: ArrayLike, correlation: float) -> float:
     """
     column = check_column(sizes, "sizes")
     if not len(column) or not (column >= 1).all() or not correlation <= 1:
-        message = f"expected blocks with queries in them and a correlation of at most 1, got {correlation!r}"
-        raise MetricError(message)
+        raise MetricError(f"expected blocks with queries in them and a correlation of at most 1, got {correlation!r}")
     size = float((column**2).sum() / column.sum())
     return 1.0 + (size - 1.0) * max(correlation, 0.0)
 
@@ -334,8 +329,9 @@ def detectable_difference(pairs: float, discordant_share: float, *, level: float
     0.03
     """
     if not pairs >= 0 or not 0 <= discordant_share <= 1:
-        message = f"expected pairs >= 0 and a discordant share in [0, 1], got {pairs!r} and {discordant_share!r}"
-        raise MetricError(message)
+        raise MetricError(
+            f"expected pairs >= 0 and a discordant share in [0, 1], got {pairs!r} and {discordant_share!r}"
+        )
     z_level = float(norm.isf(level / 2))
     # Even if all discordant pairs point one way, d = p: n p^2 must reach (z_a sqrt(p) + z_b sqrt(p - p^2))^2.
     least = z_level + _Z_POWER * math.sqrt(1.0 - discordant_share)
@@ -358,8 +354,7 @@ def detectable_mean(pairs: float, spread: float, *, level: float = 0.05) -> floa
     0.085
     """
     if not pairs > 0 or not spread >= 0:
-        message = f"expected pairs > 0 and a spread >= 0, got {pairs!r} and {spread!r}"
-        raise MetricError(message)
+        raise MetricError(f"expected pairs > 0 and a spread >= 0, got {pairs!r} and {spread!r}")
     return (float(norm.isf(level / 2)) + _Z_POWER) * spread / math.sqrt(pairs)
 
 
@@ -375,8 +370,7 @@ def sensitivity(
     gaps = ours - check_column(second, "second", len(ours))
     sizes, _ = block_codes(blocks, len(ours))
     if not len(sizes):
-        message = "no queries, so no difference can be detected: draw some first"
-        raise MetricError(message)
+        raise MetricError("no queries, so no difference can be detected: draw some first")
     correlation = intraclass_correlation(gaps, blocks)
     effect = design_effect(sizes, 0.0 if math.isnan(correlation) else correlation)
     if are_shares:

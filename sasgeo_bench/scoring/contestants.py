@@ -157,14 +157,12 @@ def read_entry_answers(
     if tasks and (refused is not None or (stale and not answers)):
         holder = "these tasks do" if folders else "its task does"
         first = refused or stale[0]
-        message = f"{first} holds answers to other queries than {holder} now: {_HOW_TO_MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{first} holds answers to other queries than {holder} now: {_HOW_TO_MEND}")
     if not answers:
-        message = (
+        raise ConfigError(
             f"there is nothing to score: no task in {root / 'tasks'} is answered "
             "(--out names another root, --tasks the tasks themselves)"
         )
-        raise ConfigError(message)
     if stale:
         listed = ", ".join(map(str, stale[:MOST_NAMED])) + (", ..." if len(stale) > MOST_NAMED else "")
         tell(f"left out: {counted(len(stale), 'run')} without an answer to these queries ({listed})")
@@ -353,11 +351,10 @@ def scored_rows(contest: Contest, split: Split | None, *, tell: Callable[[str], 
         if len(rows):
             found[item.entry.name] = rows
     if not found:
-        message = (
+        raise ConfigError(
             f"there is nothing to rank: but for the suite {CONTROLS!r} no suite has a matcher that was asked all of "
             "its tasks (--tasks names some)"
         )
-        raise ConfigError(message)
     return found
 
 
@@ -373,8 +370,7 @@ def rows_to_rank(scored: Mapping[str, pd.DataFrame], split: Split | None) -> dic
     }
     found = {name: rows for name, rows in counted_rows.items() if len(rows)}
     if not found:
-        message = f"there is nothing to rank: no query is of a test place of the hold-out {split.spec.id!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"there is nothing to rank: no query is of a test place of the hold-out {split.spec.id!r}")
     return found
 
 
@@ -391,8 +387,7 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
         found = submission_faults(path, entry.submission, folders, split)
     faults = [fault for fault in found if not fault.is_missing_row]
     if faults:
-        message = f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)"
-        raise ConfigError(message)
+        raise ConfigError(f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)")
 
 
 def design_rows(task: ScoredTask, split: Split | None) -> pd.DataFrame:

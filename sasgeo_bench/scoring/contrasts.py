@@ -157,8 +157,7 @@ def both_on(
     for name in (contrast.first, contrast.second):
         if name not in known:
             there = ", ".join(sorted(known)) or "nothing of the kind"
-            message = f"contrast {contrast.name!r} names {name!r}, which is not on the board: there is {there}"
-            raise ConfigError(message)
+            raise ConfigError(f"contrast {contrast.name!r} names {name!r}, which is not on the board: there is {there}")
         frames.append(_rows_of(contrast, known[name], chosen))
     shared = sorted(set(frames[0]["query_id"]) & set(frames[1]["query_id"]))
     first, second = (frame.set_index("query_id", drop=False).loc[shared] for frame in frames)

@@ -71,8 +71,7 @@ def _number(about: Mapping[str, Any], name: str) -> float:
     if value is None:
         return math.nan
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= _MOST:
-        message = f"{name} of a run is {value!r}, expected a number from 0 to {_MOST:.0e}"
-        raise MetricError(message)
+        raise MetricError(f"{name} of a run is {value!r}, expected a number from 0 to {_MOST:.0e}")
     return float(value)
 
 
@@ -126,8 +125,7 @@ def per_fix(total: float, fixes: float) -> float:
     (3000.0, inf)
     """
     if total < 0 or not fixes >= 0:
-        message = f"total and fixes are not negative, got {total!r} and {fixes!r}"
-        raise MetricError(message)
+        raise MetricError(f"total and fixes are not negative, got {total!r} and {fixes!r}")
     if fixes > 0:
         return total / fixes
     return math.inf if total > 0 else math.nan

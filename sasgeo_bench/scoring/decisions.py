@@ -47,11 +47,9 @@ class Answers:
             object.__setattr__(self, name, check_column(getattr(self, name), name, count) > 0)
         given = np.asarray(self.confidence, dtype=np.float64)
         if given.shape != (count,) or np.isinf(given[self.is_answered]).any():
-            message = f"confidence has shape {given.shape}, expected ({count},), each a finite number or NaN"
-            raise MetricError(message)
+            raise MetricError(f"confidence has shape {given.shape}, expected ({count},), each a finite number or NaN")
         if (self.is_right & ~(self.is_answered & self.is_present)).any():
-            message = "a fix is right only where there is an answer and the place is present: mend is_right"
-            raise MetricError(message)
+            raise MetricError("a fix is right only where there is an answer and the place is present: mend is_right")
         key = np.where(self.is_answered, np.nan_to_num(given, nan=-np.inf), -np.inf)
         values, group = np.unique(-key[self.is_answered], return_inverse=True)
         tie = np.full(count, len(values), dtype=np.int64)
@@ -75,14 +73,14 @@ def presence_weights(is_present: ArrayLike, share: float) -> Floats:
     """
     present = check_column(is_present, "is_present") > 0
     if not 0 <= share <= 1:
-        message = f"share must lie in [0, 1], got {share!r}"
-        raise MetricError(message)
+        raise MetricError(f"share must lie in [0, 1], got {share!r}")
     target = np.where(present, share, 1.0 - share)
     there = np.where(present, present.sum(), (~present).sum()) / max(len(present), 1)
     for side, part, count in (("present", share, present.sum()), ("absent", 1.0 - share, (~present).sum())):
         if part > 0 and len(present) and not count:
-            message = f"no query has its place {side}, so none can count {part:g}: draw some, or ask for another share"
-            raise MetricError(message)
+            raise MetricError(
+                f"no query has its place {side}, so none can count {part:g}: draw some, or ask for another share"
+            )
     return np.asarray(np.divide(target, there, out=np.zeros(len(present)), where=there > 0))
 
 
@@ -117,8 +115,7 @@ def accept_by_cost(answers: Answers, cost_ratio: float) -> Bools:
 
 def _check_ratio(cost_ratio: float) -> None:
     if not 0 < cost_ratio < math.inf:
-        message = f"cost_ratio must be positive and finite, got {cost_ratio!r}"
-        raise MetricError(message)
+        raise MetricError(f"cost_ratio must be positive and finite, got {cost_ratio!r}")
 
 
 def check_probabilities(answers: Answers) -> None:
@@ -128,8 +125,9 @@ def check_probabilities(answers: Answers) -> None:
     """
     given = answers.confidence[~np.isnan(answers.confidence)]
     if ((given < 0) | (given > 1)).any():
-        message = f"confidences reach from {given.min():g} to {given.max():g}, expected probabilities in [0, 1]"
-        raise MetricError(message)
+        raise MetricError(
+            f"confidences reach from {given.min():g} to {given.max():g}, expected probabilities in [0, 1]"
+        )
 
 
 def cost_values(
@@ -151,8 +149,7 @@ def cost_values(
     _check_ratio(cost_ratio)
     taken = check_column(accepted, "accepted", len(answers)) > 0
     if (taken & ~answers.is_answered).any():
-        message = "a query without an answer is accepted: decide with accept() or accept_by_cost()"
-        raise MetricError(message)
+        raise MetricError("a query without an answer is accepted: decide with accept() or accept_by_cost()")
     missed = ~taken & (answers.is_right if charged == "right fix" else answers.is_present)
     return np.asarray(cost_ratio * (taken & ~answers.is_right) + missed)
 
@@ -215,8 +212,7 @@ def calibration_error(answers: Answers, weights: ArrayLike | None = None, *, bin
     mass = check_weights(weights, len(answers))
     check_probabilities(answers)
     if bins < 1:
-        message = f"bins must be at least 1, got {bins!r}"
-        raise MetricError(message)
+        raise MetricError(f"bins must be at least 1, got {bins!r}")
     counts = answers.is_answered & (mass > 0)
     if not _have_confidence(answers) or not counts.any():
         return float("nan")
@@ -276,8 +272,9 @@ def stanford(protection_level_m: ArrayLike, position_error_m: ArrayLike, alert_l
     level = check_column(protection_level_m, "protection_level_m")
     error = check_column(position_error_m, "position_error_m", len(level))
     if not 0 < alert_limit_m < math.inf or (level < 0).any() or (error < 0).any():
-        message = f"levels and errors are not negative, the alert limit is positive and finite, got {alert_limit_m!r}"
-        raise MetricError(message)
+        raise MetricError(
+            f"levels and errors are not negative, the alert limit is positive and finite, got {alert_limit_m!r}"
+        )
     is_available, is_bounded = level <= alert_limit_m, error <= level
     return Stanford(
         nominal=is_available & is_bounded,

@@ -65,8 +65,7 @@ class ClusterDraws:
     def __post_init__(self) -> None:
         """Group blocks by size, so that drawing takes few vectorized steps."""
         if self.draws < 1:
-            message = f"draws must be at least 1, got {self.draws!r}"
-            raise MetricError(message)
+            raise MetricError(f"draws must be at least 1, got {self.draws!r}")
         sizes, block = block_codes(self.blocks, len(self.blocks))
         site, first_of = _numbered(block, self.sites)
         place = np.arange(len(sizes)) if self.places is None else _place_of(self.places, block, len(sizes))
@@ -161,8 +160,7 @@ def _place_of(places: Sequence[str] | Ints, block: Ints, count: int) -> Ints:
     place = np.zeros(count, dtype=np.int64)
     place[block] = code
     if (place[block] != code).any():
-        message = "a block is in two places: name blocks by their region"
-        raise MetricError(message)
+        raise MetricError("a block is in two places: name blocks by their region")
     return place
 
 

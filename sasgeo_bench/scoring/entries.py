@@ -127,18 +127,19 @@ def find_entries(
         found = sorted(path.rglob(prediction_files.RUN))
         for folder in sorted({part.parent for part in path.rglob("part-*.parquet")} - {run.parent for run in found}):
             with _noted(failures, str(folder)):
-                message = f"{folder} holds answers and no {prediction_files.RUN}: run the matcher again, they are kept"
-                raise StoreError(message)
+                raise StoreError(
+                    f"{folder} holds answers and no {prediction_files.RUN}: run the matcher again, they are kept"
+                )
         if not found:
-            message = f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
-            raise StoreError(message)
+            raise StoreError(
+                f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
+            )
         runs += [run for run in found if _is_new(run, seen)]
     entries = [*_entries_of_runs(_by_run(runs, failures)), *files]
     listed = [entry.name for entry in entries]
     twice = next((name for name in listed if listed.count(name) > 1), None)
     if twice is not None:
-        message = f"two entries are named {twice!r}: rename the file of one"
-        raise ConfigError(message)
+        raise ConfigError(f"two entries are named {twice!r}: rename the file of one")
     # A submission may not have the name of a matcher shown as several versions: readers would confuse them.
     taken = {*listed, *(entry.runs[0]["matcher"]["name"] for entry in entries if entry.runs)}
     entries += _submitted(submissions, taken, failures)
@@ -155,16 +156,17 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
         return entries
     file = next((entry for entry in entries if not entry.runs), None)
     if file is not None:
-        message = f"{file.sources[0]} is a file of predictions, of which no region can be left out: name runs alone"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{file.sources[0]} is a file of predictions, of which no region can be left out: name runs alone"
+        )
     known = {base_of(about["region"]) for entry in entries for about in entry.runs}
     unknown = sorted(set(regions) - known)
     if unknown:
-        message = f"no run is on {unknown[0]!r}: regions that can be left out are {', '.join(sorted(known))}"
-        raise ConfigError(message)
+        raise ConfigError(f"no run is on {unknown[0]!r}: regions that can be left out are {', '.join(sorted(known))}")
     if known <= set(regions):
-        message = "there is nothing to score: every run is on a region that is left out, leave fewer out (--without)"
-        raise ConfigError(message)
+        raise ConfigError(
+            "there is nothing to score: every run is on a region that is left out, leave fewer out (--without)"
+        )
     kept = [[base_of(about["region"]) not in regions for about in entry.runs] for entry in entries]
     return tuple(
         replace(entry, sources=tuple(compress(entry.sources, keep)), runs=tuple(compress(entry.runs, keep)))
@@ -228,11 +230,9 @@ def _is_new(path: Path, seen: set[Path]) -> bool:
 
 def _file_entry(path: Path) -> Entry:
     if not FILE_NAME.fullmatch(path.stem):
-        message = f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone"
-        raise ConfigError(message)
+        raise ConfigError(f"{path.name!r}: name the file by letters, digits, hyphens, dots and underscores alone")
     if is_unranked(path.stem):
-        message = f"{path.name!r}: {path.stem!r} is the name of a control of every board: choose another name"
-        raise ConfigError(message)
+        raise ConfigError(f"{path.name!r}: {path.stem!r} is the name of a control of every board: choose another name")
     return Entry(name=path.stem, version="", hash="", how=AS_SUBMITTED, sources=(path,))
 
 
@@ -253,8 +253,7 @@ def check_name(name: str, taken: Collection[str] = (), *, source: str) -> None:
     }
     whose = next((kind for kind, is_taken in kinds.items() if is_taken), None)
     if whose is not None:
-        message = f"{source}: {name!r} is the name of {whose}: choose another name"
-        raise ConfigError(message)
+        raise ConfigError(f"{source}: {name!r} is the name of {whose}: choose another name")
 
 
 def _submitted(folders: Sequence[Path], taken: Collection[str], failures: Failures | None) -> list[Entry]:
@@ -274,8 +273,9 @@ def _submitted(folders: Sequence[Path], taken: Collection[str], failures: Failur
         twins = [str(other) for other, one in read.items() if one.card.name == name and other != folder]
         with _noted(failures, one_line(str(folder))):
             if twins:
-                message = f"{folder} and {', '.join(twins)} have one name, {name!r}: remove or rename a submission"
-                raise ConfigError(message)
+                raise ConfigError(
+                    f"{folder} and {', '.join(twins)} have one name, {name!r}: remove or rename a submission"
+                )
             found.append(_entry_of(folder, submission))
     return found
 
@@ -313,8 +313,7 @@ def _read_run(path: Path) -> dict[str, Any]:
     if stated["matcher.name"] == ORACLE != about.get("spec", ORACLE):
         fault = f"it has the name of the control {ORACLE}, and was run as {about['spec']!r}"
     if fault is not None:
-        message = f"{path} is damaged ({one_line(fault)}): remove it and run again, its parts are kept"
-        raise StoreError(message)
+        raise StoreError(f"{path} is damaged ({one_line(fault)}): remove it and run again, its parts are kept")
     return about
 
 

@@ -144,8 +144,7 @@ def score_flights(
     """
     asked = sorted(heads, key=lambda head: head.query_id)  # by flight, then by time
     if not asked:
-        message = "a task holds no flight: make the queries again"
-        raise MetricError(message)
+        raise MetricError("a task holds no flight: make the queries again")
     by_id = truths_of(asked, truths, predictions)
     views = view_frame(asked, [by_id[head.query_id] for head in asked], predictions, place_of)
     ends = _ends(views["sequence_id"].tolist())
@@ -219,8 +218,9 @@ def view_frame(
     measured, places = [truth.measured for truth in truths], place_of or {}
     lost = next((truth.query_id for truth in truths if not truth.measured.keys() >= _NEEDED), None)
     if lost is not None:
-        message = f"view {lost} was drawn by an older program: remove its task and truths, and make the queries again"
-        raise MetricError(message)
+        raise MetricError(
+            f"view {lost} was drawn by an older program: remove its task and truths, and make the queries again"
+        )
     distance_m = np.array([one["distance_m"] for one in measured])
     frame = np.array([head.frame or 0 for head in heads])
     jump_m = np.hypot(*np.diff(true[:, :2], axis=0, prepend=true[:1, :2]).T)
@@ -251,8 +251,7 @@ def view_frame(
 
 def _true_pose(truth: Truth) -> tuple[float, float, float]:
     if truth.pose is None:
-        message = f"view {truth.query_id} of a flight has no true pose: make the queries again"
-        raise MetricError(message)
+        raise MetricError(f"view {truth.query_id} of a flight has no true pose: make the queries again")
     return truth.pose.easting_m, truth.pose.northing_m, truth.pose.yaw_deg
 
 

@@ -257,8 +257,7 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
     0.25
     """
     if not 0 < coverage <= 1:
-        message = f"coverage must lie in (0, 1], got {coverage!r}"
-        raise MetricError(message)
+        raise MetricError(f"coverage must lie in (0, 1], got {coverage!r}")
     group, false = _masses(answers, weights)
     total = float(group.sum())
     if total == 0:
@@ -289,8 +288,7 @@ def choose_absent_threshold(calibration: Answers, rate: float) -> float:
 
 def _check_share(value: float, name: str) -> None:
     if not 0 <= value <= 1:
-        message = f"{name} must lie in [0, 1], got {value!r}"
-        raise MetricError(message)
+        raise MetricError(f"{name} must lie in [0, 1], got {value!r}")
 
 
 def choose_threshold(calibration: Answers, risk: float) -> float:

@@ -55,8 +55,7 @@ def wilson(successes: float, trials: float, *, level: float = LEVEL) -> Interval
     """
     _check_level(level)
     if not 0 <= successes <= trials < np.inf:
-        message = f"successes must lie between 0 and the trials, got {successes!r} of {trials!r}"
-        raise MetricError(message)
+        raise MetricError(f"successes must lie between 0 and the trials, got {successes!r} of {trials!r}")
     if trials == 0:
         return Interval(value=float("nan"), lo=0.0, hi=1.0)
     lo, hi = _wilson_ends(np.array([successes / trials]), np.array([trials]), level=level)[0].tolist()
@@ -75,8 +74,7 @@ def _wilson_ends(shares: Floats, trials: Floats, *, level: float = LEVEL) -> Flo
 
 def _check_level(level: float) -> None:
     if not 0 < level < 1:
-        message = f"level must lie in (0, 1), got {level!r}"
-        raise MetricError(message)
+        raise MetricError(f"level must lie in (0, 1), got {level!r}")
 
 
 def wilson_mean(values: ArrayLike) -> Interval:
@@ -90,8 +88,7 @@ def wilson_mean(values: ArrayLike) -> Interval:
     """
     column = check_column(values, "values")
     if ((column < 0) | (column > 1)).any():
-        message = f"values reach from {column.min():g} to {column.max():g}, expected shares in [0, 1]"
-        raise MetricError(message)
+        raise MetricError(f"values reach from {column.min():g} to {column.max():g}, expected shares in [0, 1]")
     return wilson_share(weighted_mean(column), len(column))
 
 
@@ -113,8 +110,9 @@ def bootstrap_means(values: ArrayLike, drawn: ClusterDraws, weights: ArrayLike |
     """
     table = np.asarray(values, dtype=np.float64)
     if table.ndim not in {1, 2} or len(table) != drawn.count or not np.isfinite(table).all():
-        message = f"values have shape {table.shape}, expected ({drawn.count},) or ({drawn.count}, M), all finite"
-        raise MetricError(message)
+        raise MetricError(
+            f"values have shape {table.shape}, expected ({drawn.count},) or ({drawn.count}, M), all finite"
+        )
     mass = check_weights(weights, drawn.count)
     columns = np.column_stack((table.reshape(len(table), -1) * mass[:, None], mass))
     sums = np.concatenate(list(drawn.sums(columns)) or [np.full((drawn.draws, columns.shape[1]), 0.0)])

@@ -55,8 +55,7 @@ def measure_profile(counts: Sequence[PixelCounts], *, segmenter: str, learned_fr
     """
     classes = counts[0].classes if counts else ()
     if not counts or any(one.classes != classes for one in counts):
-        message = "a profile is measured on images that all label the same classes, and on one at least"
-        raise MetricError(message)
+        raise MetricError("a profile is measured on images that all label the same classes, and on one at least")
     told = told_classes(counts)
     shares = {key: _shares(counts, key) for key in ("instead", "besides")}
     found = {}
@@ -66,8 +65,9 @@ def measure_profile(counts: Sequence[PixelCounts], *, segmenter: str, learned_fr
         if said:
             found[name] = _of_class(name, classes, total, shares).model_copy(update={"pixels": said})
     if not found:
-        message = f"no class that {segmenter} tells is there in {named([one.image for one in counts], 'image')}"
-        raise MetricError(message)
+        raise MetricError(
+            f"no class that {segmenter} tells is there in {named([one.image for one in counts], 'image')}"
+        )
     places = ", ".join(sorted({one.place for one in counts}))
     about = {"segmenter": segmenter, "learned_from": learned_from, "tested_on": places, "images": len(counts)}
     return PerceptionProfile.model_validate(about | {"class": found})

@@ -33,8 +33,7 @@ class Rank:
     def __post_init__(self) -> None:
         """Check the counts."""
         if not (self.above >= 0 and 0 <= self.right <= self.tied):
-            message = f"a rank has above >= 0 and 0 <= right <= tied, got {self!r}"
-            raise MetricError(message)
+            raise MetricError(f"a rank has above >= 0 and 0 <= right <= tied, got {self!r}")
 
 
 MISS: Final = Rank(above=0, tied=0, right=0)
@@ -79,11 +78,10 @@ def rank_candidate(prediction: Prediction | None, truth: Truth, candidates: Sequ
 def check_candidate(truth: Truth, count: int) -> None:
     """Raise MetricError if none of so many candidates is right."""
     if not 0 <= truth.candidate < count:
-        message = (
+        raise MetricError(
             f"query {truth.query_id} has no right candidate ({truth.candidate} of {count}): "
             "leave absent places out of recall, the integrity track counts them"
         )
-        raise MetricError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -134,8 +132,7 @@ def hits(ranks: Ranks, k: int) -> Floats:
     ([1.0, 0.25, 0.0], [1.0, 1.0, 0.0])
     """
     if k < 1:
-        message = f"k must be at least 1, got {k!r}"
-        raise MetricError(message)
+        raise MetricError(f"k must be at least 1, got {k!r}")
     places = np.clip(k - ranks.above, 0, ranks.tied)
     left_out = np.ones(len(places))
     for step in range(int(ranks.right.max(initial=0))):
@@ -186,8 +183,7 @@ class PoseErrors:
         for name in ("position_m", "yaw_deg", "log_scale"):
             column = check_column(getattr(self, name), name, count)
             if (column < 0).any():
-                message = f"{name} holds {column.min():g}, errors are not negative"
-                raise MetricError(message)
+                raise MetricError(f"{name} holds {column.min():g}, errors are not negative")
             object.__setattr__(self, name, column)
 
 
@@ -219,8 +215,7 @@ def pose_errors(given: Floats, true: Floats) -> PoseErrors:
     ([5.0, inf], [20.0, inf], [0.0, inf])
     """
     if len(given) != len(true):
-        message = f"{len(given)} answers for {len(true)} truths: give NaN where there is no answer"
-        raise MetricError(message)
+        raise MetricError(f"{len(given)} answers for {len(true)} truths: give NaN where there is no answer")
     is_given = ~np.isnan(given[:, 0])
     gap = np.where(is_given[:, None], given, true) - true
     ratio = np.where(is_given, given[:, 3], true[:, 3]) / true[:, 3]
@@ -247,8 +242,7 @@ def successes(errors: PoseErrors, within_m: float, within_deg: float = SUCCESS_D
     [True, False, False]
     """
     if not 0 <= within_m < math.inf or not within_deg >= 0:
-        message = f"tolerances must be finite and not negative, got {within_m!r} m and {within_deg!r} deg"
-        raise MetricError(message)
+        raise MetricError(f"tolerances must be finite and not negative, got {within_m!r} m and {within_deg!r} deg")
     return (errors.position_m <= within_m) & (errors.yaw_deg <= within_deg)
 
 

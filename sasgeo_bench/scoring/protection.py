@@ -97,8 +97,7 @@ def statement(failures: float, trials: float, *, risk: float) -> str:
     '4 of 100 support below 9 % and not below 1 % (95 % confidence)'
     """
     if not 0 < risk < 1:
-        message = f"risk must lie in (0, 1), got {risk!r}"
-        raise MetricError(message)
+        raise MetricError(f"risk must lie in (0, 1), got {risk!r}")
     at_most = supported_risk(failures, trials)
     claim = f"{failures:.4g} of {trials:.4g} support below "
     sure = f" ({100 * LEVEL:g} % confidence)"
@@ -130,8 +129,9 @@ def conformal_factor(position_error_m: ArrayLike, scale_m: ArrayLike, risk: floa
     error = check_column(position_error_m, "position_error_m")
     scale = check_column(scale_m, "scale_m", len(error))
     if not 0 < risk < 1 or (error < 0).any() or not ((scale > 0) & np.isfinite(scale)).all():
-        message = f"risk must lie in (0, 1), errors be not negative, scales positive and finite, got risk {risk!r}"
-        raise MetricError(message)
+        raise MetricError(
+            f"risk must lie in (0, 1), errors be not negative, scales positive and finite, got risk {risk!r}"
+        )
     ratios: Floats = np.sort(error / scale)
     rank = math.ceil((len(ratios) + 1) * (1.0 - risk) - 1e-9)
     return float(ratios[rank - 1]) if rank <= len(ratios) else math.inf

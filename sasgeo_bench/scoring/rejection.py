@@ -58,16 +58,15 @@ def rules_of(specs: Sequence[str], split: Split | None) -> dict[str, Rule]:
     named: dict[str, str] = {}
     for spec in specs:
         if split is None:
-            message = "rejectors are fitted on the calibration places of a split: name one with --split"
-            raise ConfigError(message)
+            raise ConfigError("rejectors are fitted on the calibration places of a split: name one with --split")
         make = rejector_maker(spec)
         card = make().card
         if named.setdefault(card.name, spec) != spec:
-            message = f"{named[card.name]} and {spec} are both named {card.name!r}: rename one, or leave it out"
-            raise ConfigError(message)
+            raise ConfigError(
+                f"{named[card.name]} and {spec} are both named {card.name!r}: rename one, or leave it out"
+            )
         if card.name == OWN:
-            message = f"{spec}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector"
-            raise ConfigError(message)
+            raise ConfigError(f"{spec}: {OWN!r} is what a board calls a matcher's own confidence: rename the rejector")
         found[card.name] = Rule(card=card, make=make, split=split)
     return found
 
@@ -300,8 +299,9 @@ def _blamed(rejector: Rejector) -> Iterator[None]:
     try:
         yield
     except (Exception, SystemExit) as error:
-        message = f"rejector {rejector.card.name!r} failed ({message_of(error)}): mend it, or leave it out"
-        raise MatchError(message) from error
+        raise MatchError(
+            f"rejector {rejector.card.name!r} failed ({message_of(error)}): mend it, or leave it out"
+        ) from error
 
 
 def _answers(rows: pd.DataFrame, predictions: Mapping[str, Prediction]) -> Sequence[Prediction]:

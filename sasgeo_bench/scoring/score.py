@@ -266,8 +266,7 @@ def truths_of(asked: Sequence[Head], truths: Iterable[Truth], answered: Iterable
     by_id = {truth.query_id: truth for truth in truths}
     lost = next((head.query_id for head in asked if head.query_id not in by_id), None)
     if lost is not None:
-        message = f"query {lost} has no truth: these are the truths of other queries, make the queries again"
-        raise MetricError(message)
+        raise MetricError(f"query {lost} has no truth: these are the truths of other queries, make the queries again")
     _check_known(answered, {head.query_id for head in asked})
     return by_id
 
@@ -275,8 +274,7 @@ def truths_of(asked: Sequence[Head], truths: Iterable[Truth], answered: Iterable
 def _check_known(answered: Iterable[str], asked: Collection[str]) -> None:
     foreign = next((name for name in answered if name not in asked), None)
     if foreign is not None:
-        message = f"prediction {foreign} belongs to no query of the task: 'validate' lists them all"
-        raise MetricError(message)
+        raise MetricError(f"prediction {foreign} belongs to no query of the task: 'validate' lists them all")
 
 
 def ceiling_of(truth: Truth) -> float:

@@ -65,8 +65,9 @@ class PixelCounts:
     def of(cls, labelled: LabelledImage, found: Segmentation, *, image: str) -> Self:
         """Count a segmentation against the labels; raise `MetricError` if it is of another size."""
         if found.shape != labelled.image.shape:
-            message = f"a segmentation of shape {found.shape} is scored on a picture of shape {labelled.image.shape}"
-            raise MetricError(message)
+            raise MetricError(
+                f"a segmentation of shape {found.shape} is scored on a picture of shape {labelled.image.shape}"
+            )
         bytes_ = np.full(labelled.labels.shape, SILENT, dtype=np.uint8)
         for at, name in enumerate(labelled.classes):
             if name in found.classes:
@@ -133,8 +134,7 @@ def read_counts(path: Path) -> tuple[PixelCounts, ...]:
     try:
         return tuple(_read(part) for _, part in frame.groupby("image", sort=False))
     except (KeyError, ValueError, TypeError, IndexError) as error:
-        message = f"{path} holds no counts of segmented images: {_MEND}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} holds no counts of segmented images: {_MEND}") from error
 
 
 def _read(part: pd.DataFrame) -> PixelCounts:

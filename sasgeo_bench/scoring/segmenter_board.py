@@ -87,8 +87,7 @@ class SegmenterBoard:
         frames = {name: read_frame(folder / f"{name}.parquet", mend=_MEND) for name in TABLES}
         for name, frame in frames.items():
             if not {*TRIAL} <= {*frame.columns}:
-                message = f"{folder / name}.parquet is no table of a board of segmenters: {_MEND}"
-                raise StoreError(message)
+                raise StoreError(f"{folder / name}.parquet is no table of a board of segmenters: {_MEND}")
         files = sorted((folder / PROFILES).glob("*.toml"))
         return cls(**frames, profiles={path.name: read_profile(path) for path in files})
 

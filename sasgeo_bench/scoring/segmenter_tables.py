@@ -72,8 +72,7 @@ def with_tables(page: str, board: SegmenterBoard) -> str:
     for title, table in _tables(board).items():
         found = re.search(rf"^## {re.escape(title)}\n(?:(?!##? |\|).*\n)*((?:\|.*\n)+)", page, re.MULTILINE)
         if found is None:
-            message = f"the page has no heading '## {title}' with a table below it: add them"
-            raise MetricError(message)
+            raise MetricError(f"the page has no heading '## {title}' with a table below it: add them")
         page = page[: found.start(1)] + table + "\n" + page[found.end(1) :]
     return page
 

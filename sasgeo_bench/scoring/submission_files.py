@@ -45,14 +45,12 @@ def predictions_name(name: str) -> str:
 def check_submission_folder(folder: Path, name: str) -> None:
     """Raise StoreError if a submission of this name cannot be written to a folder: other things would be lost."""
     if folder.name != name:
-        message = f"{folder} must be named as the card is, {name!r}: name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{folder} must be named as the card is, {name!r}: name another folder")
     is_free = not os.path.lexists(folder) or (folder.is_dir() and not folder.is_symlink() and not any(folder.iterdir()))
     if is_free:
         return
     if folder.is_symlink() or not is_ours(folder / SUBMISSION):
-        message = f"{folder} holds something else than a submission, which would be lost: name another folder"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds something else than a submission, which would be lost: name another folder")
     check_known(folder, {SUBMISSION, predictions_name(name)}, "a submission")
 
 
@@ -87,18 +85,18 @@ def write_submission(
     except SasgeoError:
         raise
     except OSError as error:
-        message = f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
+        ) from error
     return whole
 
 
 def _check_bytes(path: Path, size: int) -> None:
     if size > MOST_BYTES:
-        message = (
+        raise StoreError(
             f"{path} has {size / 1e6:.1f} MB, {MOST_BYTES / 1e6:g} MB at most: give fewer "
             "candidates to each query (run --top-k)"
         )
-        raise StoreError(message)
 
 
 def is_submission(folder: Path) -> bool:
@@ -118,8 +116,7 @@ def list_submissions(folder: Path) -> tuple[Path, ...]:
     inner = _visible(folder)
     found = None if inner is None else tuple(path for one in inner for path in _of_board(one) or (one,))
     if found is None or (found and not any(map(is_submission, found))):
-        message = f"{folder} is no folder of submissions: name one, or a submission itself"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is no folder of submissions: name one, or a submission itself")
     return found
 
 
@@ -144,18 +141,15 @@ def read_submission(folder: Path) -> Submission:
     Raise ConfigError if a field of `submission.json` is wrong; all faults on one line.
     """
     if not is_submission(folder):
-        message = f"{folder} is no submission, for it holds no {SUBMISSION}: remove it, or make it by 'submit'"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is no submission, for it holds no {SUBMISSION}: remove it, or make it by 'submit'")
     _check_names(folder, {SUBMISSION, PREDICTIONS})
     submission = _read_document(folder / SUBMISSION)
     name = predictions_name(submission.card.name)
     if folder.resolve().name != submission.card.name:
-        message = f"{folder} holds the submission {submission.card.name!r}: name the folder so"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds the submission {submission.card.name!r}: name the folder so")
     if list(submission.files) != [name]:
         listed = ", ".join(submission.files) or "none"
-        message = f"{folder / SUBMISSION} lists the files {listed}, expected {name}: submit again"
-        raise StoreError(message)
+        raise StoreError(f"{folder / SUBMISSION} lists the files {listed}, expected {name}: submit again")
     _check_names(folder / PREDICTIONS, {Path(name).name})
     _check_file(folder / name, submission.files[name])
     _check_table(folder / name)
@@ -165,19 +159,16 @@ def read_submission(folder: Path) -> Submission:
 def _check_names(folder: Path, expected: set[str]) -> None:
     """Refuse a folder with other names than expected, and every link: it may lead anywhere."""
     if folder.is_symlink() or not folder.is_dir():
-        message = f"{folder} is no folder of a submission: make it by 'submit'"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is no folder of a submission: make it by 'submit'")
     with os.scandir(folder) as entries:
         found = {entry.name: _is_plain(entry) for entry in entries}
     odd = next((name for name, is_plain in sorted(found.items()) if not is_plain), None)
     if odd is not None:
-        message = f"{folder / odd} is a link, or no plain file: a submission holds files alone"
-        raise StoreError(message)
+        raise StoreError(f"{folder / odd} is a link, or no plain file: a submission holds files alone")
     wrong = sorted(set(found) ^ expected)
     if wrong:
         fault = "is missing" if wrong[0] in expected else "is no part of a submission"
-        message = f"{folder / wrong[0]} {fault}: a submission is made by 'submit', and nothing is added to it"
-        raise StoreError(message)
+        raise StoreError(f"{folder / wrong[0]} {fault}: a submission is made by 'submit', and nothing is added to it")
 
 
 def _is_plain(entry: os.DirEntry[str]) -> bool:
@@ -191,8 +182,7 @@ def _read_document(path: Path) -> Submission:
     version = content.get("schema_version") if isinstance(content, dict) else None
     if version != SCHEMA_VERSION:
         stated = "states no schema version" if version is None else f"has schema version {version!r}"
-        message = f"{path} {stated}, this version reads {SCHEMA_VERSION}: submit again"
-        raise StoreError(message)
+        raise StoreError(f"{path} {stated}, this version reads {SCHEMA_VERSION}: submit again")
     return check_document(content, Submission, source=str(path))
 
 
@@ -200,11 +190,10 @@ def _check_file(path: Path, expected: SubmittedFile) -> None:
     _check_bytes(path, path.stat().st_size)
     found = file_record(path)
     if (found.sha256, found.bytes) != (expected.sha256, expected.bytes):
-        message = (
+        raise StoreError(
             f"{path} is not what {SUBMISSION} says: {found.bytes} bytes, SHA-256 {found.sha256}, "
             f"expected {expected.bytes} bytes, {expected.sha256}: submit again"
         )
-        raise StoreError(message)
 
 
 def _check_table(path: Path) -> None:
@@ -225,5 +214,6 @@ def _check_schema(path: Path, schema: pa.Schema) -> None:
     allowed = [known.append(asked).remove_metadata() for known in (PREDICTION_SCHEMA, FLOWN_SCHEMA)]
     if plain not in allowed:
         wrong = sorted(set(plain.names) ^ set(RUN_SCHEMA.names)) or ["the types of its columns"]
-        message = f"{path} holds no predictions as 'submit' writes them ({wrong[0]} is not as it must be): submit again"
-        raise StoreError(message)
+        raise StoreError(
+            f"{path} holds no predictions as 'submit' writes them ({wrong[0]} is not as it must be): submit again"
+        )

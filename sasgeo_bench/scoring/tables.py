@@ -51,8 +51,7 @@ def leaderboard(
     queries = scored[first][["query_id", *GROUP]].iloc[orders[first]]
     for name, frame in scored.items():
         if not np.array_equal(frame["query_id"].to_numpy(object)[orders[name]], queries["query_id"].to_numpy(object)):
-            message = f"{name} was scored on other queries than {first}: score them together"
-            raise MetricError(message)
+            raise MetricError(f"{name} was scored on other queries than {first}: score them together")
     unranked = frozenset({*excluded, *filter(is_unranked, scored)})
     places: Mapping[Any, Any] = queries.groupby(list(GROUP), sort=True).indices
 

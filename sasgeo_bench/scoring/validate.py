@@ -70,8 +70,7 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
     seen: dict[str, str] = {}
     files = prediction_files.parts_of(path)
     if not files:
-        message = f"{path} holds no predictions: name a predictions file, or the folder of a run"
-        raise StoreError(message)
+        raise StoreError(f"{path} holds no predictions: name a predictions file, or the folder of a run")
     under = {
         parent: prediction_files.asked_in(parent, asked) for parent in {file.parent for file in files} if path.is_dir()
     }
@@ -316,8 +315,7 @@ def _check_inside(poses: Sequence[Pose], query: _Asked) -> None:
     west, south, east, north = query.bounds_m
     for pose in poses:
         if not (west <= pose.easting_m <= east and south <= pose.northing_m <= north):
-            message = (
+            raise MatchError(
                 f"candidates hold ({pose.easting_m:.1f}, {pose.northing_m:.1f}), outside of {query.head.region}, "
                 f"expected eastings of {west:.0f}..{east:.0f} m and northings of {south:.0f}..{north:.0f} m"
             )
-            raise MatchError(message)

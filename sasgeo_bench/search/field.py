@@ -82,11 +82,9 @@ class Field:
     def __post_init__(self) -> None:
         """Check shape and type; lock the cells."""
         if self.cells.ndim != _AXES or self.cells.shape[:2] != self.grid.shape:
-            message = f"a field has cells (rows, cols, K + 1), {self.grid.shape}, got {self.cells.shape}"
-            raise ShapeError(message)
+            raise ShapeError(f"a field has cells (rows, cols, K + 1), {self.grid.shape}, got {self.cells.shape}")
         if self.cells.dtype != np.uint8:
-            message = f"a field holds uint8, got {self.cells.dtype}"
-            raise ShapeError(message)
+            raise ShapeError(f"a field holds uint8, got {self.cells.dtype}")
         self.cells.flags.writeable = False
 
     @classmethod
@@ -94,8 +92,7 @@ class Field:
         """Return the field of layers, shape (K, rows, cols), and of known cells, (rows, cols); raise `ShapeError`."""
         shapes = (layers.shape, known.shape)
         if layers.ndim != _AXES or not layers.shape[1:] == known.shape == grid.shape:
-            message = f"a field has layers (K, rows, cols) and known (rows, cols), {grid.shape}, got {shapes}"
-            raise ShapeError(message)
+            raise ShapeError(f"a field has layers (K, rows, cols) and known (rows, cols), {grid.shape}, got {shapes}")
         return cls(grid=grid, cells=np.stack((*layers, known), axis=-1))
 
     @property
@@ -138,11 +135,9 @@ class Template:
         """Check shapes and numbers."""
         if self.weights.ndim != _AXES or self.weights.shape[1:] != self.known.shape:
             shapes = (self.weights.shape, self.known.shape)
-            message = f"a template has weights (K, rows, cols) and known (rows, cols), got {shapes}"
-            raise ShapeError(message)
+            raise ShapeError(f"a template has weights (K, rows, cols) and known (rows, cols), got {shapes}")
         if not (np.isfinite(self.weights).all() and np.isfinite(self.known).all()):
-            message = "the weights of a template must be finite: correct the rates they were made of"
-            raise ShapeError(message)
+            raise ShapeError("the weights of a template must be finite: correct the rates they were made of")
 
     @property
     def side_m(self) -> float:

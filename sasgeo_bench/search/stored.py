@@ -69,8 +69,7 @@ class StoredField:
         """Return the map in cells of `factor` of its own a side; raise `StoreError` if that level is not stored."""
         if factor not in self.thinner:
             stored = ", ".join(map(str, self.thinner))
-            message = f"{self.folder} holds the levels {stored}, not {factor}: search for a smaller view"
-            raise StoreError(message)
+            raise StoreError(f"{self.folder} holds the levels {stored}, not {factor}: search for a smaller view")
         shares = np.array(self.thinner[factor])
         return Level(factor=factor, grid=self.grid.coarsen(factor), cells=self._cells(factor), thinner=shares)
 
@@ -79,8 +78,7 @@ def _shares(values: Iterable[float]) -> tuple[float, ...]:
     """Return the `thinner` of a level; raise `ValueError` for what is no share."""
     shares = tuple(map(float, values))
     if not all(0.0 <= share <= 1.0 for share in shares):
-        message = f"{shares} are no shares"
-        raise ValueError(message)
+        raise ValueError(f"{shares} are no shares")
     return shares
 
 
@@ -88,11 +86,9 @@ def _mapped(path: Path, shape: tuple[int, ...]) -> NDArray[np.uint8]:
     """Map the cells of a file into memory; raise `ValueError` for other ones."""
     cells = open_memmap(plain_file(path), mode="r")
     if cells.dtype != np.uint8 or cells.shape != shape or not cells.flags.c_contiguous:
-        message = f"{path.name} has {cells.dtype} of shape {cells.shape}, expected uint8 of {shape}"
-        raise ValueError(message)
+        raise ValueError(f"{path.name} has {cells.dtype} of shape {cells.shape}, expected uint8 of {shape}")
     if path.stat().st_size != cells.offset + cells.nbytes:
-        message = f"{path.name} is longer than its cells"
-        raise ValueError(message)
+        raise ValueError(f"{path.name} is longer than its cells")
     return np.asarray(cells)
 
 
@@ -155,14 +151,14 @@ def store_levels(
     window_cells = window_cells or WINDOW_CELLS
     uneven = [factor for factor in factors if window_cells % factor]
     if uneven:
-        message = f"windows of {window_cells} cells cut cells of the levels {uneven}: name a multiple of all factors"
-        raise ShapeError(message)
+        raise ShapeError(
+            f"windows of {window_cells} cells cut cells of the levels {uneven}: name a multiple of all factors"
+        )
     with locked(folder, tell=lambda _: None):
         if (folder / _ABOUT).is_file() and (found := StoredField.open(folder)).key == key:
             return found
         if folder.exists() and not folder.is_dir():
-            message = f"{folder} is no folder: name another one"
-            raise StoreError(message)
+            raise StoreError(f"{folder} is no folder: name another one")
         names = {_ABOUT, *map(_name, FACTORS), *map(_name, factors)} if is_ours(folder / _ABOUT) else set[str]()
         check_known(folder, names, "the levels of a map")
         try:
@@ -186,8 +182,9 @@ def store_levels(
         except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
             raise
         except OSError as error:
-            message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
-            raise StoreError(message) from error
+            raise StoreError(
+                f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+            ) from error
     return StoredField.open(folder)
 
 

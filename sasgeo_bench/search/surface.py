@@ -108,8 +108,9 @@ def surface(
     level = field.level(factor)
     tiles = tiles_of(level.grid, field.grid, Disc(center_m=center_m, radius_m=radius_m))
     if not tiles:
-        message = f"the square of {radius_m!r} m around {center_m!r} does not meet the map, {field.grid.bounds_m!r}"
-        raise PoseError(message)
+        raise PoseError(
+            f"the square of {radius_m!r} m around {center_m!r} does not meet the map, {field.grid.bounds_m!r}"
+        )
     grid = _joined(level.grid, tiles)
     scores = np.zeros((len(yaws), *grid.shape), dtype=np.float32)
     if len(template.active):
@@ -126,15 +127,13 @@ def surface(
 
 def _check(center_m: tuple[float, float], radius_m: float, yaws: NDArray[np.float64], scale: float) -> None:
     if not (yaws.ndim == 1 and len(yaws) and np.isfinite(yaws).all()):
-        message = f"yaws_deg must be at least one finite heading in a row, got an array of shape {yaws.shape}"
-        raise PoseError(message)
+        raise PoseError(f"yaws_deg must be at least one finite heading in a row, got an array of shape {yaws.shape}")
     is_finite = all(map(math.isfinite, (*center_m, radius_m, scale)))
     if not (is_finite and radius_m >= 0 and scale > 0):
-        message = (
+        raise PoseError(
             "center_m must be finite, radius_m at least 0 and scale positive, "
             f"got {center_m!r}, {radius_m!r} and {scale!r}"
         )
-        raise PoseError(message)
 
 
 def _joined(grid: Grid, tiles: Sequence[Tile]) -> Grid:

@@ -105,25 +105,24 @@ class BatchSearch:
     def __post_init__(self) -> None:
         """Check that the device is there."""
         if torch is None:
-            message = "search_batch needs PyTorch: pip install 'sasgeo-bench[torch]'"
-            raise ConfigError(message)
+            raise ConfigError("search_batch needs PyTorch: pip install 'sasgeo-bench[torch]'")
         if self.device not in DEVICES:
-            message = f"device must be one of {', '.join(DEVICES)}, got {self.device!r}"
-            raise ConfigError(message)
+            raise ConfigError(f"device must be one of {', '.join(DEVICES)}, got {self.device!r}")
         if self.device == "cuda" and not torch.cuda.is_available():
-            message = "PyTorch finds no GPU for device 'cuda': use 'cpu', or install a build of PyTorch for this GPU"
-            raise ConfigError(message)
+            raise ConfigError(
+                "PyTorch finds no GPU for device 'cuda': use 'cpu', or install a build of PyTorch for this GPU"
+            )
 
     def places(self, templates: Sequence[Template], priors: Sequence[Prior], *, count: int = 10) -> list[Found]:
         """Return the best modes of each view within its prior: at most `count`, best first."""
         if len(templates) != len(priors):
-            message = f"each view has a prior, got {len(templates)} templates and {len(priors)} priors"
-            raise ShapeError(message)
+            raise ShapeError(f"each view has a prior, got {len(templates)} templates and {len(priors)} priors")
         groups: dict[tuple[object, ...], list[int]] = {}
         for at, template in enumerate(templates):
             if len(template.bands) != self.field.cells.shape[-1]:
-                message = f"templates[{at}] has {len(template.weights)} classes, the map {len(self.field.layers)}"
-                raise ShapeError(message)
+                raise ShapeError(
+                    f"templates[{at}] has {len(template.weights)} classes, the map {len(self.field.layers)}"
+                )
             if len(template.active):
                 patches = self._search(template, priors[at]).patches
                 groups.setdefault((template.weights.shape, template.cell_size_m, patches), []).append(at)

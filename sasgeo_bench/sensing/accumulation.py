@@ -47,8 +47,7 @@ class Errors:
         values = [getattr(self, each.name) for each in fields(self)]
         shares = (self.height_share, self.position_share)
         if not all(map(math.isfinite, values)) or min(values) < 0 or max(shares) >= _MOST_SHARE:
-            message = f"errors are finite and not negative, shares under 1, got {self!r}"
-            raise CameraError(message)
+            raise CameraError(f"errors are finite and not negative, shares under 1, got {self!r}")
 
     def apart_m(self, *, distance_m: float, height_m: float, reach_m: float) -> float:
         """Return how far apart two frames show the same point, metres (1 sigma).
@@ -183,15 +182,12 @@ def accumulate(
 
 def _check(frames: Sequence[SoftView], steps: Sequence[Pose], correlation: float, caution: float) -> None:
     if not frames or len(steps) != len(frames) - 1:
-        message = f"n frames, at least one, have n - 1 steps between them, got {len(frames)} and {len(steps)}"
-        raise ShapeError(message)
+        raise ShapeError(f"n frames, at least one, have n - 1 steps between them, got {len(frames)} and {len(steps)}")
     kinds = {(frame.classes, frame.probabilities.shape, frame.cell_size_m) for frame in frames}
     if len(kinds) > 1:
-        message = f"frames have one lattice and the same classes, got {len(kinds)} kinds of them"
-        raise ShapeError(message)
+        raise ShapeError(f"frames have one lattice and the same classes, got {len(kinds)} kinds of them")
     if not 0 <= correlation <= 1 or not 0 <= caution < math.inf:
-        message = f"correlation is 0 to 1 and caution not negative, got {correlation!r} and {caution!r}"
-        raise CameraError(message)
+        raise CameraError(f"correlation is 0 to 1 and caution not negative, got {correlation!r} and {caution!r}")
 
 
 def _after(first: Pose, second: Pose) -> Pose:

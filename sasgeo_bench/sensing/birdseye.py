@@ -77,11 +77,11 @@ class Reading:
     def __post_init__(self) -> None:
         """Check the values."""
         if not 0 <= self.absent_at <= self.present_at <= 1:
-            message = f"0 <= absent_at <= present_at <= 1, got {self.absent_at!r} and {self.present_at!r}"
-            raise CameraError(message)
+            raise CameraError(f"0 <= absent_at <= present_at <= 1, got {self.absent_at!r} and {self.present_at!r}")
         if not all(value >= 0 for value in (*self.widths_m.values(), *self.standing_m.values())):
-            message = f"widths and heights are not negative, got {dict(self.widths_m)!r} and {dict(self.standing_m)!r}"
-            raise CameraError(message)
+            raise CameraError(
+                f"widths and heights are not negative, got {dict(self.widths_m)!r} and {dict(self.standing_m)!r}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -95,8 +95,7 @@ class SoftView:
     def __post_init__(self) -> None:
         """Check the shape."""
         if self.probabilities.ndim != 3 or len(self.probabilities) != len(self.classes):  # noqa: PLR2004 - C, rows, cols
-            message = f"{len(self.classes)} classes need (C, rows, cols), got shape {self.probabilities.shape}"
-            raise ShapeError(message)
+            raise ShapeError(f"{len(self.classes)} classes need (C, rows, cols), got shape {self.probabilities.shape}")
 
     def to_evidence(self, reading: Reading | None = None) -> Evidence:
         """Return present, absent and unknown cells; confidence is 255 * |2 P - 1|, 0 where unknown.
@@ -138,8 +137,7 @@ class BirdsEye:
         `pose` puts it elsewhere. Raise `CameraError` for a lattice that cannot be, or ground without height beneath.
         """
         if not (1 < size_cells <= _MOST_CELLS and math.isfinite(cell_size_m) and cell_size_m > 0):
-            message = f"a view has 2 to {_MOST_CELLS} cells a side, got {size_cells!r} of {cell_size_m!r} m"
-            raise CameraError(message)
+            raise CameraError(f"a view has 2 to {_MOST_CELLS} cells a side, got {size_cells!r} of {cell_size_m!r} m")
         pose = pose or Pose(easting_m=camera.east_m, northing_m=camera.north_m, yaw_deg=camera.yaw_deg)
         shape = (size_cells, size_cells)
         en_m = pose.to_map(cell_offsets_m(shape, cell_size_m))
@@ -245,8 +243,9 @@ def see_ground(
     reading = reading or Reading()
     planes, lens = seen.probabilities(), camera.intrinsics
     if planes.shape[1:] != (lens.height_px, lens.width_px):
-        message = f"the camera's pictures are {lens.height_px} x {lens.width_px}, got probabilities {planes.shape}"
-        raise ShapeError(message)
+        raise ShapeError(
+            f"the camera's pictures are {lens.height_px} x {lens.width_px}, got probabilities {planes.shape}"
+        )
     lattice = BirdsEye.of(camera, ground, size_cells=size_cells, cell_size_m=cell_size_m, pose=pose)
     found = lattice.sample(planes)
     hidden = np.zeros(lattice.is_seen.shape, dtype=bool)
@@ -329,8 +328,7 @@ def rectify(
     """Return a picture, uint8 (H, W, 3), as seen from above; black where it shows nothing."""
     lattice = BirdsEye.of(camera, ground, size_cells=size_cells, cell_size_m=cell_size_m, pose=pose)
     if picture.shape != (camera.intrinsics.height_px, camera.intrinsics.width_px, 3):
-        message = f"the camera's pictures are of another size than {picture.shape}"
-        raise ShapeError(message)
+        raise ShapeError(f"the camera's pictures are of another size than {picture.shape}")
     bands = lattice.sample(np.moveaxis(picture, 2, 0).astype(np.float32))
     return np.rint(np.nan_to_num(np.moveaxis(bands, 0, 2))).astype(np.uint8)
 

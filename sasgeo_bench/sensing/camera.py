@@ -41,8 +41,7 @@ _HALF_PX: Final = 0.5
 
 def _check_finite(owner: object, *values: float) -> None:
     if not all(map(math.isfinite, values)):
-        message = f"angles and places of a camera are finite numbers, got {owner!r}"
-        raise CameraError(message)
+        raise CameraError(f"angles and places of a camera are finite numbers, got {owner!r}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,15 +114,13 @@ class Camera:
         """Check the values."""
         _check_finite(self, self.east_m, self.north_m, self.height_m, *self.rotation)
         if max(abs(self.east_m), abs(self.north_m)) > _MOST_M or abs(self.height_m) > _HIGHEST_M:
-            message = (
+            raise CameraError(
                 f"a camera is within {_HIGHEST_M:g} m of height 0 and at coordinates in metres, got height "
                 f"{self.height_m!r} at {self.east_m!r}, {self.north_m!r}"
             )
-            raise CameraError(message)
         matrix = np.reshape(self.rotation, (3, 3))
         if not np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6) or np.linalg.det(matrix) < 0:
-            message = f"rotation is nine numbers of a right-handed rotation, got {self.rotation!r}"
-            raise CameraError(message)
+            raise CameraError(f"rotation is nine numbers of a right-handed rotation, got {self.rotation!r}")
 
     @classmethod
     def pointed(

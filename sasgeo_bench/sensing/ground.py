@@ -48,8 +48,7 @@ class Plane:
     def __post_init__(self) -> None:
         """Check the height."""
         if not _LOWEST_M <= self.height_m <= _HIGHEST_M:
-            message = f"the ground lies {_LOWEST_M:g} to {_HIGHEST_M:g} m high, got {self.height_m!r}"
-            raise CameraError(message)
+            raise CameraError(f"the ground lies {_LOWEST_M:g} to {_HIGHEST_M:g} m high, got {self.height_m!r}")
 
     def heights_m(self, en_m: Points) -> Points:
         """Return the height under each point, shape (N, 2) -> (N,), metres."""
@@ -78,16 +77,14 @@ class Dem:
     def __post_init__(self) -> None:
         """Check shape and heights; lock the array."""
         if self.cells_m.shape != self.grid.shape:
-            message = f"heights for {self.grid.shape} cells have that shape, got {self.cells_m.shape}"
-            raise CameraError(message)
+            raise CameraError(f"heights for {self.grid.shape} cells have that shape, got {self.cells_m.shape}")
         known = self.cells_m[np.isfinite(self.cells_m)]
         if not len(known) or known.min() < _LOWEST_M or known.max() > _HIGHEST_M:
             found = f"{known.min():g} to {known.max():g}" if len(known) else "none"
-            message = (
+            raise CameraError(
                 f"heights of a ground lie within {_LOWEST_M:g} and {_HIGHEST_M:g} m, got {found}: "
                 "is there a nodata value that the file does not name?"
             )
-            raise CameraError(message)
         self.cells_m.flags.writeable = False
 
     def relative_to(self, east_m: float, north_m: float, height_m: float = 0.0) -> Self:
@@ -178,8 +175,9 @@ def read_dem(path: Path, grid: Grid) -> Dem:
     refused.
     """
     if grid.rows * grid.cols > _MOST_CELLS:
-        message = f"a ground of {grid.rows} x {grid.cols} cells is too large: cut a smaller lattice, or larger cells"
-        raise CameraError(message)
+        raise CameraError(
+            f"a ground of {grid.rows} x {grid.cols} cells is too large: cut a smaller lattice, or larger cells"
+        )
     try:
         with open_geotiff(path, has_more=True) as source:
             _check_source(path, source, grid.epsg)
@@ -196,24 +194,21 @@ def read_dem(path: Path, grid: Grid) -> Dem:
             ) as warped:
                 cells_m = warped.read(1)
     except CPLE_BaseError as error:  # of GDAL where no operation leads from one CRS to the other: no `RasterioError`
-        message = (
+        raise CameraError(
             f"{path} cannot be transformed to EPSG:{grid.epsg}: no operation leads there from its CRS; name a file in "
             "a geographic or projected CRS of the Earth"
-        )
-        raise CameraError(message) from error
+        ) from error
     except (RasterioError, OSError, ValueError) as error:
         if isinstance(error, CameraError):
             raise
-        message = f"{path} cannot be read as a GeoTIFF of heights ({error}): check the file"
-        raise CameraError(message) from error
+        raise CameraError(f"{path} cannot be read as a GeoTIFF of heights ({error}): check the file") from error
     unknown = float(np.mean(~np.isfinite(cells_m)))
     if unknown:
         west_m, south_m, east_m, north_m = grid.bounds_m
-        message = (
+        raise CameraError(
             f"{path} does not cover {west_m:g} {south_m:g} {east_m:g} {north_m:g} (EPSG:{grid.epsg}): {unknown:.2%} "
             "has no height; name a file that reaches beyond it on every side"
         )
-        raise CameraError(message)
     if (scale, offset, unit_m) != (1.0, 0.0, 1.0):
         cells_m = ((cells_m * scale + offset) * unit_m).astype(np.float32)
     return Dem(grid=grid, cells_m=cells_m)
@@ -223,27 +218,23 @@ def _unit_m(path: Path, source: rasterio.DatasetReader) -> float:
     """Return the unit of a file's heights in metres; files that name none are in metres."""
     unit = (source.units[0] or "metre").strip().lower()
     if unit not in _UNITS_M:
-        message = (
+        raise CameraError(
             f"{path} has heights in {unit[:40]!r}, metres or feet are read: convert it (gdal_calc.py, gdal_edit.py)"
         )
-        raise CameraError(message)
     return _UNITS_M[unit]
 
 
 def _check_source(path: Path, source: rasterio.DatasetReader, epsg: int) -> None:
     if source.crs is None:
-        message = f"{path} has no CRS: write one into it (gdal_edit.py -a_srs EPSG:...), or name another file"
-        raise CameraError(message)
+        raise CameraError(f"{path} has no CRS: write one into it (gdal_edit.py -a_srs EPSG:...), or name another file")
     try:
         pyproj.Transformer.from_crs(source.crs.to_wkt(), epsg)
     except ProjError as error:
-        message = (
+        raise CameraError(
             f"{path} has the coordinate reference system {one_line(source.crs.to_wkt())[:60]!r}, from which no way "
             f"leads to EPSG:{epsg}: write the right one into it (gdal_edit.py -a_srs EPSG:...)"
-        )
-        raise CameraError(message) from error
+        ) from error
     if source.count != 1 or np.dtype(source.dtypes[0]).kind not in "iuf":
-        message = (
+        raise CameraError(
             f"{path} is no file of heights: it has {source.count} bands of {source.dtypes[0]}, one of numbers is needed"
         )
-        raise CameraError(message)

@@ -69,11 +69,11 @@ def decode_image(
     sasgeo_bench.errors.ImageError: roof.png has 3 x 2 pixels, at most 5 are decoded: cut it, or scale it down, first
     """
     if not data:
-        message = f"{name} is empty: copy or download it again"
-        raise ImageError(message)
+        raise ImageError(f"{name} is empty: copy or download it again")
     if len(data) > most_bytes:
-        message = f"{name} has {len(data)} bytes, at most {most_bytes} are read: cut it, or scale it down, first"
-        raise ImageError(message)
+        raise ImageError(
+            f"{name} has {len(data)} bytes, at most {most_bytes} are read: cut it, or scale it down, first"
+        )
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of Pillow: large images and odd metadata; we refuse what matters
         return _decoded(data, name, most_pixels)
@@ -87,33 +87,32 @@ def _decoded(data: bytes, name: str, most_pixels: int) -> Picture:
     except ImageError:
         raise
     except Image.DecompressionBombError as error:
-        message = f"{name} has more than twice the pixels that Pillow decodes: cut it, or scale it down, first"
-        raise ImageError(message) from error
+        raise ImageError(
+            f"{name} has more than twice the pixels that Pillow decodes: cut it, or scale it down, first"
+        ) from error
     except UnidentifiedImageError as error:
-        message = f"{name} is no JPEG, PNG, WebP or TIFF image, or its first bytes are damaged: export it as one"
-        raise ImageError(message) from error
+        raise ImageError(
+            f"{name} is no JPEG, PNG, WebP or TIFF image, or its first bytes are damaged: export it as one"
+        ) from error
     except Exception as error:  # Pillow fails at damaged files with errors of many kinds
-        message = f"{name} is truncated or damaged ({message_of(error)}): copy or download it again"
-        raise ImageError(message) from error
+        raise ImageError(f"{name} is truncated or damaged ({message_of(error)}): copy or download it again") from error
 
 
 def _check_head(image: Image.Image, name: str, most_pixels: int) -> None:
     """Refuse an image by its head, before its pixels are decoded."""
     width, height = image.size
     if width < 1 or height < 1:
-        message = f"{name} has {width} x {height} pixels: export it again"
-        raise ImageError(message)
+        raise ImageError(f"{name} has {width} x {height} pixels: export it again")
     if width * height > most_pixels:
-        message = (
+        raise ImageError(
             f"{name} has {width} x {height} pixels, at most {most_pixels} are decoded: cut it, or scale it down, first"
         )
-        raise ImageError(message)
     if getattr(image, "tag_v2", {}).get(_KIND, 0) & _REDUCED:
-        message = f"{name} begins with what is a preview of another picture in the file: export it as JPEG"
-        raise ImageError(message)
+        raise ImageError(f"{name} begins with what is a preview of another picture in the file: export it as JPEG")
     if image.mode not in _WITHIN_8_BITS and not image.mode.startswith("I;16"):
-        message = f"{name} holds numbers of kind {image.mode!r}, not colours: export it with 8 or 16 bits a band"
-        raise ImageError(message)
+        raise ImageError(
+            f"{name} holds numbers of kind {image.mode!r}, not colours: export it with 8 or 16 bits a band"
+        )
 
 
 def _to_rgb(image: Image.Image, name: str, *, is_tiff: bool) -> Picture:
@@ -126,11 +125,10 @@ def _to_rgb(image: Image.Image, name: str, *, is_tiff: bool) -> Picture:
         seen = image.convert("RGBA")
         alpha = np.asarray(seen.getchannel("A"))
         if is_tiff and ((alpha >= _BETWEEN[0]) & (alpha <= _BETWEEN[1])).mean() > _MOST_BETWEEN:
-            message = (
+            raise ImageError(
                 f"{name} has a band that calls itself alpha and holds a picture, such as near infrared: write its red, "
                 "green and blue alone (gdal_translate -b 1 -b 2 -b 3)"
             )
-            raise ImageError(message)
         image = Image.new("RGBA", seen.size, (0, 0, 0, 255))
         image.alpha_composite(seen)
     return np.array(image.convert("RGB"), dtype=np.uint8)
@@ -170,16 +168,14 @@ class AerialImage:
         """Check shape, type and sigmas; lock the picture."""
         size = (self.camera.intrinsics.height_px, self.camera.intrinsics.width_px)
         if self.rgb.dtype != np.uint8 or self.rgb.shape != (*size, 3):
-            message = (
+            raise ImageError(
                 f"rgb is uint8 of shape {(*size, 3)}, as the camera's pictures are; "
                 f"got {self.rgb.dtype} of shape {self.rgb.shape}"
             )
-            raise ImageError(message)
         for name in ("height_sigma_m", "attitude_sigma_deg"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                message = f"{name} must be finite and not negative, got {value!r}"
-                raise ImageError(message)
+                raise ImageError(f"{name} must be finite and not negative, got {value!r}")
         self.rgb.flags.writeable = False
 
     @property
@@ -219,11 +215,11 @@ class LabelledImage:
         check_classes(self.classes)
         expected = (len(self.classes), *self.image.shape)
         if self.labels.dtype != np.uint8 or self.labels.shape != expected:
-            message = f"labels are uint8 of shape {expected}, got {self.labels.dtype} of shape {self.labels.shape}"
-            raise ImageError(message)
+            raise ImageError(
+                f"labels are uint8 of shape {expected}, got {self.labels.dtype} of shape {self.labels.shape}"
+            )
         if self.labels.max() > UNKNOWN:
-            message = f"labels are 0 absent, 1 present or 2 unknown, got {int(self.labels.max())}"
-            raise ImageError(message)
+            raise ImageError(f"labels are 0 absent, 1 present or 2 unknown, got {int(self.labels.max())}")
         self.labels.flags.writeable = False
 
 
@@ -236,5 +232,4 @@ def check_classes(classes: tuple[str, ...]) -> None:
     sasgeo_bench.errors.ImageError: classes are at least one and each once, got building, water, building
     """
     if not classes or len(set(classes)) != len(classes):
-        message = f"classes are at least one and each once, got {', '.join(classes) or 'none'}"
-        raise ImageError(message)
+        raise ImageError(f"classes are at least one and each once, got {', '.join(classes) or 'none'}")

@@ -60,8 +60,7 @@ def labelled_from(data: bytes) -> LabelledImage:
     camera = _camera(head)
     classes, place = head.get("classes"), head.get("place")
     if not isinstance(classes, list) or len(classes) > _MOST_CLASSES or not isinstance(place, str):
-        message = f"the head of {what} is damaged: make it again"
-        raise ImageError(message)
+        raise ImageError(f"the head of {what} is damaged: make it again")
     shape = (len(classes), camera.intrinsics.height_px, camera.intrinsics.width_px)
     picture_bytes = _pixels(camera) * _BANDS
     body = unpack_body(rest, picture_bytes + -(-int(np.prod(shape)) // CELLS_PER_BYTE), what)
@@ -89,11 +88,9 @@ def _camera(head: Mapping[str, Any]) -> Camera:
         intrinsics = Intrinsics(**lens)
         camera = Camera(**{**given, "intrinsics": intrinsics, "rotation": tuple(given["rotation"])})
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        message = "the camera of an image's head is damaged: make it again"
-        raise ImageError(message) from error
+        raise ImageError("the camera of an image's head is damaged: make it again") from error
     if type(intrinsics.width_px) is not int or type(intrinsics.height_px) is not int or _pixels(camera) > MOST_PIXELS:
-        message = f"an image has at most {MOST_PIXELS} pixels: cut it, or scale it down, first"
-        raise ImageError(message)
+        raise ImageError(f"an image has at most {MOST_PIXELS} pixels: cut it, or scale it down, first")
     return camera
 
 
@@ -107,8 +104,7 @@ def _image(head: Mapping[str, Any], camera: Camera, pixels: NDArray[np.uint8]) -
         sigmas = {name: float(head[name]) for name in ("height_sigma_m", "attitude_sigma_deg")}
         observed_on = None if day is None else dt.date.fromisoformat(day)
     except (KeyError, TypeError, ValueError) as error:
-        message = "the head of an image is damaged: make it again"
-        raise ImageError(message) from error
+        raise ImageError("the head of an image is damaged: make it again") from error
     rgb = pixels.reshape(camera.intrinsics.height_px, camera.intrinsics.width_px, _BANDS)
     return AerialImage(rgb=rgb, camera=camera, observed_on=observed_on, season=season, **sigmas)
 
@@ -123,11 +119,10 @@ def write_labelled(folder: Path, images: Iterable[LabelledImage]) -> tuple[Path,
     for number, labelled in enumerate(images):
         classes = classes or labelled.classes
         if labelled.classes != classes:
-            message = (
+            raise ImageError(
                 f"image {number} labels {', '.join(labelled.classes)}, the first one {', '.join(classes)}: "
                 "label the same classes everywhere, as unknown where nobody has looked"
             )
-            raise ImageError(message)
         paths.append(folder / f"{number:06d}{SUFFIX}")
         with fresh_file(paths[-1], mend="free some space and run again") as scratch:
             scratch.write_bytes(labelled_bytes(labelled))
@@ -152,11 +147,9 @@ class LabelledFiles(Sequence[LabelledImage]):
         try:
             return labelled_from(plain_file(path).read_bytes())
         except ImageError as error:
-            message = f"{path}: {error}"
-            raise ImageError(message) from error
+            raise ImageError(f"{path}: {error}") from error
         except OSError as error:
-            message = f"{path} cannot be read ({error.strerror or error}): make the images again"
-            raise StoreError(message) from error
+            raise StoreError(f"{path} cannot be read ({error.strerror or error}): make the images again") from error
 
     def __len__(self) -> int:
         """Number of images."""

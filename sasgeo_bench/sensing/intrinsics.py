@@ -52,21 +52,20 @@ class Intrinsics:
     def __post_init__(self) -> None:
         """Check that the values describe a lens."""
         if not (1 <= self.width_px <= _MOST_PX and 1 <= self.height_px <= _MOST_PX):
-            message = f"a picture has 1 to {_MOST_PX} pixels a side, got {self.width_px!r} x {self.height_px!r}"
-            raise CameraError(message)
+            raise CameraError(
+                f"a picture has 1 to {_MOST_PX} pixels a side, got {self.width_px!r} x {self.height_px!r}"
+            )
         numbers = (*self.focal_px, *self.centre_px, *self.distortion)
         if len(numbers) != 2 + 2 + len(NO_DISTORTION) or not all(map(math.isfinite, numbers)):
-            message = (
+            raise CameraError(
                 f"a camera has two focal lengths, two coordinates of its centre and five coefficients of distortion "
                 f"(k1, k2, p1, p2, k3), all finite, got {self.focal_px!r}, {self.centre_px!r}, {self.distortion!r}"
             )
-            raise CameraError(message)
         if not min(self.focal_px) > 0 or self.horizontal_deg > _WIDEST_DEG:
-            message = (
+            raise CameraError(
                 f"focal_px must be positive and leave a field of view of at most {_WIDEST_DEG:g} degrees, "
                 f"got {self.focal_px!r} for {self.width_px} pixels: is it in millimetres?"
             )
-            raise CameraError(message)
 
     @classmethod
     def from_field_of_view(
@@ -78,8 +77,7 @@ class Intrinsics:
         (400.0, 400.0)
         """
         if not 0 < horizontal_deg <= _WIDEST_DEG:
-            message = f"a field of view is above 0 and at most {_WIDEST_DEG:g} degrees, got {horizontal_deg!r}"
-            raise CameraError(message)
+            raise CameraError(f"a field of view is above 0 and at most {_WIDEST_DEG:g} degrees, got {horizontal_deg!r}")
         focal_px = round(width_px / 2 / math.tan(math.radians(horizontal_deg) / 2), 9)
         return cls(
             width_px=width_px,
@@ -101,8 +99,9 @@ class Intrinsics:
         """
         matrix = np.asarray(matrix, dtype=np.float64)
         if matrix.shape != (3, 3) or matrix[0, 1] or matrix[1, 0] or matrix[2].tolist() != [0.0, 0.0, 1.0]:
-            message = f"a camera matrix is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew), got {matrix.tolist()!r}"
-            raise CameraError(message)
+            raise CameraError(
+                f"a camera matrix is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew), got {matrix.tolist()!r}"
+            )
         (fx, _, cx), (_, fy, cy), _ = matrix.tolist()
         return cls(
             width_px=width_px,

@@ -52,9 +52,7 @@ def unpack_body(rest: bytes, count: int, what: str) -> bytes:
     try:
         body = unpacking.decompress(rest, count + 1)
     except zlib.error as error:
-        message = f"the bytes of {what} are damaged ({error}): make it again"
-        raise ImageError(message) from error
+        raise ImageError(f"the bytes of {what} are damaged ({error}): make it again") from error
     if len(body) != count or not unpacking.eof or unpacking.unused_data:
-        message = f"{what} does not hold the {count} bytes that its head announces: make it again"
-        raise ImageError(message)
+        raise ImageError(f"{what} does not hold the {count} bytes that its head announces: make it again")
     return body

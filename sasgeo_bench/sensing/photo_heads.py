@@ -52,14 +52,13 @@ def read_head(path: Path) -> PhotoHead:
     except ImageError:
         raise
     except (UnidentifiedImageError, Image.DecompressionBombError) as error:
-        message = f"{path} is no JPEG, TIFF or DNG of a size that can be read ({message_of(error)}): check the file"
-        raise ImageError(message) from error
+        raise ImageError(
+            f"{path} is no JPEG, TIFF or DNG of a size that can be read ({message_of(error)}): check the file"
+        ) from error
     except FileNotFoundError as error:
-        message = f"there is no photo {path}: check the path"
-        raise ImageError(message) from error
+        raise ImageError(f"there is no photo {path}: check the path") from error
     except Exception as error:  # Pillow and the reader of XML fail at damaged files with errors of many kinds
-        message = f"{path} has damaged metadata ({message_of(error)}): copy it again from the drone"
-        raise ImageError(message) from error
+        raise ImageError(f"{path} has damaged metadata ({message_of(error)}): copy it again from the drone") from error
 
 
 def _head(size_px: tuple[int, int], exif: Image.Exif, xmp: object) -> PhotoHead:

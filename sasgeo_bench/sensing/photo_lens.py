@@ -50,8 +50,9 @@ class Lens:
         1833.335
         """
         if self.projection:
-            message = f"{name} is a {self.projection} picture, which no pinhole describes: give the camera's intrinsics"
-            raise CameraError(message)
+            raise CameraError(
+                f"{name} is a {self.projection} picture, which no pinhole describes: give the camera's intrinsics"
+            )
         calibrated, film = self._by_calibration(name, size_px), self._by_film(name, size_px)
         sensor = self._by_sensor(name, size_px)
         by, other = "the pixels of its sensor", sensor
@@ -59,23 +60,20 @@ class Lens:
             is_sized = self.calibrated_size_px or self.native_size_px
             by, other = "calibration", None if is_sized else calibrated
         if film is not None and other is not None and abs(film / other - 1) > _AGREES:
-            message = (
+            raise CameraError(
                 f"{name} has two focal lengths, {film:.0f} px by 35 mm film and {other:.0f} px by {by}: it was cut or "
                 "resized; use the drone's own file, or give the camera's intrinsics"
             )
-            raise CameraError(message)
         found = next((focal_px for focal_px in (calibrated, film, sensor) if focal_px is not None), None)
         if found is None:
-            message = f"{name} has no focal length on 35 mm film: give the camera's intrinsics"
-            raise CameraError(message)
+            raise CameraError(f"{name} has no focal length on 35 mm film: give the camera's intrinsics")
         zoom = self.zoom or 1.0
         leaves_out = calibrated is None and film is not None and self.make.lower() in _NOT_IN_FILM
         if zoom < 1.0 or (zoom > 1.0 and not leaves_out):
-            message = (
+            raise CameraError(
                 f"{name} has a digital zoom of {zoom:g}, which its focal length may count or not: give the camera's "
                 "intrinsics"
             )
-            raise CameraError(message)
         return found * zoom
 
     def _by_calibration(self, name: str, size_px: Size) -> float | None:
@@ -98,11 +96,10 @@ class Lens:
             return native
         if native is None or _is_near(native, size_px):
             return middle
-        message = (
+        raise CameraError(
             f"{name} of {_text(size_px)} pixels was one of {_text(native)} by its EXIF, and is calibrated for "
             f"{_text(middle)}: use the drone's own file, or give the camera's intrinsics"
         )
-        raise CameraError(message)
 
     def _by_film(self, name: str, size_px: Size) -> float | None:
         """Compare diagonals of sensors; a picture of 16 : 9 is taken for a cut out of a sensor of 4 : 3 as wide."""
@@ -124,11 +121,10 @@ class Lens:
         across, down = size_px[0] / of_px[0], size_px[1] / of_px[1]
         is_cut = down < across and any(abs(size_px[0] / size_px[1] / aspect - 1) <= _SAME for aspect in _CUTS)
         if abs(across / down - 1) > _SAME and not (is_cut and of_px[0] / of_px[1] < _WIDEST_SENSOR):
-            message = (
+            raise CameraError(
                 f"{name} of {_text(size_px)} pixels is cut out of a picture of {_text(of_px)}, or turned: use the "
                 "drone's own file, or give the camera's intrinsics"
             )
-            raise CameraError(message)
         return across
 
 

@@ -116,8 +116,7 @@ class Photo:
         """
         height_m = self.height_m if height_m is None else height_m
         if self.gimbal_fault:
-            message = f"{self.name} has {self.gimbal_fault}: make the camera by `Camera.pointed`"
-            raise CameraError(message)
+            raise CameraError(f"{self.name} has {self.gimbal_fault}: make the camera by `Camera.pointed`")
         if self.lon_deg is None or self.lat_deg is None or height_m is None or self.gimbal is None:
             facts = {"GPS": self.lon_deg, "height above take-off": height_m, "gimbal angles": self.gimbal}
             lacking = [name for name, value in facts.items() if value is None]
@@ -126,14 +125,12 @@ class Photo:
                 if height_m is None and len(lacking) == 1
                 else "use the drone's own file, not an edited copy"
             )
-            message = f"{self.name} has no pose: {', '.join(lacking)} missing; {mend}"
-            raise CameraError(message)
+            raise CameraError(f"{self.name} has no pose: {', '.join(lacking)} missing; {mend}")
         if not height_m > 0:
-            message = (
+            raise CameraError(
                 f"{self.name} was taken {height_m:+g} m above the ground or the place of take-off: give its own height "
                 "above the ground (height_m)"
             )
-            raise CameraError(message)
         crs = epsg or utm_epsg(self.lon_deg, self.lat_deg)
         east_m, north_m, convergence_deg = _to_grid(self.lon_deg, self.lat_deg, crs)
         sensor = Camera.mounted(
@@ -145,11 +142,10 @@ class Photo:
             mount=Mount(tilt_deg=self.gimbal.pitch_deg - _STRAIGHT_DOWN_DEG, roll_deg=self.gimbal.roll_deg),
         )
         if not sensor.tilt_deg < _HORIZON_DEG:
-            message = (
+            raise CameraError(
                 f"{self.name} looks at the horizon or the sky (gimbal pitch {self.gimbal.pitch_deg:+.1f}, -90 is "
                 "straight down; some drones write 0 for unknown): leave it out, or make the camera by `Camera.pointed`"
             )
-            raise CameraError(message)
         return sensor.upright(_TURNS[self.orientation])
 
 
@@ -174,19 +170,18 @@ def read_photo(path: Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = M
 def _check_bytes(path: Path, most_bytes: int) -> None:
     size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
     if size > most_bytes:
-        message = f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first"
-        raise ImageError(message)
+        raise ImageError(f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first")
 
 
 def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:
     width_px, height_px = head.size_px
     if width_px * height_px > most_pixels or min(head.size_px) < 1:
-        message = f"{name} has {width_px} x {height_px} pixels, at most {most_pixels} are read: scale it down first"
-        raise ImageError(message)
+        raise ImageError(
+            f"{name} has {width_px} x {height_px} pixels, at most {most_pixels} are read: scale it down first"
+        )
     orientation = head.exif.get(ExifTags.Base.Orientation, 1)
     if orientation not in _TURNS:
-        message = f"{name} is mirrored or damaged (EXIF orientation {orientation!r}): use the drone's own file"
-        raise ImageError(message)
+        raise ImageError(f"{name} is mirrored or damaged (EXIF orientation {orientation!r}): use the drone's own file")
     if _TURNS[orientation][0][0] == 0:
         width_px, height_px = height_px, width_px
     lon_deg, lat_deg = _place(head.gps)

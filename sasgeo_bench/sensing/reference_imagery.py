@@ -62,11 +62,9 @@ class Look:
         """Check every value."""
         for name, known in (("family", tuple(PALETTES)), ("season", SEASONS)):
             if getattr(self, name) not in known:
-                message = f"{name} is one of {', '.join(known)}, got {getattr(self, name)!r}"
-                raise ConfigError(message)
+                raise ConfigError(f"{name} is one of {', '.join(known)}, got {getattr(self, name)!r}")
         if not FINEST_M <= self.gsd_m <= COARSEST_M:
-            message = f"gsd_m lies between {FINEST_M:g} and {COARSEST_M:g} m, got {self.gsd_m!r}"
-            raise ConfigError(message)
+            raise ConfigError(f"gsd_m lies between {FINEST_M:g} and {COARSEST_M:g} m, got {self.gsd_m!r}")
 
     def conditions(self, place: str) -> Conditions:
         """Return one light for the whole image, drawn for place and seed: a survey flies around noon, in the clear."""
@@ -111,8 +109,9 @@ def render_imagery(folder: Path, world: Path, look: Look, *, tell: Tell) -> Orth
     except SasgeoError:
         raise
     except OSError as error:
-        message = f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        ) from error
 
 
 def render_place(
@@ -130,8 +129,9 @@ def render_place(
     """
     plan = plan_build(spec, out=out, extract_folders=extract_folders)
     if not plan.is_current:
-        message = f"{plan.folder} is not built, or not by this region file: run sasgeo-bench build-region {spec.id}"
-        raise StoreError(message)
+        raise StoreError(
+            f"{plan.folder} is not built, or not by this region file: run sasgeo-bench build-region {spec.id}"
+        )
     world = plan if date is None else plan_build(spec, out=out, date=date, extract_folders=extract_folders)
     if not world.is_current:
         build_region(world, tell=tell)
@@ -171,8 +171,9 @@ def place_of(region: str) -> str:
 def _picture(manifest: Manifest, shown: Manifest, look: Look) -> PictureRecord:
     """Return the record of the image; refuse a region whose imagery is real."""
     if manifest.imagery is not None and not manifest.imagery.is_rendered:
-        message = f"{manifest.id} has imagery of its own ([[imagery]] in its region file): a rendered one adds nothing"
-        raise ImageryError(message)
+        raise ImageryError(
+            f"{manifest.id} has imagery of its own ([[imagery]] in its region file): a rendered one adds nothing"
+        )
     extract, sun = shown.extract, look.conditions(place_of(manifest.id)).sun
     return PictureRecord(
         file=extract.file,
@@ -207,8 +208,9 @@ def _check_drawable(rendering: _Rendering) -> None:
     """Refuse a map without a visible feature in the bounds."""
     geometry = rendering.features.geometry.to_numpy()[rendering.features["is_visible"].to_numpy()]
     if not shapely.intersects(geometry, shapely.box(*rendering.manifest.bounds_m)).any():
-        message = f"{rendering.folder.name} of {rendering.picture.date} shows nothing to draw: take another date"
-        raise ImageryError(message)
+        raise ImageryError(
+            f"{rendering.folder.name} of {rendering.picture.date} shows nothing to draw: take another date"
+        )
 
 
 def _render_into(scratch: Path, rendering: _Rendering, tell: Tell) -> OrthoRecord:
@@ -222,8 +224,7 @@ def _render_into(scratch: Path, rendering: _Rendering, tell: Tell) -> OrthoRecor
     grid = lattice_within(bounds, manifest.grid, finest_m=rendering.look.gsd_m)
     tiles = _tiles(rendering, grid)
     if not write_tiles(scratch / ORTHO, grid, tiles, attribution=ATTRIBUTION, licence=LICENCE):
-        message = f"{folder.name} of {rendering.picture.date} has no mapped ground: take another date"
-        raise ImageryError(message)
+        raise ImageryError(f"{folder.name} of {rendering.picture.date} has no mapped ground: take another date")
     record = _measured(scratch, rendering, grid)
     files = manifest.files | {ORTHO: file_record(scratch / ORTHO)}
     changed = manifest.model_copy(update={"files": dict(sorted(files.items())), "imagery": record})

@@ -81,8 +81,7 @@ def region_views(
     `list(region_views(read_region("out/regions/zanzibar"), bounds_m, place="zanzibar-north"))` holds views of 100 m.
     """
     if region.imagery is None:
-        message = f"region {region.manifest.id} has no imagery: choose one whose region file names some"
-        raise ImageryError(message)
+        raise ImageryError(f"region {region.manifest.id} has no imagery: choose one whose region file names some")
     paint = make_paint(region.features, region.classes, region.coverage)
     whole = Grid.from_bounds(*bounds_m, cell_size_m=gsd_m, epsg=region.grid.epsg)
     for row, rows in _strips(whole.rows, side_px):

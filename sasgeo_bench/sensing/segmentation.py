@@ -57,11 +57,10 @@ class Segmentation:
         planes = self.probability_bytes
         is_sound = planes.dtype == np.uint8 and planes.ndim == 3 and len(planes) == len(self.classes)  # noqa: PLR2004
         if not is_sound or planes.size == 0:
-            message = (
+            raise ImageError(
                 f"a segmentation of {len(self.classes)} classes is uint8 of shape (C, H, W) with a pixel at least, "
                 f"got {planes.dtype} of shape {planes.shape}"
             )
-            raise ImageError(message)
         planes.flags.writeable = False
 
     @classmethod
@@ -74,8 +73,7 @@ class Segmentation:
         is_silent = np.isnan(probabilities)
         filled = np.where(is_silent, 0, probabilities)
         if filled.size and not (filled.min() >= 0 and filled.max() <= 1):
-            message = f"probabilities lie in 0..1, got {filled.min():g}..{filled.max():g}"
-            raise ImageError(message)
+            raise ImageError(f"probabilities lie in 0..1, got {filled.min():g}..{filled.max():g}")
         planes = np.where(is_silent, SILENT, np.floor(filled * CERTAIN + 0.5)).astype(np.uint8)
         return cls(classes=classes, probability_bytes=planes)
 
@@ -171,8 +169,7 @@ class Segmentation:
         head, rest = split_parts(_MAGIC, data, "a segmentation")
         classes, found = _read_head(head)
         if shape is not None and found != shape:
-            message = f"a segmentation of shape {found}, expected {shape} as the picture is"
-            raise ImageError(message)
+            raise ImageError(f"a segmentation of shape {found}, expected {shape} as the picture is")
         planes = unpack_body(rest, len(classes) * found[0] * found[1], "a segmentation")
         cells = np.frombuffer(planes, dtype=np.uint8).reshape(len(classes), *found)
         return cls(classes=classes, probability_bytes=cells)
@@ -189,11 +186,9 @@ def tables_of(counts: Mapping[str, NDArray[np.int64]], shares: Mapping[str, floa
     tables = {}
     for name, share in shares.items():
         if name not in counts:
-            message = f"there is no class {name!r}, the segmentation has {', '.join(counts)}"
-            raise ImageError(message)
+            raise ImageError(f"there is no class {name!r}, the segmentation has {', '.join(counts)}")
         if not 0 <= share <= 1:
-            message = f"the share of {name} must lie in 0..1, got {share!r}"
-            raise ImageError(message)
+            raise ImageError(f"the share of {name} must lie in 0..1, got {share!r}")
         tables[name] = _shifted_bytes(counts[name], share)
     return tables
 
@@ -225,10 +220,10 @@ def _read_head(head: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[int, int
         and all(type(side) is int and side > 0 for side in shape)
     )
     if not is_sound or classes is None or shape is None:
-        message = "the head of a segmentation is damaged: make it again"
-        raise ImageError(message)
+        raise ImageError("the head of a segmentation is damaged: make it again")
     rows, cols = shape
     if len(classes) > MOST_CLASSES or len(classes) * rows * cols > MOST_VALUES:
-        message = f"a segmentation of {len(classes)} classes and {rows} x {cols} pixels is too large: cut the picture"
-        raise ImageError(message)
+        raise ImageError(
+            f"a segmentation of {len(classes)} classes and {rows} x {cols} pixels is too large: cut the picture"
+        )
     return tuple(classes), (rows, cols)

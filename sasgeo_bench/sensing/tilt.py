@@ -105,14 +105,14 @@ def refine_tilt(
     (30, 25)
     """
     if not all(sigma > 0 for sigma in (attitude_sigma_deg, end_sigma_px, parallel_sigma_deg)):
-        message = (
+        raise CameraError(
             "standard deviations are positive, got "
             f"attitude_sigma_deg={attitude_sigma_deg!r}, {end_sigma_px!r}, {parallel_sigma_deg!r}"
         )
-        raise CameraError(message)
     if any(lines.ndim != 3 or lines.shape[1:] != (2, 2) or len(lines) < 2 for lines in roads):  # noqa: PLR2004
-        message = f"borders of a road have shape (2 or more, 2 ends, 2), got {[lines.shape for lines in roads]!r}"
-        raise CameraError(message)
+        raise CameraError(
+            f"borders of a road have shape (2 or more, 2 ends, 2), got {[lines.shape for lines in roads]!r}"
+        )
     sigmas = [_sigmas_deg(lines, end_sigma_px, parallel_sigma_deg) for lines in roads]
 
     def residuals(turn_deg: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -161,13 +161,11 @@ def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
     suite = replace(suite, variants=no_larger(suite.variants, request.region.largest_view_m))
     refusal = None if request.group is None else suite.refusal(request.group)
     if refusal is not None:
-        message = f"suite {suite.card.name!r} {refusal}"
-        raise ConfigError(message)
+        raise ConfigError(f"suite {suite.card.name!r} {refusal}")
     scene, base = read_scene(request, suite, tell)
     reason = suite.lack(scene)
     if reason is not None:
-        message = f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason}{_SKIP}"
-        raise ConfigError(message)
+        raise ConfigError(f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason}{_SKIP}")
     group = request.group or suite.card.group
     seeds = Seeds(root=request.seed, names=(request.region.id, suite.card.name, str(suite.card.version)))
     suite = replace(suite, variants=suite.usable(scene))
@@ -189,11 +187,10 @@ def _view_reach_m(request: Request, suite: Suite) -> float:
     reach_m = largest_m / 2 * float(np.sqrt(2)) * largest_scale(request.group or suite.card.group)
     allowed_m = request.split.spec.reach_m
     if reach_m > allowed_m:
-        message = (
+        raise ConfigError(
             f"views of {largest_m:g} m reach up to {reach_m:.0f} m beyond a block, the split {allowed_m:g} m: "
             "use a split with a larger reach_m"
         )
-        raise ConfigError(message)
     return reach_m
 
 
@@ -203,8 +200,7 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
     base = region_files.read_region(folder, with_layers=False)
     blocks = request.split.blocks_in(request.region.id)
     if not blocks:
-        message = f"split {request.split.spec.id!r} does not speak of region {request.region.id!r}"
-        raise ConfigError(message)
+        raise ConfigError(f"split {request.split.spec.id!r} does not speak of region {request.region.id!r}")
     state = State.of(base, bits=read_bits(folder / region_files.LAYERS))
     needs = suite.card.needs
     others: tuple[State, ...] = ()
@@ -318,8 +314,9 @@ def put_task(
     except SasgeoError:
         raise
     except OSError as error:
-        message = f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
+        ) from error
     return Made(folder=task_folder, queries=total, sites=about["sites"])
 
 
@@ -328,8 +325,9 @@ def _check_unmixed(truth_folder: Path, hidden: Mapping[str, Any]) -> None:
     before = task_files.read_hidden(truth_folder)
     if before and (task_files.PRIVATE in before) != (task_files.PRIVATE in hidden):
         kinds = ("public", "private") if task_files.PRIVATE in hidden else ("private", "public")
-        message = f"{truth_folder} was drawn by a {kinds[0]} seed, and this one is {kinds[1]}: choose another --out"
-        raise StoreError(message)
+        raise StoreError(
+            f"{truth_folder} was drawn by a {kinds[0]} seed, and this one is {kinds[1]}: choose another --out"
+        )
 
 
 def _about(

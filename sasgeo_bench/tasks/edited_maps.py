@@ -46,14 +46,12 @@ def edit_maps(
     if edit is None:
         return drawer, sites
     if not edit.sites:
-        message = f"{request.region.id} has no room for a copy of a site, as suite {suite.card.name!r} needs"
-        raise ConfigError(message)
+        raise ConfigError(f"{request.region.id} has no room for a copy of a site, as suite {suite.card.name!r} needs")
     if len(edit.sites) < request.count and not request.may_be_fewer:
-        message = (
+        raise ConfigError(
             f"{request.region.id} has room for the copies of {len(edit.sites)} of {len(sites)} sites of suite "
             f"{suite.card.name!r}: lower --n or pass --up-to"
         )
-        raise ConfigError(message)
     # Tried on the unedited map, so that no edited map is written without a query to ask on it.
     trial = replace(drawer, scene=replace(scene, twins=edit.twins))
     reasons = Counter(map(trial.why_not, trial.jobs(edit.sites)))

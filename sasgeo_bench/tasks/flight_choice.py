@@ -92,12 +92,11 @@ class Airspace:
             if flight is not None:
                 flights[index] = flight
         if not flights or (len(flights) < count and not may_be_fewer):
-            message = (
+            raise ConfigError(
                 f"{self.scene.map.region} has room for {len(flights)} of {count} flights of suite "
                 f"{self.suite.card.name!r}: too little is mapped or drawn"
                 + (", lower --n or pass --up-to" if flights else "")
             )
-            raise ConfigError(message)
         return flights
 
     def _flight(self, index: int, before: Sequence[Flight]) -> Flight | None:

@@ -122,19 +122,17 @@ def flight_panels(
     else:
         chosen = [name for name in truths if name.startswith(flight)][:1]
         if not chosen:
-            message = (
+            raise ConfigError(
                 f"{task_folder} holds no flight {flight!r}: it has {counted(len(truths), 'flight')}, as "
                 f"{', '.join(list(truths)[:3])}"
             )
-            raise ConfigError(message)
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in chosen}
     for batch in task_files.read_batches(task_folder / task_files.QUERIES, _COLUMNS):
         for row in batch.to_pylist():
             rows.get(flight_id(row["query_id"]), []).append(row)
     for name in chosen:
         if [row["query_id"] for row in rows[name]] != [truth.query_id for truth in truths[name]]:
-            message = f"{truth_folder} does not hold the truths of {task_folder}: make the queries again"
-            raise StoreError(message)
+            raise StoreError(f"{truth_folder} does not hold the truths of {task_folder}: make the queries again")
     return tuple(_panel(name, truths[name], rows[name]) for name in chosen)
 
 

@@ -82,13 +82,13 @@ class Frame:
     def __post_init__(self) -> None:
         """Check size and standard deviations."""
         if len(self.picture) > MOST_PICTURE_BYTES:
-            message = f"a picture has at most {MOST_PICTURE_BYTES} bytes, got {len(self.picture)}: compress it more"
-            raise ImageError(message)
+            raise ImageError(
+                f"a picture has at most {MOST_PICTURE_BYTES} bytes, got {len(self.picture)}: compress it more"
+            )
         for name in _SIGMAS:
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                message = f"{name} must be finite and not negative, got {value!r}"
-                raise ImageError(message)
+                raise ImageError(f"{name} must be finite and not negative, got {value!r}")
 
     def image(self, *, observed_on: dt.date | None = None, season: str = "") -> "AerialImage":
         """Decode the picture; its camera stands above the origin and looks as in the view's frame."""
@@ -160,10 +160,9 @@ def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES)
         picture.save(encoded, format="WEBP", quality=quality, method=2)
         if encoded.tell() <= most_bytes:
             return encoded.getvalue()
-    message = (
+    raise ImageError(
         f"a picture of {rgb.shape[1]} x {rgb.shape[0]} pixels does not fit into {most_bytes} bytes: make it smaller"
     )
-    raise ImageError(message)
 
 
 def frame_row(frame: Frame) -> dict[str, Any]:

@@ -62,8 +62,7 @@ def parse_openings(content: object, path: Path) -> Openings:
     try:
         return _ADAPTER.validate_python(content)
     except ValidationError as error:
-        message = f"{path} is damaged ({error.errors()[0]['msg']}): {_MEND}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} is damaged ({error.errors()[0]['msg']}): {_MEND}") from error
 
 
 def joined_openings(first: Openings, second: Openings) -> Openings:

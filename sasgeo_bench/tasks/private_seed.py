@@ -43,11 +43,10 @@ class PrivateSeed:
     def __post_init__(self) -> None:
         """Check the digits."""
         if not _DIGITS.fullmatch(self.text):
-            message = (
+            raise ConfigError(
                 f"the {self.kind} seed of {self.file or 'the environment'} must be random digits 0-9 and a-f alone, as "
                 "secrets.token_hex(16) makes them"
             )
-            raise ConfigError(message)
 
     @property
     def kind(self) -> str:
@@ -113,8 +112,7 @@ def take_seed(
     )
     text = (os.environ if environ is None else environ).pop(variable, None)
     if file is not None and text is not None:
-        message = f"{flag} and {variable} both give a {kind} seed: leave one of them out"
-        raise ConfigError(message)
+        raise ConfigError(f"{flag} and {variable} both give a {kind} seed: leave one of them out")
     if file is None and text is None:
         return None
     if environ is None:
@@ -126,16 +124,17 @@ def take_seed(
 
 def _read(file: Path) -> str:
     if file.suffix != SUFFIX:
-        message = f"{file} must be named <name>{SUFFIX}, by which runs know what to hide from matchers: rename it"
-        raise StoreError(message)
+        raise StoreError(
+            f"{file} must be named <name>{SUFFIX}, by which runs know what to hide from matchers: rename it"
+        )
     try:
         status, text = file.stat(), plain_file(file).read_bytes()[: _MOST_BYTES + 1].decode("ascii", errors="replace")
     except OSError as error:
-        message = f"{file} cannot be read ({error.strerror or error}): name a file with a seed that you can read"
-        raise StoreError(message) from error
+        raise StoreError(
+            f"{file} cannot be read ({error.strerror or error}): name a file with a seed that you can read"
+        ) from error
     if status.st_mode & (stat.S_IRWXG | stat.S_IRWXO):
-        message = f"{file} can be read by others (mode {stat.S_IMODE(status.st_mode):03o}): chmod 600 {file}"
-        raise StoreError(message)
+        raise StoreError(f"{file} can be read by others (mode {stat.S_IMODE(status.st_mode):03o}): chmod 600 {file}")
     return text.strip()
 
 

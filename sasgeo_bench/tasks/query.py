@@ -107,11 +107,10 @@ class PriorGroup:
         declared = product(RADII_M, YAWS, SCALE_SIGMAS)
         groups = {group.name: group for group in (cls(radius_m=r, yaw=y, scale_sigma=s) for r, y, s in declared)}
         if name not in groups:
-            message = (
+            raise ConfigError(
                 f"{name!r} is no prior group: r100, r250, r500, r2000 or rnone, then known, weak or unknown yaw, "
                 "then s3, s10 or s15, as in r500-weak-s3"
             )
-            raise ConfigError(message)
         return groups[name]
 
 
@@ -172,14 +171,12 @@ class Step:
         numbers = (*(self.increment or ()), *(self.covariance or ()))
         is_whole = counts == [0, 0] or (counts == [3, 9] and self.frame > 0)
         if not is_whole or not all(map(math.isfinite, numbers)) or self.frame < 0:
-            message = (
+            raise PoseError(
                 "a step has a frame from 0 on and, after the first, 3 finite numbers with a covariance of 9 or "
                 f"neither, got {self!r}"
             )
-            raise PoseError(message)
         if self.covariance is not None and not _is_covariance(self.covariance):
-            message = f"a covariance is symmetric and positive semidefinite, got {self.covariance!r}"
-            raise PoseError(message)
+            raise PoseError(f"a covariance is symmetric and positive semidefinite, got {self.covariance!r}")
 
 
 def _is_covariance(values: tuple[float, ...]) -> bool:
@@ -271,11 +268,10 @@ class Query(_Question):
         shapes = self.vectors.geometry
         has_shapes = not (shapes.isna() | shapes.is_empty).any()
         if not (is_whole and has_shapes and (np.abs(shapely.get_coordinates(shapes)) <= _MOST_M).all()):
-            message = (
+            raise ShapeError(
                 f"vectors of query {self.query_id!r} have columns class, level and is_bridge, and geometries with "
                 f"coordinates of at most {_MOST_M:g} m"
             )
-            raise ShapeError(message)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

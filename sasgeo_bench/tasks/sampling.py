@@ -335,8 +335,7 @@ def _holding(places_m: NDArray[np.float64], reach_m: float, *, rng: np.random.Ge
     off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
     fit = points[(off_m <= reach_m).all(axis=1)]
     if len(fit) == 0:
-        message = f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior"
-        raise ConfigError(message)
+        raise ConfigError(f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior")
     return (round(float(fit[0, 0]), 1), round(float(fit[0, 1]), 1))
 
 
@@ -359,8 +358,9 @@ def away(
         If the prior has no disc: then there is no place outside.
     """
     if prior.radius_m is None or prior.center_m is None:
-        message = "a prior group without a disc searches the whole map, and no place is outside: name one with a disc"
-        raise ConfigError(message)
+        raise ConfigError(
+            "a prior group without a disc searches the whole map, and no place is outside: name one with a disc"
+        )
     radius_m = prior.radius_m
     before = share_of(prior.center_m, radius_m)
     turns = rng.uniform(0, 2 * np.pi, _TURNS)

@@ -114,5 +114,4 @@ def read_segmented(path: Path, query_id: str) -> Segmented | None:
         drawn = np.frombuffer(zlib.decompressobj().decompress(row["drawn"], most), dtype=np.uint8)
         return Segmented(drawn=drawn.reshape(row["rows"], row["cols"]))
     except (ValueError, TypeError, zlib.error) as error:
-        message = f"{path} is damaged ({error}): {_MEND}"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} is damaged ({error}): {_MEND}") from error

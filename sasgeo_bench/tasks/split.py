@@ -47,14 +47,15 @@ class Place(Document):
     @model_validator(mode="after")
     def _holds_something(self) -> Self:
         if not self.regions and not self.blocks:
-            message = f"place {self.name!r} needs regions or blocks"
-            raise ValueError(message)
+            raise ValueError(f"place {self.name!r} needs regions or blocks")
         if self.sealed and self.blocks:
-            message = f"place {self.name!r} is sealed, and names single blocks: a sealed place needs whole regions"
-            raise ValueError(message)
+            raise ValueError(
+                f"place {self.name!r} is sealed, and names single blocks: a sealed place needs whole regions"
+            )
         if self.sealed and self.part not in {None, "test"}:
-            message = f"place {self.name!r} is sealed, and its part is {self.part!r}: a sealed place can only test"
-            raise ValueError(message)
+            raise ValueError(
+                f"place {self.name!r} is sealed, and its part is {self.part!r}: a sealed place can only test"
+            )
         return self
 
     @model_serializer(mode="wrap")
@@ -88,8 +89,7 @@ class SplitFile(NamedDocument):
         for what, listed in (("place", names), ("region", regions)):
             twice = sorted({name for name in listed if listed.count(name) > 1})
             if twice:
-                message = f"{what} {twice[0]!r} is listed twice"
-                raise ValueError(message)
+                raise ValueError(f"{what} {twice[0]!r} is listed twice")
         for name, kind in (("part", "holdout"), ("half", "crossfit")):
             is_needed = self.kind == kind
             wrong = next((place.name for place in self.place if (getattr(place, name) is not None) != is_needed), None)
@@ -97,26 +97,24 @@ class SplitFile(NamedDocument):
                 kinds = {"part": "a cross-fit", "half": "a hold-out"}
                 needed = "part: train, calibration or test" if name == "part" else "half: a or b"
                 fault = f"needs a {needed}" if is_needed else f"must not have a {name} in {kinds[name]}: leave it out"
-                message = f"place {wrong!r} {fault}"
-                raise ValueError(message)
+                raise ValueError(f"place {wrong!r} {fault}")
         sides: dict[str, str] = {}
         for place in self.place:
             side = place.part or f"half {place.half}"
             if place.country and sides.setdefault(place.country, side) != side:
-                message = (
+                raise ValueError(
                     f"country {place.country!r} is in {sides[place.country]} and, with {place.name!r}, in {side}: put "
                     "all its places on one side"
                 )
-                raise ValueError(message)
         for half in HALVES if self.kind == "crossfit" else ():
             own = [place for place in self.place if place.half == half]
             if sum(not place.sealed for place in own) < _LEAST_PLACES:
                 open_ones = "two places that are not sealed" if any(place.sealed for place in own) else "two places"
-                message = f"half {half!r} needs {open_ones} at least: one is tested, and another one calibrates"
-                raise ValueError(message)
+                raise ValueError(f"half {half!r} needs {open_ones} at least: one is tested, and another one calibrates")
             if len({place.country or place.name for place in own if not place.sealed}) == 1:
-                message = f"half {half!r} needs places of two countries: those of one do not calibrate each other"
-                raise ValueError(message)
+                raise ValueError(
+                    f"half {half!r} needs places of two countries: those of one do not calibrate each other"
+                )
         return self
 
     @property
@@ -296,23 +294,20 @@ def make_split(spec: SplitFile, grids: Mapping[str, Grid]) -> Split:
     if unknown:
         own = "list-regions shows all that ship; --region-files names a folder of your own"
         mend = "a block stands under 'blocks'" if "/" in unknown[0] else own
-        message = f"split {spec.id!r} names the unknown region {unknown[0]!r}: {mend}"
-        raise ConfigError(message)
+        raise ConfigError(f"split {spec.id!r} names the unknown region {unknown[0]!r}: {mend}")
     blocks = {place.name: _blocks_of_place(spec, place, grids) for place in spec.place}
     split = Split(spec=spec, blocks=blocks)
     seen: dict[str, str] = {}
     for place, listed in blocks.items():
         for block in listed:
             if seen.setdefault(block.id, place) != place:
-                message = f"split {spec.id!r}: block {block.id} stands in {seen[block.id]!r} and in {place!r}"
-                raise ConfigError(message)
+                raise ConfigError(f"split {spec.id!r}: block {block.id} stands in {seen[block.id]!r} and in {place!r}")
     near = nearest_pair(split, within_m=spec.buffer_m + 2 * spec.reach_m)
     if near is not None and near.gap_m - 2 * spec.reach_m < spec.buffer_m:
-        message = (
+        raise ConfigError(
             f"split {spec.id!r}: blocks {near.first} and {near.second} of different parts are {near.gap_m:.0f} m "
             f"apart; footprints reach {spec.reach_m:g} m beyond each, and {spec.buffer_m:g} m must stay between them"
         )
-        raise ConfigError(message)
     return split
 
 
@@ -322,8 +317,7 @@ def _blocks_of_place(spec: SplitFile, place: Place, grids: Mapping[str, Grid]) -
         region = name.split("/")[0]
         known = {block.id: block for block in blocks_of(region, grids[region], block_m=spec.block_m)}
         if name not in known:
-            message = f"split {spec.id!r} names the unknown block {name!r}; {region} has {', '.join(known)}"
-            raise ConfigError(message)
+            raise ConfigError(f"split {spec.id!r} names the unknown block {name!r}; {region} has {', '.join(known)}")
         found.append(known[name])
     return tuple(found)
 

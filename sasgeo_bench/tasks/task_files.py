@@ -199,15 +199,13 @@ def read_task(folder: str | Path) -> dict[str, Any]:
     """Read `task.json`; raise a StoreError if it is missing, damaged or of another version."""
     path = given_path(folder) / TASK
     if not path.is_file():
-        message = f"{folder} holds no {TASK}: make the queries first"
-        raise StoreError(message)
+        raise StoreError(f"{folder} holds no {TASK}: make the queries first")
     content = read_json(path, mend=_MEND)
     about = content if isinstance(content, dict) else {}
     for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):
         if name in about and about[name] not in known:
             noun, versions = name.replace("_", " "), ", ".join(map(str, known))
-            message = f"{path} has {noun} {about[name]!r}, this version reads {versions}: {_MEND}"
-            raise StoreError(message)
+            raise StoreError(f"{path} has {noun} {about[name]!r}, this version reads {versions}: {_MEND}")
     try:
         check_document(content, TaskManifest, source=TASK)
     except ConfigError as error:
@@ -224,19 +222,16 @@ def check_queries(folder: Path) -> None:
     recorded = read_task(folder)["files"][QUERIES]["sha256"]
     path = folder / QUERIES
     if not path.is_file() or sha256_of(path) != recorded:
-        message = f"{path} is not what {TASK} says: make the queries again"
-        raise StoreError(message)
+        raise StoreError(f"{path} is not what {TASK} says: make the queries again")
 
 
 def check_ours(folder: Path, names: Sequence[str]) -> None:
     """Raise a StoreError if a folder to replace holds foreign files."""
     if folder.exists() and not folder.is_dir():
-        message = f"{folder} is a file: move it away, a task goes there"
-        raise StoreError(message)
+        raise StoreError(f"{folder} is a file: move it away, a task goes there")
     other = next((path for path in sorted(folder.glob("*")) if path.name not in names), None)
     if other is not None:
-        message = f"{other} is no part of a task and would be lost: move it away"
-        raise StoreError(message)
+        raise StoreError(f"{other} is no part of a task and would be lost: move it away")
 
 
 def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
@@ -288,23 +283,20 @@ def _belongs_to(truth_folder: Path) -> str:
 def check_truths(task_folder: Path, truth_folder: Path) -> None:
     """Raise a StoreError if truths are missing, belong to other queries, or have another task version."""
     if not (truth_folder / TRUTH).is_file():
-        message = (
+        raise StoreError(
             f"{truth_folder} holds no truths of {task_folder}: "
             "name their folder with --truth, or make the queries again"
         )
-        raise StoreError(message)
     if (truth_folder / TRUTH_OF).is_file():
         read_json(truth_folder / TRUTH_OF, mend=_MEND)  # a damaged file raises here
     if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
-        message = f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again"
-        raise StoreError(message)
+        raise StoreError(f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again")
     metadata = read_schema(truth_folder / TRUTH, mend=_MEND).metadata or {}
     version = metadata.get(b"task_version", b"none").decode(errors="replace")
     if version not in map(str, TASK_VERSIONS):
-        message = (
+        raise StoreError(
             f"{truth_folder} holds truths of task version {version}, this version reads {_READ}: make the queries again"
         )
-        raise StoreError(message)
 
 
 def read_hidden(truth_folder: Path) -> dict[str, Any]:
@@ -447,12 +439,10 @@ def check_columns(path: Path, needed: Sequence[str]) -> None:
 def _check_columns(path: Path, found: pa.Schema, needed: Sequence[str]) -> None:
     missing = [name for name in needed if name not in found.names]
     if missing:
-        message = f"{path} lacks the columns {', '.join(missing)}: {_MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{path} lacks the columns {', '.join(missing)}: {_MEND}")
     odd = next((name for name in needed if found.names.count(name) > 1 or not _is_known(found.field(name))), None)
     if odd is not None:
-        message = f"{path} holds the column {odd} twice, or with another type than it should: {_MEND}"
-        raise StoreError(message)
+        raise StoreError(f"{path} holds the column {odd} twice, or with another type than it should: {_MEND}")
 
 
 def _is_known(field: pa.Field) -> bool:

@@ -114,8 +114,7 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
             tell(f"{len(left)} regions have no extract on this machine and are left out: {', '.join(left)}")
     stranger = next((item.id for item in named if item.id not in split.spec.region_ids), None)
     if stranger is not None:
-        message = f"split {split.spec.id!r} does not speak of region {stranger!r}: {_other_split(stranger)}"
-        raise ConfigError(message)
+        raise ConfigError(f"split {split.spec.id!r} does not speak of region {stranger!r}: {_other_split(stranger)}")
     settings = {item.name: getattr(wanted, item.name) for item in fields(Settings)}
     return tuple(
         Request(
@@ -163,8 +162,7 @@ def root_of(out: Path, seed: PrivateSeed | None) -> Path:
 def check_count(count: int) -> None:
     """Refuse a count below one."""
     if count < 1:
-        message = f"--n must be at least 1, got {count}"
-        raise ConfigError(message)
+        raise ConfigError(f"--n must be at least 1, got {count}")
 
 
 def check_roots(out: Path) -> None:
@@ -172,16 +170,14 @@ def check_roots(out: Path) -> None:
     check_separate(out / "tasks", out / "truth")
     above = next((folder for folder in (out, *out.resolve().parents) if (folder / task_files.TASK).is_file()), None)
     if above is not None:
-        message = f"{out / 'truth'} lies inside {above}, where the queries are: choose another --out"
-        raise ConfigError(message)
+        raise ConfigError(f"{out / 'truth'} lies inside {above}, where the queries are: choose another --out")
 
 
 def check_separate(tasks: Path, truth: Path) -> None:
     """Refuse folders of tasks and truths of which one is inside the other, links followed."""
     one, two = tasks.resolve(), truth.resolve()
     if two.is_relative_to(one) or one.is_relative_to(two):
-        message = f"{truth} lies inside {tasks}, where the queries are: choose another --out"
-        raise ConfigError(message)
+        raise ConfigError(f"{truth} lies inside {tasks}, where the queries are: choose another --out")
 
 
 def is_reachable(spec: RegionFile, request_folders: Sequence[Path], out: Path) -> bool:

@@ -49,8 +49,7 @@ def without_torch(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def refusing(name: str, *args: Any, **kwargs: Any) -> Any:
         if name == "torch":
-            message = "No module named 'torch'"
-            raise ModuleNotFoundError(message, name=name)
+            raise ModuleNotFoundError("No module named 'torch'", name=name)
         return real(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", refusing)

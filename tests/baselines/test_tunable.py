@@ -116,8 +116,7 @@ class Failing(SchmidtSegcorr):
 
     def __init__(self, **numbers):
         if numbers.get("sharpness") == 2.0:
-            message = "too sharp"
-            raise ValueError(message)
+            raise ValueError("too sharp")
         super().__init__()
 
 

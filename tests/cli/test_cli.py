@@ -69,8 +69,7 @@ def test_a_run_and_segmentations_take_several_tasks(mistake, monkeypatch):
     assert "a holds no task.json" in mistake("run", "--matcher", "random", "--tasks", "a", "b")
 
     def split(name, *, folders):
-        message = f"asked for {name} of {folders}"
-        raise ConfigError(message)
+        raise ConfigError(f"asked for {name} of {folders}")
 
     monkeypatch.setattr(segmenters, "find_split", split)
     words = ("--tasks", "a", "b", "--split", "mine", "--region-files", "own")

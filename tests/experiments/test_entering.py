@@ -67,8 +67,7 @@ class Lost(PriorCentre):
     card = replace(PriorCentre.card, name="lost")
 
     def match(self, query, *, top_k):  # noqa: ARG002 - of every matcher
-        message = f"no road\nnear {query.track}"
-        raise KeyError(message)
+        raise KeyError(f"no road\nnear {query.track}")
 
 
 def silent(line):

@@ -144,8 +144,7 @@ def test_every_card_is_read_before_the_first_query_is_asked(made, tmp_path, monk
     """A name that is taken is told at once, not after the hours of all others."""
 
     def stop(*_, **__):
-        message = "here begins the first run"
-        raise ConfigError(message)
+        raise ConfigError("here begins the first run")
 
     (tmp_path / "taken.py").write_text(
         "from sasgeo_bench.matching.controls.fft_vote import FftVote\n\n\nclass Mine(FftVote):\n    pass\n"
@@ -704,8 +703,7 @@ def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch
 
     def broken(request):
         if request.spec == "random":
-            message = "a mistake of ours"
-            raise KeyError(message)
+            raise KeyError("a mistake of ours")
         return work(request)
 
     monkeypatch.setattr(pipeline_plan, "plan_run", broken)

@@ -74,8 +74,7 @@ def test_what_was_cut_goes_on_where_it_was_and_is_nothing_until_then(url, folder
     def cut(move, most):
         def moving(self, first, second, **more):
             if len(moved) == most:
-                message = "the line is dead"
-                raise ConnectionError(message)
+                raise ConnectionError("the line is dead")
             moved.append(first)
             return move(self, first, second, **more)
 

@@ -884,8 +884,7 @@ def fails_with(monkeypatch, name, is_bad):
 
     def broken(*words, **more):
         if is_bad(*words, **more):
-            message = "a mistake of ours"
-            raise KeyError(message)
+            raise KeyError("a mistake of ours")
         return work(*words, **more)
 
     monkeypatch.setattr(room, name, broken)
@@ -971,8 +970,7 @@ def test_the_program_says_who_failed_and_ends_with_a_status_of_its_own(out, both
 
 def test_a_disk_that_is_full_stops_everything(out, both, monkeypatch):
     def full(*_, **__):
-        message = "cannot be written"
-        raise StoreError(message) from OSError(errno.ENOSPC, "No space left on device")
+        raise StoreError("cannot be written") from OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(contestants, "_scored", full)
     with pytest.raises(StoreError, match="cannot be written"):

@@ -39,8 +39,7 @@ class NoCard:
 
 class Raises:
     def __init__(self):
-        message = "first line\nsecond line"
-        raise ValueError(message)
+        raise ValueError("first line\nsecond line")
 
 
 def test_a_rejector_is_found_by_module_and_class():

@@ -103,8 +103,7 @@ def in_child(attack):
     if child == 0:
         os._exit(0 if outcome(attack) == "done" else 1)
     if os.waitpid(child, 0)[1]:
-        message = "refused"
-        raise OSError(message)
+        raise OSError("refused")
 
 
 def fill_scratch():

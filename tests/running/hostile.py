@@ -149,8 +149,7 @@ class Exits(Plain):
 
 class Raises(Plain):
     def match(self, query, *, top_k):
-        message = "no idea\nwhere this is"
-        raise ValueError(message)
+        raise ValueError("no idea\nwhere this is")
 
 
 class Holds(Plain):
@@ -162,8 +161,7 @@ class Holds(Plain):
 
 class RaisesInPrepare(Plain):
     def prepare(self, region, learned):
-        message = "no index today"
-        raise ValueError(message)
+        raise ValueError("no index today")
 
 
 class Leaks(Plain):
@@ -235,8 +233,7 @@ class ReadsTruth(Plain):
         for path in sys.path:
             for truth in (Path(path) / "out" / "truth").rglob("*.parquet"):
                 truth.read_bytes()
-                message = "read the truth"
-                raise RuntimeError(message)
+                raise RuntimeError("read the truth")
         return super().match(query, top_k=top_k)
 
 

@@ -50,8 +50,7 @@ class Oracle(Counts):
 
 class RaisesInLearn(Counts):
     def learn(self, training):
-        message = "nothing\nto see"
-        raise ValueError(message)
+        raise ValueError("nothing\nto see")
 
 
 class HangsInLearn(Counts):

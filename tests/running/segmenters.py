@@ -89,8 +89,7 @@ class LearnsByChance(Learns):
 
 class LearnsNothing(Learns):
     def learn(self, training):
-        message = "too few roofs"
-        raise ValueError(message)
+        raise ValueError("too few roofs")
 
 
 class LearnsTooMuch(Learns):
@@ -136,8 +135,7 @@ class OtherClasses(Good):
 class WantsRoom(Good):
     def segment(self, image, *, learned):
         if min(image.shape) < 8:
-            message = "the picture is smaller than the filter"
-            raise ValueError(message)
+            raise ValueError("the picture is smaller than the filter")
         return super().segment(image, learned=None)
 
 

@@ -37,8 +37,7 @@ class Imitates(Still):
 
 class Unprepared(Still):
     def prepare(self, region, learned):
-        message = "no map today"
-        raise ValueError(message)
+        raise ValueError("no map today")
 
 
 class Singular(Still):
@@ -77,8 +76,7 @@ class Remembers(Still):
 class LooksHard(Still):
     def step(self, query):
         if not (query.evidence.cells == PRESENT).any():
-            message = "nothing to see"
-            raise ValueError(message)
+            raise ValueError("nothing to see")
         return super().step(query)
 
 
@@ -93,8 +91,7 @@ class Brittle(Still):
         if query.step.frame:
             np.linalg.inv(np.reshape(query.step.covariance, (3, 3)))
             if query.step.increment[1] > self.bounds_m[2] - self.bounds_m[0]:
-                message = "off the map"
-                raise IndexError(message)
+                raise IndexError("off the map")
         return super().step(query)
 
 

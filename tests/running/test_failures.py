@@ -31,8 +31,7 @@ def test_a_named_fault_stands_in_its_own_words_and_once(tmp_path):
     failures = Failures(tmp_path / LOG, tell=lines.append)
     for _ in range(2):
         with failures.of("mine"):
-            message = "mine: no answers, run again"
-            raise StoreError(message)
+            raise StoreError("mine: no answers, run again")
     assert lines == ["mine failed: no answers, run again"] * 2
     assert not (tmp_path / LOG).exists()
 

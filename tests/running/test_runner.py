@@ -328,8 +328,7 @@ def test_a_mistake_of_ours_about_one_answer_costs_its_row_and_the_log_says_where
 
     def broken(*words, **more):
         if next(count) == 1:
-            message = "a mistake of ours"
-            raise KeyError(message)
+            raise KeyError("a mistake of ours")
         return work(*words, **more)
 
     monkeypatch.setattr(answers, step, broken)

@@ -212,8 +212,7 @@ def test_the_control_answers_with_the_labels_and_starts_no_process(request_of) -
 
 def test_an_error_of_our_own_costs_one_image_and_is_logged(request_of, tmp_path, monkeypatch) -> None:
     def fail(*_, **__):
-        message = "no such thing"
-        raise RuntimeError(message)
+        raise RuntimeError("no such thing")
 
     request = request_of("Good")
     monkeypatch.setattr("sasgeo_bench.running.segmenter_process.image_bytes", fail)

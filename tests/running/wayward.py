@@ -102,8 +102,7 @@ class Failing(Counting):
         if way == "dies":
             os._exit(3)
         if way == "raises":
-            message = "no more today"
-            raise ValueError(message)
+            raise ValueError("no more today")
         if way == "singular":
             return Fix(pose=HERE, covariance=[[1, 1, 0], [1, 1, 0], [0, 0, 1]])
         return "a text"

@@ -239,8 +239,7 @@ def test_a_full_disk_while_tiles_are_written_is_one_line(rendered, tmp_path, mon
     before = state_of(out / "regions" / TOWN)
 
     def full(*_, **__):
-        message = "No space left on device"
-        raise rasterio.errors.RasterioIOError(message)
+        raise rasterio.errors.RasterioIOError("No space left on device")
 
     monkeypatch.setattr(rasterio.shutil, "copy", full)
     with pytest.raises(ImageryError, match=r"ortho.tif cannot be written \(No space left on device\)"):

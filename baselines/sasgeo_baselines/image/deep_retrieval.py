@@ -170,11 +170,10 @@ class DeepRetrieval:
         del learned
         self._whitening = None
         if self.weights is None:
-            message = (
+            raise ValueError(
                 f"{self.card.name} has no weights: name their file in a class of your own, "
                 "class Mine(DeepRetrieval): weights = Path(...) (docs/howto/imagery.md)"
             )
-            raise ValueError(message)
         self._encoder = Encoder.of(self.weights, name=self.card.name)
         ortho = Ortho.of(region, gsd_m=PIXEL_M)
         if ortho is None or not ortho.is_known.any():

@@ -46,8 +46,7 @@ class IsotonicMargin:
         """Return calibrated shares of false fixes, shape (N,)."""
         curve = self._curve
         if curve is None:
-            message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call fit() with answers of calibration blocks before p_false()")
         if isinstance(curve, float):
             return with_withheld(predictions, lambda answers: np.full(len(answers), curve))
         return with_withheld(predictions, lambda answers: np.asarray(curve.predict([margin(item) for item in answers])))

@@ -66,8 +66,7 @@ class LogisticAll:
         """Return calibrated probabilities of a false fix, shape (N,)."""
         model = self._model
         if model is None:
-            message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call fit() with answers of calibration blocks before p_false()")
         if isinstance(model, float):
             return with_withheld(predictions, lambda answers: np.full(len(answers), model))
         return with_withheld(predictions, model.p_false)

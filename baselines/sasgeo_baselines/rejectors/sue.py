@@ -69,8 +69,7 @@ class Sue:
         """Return values that grow with the spread, shape (N,)."""
         slope = self._slope
         if slope is None:
-            message = f"{self.card.name}: call fit() with answers of calibration blocks before p_false()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call fit() with answers of calibration blocks before p_false()")
         return with_withheld(predictions, lambda answers: np.array([_doubt(item, slope) for item in answers]))
 
 

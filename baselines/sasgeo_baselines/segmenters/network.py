@@ -54,8 +54,9 @@ def torch_module(name: str) -> Any:  # noqa: ANN401 - a module
     try:
         import torch  # noqa: PLC0415 - an extra; a second to import
     except (ImportError, OSError) as error:
-        message = f"{name} needs PyTorch, which cannot be imported ({error}): pip install 'sasgeo-baselines[torch]'"
-        raise RuntimeError(message) from error
+        raise RuntimeError(
+            f"{name} needs PyTorch, which cannot be imported ({error}): pip install 'sasgeo-baselines[torch]'"
+        ) from error
     threads = os.environ.get("OMP_NUM_THREADS", "")
     torch.set_num_threads(int(threads) if threads.isdecimal() and int(threads) else 1)
     return torch
@@ -161,16 +162,14 @@ def weights_of(text: str) -> tuple[tuple[str, ...], Weights]:
         found = {name: np.frombuffer(part, dtype="<f2") for name, part in given.items()}
         return classes, _fitted(found, unet_shapes(len(classes)))
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, binascii.Error) as error:
-        message = f"the learned text of a unet cannot be used ({_shown(error)}): learn again"
-        raise ValueError(message) from error
+        raise ValueError(f"the learned text of a unet cannot be used ({_shown(error)}): learn again") from error
 
 
 def _content(text: str) -> Any:  # noqa: ANN401 - JSON
     """Return a learned text as JSON; raise `ValueError` or another error of JSON if it is not one of ours."""
     content = json.loads(text)
     if content["format"] != FORMAT:
-        message = f"it is not of {FORMAT}"
-        raise ValueError(message)
+        raise ValueError(f"it is not of {FORMAT}")
     return content
 
 
@@ -179,12 +178,10 @@ def _fitted(found: Mapping[str, NDArray[Any]], shapes: Mapping[str, tuple[int, .
     fitted = {}
     for name, shape in shapes.items():
         if name not in found:
-            message = f"the array {name} is missing"
-            raise ValueError(message)
+            raise ValueError(f"the array {name} is missing")
         values = np.asarray(found[name])
         if values.dtype.kind != "f" or values.size != np.prod(shape) or not np.isfinite(values).all():
-            message = f"the array {name} does not hold {np.prod(shape)} finite numbers"
-            raise ValueError(message)
+            raise ValueError(f"the array {name} does not hold {np.prod(shape)} finite numbers")
         fitted[name] = values.astype(np.float32).reshape(shape)
     return fitted
 
@@ -208,8 +205,9 @@ def read_encoder(path: Path) -> Weights:
                 return _fitted({name: archive[name] for name in encoder_shapes() if name in archive}, encoder_shapes())
         _, weights = weights_of(_file_bytes(path).decode())
     except (OSError, ValueError, BadZipFile, KeyError, EOFError) as error:
-        message = f"{path} holds no weights of the encoder ({_shown(error)}): name a learned text of unet, or an .npz"
-        raise ValueError(message) from error
+        raise ValueError(
+            f"{path} holds no weights of the encoder ({_shown(error)}): name a learned text of unet, or an .npz"
+        ) from error
     return {name: values for name, values in weights.items() if name.startswith(_ENCODER)}
 
 
@@ -220,8 +218,7 @@ def card_with(card: Card, weights: Path | None) -> Card:
     try:
         digest = hashlib.sha256(_file_bytes(weights)).hexdigest()
     except OSError as error:
-        message = f"{card.name}: the file of its weights cannot be read ({_shown(error)})"
-        raise ValueError(message) from error
+        raise ValueError(f"{card.name}: the file of its weights cannot be read ({_shown(error)})") from error
     return replace(card, version=f"{card.version}+{digest[:_HASHED]}")
 
 
@@ -229,8 +226,7 @@ def _file_bytes(path: Path) -> bytes:
     """Read a file of weights; raise `ValueError` for one that is far too large."""
     size = path.stat().st_size
     if size > _MOST_BYTES:
-        message = f"{path} has {size} bytes, weights take at most {_MOST_BYTES}"
-        raise ValueError(message)
+        raise ValueError(f"{path} has {size} bytes, weights take at most {_MOST_BYTES}")
     return path.read_bytes()
 
 

@@ -71,23 +71,20 @@ class PixelForest:
             if min(present.sum(), (~present).sum()) >= _LEAST_PRESENT:
                 models[name] = _trees(values[known], present, weights[known])
         if not models:
-            message = (
+            raise ValueError(
                 f"no class has {_LEAST_PRESENT} labelled pixels of either kind: give more pictures, or larger ones"
             )
-            raise ValueError(message)
         return json.dumps({"format": FORMAT, "features": drawn[0].names, "models": models})
 
     def segment(self, image: sgb.AerialImage, *, learned: str | None) -> sgb.Segmentation:
         """Return probabilities at every pixel; silent on patches of pure black or white."""
         if learned is None:
-            message = f"{self.card.name} needs training: learn from labelled pictures first"
-            raise ValueError(message)
+            raise ValueError(f"{self.card.name} needs training: learn from labelled pictures first")
         forest = _forest(learned)
         small, pixel_m = working_picture(image)
         names, planes = features(small, pixel_m)
         if list(names) != forest.features:
-            message = f"the learned text has other features than this version of {self.card.name}: learn again"
-            raise ValueError(message)
+            raise ValueError(f"the learned text has other features than this version of {self.card.name}: learn again")
         table = np.ascontiguousarray(planes.reshape(len(names), -1).T)
         seen = has_data(small, pixel_m)
         found = np.empty((len(forest.models), *image.shape), dtype=np.float32)
@@ -146,8 +143,7 @@ def _forest(learned: str) -> _Forest:
     """Read the learned text; every call of a process gets the same."""
     content = json.loads(learned)
     if content.get("format") != FORMAT:
-        message = f"the learned text is not of {FORMAT}: learn again"
-        raise ValueError(message)
+        raise ValueError(f"the learned text is not of {FORMAT}: learn again")
     make = _lightgbm().Booster
     return _Forest(
         features=content["features"],
@@ -167,6 +163,7 @@ def _lightgbm() -> Any:  # noqa: ANN401 - a module
     try:
         import lightgbm  # noqa: PLC0415 - the other segmenters work without it
     except OSError as error:
-        message = f"LightGBM cannot be loaded ({error}): install libgomp1 (Debian, Ubuntu) or libomp (macOS)"
-        raise RuntimeError(message) from error
+        raise RuntimeError(
+            f"LightGBM cannot be loaded ({error}): install libgomp1 (Debian, Ubuntu) or libomp (macOS)"
+        ) from error
     return lightgbm

@@ -76,10 +76,9 @@ class UNet:
         pictures = learning_pictures(training.images, rng)
         shares = _shares(pictures, len(training.classes))
         if not shares:
-            message = (
+            raise ValueError(
                 f"no class has {_LEAST_PRESENT} labelled pixels of either kind: give more pictures, or larger ones"
             )
-            raise ValueError(message)
         weights = drawn_weights(len(shares), rng)
         if self.weights is not None:
             weights |= read_encoder(self.weights)
@@ -93,8 +92,7 @@ class UNet:
     def segment(self, image: sgb.AerialImage, *, learned: str | None) -> sgb.Segmentation:
         """Return probabilities at every pixel; silent on patches of pure black or white."""
         if learned is None:
-            message = f"{self.card.name} needs training: learn from labelled pictures first"
-            raise ValueError(message)
+            raise ValueError(f"{self.card.name} needs training: learn from labelled pictures first")
         torch = torch_module(self.card.name)
         classes, arrays = _network(learned)
         small, pixel_m = working_picture(image)

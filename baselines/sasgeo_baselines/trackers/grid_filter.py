@@ -37,8 +37,7 @@ class GridFilter(ABC):
     def belief(self) -> sgb.GridBelief:
         """Return the belief after the last view."""
         if self._belief is None:
-            message = f"{self.card.name}: call prepare() with a region, then start(), before step()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region, then start(), before step()")
         return self._belief
 
     def prepare(self, region: sgb.Region, learned: str | None) -> None:
@@ -48,15 +47,13 @@ class GridFilter(ABC):
     def start(self, prior: sgb.Prior) -> None:
         """Begin with an even belief over the prior."""
         if self._grid is None:
-            message = f"{self.card.name}: call prepare() with a region before start()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before start()")
         self._belief = sgb.GridBelief.of(prior, self._grid)
 
     def step(self, query: sgb.Query) -> sgb.Fix:
         """Move the belief by the odometer, multiply it by the view, and sum it up."""
         if query.step is None:
-            message = f"{self.card.name}: step() needs the views of a flight"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: step() needs the views of a flight")
         belief = sgb.followed(self.belief, query.step, diffuses=self.diffuses)
         if not sgb.is_blind(query):
             belief = belief.weighed(self.logs(query, belief), doubt=self.doubt)

@@ -271,16 +271,14 @@ class ParticleFilter(ABC):
     def start(self, prior: sgb.Prior) -> None:
         """Begin a flight; particles are drawn when its name is known, at the first view."""
         if self._grid is None:
-            message = f"{self.card.name}: call prepare() with a region before start()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before start()")
         self._prior, self._particles = prior, None
 
     def step(self, query: sgb.Query) -> sgb.Fix:
         """Move the particles, weigh them by the view, and return a fix."""
         step = query.step
         if self._grid is None or self._prior is None or step is None:
-            message = f"{self.card.name}: call start() first, and step() with the views of a flight"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call start() first, and step() with the views of a flight")
         if self._particles is None:
             self._rng = generator(self.card.name, step.sequence_id)
             moved = Particles.drawn(self._prior, self._grid, count=self.count, rng=self._rng)

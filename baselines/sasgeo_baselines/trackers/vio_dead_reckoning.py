@@ -44,15 +44,13 @@ class VioDeadReckoning:
     def start(self, prior: sgb.Prior) -> None:
         """Begin in the middle of the prior."""
         if self._grid is None:
-            message = f"{self.card.name}: call prepare() with a region before start()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before start()")
         self._pose, self._covariance = sgb.start_of(prior, self._grid)
 
     def step(self, query: sgb.Query) -> sgb.Fix:
         """Add the increment."""
         if self._pose is None or query.step is None:
-            message = f"{self.card.name}: call start() first, and step() with the views of a flight"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call start() first, and step() with the views of a flight")
         self._pose, self._covariance = sgb.advance(self._pose, self._covariance, query.step)
         is_near = radius_95_m(self._covariance) <= NEAR_M
         return sgb.Fix(pose=self._pose, covariance=self._covariance + _FLOOR, is_accepted=is_near)

@@ -46,8 +46,7 @@ class Embedding:
         """Read the embedding that ships, made by `benchmarks/fit_particle_filters.py`, or another."""
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != sha256:
-            message = f"{path} is another embedding than the program knows of: install sasgeo-baselines again"
-            raise ValueError(message)
+            raise ValueError(f"{path} is another embedding than the program knows of: install sasgeo-baselines again")
         with np.load(io.BytesIO(content)) as arrays:
             return cls(**{name: arrays[name].astype(np.float32) for name in arrays.files})
 

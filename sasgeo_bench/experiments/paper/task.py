@@ -82,11 +82,9 @@ def make_paper_task(
     truths would lie where the queries are; `StoreError` if a folder cannot be written, or holds something else.
     """
     if seed < 0:
-        message = f"the seed names the region and must be 0 or more, got {seed}"
-        raise ConfigError(message)
+        raise ConfigError(f"the seed names the region and must be 0 or more, got {seed}")
     if trials < 1:
-        message = f"there must be at least one trial, got {trials}"
-        raise ConfigError(message)
+        raise ConfigError(f"there must be at least one trial, got {trials}")
     check_roots(out)
     seeds = Seeds(root=seed, names=(SUITE, str(VERSION)))
     if private is not None:

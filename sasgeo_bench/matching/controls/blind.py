@@ -105,8 +105,7 @@ class PriorCentre:
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return the centre of the prior."""
         if self._region is None:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         if is_blind(query):
             return WITHHELD
         if query.track == "retrieval":
@@ -143,8 +142,7 @@ class RandomPlaces:
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return random poses."""
         if self._grid is None:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         if is_blind(query):
             return WITHHELD
         rng = generator(query.query_id)

@@ -99,8 +99,7 @@ class DenseMatcher(ABC):
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return the best modes, or rank the candidates by the best pose near each."""
         if self._chart is None:
-            message = f"{self.card.name}: call prepare() with a region before match()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before match()")
         if is_blind(query) or set(query.evidence.classes).isdisjoint(self._chart.classes):
             return WITHHELD
         chart, view = self._chart, self._read(query.evidence, self._chart)

@@ -93,15 +93,13 @@ class DeadReckoning:
     def start(self, prior: Prior) -> None:
         """Begin in the middle of the prior."""
         if self._region is None:
-            message = f"{self.card.name}: call prepare() with a region before start()"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call prepare() with a region before start()")
         self._belief = start_of(prior, self._region.grid)
 
     def step(self, query: Query) -> Fix:
         """Add the increment to the estimate."""
         if self._belief is None or query.step is None:
-            message = f"{self.card.name}: call start() first, and step() with the views of a flight"
-            raise RuntimeError(message)
+            raise RuntimeError(f"{self.card.name}: call start() first, and step() with the views of a flight")
         self._belief = self._moved(*self._belief, query.step)
         pose, covariance = self._belief
         return Fix(pose=pose, covariance=covariance + _FLOOR * np.eye(SIDE), is_accepted=False)

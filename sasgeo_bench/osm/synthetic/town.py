@@ -96,8 +96,7 @@ def write_town(plan: TownPlan, path: Path, *, on: dt.date | None = None) -> None
     """
     day = LAST_DATE if on is None else on
     if not FIRST_DATE <= day <= LAST_DATE:
-        message = f"the embedded towns have a history from {FIRST_DATE} to {LAST_DATE}, got {day}"
-        raise ExtractError(message)
+        raise ExtractError(f"the embedded towns have a history from {FIRST_DATE} to {LAST_DATE}, got {day}")
     elements = sorted(_elements(_things(plan), day), key=lambda element: element[:2])
     temporary = path.with_name(f".{path.name}.partial.osm.pbf")
     try:
@@ -106,8 +105,9 @@ def write_town(plan: TownPlan, path: Path, *, on: dt.date | None = None) -> None
     except SasgeoError:  # an error with a cause of its own, though it may be an `OSError`
         raise
     except (OSError, RuntimeError) as error:
-        message = f"{path} cannot be written ({error}): check the free space and the rights of its folder"
-        raise ExtractError(message) from error
+        raise ExtractError(
+            f"{path} cannot be written ({error}): check the free space and the rights of its folder"
+        ) from error
     finally:
         temporary.unlink(missing_ok=True)
 

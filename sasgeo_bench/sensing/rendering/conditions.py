@@ -108,18 +108,15 @@ class Conditions:
     def __post_init__(self) -> None:
         """Check every value."""
         if self.season not in SEASONS:
-            message = f"season is one of {', '.join(SEASONS)}, got {self.season!r}"
-            raise ConfigError(message)
+            raise ConfigError(f"season is one of {', '.join(SEASONS)}, got {self.season!r}")
         for name, (low, high) in _RANGES.items():
             value = getattr(self, name)
             if not low <= value <= high:
-                message = f"{name} lies within {low:g} and {high:g}, got {value!r}"
-                raise ConfigError(message)
+                raise ConfigError(f"{name} lies within {low:g} and {high:g}, got {value!r}")
         if not (0 <= self.jpeg_quality <= 100 and 0 <= self.motion_px <= 100):
-            message = (
+            raise ConfigError(
                 f"jpeg_quality and motion_px lie within 0 and 100, got {self.jpeg_quality!r} and {self.motion_px!r}"
             )
-            raise ConfigError(message)
 
     @classmethod
     def at(cls, when: dt.datetime, lon_deg: float, lat_deg: float, *, is_snowy: bool = False) -> Self:

@@ -169,17 +169,16 @@ def make_scene(
 
 def _check(features: "gpd.GeoDataFrame", classes: tuple[str, ...], window: Grid) -> None:
     if window.rows * window.cols > _MOST_CELLS:
-        message = (
+        raise ShapeError(
             f"a scene has at most {_MOST_CELLS:,} cells, got {window.rows:,} x {window.cols:,}: take a smaller window, "
             "or larger cells"
         )
-        raise ShapeError(message)
     if features.crs is None or features.crs.to_epsg() != window.epsg:
-        message = f"window lies in EPSG:{window.epsg}, the features in {features.crs!r}: give both in the region's CRS"
-        raise ShapeError(message)
+        raise ShapeError(
+            f"window lies in EPSG:{window.epsg}, the features in {features.crs!r}: give both in the region's CRS"
+        )
     if len(classes) > _MOST_CLASSES:
-        message = f"a scene holds at most {_MOST_CLASSES} classes, got {len(classes)}"
-        raise ShapeError(message)
+        raise ShapeError(f"a scene holds at most {_MOST_CLASSES} classes, got {len(classes)}")
 
 
 def paint(plan: Plan, buildings: Buildings, season: Season, below_m: float = math.inf) -> Painting:

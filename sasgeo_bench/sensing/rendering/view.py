@@ -118,11 +118,10 @@ def _traced(scene: Scene, camera: Camera, season: Season) -> Iterator[tuple[slic
     """Yield strips of a picture's rows with what they see; raise `CameraError` for a camera not above the scene."""
     heights = scene.painting(season).heights
     if camera.height_m <= heights.highest_m:
-        message = (
+        raise CameraError(
             f"the highest thing of the scene ends at {heights.highest_m:.1f} m, got height_m {camera.height_m!r}: "
             "fly higher"
         )
-        raise CameraError(message)
     for rows in strips(camera):
         yield rows, trace(camera, scene.grid, heights, rows)
 

@@ -95,8 +95,7 @@ class Ageing:
         """Check the ranges, and that the rates are not the place's own."""
         check_ranges(self, years=(0, 200), shift_m=(0, 100))
         if self.place in self.measured_in:
-            message = f"Ageing: the rates come from {self.place!r} itself, take those of other places"
-            raise PerturbError(message)
+            raise PerturbError(f"Ageing: the rates come from {self.place!r} itself, take those of other places")
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
         """Remove and shift objects of all classes first, then add new ones on free ground."""

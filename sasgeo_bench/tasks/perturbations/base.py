@@ -25,8 +25,7 @@ def check_ranges(owner: object, **ranges: tuple[float, float]) -> None:
         value: Any = getattr(owner, name)
         is_number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
         if not is_number or not low <= value <= high:
-            message = f"{type(owner).__name__}: {name} lies between {low:g} and {high:g}, got {value!r}"
-            raise PerturbError(message)
+            raise PerturbError(f"{type(owner).__name__}: {name} lies between {low:g} and {high:g}, got {value!r}")
 
 
 def share_changed(before: Evidence, after: Evidence) -> float:

@@ -48,8 +48,7 @@ class ClassConfusions(Document):
     @model_validator(mode="after")
     def _is_whole(self) -> Self:
         if self.recall + sum(self.called.values()) > 1 + 10 ** (1 - _DIGITS):
-            message = "recall and called add up to more than 1"
-            raise ValueError(message)
+            raise ValueError("recall and called add up to more than 1")
         return self
 
 
@@ -67,8 +66,7 @@ class PerceptionProfile(Document):
     @classmethod
     def _is_current(cls, version: int) -> int:
         if version != VERSION:
-            message = f"measure the profile anew: this program reads version {VERSION}"
-            raise ValueError(message)
+            raise ValueError(f"measure the profile anew: this program reads version {VERSION}")
         return version
 
     def errors(self) -> Mapping[str, MeasuredErrors]:
@@ -99,18 +97,17 @@ def read_profile(path: Path) -> PerceptionProfile:
     """Read a profile; raise `ConfigError`, in one line, if it is missing or wrong."""
     try:
         if path.exists() and not (path.is_file() and path.stat().st_size <= _MOST_BYTES):
-            message = f"{path} is no perception profile: expected a file of at most {_MOST_BYTES} bytes"
-            raise ConfigError(message)
+            raise ConfigError(f"{path} is no perception profile: expected a file of at most {_MOST_BYTES} bytes")
         text = plain_file(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        message = f"{path} cannot be read as a perception profile ({error}): {_MEND}"
-        raise ConfigError(message) from error
+        raise ConfigError(f"{path} cannot be read as a perception profile ({error}): {_MEND}") from error
     profile = parse_toml(text, PerceptionProfile, source=str(path))
     known = {item.name for item in load_taxonomy().classes}
     named = {name for at, found in profile.classes.items() for name in (at, *found.called, *found.also)}
     if strange := sorted(named - known):
-        message = f"{path} has rates of {', '.join(strange)}, which is no class: choose of {', '.join(sorted(known))}"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{path} has rates of {', '.join(strange)}, which is no class: choose of {', '.join(sorted(known))}"
+        )
     return profile
 
 
@@ -128,8 +125,7 @@ def write_profile(profile: PerceptionProfile, path: Path) -> None:
         with fresh_file(path, mend="free some space and measure again") as scratch:
             scratch.write_text("\n".join(lines) + "\n", encoding="utf-8")
     except OSError as error:
-        message = f"{path} cannot be written ({error.strerror or error}): name another place"
-        raise StoreError(message) from error
+        raise StoreError(f"{path} cannot be written ({error.strerror or error}): name another place") from error
 
 
 def _lines(values: Mapping[str, object]) -> list[str]:

@@ -52,8 +52,7 @@ class Season:
         """Check the season and the range."""
         check_ranges(self, strength=(0, 1))
         if self.kind not in get_args(Kind):
-            message = f"Season: kind is one of {', '.join(get_args(Kind))}, got {self.kind!r}"
-            raise PerturbError(message)
+            raise PerturbError(f"Season: kind is one of {', '.join(get_args(Kind))}, got {self.kind!r}")
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
         """Change the layers that the season changes."""

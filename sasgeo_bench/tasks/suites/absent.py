@@ -130,8 +130,7 @@ def _same_place_elsewhere(shot: Shot, other: State) -> Site:
         if other.is_mapped(point, shot.scene.view_reach_m)
     ]
     if not points:
-        message = f"{other.region} is too small to take a view of a wrong place from: choose another split"
-        raise ConfigError(message)
+        raise ConfigError(f"{other.region} is too small to take a view of a wrong place from: choose another split")
     densities = [_density(other, point, shot.variant) for point in points]
     best = int(np.argmin(np.abs(np.array(densities) - shot.site.density)))
     return _moved(shot.site, points[best], densities[best])

@@ -110,6 +110,5 @@ def find_suite(name: str) -> Suite:
     if name not in EVERY_SUITE:
         near = difflib.get_close_matches(name, EVERY_SUITE, n=1, cutoff=0.5)
         hint = f", did you mean {near[0]!r}?" if near else ""
-        message = f"there is no suite {name!r}{hint} (list-suites shows all)"
-        raise ConfigError(message)
+        raise ConfigError(f"there is no suite {name!r}{hint} (list-suites shows all)")
     return EVERY_SUITE[name]

@@ -67,8 +67,7 @@ class RealImageSuite(Suite):
         """Cut the picture of a shot; its evidence is unknown until a segmenter has seen it."""
         variant, state, imagery = shot.variant, shot.scene.world, shot.scene.imagery
         if imagery is None:
-            message = f"{state.region} has no imagery"
-            raise ValueError(message)
+            raise ValueError(f"{state.region} has no imagery")
         pose = _pose(shot)
         width_px = min(_MOST_PX, round(_PICTURE * variant.side_m / imagery.record.gsd_m))
         pixel_m = _PICTURE * variant.side_m / width_px

@@ -79,14 +79,14 @@ def choose_sites(
             if len(found) == count:
                 break
     if not found:
-        message = f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn"
-        raise ConfigError(message)
+        raise ConfigError(
+            f"{scene.map.region} holds no place for suite {suite.card.name!r}: too little is mapped or drawn"
+        )
     if len(found) < count and not may_be_fewer:
-        message = (
+        raise ConfigError(
             f"{scene.map.region} holds {len(found)} places for suite {suite.card.name!r} that do not overlap, "
             f"{count} were asked for: lower --n or pass --up-to"
         )
-        raise ConfigError(message)
     return tuple(found)
 
 

@@ -10,9 +10,9 @@ import pytest
 
 from sasgeo_bench.config import check_document
 from sasgeo_bench.errors import ConfigError, MatchError
+from sasgeo_bench.files.plugins import MATCHERS, REJECTORS
 from sasgeo_bench.leaderboard.pipeline_spec import ContrastSpec, PipelineFile, list_pipeline_files, read_pipeline_file
 from sasgeo_bench.matching.matcher import MatcherCard, RejectorCard
-from sasgeo_bench.matching.plugins import MATCHERS, REJECTORS
 from sasgeo_bench.matching.submission import Card
 from sasgeo_bench.tasks.split import SplitFile
 from sasgeo_bench.texts import NAME, VERSION

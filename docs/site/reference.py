@@ -17,6 +17,7 @@ from pydantic import BaseModel
 
 from sasgeo_bench.cli import program
 from sasgeo_bench.files.parquet import read_frame
+from sasgeo_bench.files.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.leaderboard.board_files import BOARD
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, TERMS
@@ -29,7 +30,6 @@ from sasgeo_bench.leaderboard.pipeline_spec import (
     find_pipeline_file,
     read_pipeline_file,
 )
-from sasgeo_bench.matching.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import Card, Submission
 from sasgeo_bench.osm.features import DTYPES

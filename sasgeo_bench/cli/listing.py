@@ -10,7 +10,7 @@ from rich.table import Table
 
 from sasgeo_bench.cli.console import print_table, say, tell
 from sasgeo_bench.cli.options import RegionFolders
-from sasgeo_bench.matching.plugins import (
+from sasgeo_bench.files.plugins import (
     MATCHERS,
     ORACLE,
     ORACLE_SEGMENTER,
@@ -18,11 +18,8 @@ from sasgeo_bench.matching.plugins import (
     SEGMENTERS,
     TRACKERS,
     list_entry_points,
-    load_matcher,
-    load_rejector,
-    load_segmenter,
-    load_tracker,
 )
+from sasgeo_bench.matching.plugins import load_matcher, load_rejector, load_segmenter, load_tracker
 from sasgeo_bench.texts import plain
 
 _OF_DEMO: Final = "demo-"  # too many made-up towns to list

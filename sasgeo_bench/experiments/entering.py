@@ -14,9 +14,9 @@ from sasgeo_bench.experiments import entry_cost
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, plan_board, same_queries
 from sasgeo_bench.experiments.pipeline import ask, draw_all
 from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, Run, plan_runs
+from sasgeo_bench.files.plugins import check_registered
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.matching.matcher import MatcherCard
-from sasgeo_bench.matching.plugins import check_registered
 from sasgeo_bench.matching.results import SOUND, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
 from sasgeo_bench.progress import Progress, Tell

@@ -14,8 +14,8 @@ from sasgeo_bench.experiments.paper import made_paper_task
 from sasgeo_bench.experiments.paper.task import region_name
 from sasgeo_bench.experiments.sealed import Seal, seal_of
 from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
+from sasgeo_bench.files.plugins import ORACLE, YARDSTICK, check_names, is_tracker
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.matching.plugins import ORACLE, YARDSTICK, check_names, is_tracker
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files

@@ -21,7 +21,7 @@ from sasgeo_bench.config import (
     list_documents,
     read_document,
 )
-from sasgeo_bench.matching.plugins import YARDSTICK
+from sasgeo_bench.files.plugins import YARDSTICK
 from sasgeo_bench.scoring.verdicts import (
     LESS,
     LOWER,

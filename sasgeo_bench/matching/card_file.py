@@ -7,10 +7,10 @@ from typing import Any, Final
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.files.paths import given_path, plain_file
+from sasgeo_bench.files.plugins import CARD_FILE
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.submission import Card
 
-CARD_FILE: Final = "card.toml"
 _EXAMPLE: Final = "submit --example-card prints a sound one"
 _MOST_BYTES: Final = 100_000
 

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.matching.card_file import CARD_FILE
-from sasgeo_bench.matching.plugins import KINDS, MATCHERS, shipped_names
+from sasgeo_bench.files.plugins import CARD_FILE, KINDS, MATCHERS, shipped_names
 from sasgeo_bench.matching.submission import EXAMPLE
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")

@@ -3,7 +3,7 @@
 
 from typing import Final
 
-from sasgeo_bench.matching.plugins import SEGMENTERS
+from sasgeo_bench.files.plugins import SEGMENTERS
 from sasgeo_bench.matching.scaffold import package_files
 
 _SEGMENTER: Final = '''\

@@ -4,7 +4,7 @@
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.matching.plugins import MATCHERS, TRACKERS, shipped_names
+from sasgeo_bench.files.plugins import MATCHERS, TRACKERS, shipped_names
 from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.matching.submission import EXAMPLE
 

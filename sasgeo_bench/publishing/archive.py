@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.files.plugins import check_registered
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
@@ -17,7 +18,6 @@ from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
 from sasgeo_bench.matching.learned_file import TrainingRecord
-from sasgeo_bench.matching.plugins import check_registered
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive_file import (
     MOST_BYTES,

@@ -12,8 +12,8 @@ from itertools import groupby
 from typing import Final, Generic, TypeVar
 
 from sasgeo_bench.errors import MatchError, StoreError
+from sasgeo_bench.files.plugins import ORACLE
 from sasgeo_bench.matching.matcher import check_match, lacks
-from sasgeo_bench.matching.plugins import ORACLE
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.tracker import check_covariance
 from sasgeo_bench.regions.region_files import check_files, read_manifest

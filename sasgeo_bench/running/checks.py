@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Final, Literal
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.plugins import check_card_name
 from sasgeo_bench.matching.matcher import MatcherCard
-from sasgeo_bench.matching.plugins import check_card_name
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.running.replies import PluginReply
 

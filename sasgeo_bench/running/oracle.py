@@ -8,8 +8,8 @@ from types import TracebackType
 from typing import Final, Self
 
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.files.plugins import ORACLE
 from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
-from sasgeo_bench.matching.plugins import ORACLE
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth

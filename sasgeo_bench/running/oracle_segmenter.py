@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER
+from sasgeo_bench.files.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.running.segmenter_process import SegmenterReply

@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
+from sasgeo_bench.files.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.matching.follower import follower_record
 from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, read_learned
 from sasgeo_bench.matching.matcher import MatcherCard
-from sasgeo_bench.matching.plugins import ORACLE, check_card_name, list_entry_points
 from sasgeo_bench.matching.results import SOUND, STATUSES, Status, matcher_hash
 from sasgeo_bench.progress import check_jobs
 from sasgeo_bench.regions.imagery import ORTHO

@@ -16,8 +16,8 @@ import numpy as np
 import psutil
 
 from sasgeo_bench.errors import ConfigError, MatchError, counted
+from sasgeo_bench.files.plugins import ORACLE
 from sasgeo_bench.matching.matcher import lacks
-from sasgeo_bench.matching.plugins import ORACLE
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run, reach_of

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.files.plugins import SEGMENTERS
 from sasgeo_bench.files.scratch import scratch_folder
-from sasgeo_bench.matching.plugins import SEGMENTERS
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.running.checks import (
     Check,

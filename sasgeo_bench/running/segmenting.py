@@ -10,8 +10,8 @@ from types import TracebackType
 from typing import Self
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.plugins import ORACLE_SEGMENTER, SEGMENTERS, check_card_name
 from sasgeo_bench.files.scratch import scratch_folder
-from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER, SEGMENTERS, check_card_name
 from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.running.code_hash import segmenter_code
 from sasgeo_bench.running.failures import LOG, guard, our_failure

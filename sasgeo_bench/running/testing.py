@@ -11,9 +11,9 @@ from typing import Any, Final
 import numpy as np
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.plugins import MATCHERS
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match, lacks
-from sasgeo_bench.matching.plugins import MATCHERS
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region

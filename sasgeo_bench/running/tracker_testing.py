@@ -11,10 +11,10 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.files.plugins import MATCHERS, TRACKERS
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import MatcherCard, is_followed, lacks
-from sasgeo_bench.matching.plugins import MATCHERS, TRACKERS
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region

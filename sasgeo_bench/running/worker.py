@@ -24,8 +24,8 @@ import psutil
 import sasgeo_bench.running.child
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.plugin_files import import_paths
 from sasgeo_bench.files.scratch import scratch_folder
-from sasgeo_bench.matching.plugin_files import import_paths
 from sasgeo_bench.matching.results import Status
 from sasgeo_bench.running import wire
 from sasgeo_bench.running.launch import PROGRAM

@@ -13,9 +13,9 @@ import pandas as pd
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
+from sasgeo_bench.files.plugins import ORACLE, shipped_names
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
-from sasgeo_bench.matching.plugins import ORACLE, shipped_names
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple, Self, TypeVar
 
 import pandas as pd
 
-from sasgeo_bench.matching.plugins import YARDSTICK
+from sasgeo_bench.files.plugins import YARDSTICK
 from sasgeo_bench.scoring.intervals import BoardInterval
 from sasgeo_bench.scoring.metric import Metric
 from sasgeo_bench.scoring.score import MISSING

@@ -13,9 +13,9 @@ import pytest
 from sasgeo_baselines.global_descriptor import GlobalDescriptor, Sums
 from sasgeo_baselines.map_density_prior import MapDensityPrior
 
+from sasgeo_bench.files.plugins import YARDSTICK
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match
-from sasgeo_bench.matching.plugins import YARDSTICK
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import read_queries, read_truths

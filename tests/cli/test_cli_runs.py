@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED
-from sasgeo_bench.matching.plugins import MATCHERS
+from sasgeo_bench.files.plugins import MATCHERS
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.testing import TOWN, check_matcher

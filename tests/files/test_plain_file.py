@@ -35,11 +35,11 @@ OWN = {
     ("experiments/head_start.py", "tarfile.open"),  # of bytes
     ("flights/drift_profile.py", "file.read_text"),
     ("matching/follower.py", "Path(module).read_bytes"),
-    ("matching/plugin_files.py", "found.read_text"),  # of what is installed
+    ("files/plugin_files.py", "found.read_text"),  # of what is installed
     ("publishing/site.py", "vendor.joinpath(name).read_text"),
     ("publishing/site_files.py", "path.read_text"),
     ("regions/ortho.py", "rasterio.open"),  # a view of a file that is open, in memory
-    ("running/code_hash.py", "(_PACKAGE / '__init__.pyi').read_bytes"),
+    ("files/code_hash.py", "(_PACKAGE / '__init__.pyi').read_bytes"),
     ("running/recalibration.py", "path.read_bytes"),
     ("sensing/image.py", "Image.open"),
 }

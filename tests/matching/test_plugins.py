@@ -9,16 +9,11 @@ from importlib.metadata import distribution
 import pytest
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matching import plugin_files
+from sasgeo_bench.files import plugin_files
+from sasgeo_bench.files.plugin_files import SHIPPED, find_module, home_of
+from sasgeo_bench.files.plugins import MATCHERS, check_card_name, check_names, list_entry_points
 from sasgeo_bench.matching.matcher import MatcherCard
-from sasgeo_bench.matching.plugin_files import SHIPPED, find_module, home_of
-from sasgeo_bench.matching.plugins import (
-    MATCHERS,
-    check_card_name,
-    check_names,
-    list_entry_points,
-    load_matcher,
-)
+from sasgeo_bench.matching.plugins import load_matcher
 from sasgeo_bench.matching.submission import example_card
 
 SOUND = """

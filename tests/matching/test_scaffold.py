@@ -13,11 +13,11 @@ import pytest
 
 import sasgeo_bench
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.files.plugin_files import SHIPPED
+from sasgeo_bench.files.plugins import MATCHERS, list_entry_points
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.matcher import Match
-from sasgeo_bench.matching.plugin_files import SHIPPED
-from sasgeo_bench.matching.plugins import MATCHERS, list_entry_points
 from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.running.testing import check_matcher

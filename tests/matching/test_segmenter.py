@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ImageError, MatchError
-from sasgeo_bench.matching.plugins import (
+from sasgeo_bench.files.plugins import (
     ORACLE_SEGMENTER,
     SEGMENTERS,
     check_card_name,
     check_names,
     list_entry_points,
-    load_segmenter,
     shipped_names,
 )
+from sasgeo_bench.matching.plugins import load_segmenter
 from sasgeo_bench.matching.segmenter import (
     MOST_TEXT_BYTES,
     ImageTraining,

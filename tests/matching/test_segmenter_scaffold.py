@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.matching.plugins import SEGMENTERS
+from sasgeo_bench.files.plugins import SEGMENTERS
 from sasgeo_bench.matching.scaffold import write_plugin
 from sasgeo_bench.matching.segmenter import ImageTraining
 from sasgeo_bench.matching.segmenter_scaffold import segmenter_files

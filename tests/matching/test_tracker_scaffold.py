@@ -8,8 +8,8 @@ import tomllib
 import pytest
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.files.plugins import TRACKERS
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.plugins import TRACKERS
 from sasgeo_bench.matching.scaffold import write_plugin
 from sasgeo_bench.matching.tracker_scaffold import tracker_files
 

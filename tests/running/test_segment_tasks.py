@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER
+from sasgeo_bench.files.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running.plan import RunRequest, plan_run

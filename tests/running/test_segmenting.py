@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ImageError, MatchError
-from sasgeo_bench.matching.plugins import ORACLE_SEGMENTER
+from sasgeo_bench.files.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.running import sandbox
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
 from sasgeo_bench.running.worker import Limits

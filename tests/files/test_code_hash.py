@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matching import plugin_files
-from sasgeo_bench.matching.plugin_files import ships
-from sasgeo_bench.matching.plugins import MATCHERS
-from sasgeo_bench.running import code_hash
-from sasgeo_bench.running.code_hash import SEGMENTER_TOOLS, TOOLS, digest_of, matcher_code, segmenter_code
+from sasgeo_bench.files import code_hash, plugin_files
+from sasgeo_bench.files.code_hash import digest_of
+from sasgeo_bench.files.plugin_files import ships
+from sasgeo_bench.files.plugins import MATCHERS
+from sasgeo_bench.running.code_hash import SEGMENTER_TOOLS, TOOLS, matcher_code, segmenter_code
 
 MODULE = '''
 """What it is."""
@@ -186,12 +186,12 @@ def test_the_tools_that_it_imports_count_by_whatever_name(lay, monkeypatch):
         "import sasgeo_bench as sgb\ny = sgb.Chart",
         "def later():\n    from sasgeo_bench import VotePlan",
     )
-    alone = code_hash._rooms([])
+    alone = code_hash._rooms([], TOOLS)
     for text in texts:
         lay({"plugin.py": text})
-        assert code_hash._rooms([Path("plugin.py")]) >= {"search"}, text
+        assert code_hash._rooms([Path("plugin.py")], TOOLS) >= {"search"}, text
     lay({"plugin.py": "import sasgeo_bench as sgb\ny = sgb.Grid"})
-    assert code_hash._rooms([Path("plugin.py")]) == alone
+    assert code_hash._rooms([Path("plugin.py")], TOOLS) == alone
     before = lay({"plugin.py": texts[0], "changed.py": "beam = 1"})
     files = code_hash._room_files
     monkeypatch.setattr(code_hash, "_room_files", lambda room: [*files(room)][: -1 if room == "search" else None])

@@ -34,31 +34,23 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "doctor": "doctor",
     },
     "Regions": {
-        "list-regions": "listing",
         "build-region": "regions",
         "render-imagery": "regions",
         "measure-ageing": "ageing",
         "compare-ageing": "ageing",
     },
     "Queries": {
-        "list-suites": "listing",
         "make-queries": "queries",
+        "segment": "segmenters",
         "inspect": "looking",
         "verify": "looking",
     },
-    "Matchers": {
-        "list-matchers": "listing",
-        "list-rejectors": "listing",
-        "new-matcher": "matchers",
-        "check-matcher": "matchers",
+    "Methods": {
+        "list": "doors",
+        "new": "doors",
+        "check": "doors",
         "weights": "weights",
         "lookalike": "weights",
-    },
-    "Segmenters": {
-        "list-segmenters": "listing",
-        "new-segmenter": "segmenters",
-        "check-segmenter": "segmenters",
-        "segment": "segmenters",
     },
     "Runs": {
         "run": "runs",
@@ -81,14 +73,21 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
     "Flights": {
         "read-flight": "flights",
         "measure-drift": "flights",
-        "list-trackers": "listing",
-        "new-tracker": "trackers",
-        "check-tracker": "trackers",
     },
     "Datasets of others": {
         "import-dataset": "importing",
         "locate-dataset": "importing",
     },
+}
+
+# Names that commands had before -> what they are now. They are in no help.
+ALIASES: Final = {
+    **{
+        f"list-{kind}": ("list", kind)
+        for kind in ("regions", "suites", "matchers", "trackers", "segmenters", "rejectors")
+    },
+    **{f"new-{kind}": ("new", kind) for kind in ("matcher", "tracker", "segmenter")},
+    **{f"check-{kind}": ("check", "--kind", kind) for kind in ("matcher", "tracker", "segmenter")},
 }
 
 # Command -> what is kept of it when it is interrupted, and how to go on; the others write all or nothing.
@@ -111,7 +110,7 @@ class _Group(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:  # noqa: ANN401 - as below
         """Name, command and the words that are left; the command is imported now."""
-        name, command, rest = super().resolve_command(ctx, args)
+        name, command, rest = super().resolve_command(ctx, [*ALIASES.get(args[0], args[:1]), *args[1:]])
         command = command and load(name or "")
         return name, command, spelled_out(rest, command.params) if command else rest
 

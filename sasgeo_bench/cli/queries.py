@@ -18,7 +18,7 @@ from sasgeo_bench.progress import Lines, Tell, spread
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
 from sasgeo_bench.tasks.query import PROFILE, Detector, PriorGroup
-from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
@@ -142,8 +142,9 @@ def _detectors(names: Sequence[str] | None) -> tuple[Detector, ...]:
 
 
 def _in_words(request: Request) -> str:
-    suite = find_suite(request.suite)
-    named = "flights" if "sequence" in suite.card.tracks else "queries"  # the ground decides how many views one has
+    named = (
+        "flights" if "sequence" in request.found.card.tracks else "queries"
+    )  # the ground decides how many views one has
     most = f"at most {request.count} sites, {request.most} {named}"
     return f"{request.suite} on {request.region.id}: {most}, {_folder(request)}"
 

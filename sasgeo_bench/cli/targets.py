@@ -15,7 +15,7 @@ from sasgeo_bench.running.prediction_files import RUN
 from sasgeo_bench.scoring.submission_files import SUBMISSION
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.split import list_split_files
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.suites.all_suites import list_suites
 from sasgeo_bench.tasks.task_files import TASK
 
 MOST_NAMED: Final = 8
@@ -84,14 +84,14 @@ def _of_name(name: str, out: Path, folders: Collection[Path]) -> str:
     """Describe a name or path where nothing is: a suite or region that is misspelled, or not made yet."""
     suite, slash, region = name.partition("/")
     tasks = [f"{path.parent.parent.name}/{path.parent.name}" for path in sorted((out / "tasks").glob(f"*/*/{TASK}"))]
-    if suite in EVERY_SUITE:
+    if suite in list_suites():
         made = [task for task in tasks if task.startswith(f"{suite}/")]
         same = [task for task in made if base_of(task) == base_of(name)]
         near = same or difflib.get_close_matches(name, made, n=1, cutoff=0.8) or made
         there = f"there is {', '.join(near[:MOST_NAMED])}" if near else f"draw it with make-queries --suite {suite}"
         return f"{out / 'tasks'} holds no task {name}: {there}"
     if slash:
-        near = difflib.get_close_matches(suite, EVERY_SUITE, n=1)
+        near = difflib.get_close_matches(suite, list_suites(), n=1)
         hint = f", did you mean '{near[0]}/{region}'?" if near else f" (list-suites shows all): {_there(out)}"
         return f"{name} is no folder, and there is no suite {suite!r}{hint}"
     known = list_region_files(folders=tuple(folders))
@@ -100,7 +100,7 @@ def _of_name(name: str, out: Path, folders: Collection[Path]) -> str:
         of_date = f" --date {date}" if date else ""
         return f"{out / 'regions'} holds no region {name!r}: build-region {base_of(base)}{of_date} first"
     built = [path.parent.name for path in sorted((out / "regions").glob(f"*/{MANIFEST}"))]
-    near = difflib.get_close_matches(name, [*built, *list_split_files(), *EVERY_SUITE, *known], n=1)
+    near = difflib.get_close_matches(name, [*built, *list_split_files(), *list_suites(), *known], n=1)
     hint = f", did you mean {near[0]!r}?" if near else f": {_there(out)}"
     return f"there is no region, task, split or run {name!r}{hint}"
 

@@ -22,7 +22,6 @@ from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.query import TASK_VERSION
-from sasgeo_bench.tasks.suites.all_suites import PICTURED
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,7 +102,7 @@ def draw_board(request: BoardRequest, *, tell: Tell, progress: Progress | None =
     Raise as `plan_board` does, and `ConfigError` if extracts are missing or no query is drawn as it was.
     """
     plan = plan_board(request, tell=tell)
-    if plan.split is None or any(item.suite in PICTURED for item in plan.requests):
+    if plan.split is None or any(item.found.is_pictured for item in plan.requests):
         what = "has no split" if plan.split is None else "asks about pictures, which a release does not hold"
         raise ConfigError(f"the board {plan.spec.id!r} {what}: its queries cannot be released so far")
     fetch_extracts(plan)

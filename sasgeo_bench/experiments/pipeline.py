@@ -42,8 +42,8 @@ from sasgeo_bench.scoring.registration import Pilot, check_contrasts
 from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.sensing.reference_imagery import render_place
 from sasgeo_bench.tasks.build import carry_out
-from sasgeo_bench.tasks.query import RECALIBRATED, base_of
-from sasgeo_bench.tasks.suites.all_suites import PICTURED
+from sasgeo_bench.tasks.query import BY, RECALIBRATED, base_of
+from sasgeo_bench.tasks.suites.all_suites import is_pictured
 from sasgeo_bench.tasks.task_plan import Request
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
@@ -224,7 +224,7 @@ def _render(plan: PipelinePlan, tell: Tell) -> None:
 
 def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path], *, tell: Tell, progress: Progress | None) -> list[Path]:
     """Return tasks with those of pictures replaced by what each segmenter of the file made of them."""
-    pictured = [task for task in tasks if task.parent.name in PICTURED]
+    pictured = [task for task in tasks if BY not in task.parent.name and is_pictured(task.parent.name)]
     found = [task for task in tasks if task not in pictured]
     if plan.split is None:
         return found

@@ -29,7 +29,7 @@ from sasgeo_bench.tasks.build import is_of_region, look_of, made_tasks, why_to_d
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import BY, CONTROLS, SEQUENCE, PriorGroup, base_of
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES, PICTURED, find_suite
+from sasgeo_bench.tasks.suites.all_suites import find_suite, is_pictured, known_suite
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests, root_of
 
@@ -327,14 +327,15 @@ def _check_flights(spec: PipelineFile) -> None:
 
 
 def _is_of_flights(name: str) -> bool:
-    return name.split(BY, maxsplit=1)[0] in FLIGHT_SUITES
+    suite = known_suite(name)
+    return suite is not None and SEQUENCE in suite.card.tracks
 
 
 def _check_look(spec: PipelineFile, requests: Sequence[Request]) -> None:
     """Refuse reference imagery in a family of looks that a query has, too, and imagery that no suite looks at."""
     if spec.reference_imagery is None:
         return
-    pictured = [item for item in requests if item.suite in PICTURED]
+    pictured = [item for item in requests if item.found.is_pictured]
     if not pictured:
         raise ConfigError(f"pipeline {spec.id!r} has reference_imagery, and draws no suite of pictures: leave it out")
     family = spec.reference_imagery.family
@@ -469,7 +470,9 @@ def is_asked(plan: PipelinePlan, spec: str, suite: str, region: str) -> bool:
     oracle alone.
     """
     is_of_flights = _is_of_flights(suite)
-    if suite in PICTURED or (not is_of_flights and is_tracker(spec)):  # pictures are asked as a segmenter sees them
+    if BY not in suite and is_pictured(suite):  # pictures are asked as a segmenter sees them
+        return False
+    if not is_of_flights and is_tracker(spec):
         return False
     if suite in {CONTROLS, *(() if plan.spec.paper is None else plan.spec.paper.crops)}:
         return True

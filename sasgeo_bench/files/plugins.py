@@ -5,7 +5,7 @@ import difflib
 import importlib
 import sys
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint
 from typing import Any, Final
@@ -24,13 +24,21 @@ MATCHERS: Final = "sasgeo_bench.matchers"
 TRACKERS: Final = "sasgeo_bench.trackers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 SEGMENTERS: Final = "sasgeo_bench.segmenters"
+SUITES: Final = "sasgeo_bench.suites"
 CARD_FILE: Final = "card.toml"  # beside a plugin: the one description of a method
 YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are never ranked
 # The runner's own controls, which are given the truth: no plugin can have their names.
 ORACLE: Final = "oracle_pose"
 ORACLE_SEGMENTER: Final = "oracle_segmenter"
 _RESERVED: Final = {MATCHERS: ORACLE, TRACKERS: ORACLE, SEGMENTERS: ORACLE_SEGMENTER}
-KINDS: Final = {MATCHERS: "matcher", TRACKERS: "tracker", REJECTORS: "rejector", SEGMENTERS: "segmenter"}
+_WHAT: Final = {SUITES: "NAME"}  # is named behind a module, where that is no class
+KINDS: Final = {
+    MATCHERS: "matcher",
+    TRACKERS: "tracker",
+    REJECTORS: "rejector",
+    SEGMENTERS: "segmenter",
+    SUITES: "suite",
+}
 
 
 def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
@@ -135,8 +143,8 @@ def made(spec: str, target: Callable[[], Any]) -> Any:  # noqa: ANN401 - any plu
         raise _failed(spec, "cannot be made", error) from error
 
 
-def find_class(spec: str, group: str) -> Callable[[], Any]:
-    """Return the class behind a name or module:Class."""
+def find_plugin(spec: str, group: str) -> Any:  # noqa: ANN401 - any plugin
+    """Return the class behind a name or module:Class, or the instance where it is one."""
     if not isinstance(spec, str):
         raise MatchError(f"{one_line(repr(spec))} is no name of a {KINDS[group]}: name one as a text, or module:Class")
     if ":" not in spec:
@@ -188,13 +196,16 @@ def code_of(spec: str, *groups: str) -> tuple[str, str]:
     return point.module, point.attr
 
 
-def unknown(name: str, *groups: str) -> MatchError:
-    """Return the error for a name that no group has, with the nearest one."""
-    near = difflib.get_close_matches(name, [known for group in groups for known in list_entry_points(group)], n=1)
+def unknown(name: str, *groups: str, others: Collection[str] = ()) -> MatchError:
+    """Return the error for a name that no group has, with the nearest one; `others` are names without entry points."""
+    known = [*others, *(each for group in groups for each in list_entry_points(group))]
+    near = difflib.get_close_matches(name, known, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ""
     kinds = [KINDS[group] for group in groups]
     shown = f"{' and '.join(f'list-{kind}s' for kind in kinds)} show{'s' if len(kinds) == 1 else ''} all"
-    return MatchError(f"there is no {' or '.join(kinds)} {name!r}{hint} ({shown}; or module:Class)")
+    return MatchError(
+        f"there is no {' or '.join(kinds)} {name!r}{hint} ({shown}; or module:{_WHAT.get(groups[0], 'Class')})"
+    )
 
 
 def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = (), segmenters: Sequence[str] = ()) -> None:

@@ -9,8 +9,8 @@ from sasgeo_bench.leaderboard.tables import DAGGER, Column, Mark
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE
 from sasgeo_bench.scoring.verdicts import LEAST_PLACES
-from sasgeo_bench.tasks.query import BY, PriorGroup
-from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
+from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.suites.all_suites import known_suite
 from sasgeo_bench.tasks.suites.base import SuiteCard
 
 _UNKNOWN: Final = "no meaning is written down for this column"
@@ -175,7 +175,7 @@ def prior_words(name: str) -> str:
 
 def suite_card(suite: str) -> SuiteCard | None:
     """Return the card of a suite of this version, whichever segmenter made its evidence; None for any other."""
-    found = EVERY_SUITE.get(suite.partition(BY)[0])
+    found = known_suite(suite)
     return None if found is None else found.card
 
 

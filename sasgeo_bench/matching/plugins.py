@@ -12,7 +12,7 @@ from sasgeo_bench.files.plugins import (
     REJECTORS,
     SEGMENTERS,
     TRACKERS,
-    find_class,
+    find_plugin,
     is_tracker,
     list_entry_points,
     made,
@@ -38,7 +38,7 @@ def load_matcher(spec: str) -> "Matcher":
     """
     from sasgeo_bench.matching.matcher import MatcherCard  # noqa: PLC0415 - names are listed without it
 
-    matcher: Matcher = made(spec, find_class(spec, MATCHERS))
+    matcher: Matcher = made(spec, find_plugin(spec, MATCHERS))
     _check(spec, matcher, MatcherCard, MATCHERS, ("prepare", "match"))
     return matcher
 
@@ -51,7 +51,7 @@ def load_tracker(spec: str) -> "Tracker":
     """
     from sasgeo_bench.matching.matcher import MatcherCard  # noqa: PLC0415 - as in load_matcher
 
-    tracker: Tracker = made(spec, find_class(spec, TRACKERS))
+    tracker: Tracker = made(spec, find_plugin(spec, TRACKERS))
     _check(spec, tracker, MatcherCard, TRACKERS, ("prepare", "start", "step"))
     return tracker
 
@@ -62,7 +62,9 @@ def load_method(spec: str) -> "Matcher | Tracker":
     Raise `MatchError` as `load_matcher` does.
     """
     if ":" in spec:
-        return load_tracker(spec) if callable(getattr(find_class(spec, TRACKERS), "step", None)) else load_matcher(spec)
+        return (
+            load_tracker(spec) if callable(getattr(find_plugin(spec, TRACKERS), "step", None)) else load_matcher(spec)
+        )
     if is_tracker(spec):
         return load_tracker(spec)
     if spec not in list_entry_points():
@@ -81,7 +83,7 @@ def load_segmenter(spec: str) -> "Segmenter":
     """
     from sasgeo_bench.matching.segmenter import SegmenterCard  # noqa: PLC0415 - as in load_matcher
 
-    segmenter: Segmenter = made(spec, find_class(spec, SEGMENTERS))
+    segmenter: Segmenter = made(spec, find_plugin(spec, SEGMENTERS))
     _check(spec, segmenter, SegmenterCard, SEGMENTERS, ("segment",))
     return segmenter
 
@@ -96,7 +98,7 @@ def rejector_maker(spec: str) -> "Callable[[], Rejector]":
 
     Raise `MatchError` if there is none of that name, or it cannot be imported.
     """
-    return partial(_rejector, spec, find_class(spec, REJECTORS))
+    return partial(_rejector, spec, find_plugin(spec, REJECTORS))
 
 
 def _rejector(spec: str, target: Callable[[], Any]) -> "Rejector":

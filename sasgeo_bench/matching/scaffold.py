@@ -52,7 +52,7 @@ requires-python = ">=3.11"
 dependencies = ["numpy>=2", "sasgeo-bench>=0.1"]
 
 [project.entry-points."{group}"]
-{name} = "{module}.{kind}:{cls}"
+{name} = "{module}.{kind}:{attribute}"
 
 [tool.hatch.build.targets.wheel]
 packages = ["src/{module}"]
@@ -117,7 +117,7 @@ from sasgeo_bench import check_{kind}
 
 
 def test_it_conforms():
-    faults = [check for check in check_{kind}("{module}.{kind}:{cls}") if check.outcome == "fail"]
+    faults = [check for check in check_{kind}("{module}.{kind}:{attribute}") if check.outcome == "fail"]
     assert not faults, faults
 '''
 
@@ -149,13 +149,16 @@ def plugin_files(name: str) -> dict[str, str]:
     return package_files(name, group=MATCHERS, code=_MATCHER, readme=_README, card=EXAMPLE)
 
 
-def package_files(name: str, *, group: str, code: str, readme: str, card: str | None = None) -> dict[str, str]:
+def package_files(
+    name: str, *, group: str, code: str, readme: str, card: str | None = None, attribute: str | None = None
+) -> dict[str, str]:
     """Return the text of every file of a new package with a plugin, by its path.
 
-    `group` is that of its entry point; `code`, `readme` and `card`, where it has one, are templates. Raise
-    `ConfigError` if the name is not allowed, or taken.
+    `group` is that of its entry point; `code`, `readme` and `card`, where it has one, are templates. `attribute` is
+    what the entry point names, if that is not the class. Raise `ConfigError` if the name is not allowed, or taken.
     """
     words = _words_of(name, group=group, imported=_imported_names(code))
+    words["attribute"] = attribute or words["cls"]
     files = {
         "pyproject.toml": _PYPROJECT,
         "README.md": readme,

@@ -35,7 +35,7 @@ from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
 from sasgeo_bench.tasks.split import Block, Split
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.all_suites import find_suite
+from sasgeo_bench.tasks.suites.all_suites import suite_code
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, Suite, no_larger
 from sasgeo_bench.tasks.suites.flights import FlightSuite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
@@ -69,7 +69,6 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
 
 def _locked(request: Request, tell: Tell) -> AbstractContextManager[None]:
     """Lock a request from start to end, since a second run of it would change the map that this one uses."""
-    find_suite(request.suite)
     check_count(request.count)
     check_roots(request.out)
     # The lock is where maps are built, so that a refused request leaves nothing among tasks.
@@ -132,7 +131,7 @@ def is_of_region(name: str, region: str) -> bool:
 
 def _request_sha256(request: Request) -> str:
     content = {
-        "suite": [request.suite, find_suite(request.suite).card.version, TASK_VERSION],
+        "suite": [request.suite, request.found.card.version, TASK_VERSION, *_foreign_code(request)],
         "region": request.region.model_dump(mode="json"),
         "elsewhere": request.elsewhere and request.elsewhere.model_dump(mode="json"),
         # Halves decide only where methods train, countries how rows cluster: changing them redraws nothing. What is
@@ -156,8 +155,23 @@ def _request_sha256(request: Request) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+def _foreign_code(request: Request) -> tuple[str, ...]:
+    """Return the hash of a suite that is not ours: another code draws other queries."""
+    code = suite_code(request.suite_spec)
+    return () if code is None else (code,)
+
+
 def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
-    suite = find_suite(request.suite)
+    drawer, sites = plan_draw(request, tell)
+    return tuple(_write(request, drawer, sites, tell))
+
+
+def plan_draw(request: Request, tell: Tell) -> tuple[Drawer | FlightDrawer, list[Site]]:
+    """Return what draws the queries of a request, and the sites where it does; missing maps are built.
+
+    Raise `ConfigError` if the region cannot carry the suite or so many sites.
+    """
+    suite = request.found
     suite = replace(suite, variants=no_larger(suite.variants, request.region.largest_view_m))
     refusal = None if request.group is None else suite.refusal(request.group)
     if refusal is not None:
@@ -174,11 +188,11 @@ def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
         flights = airspace.choose(count=request.count, may_be_fewer=request.may_be_fewer)
         airspace = replace(airspace, scene=replace(scene, others=scene.others + changed_maps(request, base, flights)))
         pilot = FlightDrawer(airspace=airspace, flights=flights, choice=request.choice)
-        return tuple(_write(request, pilot, [flight.site for flight in flights.values()], tell))
+        return pilot, [flight.site for flight in flights.values()]
     sites = choose_sites(scene, suite, count=request.count, seeds=seeds, group=group, may_be_fewer=request.may_be_fewer)
     drawer = Drawer(suite=suite, scene=scene, seeds=seeds, group=group, split=request.split, choice=request.choice)
-    drawer, sites = edit_maps(request, drawer, base, sites)
-    return tuple(_write(request, drawer, sites, tell))
+    drawer, edited = edit_maps(request, drawer, base, sites)
+    return drawer, list(edited)
 
 
 def _view_reach_m(request: Request, suite: Suite) -> float:
@@ -334,7 +348,7 @@ def _about(
     request: Request, drawer: Drawer | FlightDrawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]
 ) -> dict[str, Any]:
     """Return the contents of `task.json`: how the queries were drawn, but not where they lie."""
-    card = drawer.suite.card
+    card, code = drawer.suite.card, suite_code(request.suite_spec)
     state = drawer.scene.state(region)
     manifest = region_files.read_manifest(request.out / "regions" / region)
     spec = request.split.spec
@@ -342,6 +356,7 @@ def _about(
     return {
         "suite": card.name,
         "suite_version": card.version,
+        **({"suite_sha256": code} if code else {}),
         **{name: getattr(card, name) for name in texts},
         "region": region,
         "map_date": state.date.isoformat(),

@@ -87,6 +87,7 @@ class TaskManifest(Document):
     task_version: int
     suite: Folder
     suite_version: Count | None = None
+    suite_sha256: str | None = None  # of the code of a suite of another package
     title: str
     what: str | None = None
     separates: str | None = None

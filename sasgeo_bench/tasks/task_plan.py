@@ -19,7 +19,7 @@ from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import Split, find_split_file, list_split_files, make_split, read_split_file
 from sasgeo_bench.tasks.suites.all_suites import find_suite
-from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice
+from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Suite
 from sasgeo_bench.tasks.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
 
 PRIVATE_ROOT: Final = "private"  # below the root of public queries, so that no folder holds both
@@ -45,24 +45,33 @@ class Settings:
 
 @dataclass(frozen=True, kw_only=True)
 class Request(Settings):
-    """One suite on one region, with the split and the region for views of a wrong place."""
+    """One suite on one region, with the split and the region for views of a wrong place.
+
+    `suite` is its name, which folders have; `suite_spec` is what it is found by in each process (`find_suite`).
+    """
 
     suite: str
+    suite_spec: str
     region: RegionFile
     split: Split
     elsewhere: RegionFile | None = None
 
     @property
+    def found(self) -> Suite:
+        """Return the suite."""
+        return find_suite(self.suite_spec)
+
+    @property
     def most(self) -> int:
         """Return how many queries, or flights, are drawn at most: a region may hold fewer sites."""
-        suite = find_suite(self.suite)
+        suite = self.found
         taken = [self.choice.takes(variant, track) for variant in suite.variants for track in suite.tracks(variant)]
         return self.count * sum(taken) * len(suite.drawn_by(self.choice.detectors))
 
     @property
     def extracts(self) -> tuple[Extract, ...]:
         """Return the extracts of all maps that the queries are drawn from."""
-        needs = find_suite(self.suite).card.needs
+        needs = self.found.card.needs
         dates = aged_dates(self.region) if "older maps" in needs else ()
         others = [self.elsewhere.pick(None)] if "another region" in needs and self.elsewhere is not None else []
         return (*map(self.region.pick, (None, *dates)), *others)
@@ -91,10 +100,10 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
         If a suite, region or split is unknown, the split is not sound or lacks a region, the count is not positive, the
         truths would be among the tasks, or all regions are sealed.
     """
-    for name in wanted.suites:
-        fault = wanted.choice.lack(find_suite(name))
-        if fault is not None:
-            raise ConfigError(fault)
+    suites = {spec: find_suite(spec) for spec in wanted.suites}
+    fault = next(filter(None, map(wanted.choice.lack, suites.values())), None)
+    if fault is not None:
+        raise ConfigError(fault)
     check_count(wanted.count)
     check_roots(wanted.out)
     files = list_region_files(folders=wanted.region_folders)
@@ -104,8 +113,9 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
         for name in wanted.regions
     ]
     known |= {spec.id: spec for spec in named}
-    spec = read_split_file(find_split_file(wanted.split))
-    split = make_split(spec, {name: item.grid() for name, item in known.items()})
+    split = make_split(
+        read_split_file(find_split_file(wanted.split)), {name: item.grid() for name, item in known.items()}
+    )
     if not named:
         listed = [known[name] for name in split.spec.region_ids]
         named = [item for item in listed if is_reachable(item, wanted.extract_folders, wanted.out)]
@@ -118,14 +128,15 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
     settings = {item.name: getattr(wanted, item.name) for item in fields(Settings)}
     return tuple(
         Request(
-            suite=name,
+            suite=suite.card.name,
+            suite_spec=spec,
             region=item,
             split=split,
             elsewhere=wrong_place(split, item, known),
             **settings | ({"seed": wanted.sealed_seed} if split.sealed_place(item.id) else {}),
         )
         for item in _without_sealed({item.id: item for item in named}, split, wanted, tell)
-        for name in dict.fromkeys(wanted.suites)
+        for spec, suite in suites.items()
     )
 
 

@@ -1,10 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All suites by name; a new suite is a file of its own and a line here."""
+"""All suites by name: ours, each a file of its own and a line here, and those of installed packages."""
 
-import difflib
+import os
+import re
+import sys
+from functools import lru_cache
 from typing import Final
 
-from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.errors import ConfigError, MatchError
+from sasgeo_bench.files.code_hash import plugin_code
+from sasgeo_bench.files.plugins import SUITES as GROUP
+from sasgeo_bench.files.plugins import find_plugin, list_entry_points, made, unknown
+from sasgeo_bench.tasks.query import BY
 from sasgeo_bench.tasks.suites import (
     absent,
     accumulated,
@@ -43,6 +50,8 @@ from sasgeo_bench.tasks.suites import (
 )
 from sasgeo_bench.tasks.suites.base import Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
+
+_NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of a suite: it becomes a folder
 
 SUITES: Final[dict[str, Suite]] = {
     suite.card.name: suite
@@ -101,14 +110,88 @@ EVERY_SUITE: Final[dict[str, Suite]] = {
     **FLIGHT_SUITES,
     board_controls.SUITE.card.name: board_controls.SUITE,
 }
-# Suites of pictures, flights among them.
-PICTURED: Final = frozenset(name for name, suite in EVERY_SUITE.items() if suite.is_pictured)
 
 
-def find_suite(name: str) -> Suite:
-    """Return the suite of a name; raise a ConfigError that suggests the nearest name if there is none."""
-    if name not in EVERY_SUITE:
-        near = difflib.get_close_matches(name, EVERY_SUITE, n=1, cutoff=0.5)
-        hint = f", did you mean {near[0]!r}?" if near else ""
-        raise ConfigError(f"there is no suite {name!r}{hint} (list-suites shows all)")
-    return EVERY_SUITE[name]
+def list_suites() -> tuple[str, ...]:
+    """Return the names of all suites: ours in the order of their families, then those of installed packages."""
+    return (*EVERY_SUITE, *(name for name in list_entry_points(GROUP) if name not in EVERY_SUITE))
+
+
+def is_foreign(spec: str) -> bool:
+    """Return whether a suite is of another package: what it draws depends on code that is not ours."""
+    return spec not in EVERY_SUITE
+
+
+def find_suite(spec: str) -> Suite:
+    """Return the suite of a name, or of "module:NAME": an instance of `Suite`, or what makes one.
+
+    Raise `ConfigError` if there is none, with the nearest name, or it cannot be imported, is no suite, or has the name
+    of another one.
+
+    >>> find_suite("clean").card.title
+    'Rotation, scale and crop'
+    >>> find_suite("cleen")
+    Traceback (most recent call last):
+        ...
+    sasgeo_bench.errors.ConfigError: there is no suite 'cleen', did you mean 'clean'? (list-suites shows all; or
+    module:NAME)
+    """
+    return _foreign(spec) if is_foreign(spec) else EVERY_SUITE[spec]
+
+
+def known_suite(name: str) -> Suite | None:
+    """Return the suite of a name, whichever segmenter made its evidence; None for one that is not here.
+
+    Queries of other datasets and of programs elsewhere have suites, too.
+
+    >>> known_suite("aerial+pixel_forest") is find_suite("aerial"), known_suite("swa-pf")
+    (True, None)
+    """
+    name = name.partition(BY)[0]
+    try:
+        return find_suite(name) if name in list_suites() else None
+    except ConfigError:  # a package that cannot be imported
+        return None
+
+
+def is_pictured(name: str) -> bool:
+    """Return whether queries of a suite of this name hold pictures; False for one that is not here."""
+    suite = known_suite(name)
+    return suite is not None and suite.is_pictured
+
+
+def suite_code(spec: str) -> str | None:
+    """Return the SHA-256 of the code of a suite of another package; None for ours, which the program's version names.
+
+    Raise `ConfigError` if its code cannot be found.
+    """
+    try:
+        return plugin_code(spec, GROUP) if is_foreign(spec) else None
+    except MatchError as error:
+        raise ConfigError(str(error)) from error
+
+
+@lru_cache(maxsize=64)
+def _foreign(spec: str) -> Suite:
+    if ":" in spec and os.getcwd() not in sys.path:  # noqa: PTH109 - a text; `module:NAME` may lie in the working folder
+        sys.path.insert(0, os.getcwd())  # noqa: PTH109
+    try:
+        if ":" not in spec and spec not in list_entry_points(GROUP):
+            raise unknown(spec, GROUP, others=EVERY_SUITE)
+        found = find_plugin(spec, GROUP)
+        suite = found if isinstance(found, Suite) else made(spec, found)
+    except MatchError as error:
+        raise ConfigError(str(error)) from error
+    if not isinstance(suite, Suite):
+        raise ConfigError(f"{spec}: a {type(suite).__name__} is no suite: name an instance of sasgeo_bench.Suite")
+    name = suite.card.name
+    if not _NAME.fullmatch(name):
+        raise ConfigError(f"{spec}: its card is named {name!r}: lower-case letters, digits, - and _ make a name")
+    if name in EVERY_SUITE:
+        raise ConfigError(f"{spec}: its card is named {name!r}, as a suite that ships: rename it")
+    if ":" not in spec and name != spec:
+        raise ConfigError(
+            f"{spec}: its card is named {name!r}, and queries are found by one name: give the entry point "
+            "(pyproject.toml) and the card the same, and install it again"
+        )
+    return suite

@@ -1,0 +1,246 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands about plugins of every kind: list them, write a new one, check one."""
+
+import shlex
+import shutil
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import fields
+from enum import StrEnum
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple
+
+import typer
+from rich.table import Table
+
+from sasgeo_bench.cli.console import EXIT_USER, complain, print_table, say, tell
+from sasgeo_bench.cli.options import RegionFolders
+from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.files.plugins import (
+    MATCHERS,
+    ORACLE,
+    ORACLE_SEGMENTER,
+    REJECTORS,
+    SEGMENTERS,
+    SUITES,
+    TRACKERS,
+    list_entry_points,
+    unknown,
+)
+from sasgeo_bench.texts import plain
+
+_OF_DEMO: Final = "demo-"  # too many made-up towns to list
+
+
+class _Door(NamedTuple):
+    """What the commands do for one kind of plugin; functions are imported when they are called."""
+
+    group: str
+    load: str
+    files: str | None = None  # of a new package
+    check: str | None = None
+    control: str | None = None  # the runner's own, which is no plugin
+
+
+_DOORS: Final = {
+    "matcher": _Door(
+        MATCHERS,
+        "matching.plugins:load_matcher",
+        "matching.scaffold:plugin_files",
+        "running.testing:check_matcher",
+        ORACLE,
+    ),
+    "tracker": _Door(
+        TRACKERS,
+        "matching.plugins:load_tracker",
+        "matching.tracker_scaffold:tracker_files",
+        "running.tracker_testing:check_tracker",
+        ORACLE,
+    ),
+    "segmenter": _Door(
+        SEGMENTERS,
+        "matching.plugins:load_segmenter",
+        "matching.segmenter_scaffold:segmenter_files",
+        "running.segmenter_testing:check_segmenter",
+        ORACLE_SEGMENTER,
+    ),
+    "rejector": _Door(REJECTORS, "matching.plugins:load_rejector"),
+    "suite": _Door(
+        SUITES,
+        "tasks.suites.all_suites:find_suite",
+        "matching.suite_scaffold:suite_files",
+        "running.suite_testing:check_suite",
+    ),
+}
+
+
+class Listed(StrEnum):
+    """What can be listed."""
+
+    REGIONS = "regions"
+    SUITES = "suites"
+    MATCHERS = "matchers"
+    TRACKERS = "trackers"
+    SEGMENTERS = "segmenters"
+    REJECTORS = "rejectors"
+
+
+class New(StrEnum):
+    """What a package can be written of."""
+
+    MATCHER = "matcher"
+    TRACKER = "tracker"
+    SEGMENTER = "segmenter"
+    SUITE = "suite"
+
+
+def list_command(
+    kind: Annotated[Listed, typer.Argument(help="what to list")],
+    name: Annotated[
+        str | None, typer.Argument(help="show the card of one: a name of the list, or module:Class")
+    ] = None,
+    regions: RegionFolders = None,
+) -> None:
+    """List regions, suites or installed plugins, and where each comes from; or show the card of one."""
+    if kind is Listed.REGIONS:
+        _list_regions(regions)
+        return
+    door = _DOORS[kind.removesuffix("s")]
+    if name is not None and name == door.control:
+        say(f"{name}: a control, given the truth, and has no card")
+    elif name is not None:
+        _show(_function(door.load)(name).card)
+    elif kind is Listed.SUITES:
+        _list_suites()
+    else:
+        _list(kind.removesuffix("s"), door)
+
+
+def _function(place: str) -> Callable[..., Any]:
+    module, _, name = place.partition(":")
+    return getattr(import_module(f"sasgeo_bench.{module}"), name)  # type: ignore[no-any-return]
+
+
+def _list(kind: str, door: _Door) -> None:
+    rows = {
+        name: (point.dist.name if point.dist is not None else "", point.value)
+        for name, point in list_entry_points(door.group).items()
+    }
+    if door.control:
+        rows[door.control] = ("sasgeo-bench", "a control, given the truth")
+    table = Table(kind, "package", "class", box=None, pad_edge=False)
+    for name, cells in sorted(rows.items()):
+        table.add_row(name, *cells)
+    print_table(table)
+
+
+def _list_regions(folders: Iterable[Path] | None) -> None:
+    from sasgeo_bench.config import shipped_dir  # noqa: PLC0415
+    from sasgeo_bench.regions.region_spec import list_region_files, read_region_file  # noqa: PLC0415
+
+    table = Table("id", "title", "km2", "cell", "dates", "scenes", box=None, pad_edge=False)
+    files = list_region_files(folders=tuple(folders or ()))
+    shipped = shipped_dir("regions")
+    of_demo = sorted(name for name, path in files.items() if name.startswith(_OF_DEMO) and path.parent == shipped)
+    for name in sorted(files.keys() - set(of_demo)):
+        spec = read_region_file(files[name])
+        grid = spec.grid()
+        area_km2 = grid.rows * grid.cols * grid.cell_size_m**2 / 1e6
+        dates = [extract.date.isoformat() for extract in spec.extract]
+        shown = dates[0] if len(dates) == 1 else f"{dates[0]} .. {dates[-1]} ({len(dates)})"
+        table.add_row(name, spec.title, f"{area_km2:.1f}", f"{grid.cell_size_m:g} m", shown, ", ".join(spec.scenes))
+    print_table(table)
+    tell(f"and {len(of_demo)} small towns of `leaderboard demo`, {_OF_DEMO}...: regions/README.md")
+
+
+def _list_suites() -> None:
+    from sasgeo_bench.tasks.suites.all_suites import find_suite, list_suites  # noqa: PLC0415
+
+    table = Table("suite", "title", "tracks", "per site", "separates", box=None, pad_edge=False)
+    for name in list_suites():
+        try:
+            suite = find_suite(name)
+        except ConfigError as error:  # of another package: the others are listed all the same
+            tell(f"left out: {error}")
+            continue
+        per_site = sum(len(suite.tracks(variant)) for variant in suite.variants)
+        table.add_row(name, suite.card.title, ", ".join(suite.card.tracks), str(per_site), suite.card.separates)
+    print_table(table)
+
+
+def _show(card: object) -> None:
+    """Print what a card says, a field after the other; what it leaves empty is left out."""
+    for field in fields(card):  # type: ignore[arg-type]
+        value = getattr(card, field.name)
+        text = ", ".join(map(str, value)) if isinstance(value, tuple) else str(value)
+        if text:
+            say(f"{field.name.replace('_', ' ')}: {plain(text)}")
+
+
+def new_command(
+    kind: Annotated[New, typer.Argument(help="what to write")],
+    name: Annotated[str, typer.Argument(help="of it, as in my-matcher")],
+    folder: Annotated[Path | None, typer.Option("--into", help="an empty folder; default: one of that name")] = None,
+) -> None:
+    """Write a plugin package that passes `check` at once, for you to put your method into."""
+    door = _DOORS[kind]
+    lay_package(name, folder, _function(str(door.files))(name))
+    if kind is New.MATCHER:
+        entry = f"sasgeo-bench enter docs/results/systems-objects --matcher {name}"
+        tell(f"later: {entry} (docs/howto/matcher.md walks the path)")
+
+
+def lay_package(name: str, folder: Path | None, files: Mapping[str, str]) -> None:
+    """Write the files of a package, and say how to go on."""
+    from sasgeo_bench.matching.scaffold import write_plugin  # noqa: PLC0415
+
+    target = folder or Path(name)
+    write_plugin(target, files)
+    install = f"{_pip()} install -e {shlex.quote(str(target))}"
+    say(f"{target}: {len(files)} files; next: {install} && sasgeo-bench check {name}")
+
+
+def _pip() -> str:
+    """The pip of this environment: another one, first on the user's path, would install where nothing finds it."""
+    mine = Path(sys.executable).with_name("pip")
+    if shutil.which("pip") == str(mine):
+        return "pip"
+    here = Path.cwd()
+    return shlex.quote(str(mine.relative_to(here) if mine.is_relative_to(here) else mine))
+
+
+def check_command(
+    name: Annotated[str, typer.Argument(help="name of a list, or module:Class")],
+    *,
+    kind: Annotated[
+        New | None, typer.Option(help="of what it is; needed for module:Class of another kind than a matcher")
+    ] = None,
+    trusted: Annotated[bool, typer.Option("--trusted", help="run without the sandbox")] = False,
+) -> None:
+    """Try a matcher, tracker, segmenter or suite on a tiny town, and print a row for each rule that all keep."""
+    found = kind or _kind_of(name)
+    check = _function(str(_DOORS[found].check))
+    rows: Iterator[Any] = check(name) if found == "suite" else check(name, is_shut_in=not trusted)
+    table = Table("check", "outcome", "found", box=None, pad_edge=False)
+    failed = 0
+    for row in rows:
+        failed += row.outcome == "fail"
+        table.add_row(row.name, row.outcome, row.found)
+    print_table(table)
+    if failed:
+        complain(f"{name}: {counted(failed, 'check')} failed")
+        raise typer.Exit(EXIT_USER)
+
+
+def _kind_of(name: str) -> str:
+    """Return the first kind that has a plugin of a name; a class of one's own is a matcher."""
+    if ":" in name:
+        return "matcher"
+    from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE  # noqa: PLC0415
+
+    checked = [kind for kind, door in _DOORS.items() if door.check]
+    found = next((kind for kind in checked if name in list_entry_points(_DOORS[kind].group)), None)
+    if found is None and name not in EVERY_SUITE:
+        raise unknown(name, *(_DOORS[kind].group for kind in checked), others=EVERY_SUITE)
+    return found or "suite"

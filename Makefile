@@ -57,7 +57,7 @@ head-start: $(STAMP) ## pack the answers that come with the demo, pipelines/demo
 	sed -i -e '/^archive = /d' -e "0,/^id = .*/s//&\narchive = {sha256 = \"$$(sha256sum $(PACK).tar.xz | cut -d ' ' -f 1)\"}/" $(PACK).toml
 
 list-regions: $(STAMP) ## list the regions that come with the package
-	$(SASGEO) list-regions $(ARGS)
+	$(SASGEO) list regions $(ARGS)
 
 build-region: $(STAMP) ## build one region: REGION=vaduz, and DATE=2021-10-28 for another date
 	@test -n "$(REGION)" || { echo "name the region: make build-region REGION=vaduz (make list-regions shows all)" >&2; exit 2; }

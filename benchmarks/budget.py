@@ -101,7 +101,7 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/open-numbers"), help="folder of maps and views")
-    parser.add_argument("--matcher", action="append", default=[], help="name from list-matchers; may be repeated")
+    parser.add_argument("--matcher", action="append", default=[], help="name from list matchers; may be repeated")
     options = parser.parse_args()
     try:
         measure(options.out, options.matcher or list(systems()))
@@ -115,7 +115,7 @@ def measure(out: Path, names: list[str]) -> None:
     stray = next((name for name in names if name not in list_entry_points(MATCHERS)), None)
     if stray is not None:
         raise MatchError(
-            f"{stray} is not among the matchers of list-matchers: name one of these, no tracker or module:Class"
+            f"{stray} is not among the matchers of list matchers: name one of these, no tracker or module:Class"
         )
     os.sched_setaffinity(0, [min(os.sched_getaffinity(0))])
     blobs = [query_bytes(query) for query, _ in drawn(out)[PLACE][:ASKED]]

@@ -102,7 +102,7 @@ def main() -> None:
     """Follow and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("tasks", type=Path, nargs="+", help="folders made by make-queries: OUT/tasks/<suite>/<region>")
-    parser.add_argument("--tracker", action="append", required=True, help="a name from list-trackers")
+    parser.add_argument("--tracker", action="append", required=True, help="a name from list trackers")
     parser.add_argument("--views", type=int, default=1_000_000, help="first views of each flight")
     parser.add_argument("--memory", action="store_true", help="measure memory too")
     parser.add_argument("--role", action="append", help="control, stress, falsifier; default: all")

@@ -51,7 +51,7 @@ ONLY_PARSED = {
     r"--extracts|--extract ": "needs extracts",
     r"--imagery|zanzibar": "needs aerial pictures; tests/regions/test_imagery.py makes some",
     r"^sasgeo-bench leaderboard (?!.*--dry-run)": "too long; tests/experiments/test_pipeline.py does a small one",
-    r"(check-tracker|--matcher|runs/) ?my-tracker": "half a minute; tests/running/test_tracker_testing.py flies it",
+    r"(check|--matcher|runs/) ?my-tracker": "half a minute; tests/running/test_tracker_testing.py flies it",
     r"--segmenter my-segmenter": "needs tasks of pictures; tests/running/test_segment_tasks.py makes some",
     r"--suite aerial|/aerial": "minutes of painting; tests/tasks/suites/test_pictures.py takes small ones",
     r"flight-image": "a minute of painting; tests/tasks/suites/test_flight_image.py flies a short one",

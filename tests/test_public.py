@@ -125,7 +125,7 @@ SLOW = {"pandas", "geopandas", "rasterio", "pyproj", "pyarrow.compute", "pyarrow
     ("code", "unused"),
     [
         ("sasgeo_bench.running.serve", SLOW),
-        ("sasgeo_bench.cli.listing", {"numpy", "pandas", "pydantic"}),
+        ("sasgeo_bench.cli.doors", {"numpy", "pandas", "pydantic"}),
         ("sasgeo_bench.cli.regions", {"matplotlib", "scipy.optimize"}),
         ("sasgeo_bench.tasks.build", {"matplotlib", "scipy.interpolate", "scipy.signal", "scipy.stats"}),
         ("sasgeo_baselines.map_density_prior", {"pandas", "scipy"}),

@@ -57,7 +57,7 @@ Results = Annotated[
 Rejectors = Annotated[
     list[str] | None,
     typer.Option(
-        help="name from list-rejectors, or module:Class; may be repeated; default: none, or those of stored results"
+        help="name from list rejectors, or module:Class; may be repeated; default: none, or those of stored results"
     ),
 ]
 Submissions = Annotated[
@@ -264,7 +264,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     tell(_how_to_publish(board_folder(plan)))
     if not options.matcher:
         more = f"sasgeo-bench leaderboard {options.pipeline} --matcher NAME"
-        tell(f"next: {more} adds one of yours (new-matcher begins one)")
+        tell(f"next: {more} adds one of yours (new matcher begins one)")
     check_controls(board)
 
 

@@ -17,7 +17,7 @@ from sasgeo_bench.running.profiling import ProfileRequest, plan_profile, profile
 class ProfileOptions(Options):
     """Flags of profile."""
 
-    matcher: Annotated[str, typer.Option(help="name from list-matchers or list-trackers, or module:Class")]
+    matcher: Annotated[str, typer.Option(help="name from list matchers or list trackers, or module:Class")]
     tasks: Annotated[
         list[Path],
         typer.Option(help="task folders, OUT/tasks/SUITE/REGION, of one map"),

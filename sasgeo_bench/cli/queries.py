@@ -28,12 +28,12 @@ class QueryOptions(Options):
     """Flags of make-queries."""
 
     suite: Annotated[
-        list[str] | None, typer.Option(help="name from list-suites; may be repeated; default: all but controls")
+        list[str] | None, typer.Option(help="name from list suites; may be repeated; default: all but controls")
     ] = None
     regions: Annotated[
         list[str] | None,
         typer.Option(
-            "--regions", help="id from list-regions, or own file; may be repeated; default: all that can be built"
+            "--regions", help="id from list regions, or own file; may be repeated; default: all that can be built"
         ),
     ] = None
     split: Annotated[str, typer.Option(help="id of a shipped split, or a file of your own (*.toml)")] = "crossfit"

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class BuildOptions(Options):
     """Flags of build-region."""
 
-    region: Annotated[list[str], typer.Argument(help="ids from list-regions, or files of your own (*.toml)")] = field(
+    region: Annotated[list[str], typer.Argument(help="ids from list regions, or files of your own (*.toml)")] = field(
         kw_only=False
     )
     date: Annotated[str | None, typer.Option(help="YYYY-MM-DD of one of the region's extracts; default: newest")] = None
@@ -83,7 +83,7 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
 class RenderOptions(Options):
     """Flags of render-imagery."""
 
-    region: Annotated[list[str], typer.Argument(help="ids from list-regions, or files of your own; built before")] = (
+    region: Annotated[list[str], typer.Argument(help="ids from list regions, or files of your own; built before")] = (
         field(kw_only=False)
     )
     date: Annotated[str | None, typer.Option(help="YYYY-MM-DD of the map that is shown; default: newest")] = None

@@ -36,7 +36,7 @@ class ReleaseOptions(Options):
     jobs: Annotated[int, typer.Option(min=1, help="processes that draw the queries of a board")] = 1
     suites: Annotated[
         list[str] | None,
-        typer.Option("--suites", help="name from list-suites; may be repeated; default: all there are queries of"),
+        typer.Option("--suites", help="name from list suites; may be repeated; default: all there are queries of"),
     ] = None
     split: Annotated[str, typer.Option(help="id or file of the split that the queries were drawn by")] = "crossfit"
     truth: Annotated[bool, typer.Option("--truth", help="put the truths of test queries into it too")] = False

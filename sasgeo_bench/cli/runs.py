@@ -28,7 +28,7 @@ SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 class RunOptions(Options):
     """Flags of run."""
 
-    matcher: Annotated[str, typer.Option(help="name from list-matchers or list-trackers, or module:Class")]
+    matcher: Annotated[str, typer.Option(help="name from list matchers or list trackers, or module:Class")]
     tasks: Annotated[list[Path], typer.Option(help="task folders, as OUT/tasks/SUITE/*")]
     top_k: Annotated[int, typer.Option(help="poses asked of each query")] = 25
     jobs: Annotated[int, typer.Option(help="processes at once")] = 1

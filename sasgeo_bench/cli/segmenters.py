@@ -19,7 +19,7 @@ from sasgeo_bench.tasks.task_files import FAILED_PICTURES, read_task
 class SegmentOptions(Options):
     """Flags of segment."""
 
-    segmenter: Annotated[str, typer.Option(help="name from list-segmenters, or module:Class")]
+    segmenter: Annotated[str, typer.Option(help="name from list segmenters, or module:Class")]
     tasks: Annotated[
         list[Path],
         typer.Option(help="task folders of pictures, OUT/tasks/SUITE/REGION"),

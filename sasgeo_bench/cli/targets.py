@@ -92,7 +92,7 @@ def _of_name(name: str, out: Path, folders: Collection[Path]) -> str:
         return f"{out / 'tasks'} holds no task {name}: {there}"
     if slash:
         near = difflib.get_close_matches(suite, list_suites(), n=1)
-        hint = f", did you mean '{near[0]}/{region}'?" if near else f" (list-suites shows all): {_there(out)}"
+        hint = f", did you mean '{near[0]}/{region}'?" if near else f" (list suites shows all): {_there(out)}"
         return f"{name} is no folder, and there is no suite {suite!r}{hint}"
     known = list_region_files(folders=tuple(folders))
     base, _, date = name.partition("@")

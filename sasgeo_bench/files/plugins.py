@@ -202,7 +202,7 @@ def unknown(name: str, *groups: str, others: Collection[str] = ()) -> MatchError
     near = difflib.get_close_matches(name, known, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ""
     kinds = [KINDS[group] for group in groups]
-    shown = f"{' and '.join(f'list-{kind}s' for kind in kinds)} show{'s' if len(kinds) == 1 else ''} all"
+    shown = f"{' and '.join(f'list {kind}s' for kind in kinds)} show{'s' if len(kinds) == 1 else ''} all"
     return MatchError(
         f"there is no {' or '.join(kinds)} {name!r}{hint} ({shown}; or module:{_WHAT.get(groups[0], 'Class')})"
     )
@@ -228,7 +228,7 @@ def check_registered(rejectors: Sequence[str], *, source: str) -> None:
     stray = next((name for name in rejectors if name not in known), None)
     if stray is not None:
         raise MatchError(
-            f"{source} names the rejector {one_line(stray)!r}, and data may name registered ones only (list-rejectors "
+            f"{source} names the rejector {one_line(stray)!r}, and data may name registered ones only (list rejectors "
             "shows all): name each that is to judge with --rejector, and code only if you trust it"
         )
 

@@ -128,7 +128,7 @@ class TaskSpec(Document):
     `prior` is that of each suite unless given; `matchers` are those that are asked and `regions` those that are drawn,
     all of the file unless given. `views_cells`, `kinds` and `tracks` choose of the variants of each suite, all where
     they are empty: fewer variants at more sites say more. Each variant is drawn with each of `detectors`. Suites of
-    pictures name `segmenters` from `list-segmenters`: each makes evidence of all pictures, which is asked, learned from
+    pictures name `segmenters` from `list segmenters`: each makes evidence of all pictures, which is asked, learned from
     and compared as a suite of its own. With `+shares` after its name it is recalibrated by the shares of the classes on
     the map.
 

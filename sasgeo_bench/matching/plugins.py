@@ -34,7 +34,7 @@ def load_matcher(spec: str) -> "Matcher":
     >>> load_matcher("no_such_matcher")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list-matchers shows all; or module:Class)
+    sasgeo_bench.errors.MatchError: there is no matcher 'no_such_matcher' (list matchers shows all; or module:Class)
     """
     from sasgeo_bench.matching.matcher import MatcherCard  # noqa: PLC0415 - names are listed without it
 
@@ -78,7 +78,7 @@ def load_segmenter(spec: str) -> "Segmenter":
     >>> load_segmenter("no_such_segmenter")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.MatchError: there is no segmenter 'no_such_segmenter' (list-segmenters shows all; or
+    sasgeo_bench.errors.MatchError: there is no segmenter 'no_such_segmenter' (list segmenters shows all; or
     module:Class)
     """
     from sasgeo_bench.matching.segmenter import SegmenterCard  # noqa: PLC0415 - as in load_matcher

@@ -128,7 +128,7 @@ A matcher for sasgeo-bench.
 
 ```bash
 pip install -e .
-sasgeo-bench check-matcher {name}
+sasgeo-bench check {name}
 sasgeo-bench run --matcher {name} --tasks out/tasks/clean/town-riverside
 ```
 

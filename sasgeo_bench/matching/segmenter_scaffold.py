@@ -68,7 +68,7 @@ A segmenter for sasgeo-bench.
 
 ```bash
 pip install -e .
-sasgeo-bench check-segmenter {name}
+sasgeo-bench check {name}
 ```
 
 Say in the card (`src/{module}/segmenter.py`) where the method comes from and what of it is yours; raise its version

@@ -111,7 +111,7 @@ A tracker for sasgeo-bench.
 
 ```bash
 pip install -e .
-sasgeo-bench check-tracker {name}
+sasgeo-bench check {name}
 sasgeo-bench make-queries --suite flight-clean --regions town-grid --n 1 --up-to
 sasgeo-bench run --matcher {name} --tasks out/tasks/flight-clean/town-grid
 ```

@@ -95,8 +95,8 @@ def test_a_file_that_holds_no_trials_is_told_in_one_line(content, tmp_path, monk
     ("name", "fault"),
     [
         ("nope", "there is no matcher 'nope'"),
-        ("dead_reckoning", "dead_reckoning is not among the matchers of list-matchers"),
-        ("nothere:Class", "nothere:Class is not among the matchers of list-matchers"),
+        ("dead_reckoning", "dead_reckoning is not among the matchers of list matchers"),
+        ("nothere:Class", "nothere:Class is not among the matchers of list matchers"),
     ],
 )
 def test_what_is_no_system_is_told_before_anything_is_drawn(name, fault, tmp_path, monkeypatch, capsys):

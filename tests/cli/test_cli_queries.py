@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`make-queries`, `list-suites`, `inspect` and `verify` as a user meets them."""
+"""`make-queries`, `list suites`, `inspect` and `verify` as a user meets them."""
 
 import json
 import os
@@ -149,7 +149,10 @@ def test_priors_that_are_asked_for_are_those_of_the_task(program, own_out):
     [
         (("--n", "0"), "--n must be at least 1, got 0"),
         (("--n", "-4"), "--n must be at least 1, got -4"),
-        (("--suite", "claen"), "there is no suite 'claen', did you mean 'clean'? (list-suites shows all)"),
+        (
+            ("--suite", "claen"),
+            "there is no suite 'claen', did you mean 'clean'? (list suites shows all; or module:NAME)",
+        ),
         (("--suite", "clean", "--suite", "nonsense-suite"), "there is no suite 'nonsense-suite'"),
         (("--regions", "town-rivrside"), "there is no region 'town-rivrside', did you mean 'town-riverside'"),
         (("--regions", "none.toml"), "there is no region file none.toml"),
@@ -172,7 +175,7 @@ def test_a_split_that_names_an_unknown_region_or_leaves_one_out_gets_one_line(mi
     path = split_file(tmp_path, RIVERSIDE, "atlantis")
     words = ("make-queries", "--suite", "clean", "--regions", RIVERSIDE, "--split", path)
     named = "--region-files names a folder of your own"
-    assert f"unknown region 'atlantis': list-regions shows all that ship; {named}" in mistake(*words)
+    assert f"unknown region 'atlantis': list regions shows all that ship; {named}" in mistake(*words)
     split_file(tmp_path, "town-grid", "town-suburb")
     assert f"split 'mine' does not speak of region '{RIVERSIDE}'" in mistake(*words)
     path.write_text(path.read_text().replace("buffer_m", "bufer_m"))
@@ -220,7 +223,7 @@ def test_an_out_without_the_right_to_write_gets_one_line(mistake, tmp_path):
     assert "cannot be written" in mistake(*words)
 
 
-# --- list-suites ----------------------------------------------------------------------------------------------------
+# --- list suites ----------------------------------------------------------------------------------------------------
 
 
 def test_all_suites_are_listed_with_what_they_separate(program):

@@ -55,9 +55,9 @@ def mine(ids, tmp_path):
 
 @pytest.fixture
 def check(program, out, tiny, monkeypatch):
-    """The command check-matcher on the place that is there already."""
+    """The command check on the place that is there already."""
     del out
-    monkeypatch.setattr("sasgeo_bench.cli.matchers.check_matcher", partial(check_matcher, place=tiny))
+    monkeypatch.setattr("sasgeo_bench.running.testing.check_matcher", partial(check_matcher, place=tiny))
     return partial(program, "check-matcher")
 
 
@@ -78,7 +78,7 @@ def change_task(**changes):
     path.write_text(json.dumps({name: value for name, value in content.items() if value is not None}))
 
 
-# --- list-matchers, new-matcher, check-matcher ----------------------------------------------------------------------
+# --- list matchers, new matcher, check ----------------------------------------------------------------------
 
 
 def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkeypatch) -> None:
@@ -129,7 +129,7 @@ def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, m
     code, told, err = program("new-matcher", "my-matcher")
     assert code == 0
     assert "enter docs/results/systems-objects --matcher my-matcher" in err
-    assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check-matcher my-matcher\n"
+    assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check my-matcher\n"
     assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
     monkeypatch.setenv("PATH", "")  # a pip that would install for another Python is not named
     code, told, _ = program("new-matcher", "other", "--into", "deep/er")

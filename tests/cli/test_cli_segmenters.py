@@ -19,7 +19,7 @@ def test_a_new_segmenter_is_written_and_the_next_step_is_told(program, tmp_path)
     code, told, err = program("new-segmenter", "my-segmenter", "--into", "deep/er")
     assert (code, err) == (0, "")
     assert told.startswith("deep/er: 5 files; next: ")
-    assert told.endswith(" install -e deep/er && sasgeo-bench check-segmenter my-segmenter\n")
+    assert told.endswith(" install -e deep/er && sasgeo-bench check my-segmenter\n")
     assert (tmp_path / "deep" / "er" / "src" / "my_segmenter" / "segmenter.py").is_file()
 
 

@@ -64,7 +64,7 @@ def test_what_is_no_rejector_is_refused(name, words):
 
 
 def test_an_unknown_name_says_where_the_names_are():
-    with pytest.raises(MatchError, match=r"there is no rejector 'halv'.*list-rejectors shows all"):
+    with pytest.raises(MatchError, match=r"there is no rejector 'halv'.*list rejectors shows all"):
         load_rejector("halv")
 
 

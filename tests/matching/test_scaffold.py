@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package that `new-matcher` writes: sound, taken names refused, written whole or not at all; it passes the kit."""
+"""The package that `new matcher` writes: sound, taken names refused, written whole or not at all; it passes the kit."""
 
 import ast
 import errno

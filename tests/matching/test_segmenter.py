@@ -75,7 +75,7 @@ def test_a_segmenter_is_found_by_its_name_or_its_class(install) -> None:
         assert isinstance(made, Segmenter)
         assert isinstance(made, LearningSegmenter) == learns
     check_names(segmenters=["mine", "any.module:Class", ORACLE_SEGMENTER])
-    with pytest.raises(MatchError, match=r"no segmenter 'mime', did you mean 'mine'\? \(list-segmenters shows all"):
+    with pytest.raises(MatchError, match=r"no segmenter 'mime', did you mean 'mine'\? \(list segmenters shows all"):
         check_names(segmenters=["mime"])
 
 

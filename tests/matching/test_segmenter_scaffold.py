@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package that `new-segmenter` writes: sound, taken names refused; it passes the kit."""
+"""The package that `new segmenter` writes: sound, taken names refused; it passes the kit."""
 
 import ast
 import re

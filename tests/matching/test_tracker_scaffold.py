@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The package that `new-tracker` writes: sound, and taken names refused; `test_tracker_testing` flies it."""
+"""The package that `new tracker` writes: sound, and taken names refused; `test_tracker_testing` flies it."""
 
 import ast
 import re

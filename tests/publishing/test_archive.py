@@ -284,7 +284,7 @@ def test_stored_results_have_no_code_imported_that_no_package_registers(kept, pr
     assert code == 2
     (line,) = err.strip().splitlines()
     assert line == (
-        f"sasgeo-bench: stored names the rejector {name!r}, and data may name registered ones only (list-rejectors "
+        f"sasgeo-bench: stored names the rejector {name!r}, and data may name registered ones only (list rejectors "
         "shows all): name each that is to judge with --rejector, and code only if you trust it"
     )
     assert not (tmp_path / "imported").exists()

@@ -111,8 +111,11 @@ def test_a_region_file_of_ones_own_goes_with_a_split_of_ones_own(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"suites": ("claen",)}, "there is no suite 'claen', did you mean 'clean'? (list-suites shows all)"),
-        ({"suites": ("clean", "zzz")}, "there is no suite 'zzz' (list-suites shows all)"),
+        (
+            {"suites": ("claen",)},
+            "there is no suite 'claen', did you mean 'clean'? (list suites shows all; or module:NAME)",
+        ),
+        ({"suites": ("clean", "zzz")}, "there is no suite 'zzz' (list suites shows all; or module:NAME)"),
         ({"regions": ("town-rivercide",)}, "did you mean 'town-riverside'"),
         ({"split": "crosfit"}, "there is no split 'crosfit', did you mean 'crossfit'"),
         ({"split": "none.toml"}, "there is no split file none.toml"),
@@ -129,7 +132,7 @@ def test_what_cannot_be_is_refused_with_a_hint(changes, told, tmp_path):
 
 def test_a_split_that_names_an_unknown_region_is_refused(tmp_path):
     split = own_split(tmp_path, RIVERSIDE, "atlantis")
-    with pytest.raises(ConfigError, match="split 'mine' names the unknown region 'atlantis': list-regions shows all"):
+    with pytest.raises(ConfigError, match="split 'mine' names the unknown region 'atlantis': list regions shows all"):
         plan(tmp_path, split=str(split))
 
 

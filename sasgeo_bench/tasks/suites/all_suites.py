@@ -133,7 +133,7 @@ def find_suite(spec: str) -> Suite:
     >>> find_suite("cleen")
     Traceback (most recent call last):
         ...
-    sasgeo_bench.errors.ConfigError: there is no suite 'cleen', did you mean 'clean'? (list-suites shows all; or
+    sasgeo_bench.errors.ConfigError: there is no suite 'cleen', did you mean 'clean'? (list suites shows all; or
     module:NAME)
     """
     return _foreign(spec) if is_foreign(spec) else EVERY_SUITE[spec]

@@ -238,11 +238,12 @@ def test_make_alone_prints_every_target_with_its_line() -> None:
     assert set(re.findall(r"^  ([a-z-]+) +\S", shown, flags=re.MULTILINE)) == set(phony)
 
 
-def test_ci_runs_the_commands_of_the_readme() -> None:
+def test_ci_runs_the_commands_of_the_guide_to_contributing() -> None:
     commands = re.findall(r"^(?:\s*)(make [a-z-]+)", read(".ci/run"), flags=re.MULTILINE)
     assert commands == ["make check", "make test", "make test"]
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
-    blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", read("README.md"), flags=re.DOTALL))
+    texts = read("CONTRIBUTING.md") + read("README.md")
+    blocks = "\n".join(re.findall(r"```(?:bash|sh)\n(.*?)```", texts, flags=re.DOTALL))
     for command in (*commands, "make demo"):
         assert re.search(rf"^{command}\b", blocks, flags=re.MULTILINE), command
 

@@ -25,17 +25,17 @@ TEXT: Final = "ageing.md"
 PLOT: Final = "ageing.svg"
 
 _READING: Final = f"""\
-Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g} or, if split or merged, by the ground
-they share; lines by the length within {NEAR_M:g} m of a line of the other map. Vanished is a share of the older map,
-appeared of the newer: by amount (ground or length), and by number, which counts each thing of which more than half
-vanished or appeared. The two differ where things are small. Re-drawn is what was kept and moved by more than
-{REDRAWN_M:g} m (areas: their centroid, so an area that grew has moved too). Ground lost and gained is what the class no
-longer, or newly, covers, with things that were redrawn, and lines in their drawn width: a raster sees it. Rates are
-those of an exponential life whose end is known only to lie between two dates, by amount, with 95 % intervals from 1,000
-draws of blocks of 1 km. Part of what vanished or appeared is retagged: another class of its kind replaced it, or was
-replaced. Tags attribute part to the world (construction, demolished, a start date after the older map) or to mapping
-that catches up (a start date before). The rest is untold (unexplained). A dash: nothing to measure, or a rate from
-dates less than {LEAST_DAYS} days apart; "all": no bound."""
+Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g}, or by the ground they share if split or
+merged; lines by the length within {NEAR_M:g} m of a line of the other map. Rates are those of an exponential life whose
+end is known only to lie between two dates, by amount (ground or length), with 95 % intervals from 1,000 draws of blocks
+of 1 km. Ground lost and gained is what the class no longer, or newly, covers, with things that were redrawn, and lines
+in their drawn width. A dash: nothing to measure, or dates less than {LEAST_DAYS} days apart; "all": no bound."""
+_READING_SHARES: Final = f"""\
+Rates are over all intervals, shares of the first map against the last: vanished of the older, appeared of the newer, by
+amount and by number (each thing of which more than half did). Re-drawn was kept and moved by more than {REDRAWN_M:g} m
+(areas: their centroid). Retagged: another class of its kind replaced it, or was replaced. Tags attribute part to the
+world (construction, demolished, a start date after the older map) or to mapping that catches up (a start date before);
+the rest is untold (unexplained). Every pair of dates: `{TABLE}`."""
 
 _BOTH_WAYS: Final = ("vanished", "vanished_number", "appeared", "appeared_number")
 _CONTROLS: Final = """\
@@ -92,20 +92,15 @@ def read_ageing(folder: Path) -> Ageing:
 
 
 def ageing_text(ageing: Ageing) -> str:
-    """Format one place as Markdown: rates, then every pair of dates, class by class."""
-    table = ageing.table
-    rates = _rate_table(table, by="class")
-    spans = table[table["span"] != "pooled"]
+    """Format one place as Markdown: rates and shares, class by class; pairs of dates are in the table alone."""
     sources = "\n".join(f"- {markdown_item(source)}" for source in ageing.sources)
     return "\n\n".join(
         (
             f"# {markdown(ageing.place)}: how the map aged",
             _READING,
             f"{ageing.area_km2:,.1f} km2 that all of these map:\n\n{sources}",
-            "## Rates over all intervals",
-            rates,
-            "## Pairs of dates",
-            _grid(_PAIR_HEAD, [_pair_cells(row) for _, row in spans.iterrows()]),
+            _READING_SHARES,
+            _grid(("class", *_RATE_HEAD, *_SHARE_HEAD), _rate_rows(ageing.table, by="class", has_shares=True)),
             f"{ATTRIBUTION}\n",
         )
     )
@@ -124,7 +119,8 @@ def summary_text(places: Sequence[Ageing], controls: Sequence[Ageing] = ()) -> s
         handset = load_taxonomy()[name].persistence
         rates = (100 * handset.vanish_per_year, 100 * handset.appear_per_year)
         note = f"The taxonomy has, set by hand: vanishes {rates[0]:.2f}, appears {rates[1]:.2f} %/year."
-        parts += [f"## {name}", note, _rate_table(together[together["class"] == name], by="place")]
+        rows = _rate_rows(together[together["class"] == name], by="place")
+        parts += [f"## {name}", note, _grid(("place", *_RATE_HEAD), rows)]
     if controls:
         parts += ["## Controls", _CONTROLS, _control_table(controls)]
     return "\n\n".join((*parts, f"{ATTRIBUTION}\n"))
@@ -178,54 +174,32 @@ def _place_cells(ageing: Ageing) -> list[str]:
 _RATE_HEAD: Final = (
     *("first amount", "last amount", "vanishes, %/year", "appears, %/year"),
     *("ground lost, %/year", "ground gained, %/year"),
+)
+_SHARE_HEAD: Final = (
     *("vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
     *("re-drawn, amount", "ids gone, number"),
     *("of vanished: world, retagged, untold", "of appeared: world, catch-up, retagged, untold"),
 )
 
 
-def _rate_table(table: pd.DataFrame, *, by: str) -> str:
-    """Format a row for each class (or place): pooled rates, then shares of the first map against the last."""
-    lines = []
+def _rate_rows(table: pd.DataFrame, *, by: str, has_shares: bool = False) -> list[list[str]]:
+    """Format a row for each class (or place): pooled rates, and shares of the first map against the last."""
+    rows = []
     pooled, whole = (table[table["span"] == span].set_index(by) for span in ("pooled", "whole"))
     for name in pooled.index:
         rate, share = pooled.loc[name], whole.loc[name]
-        lines.append(
-            [
-                str(name),
-                _amount(share["amount_from"], share["unit"]),
-                _amount(share["amount_to"], share["unit"]),
-                *(_rate(rate, column) for column in _RATEBOOK_RATES),
-                *(_percent(share[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "id_vanished")),
-                _shares(rate, "vanished", ("world", "retagged", "untold")),
-                _shares(rate, "appeared", ("world", "catch_up", "retagged", "untold")),
-            ]
-        )
-    return _grid((by, *_RATE_HEAD), lines)
-
-
-_PAIR_HEAD: Final = (
-    *("class", "from", "to", "things", "vanished, amount", "vanished, number", "appeared, amount", "appeared, number"),
-    *("re-drawn", "retagged", "ground lost, gained"),
-    *("shift median, p90", "ids gone", "vanishes, %/year", "appears, %/year"),
-)
-
-
-def _pair_cells(row: pd.Series) -> list[str]:
-    mark = " (first to last)" if row["span"] == "whole" else ""
-    shifts = (row["shift_median_m"], row["shift_p90_m"])
-    return [
-        f"{row['class']}{mark}",
-        f"{row['date_from']:%Y-%m-%d}",
-        f"{row['date_to']:%Y-%m-%d}",
-        f"{row['n_from']:,} to {row['n_to']:,}",
-        *(_percent(row[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "retagged")),
-        f"{_percent(row['ground_lost_share'])}, {_percent(row['ground_gained_share'])}",
-        "-" if pd.isna(shifts[0]) else f"{shifts[0]:.1f} m, {shifts[1]:.1f} m",
-        _percent(row["id_vanished_share"]),
-        _rate(row, "vanish_per_year"),
-        _rate(row, "appear_per_year"),
-    ]
+        row = [
+            str(name),
+            _amount(share["amount_from"], share["unit"]),
+            _amount(share["amount_to"], share["unit"]),
+            *(_rate(rate, column) for column in _RATEBOOK_RATES),
+        ]
+        if has_shares:
+            row += [_percent(share[f"{what}_share"]) for what in (*_BOTH_WAYS, "redrawn", "id_vanished")]
+            row.append(_shares(rate, "vanished", ("world", "retagged", "untold")))
+            row.append(_shares(rate, "appeared", ("world", "catch_up", "retagged", "untold")))
+        rows.append(row)
+    return rows
 
 
 def _amount(value: float, unit: str) -> str:

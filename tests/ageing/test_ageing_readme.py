@@ -18,19 +18,14 @@ SAID = [
     ("liechtenstein", "building", REDRAW, "id_vanished_share", 1),
     ("liechtenstein", "building", REDRAW, "vanished_share", 1),
     ("liechtenstein", "building", REDRAW, "redrawn_share", 1),
-    ("liechtenstein", "building", "whole", "id_vanished_share", 1),
-    ("liechtenstein", "building", "whole", "vanished_share", 1),
     ("andorra", "path_track", "whole", "id_vanished_share", 1),
     ("andorra", "path_track", "whole", "vanished_share", 1),
-    ("andorra", "field_boundary", "whole", "id_vanished_share", 1),
-    ("andorra", "field_boundary", "whole", "vanished_share", 1),
     ("liechtenstein", "building", "2013-08-03", "appear_per_year", 2),
     ("liechtenstein", "building", "2022-12-15", "appear_per_year", 2),
     ("liechtenstein", "building", "pooled", "appear_per_year", 2),
     ("monaco", "building", "pooled", "appear_per_year", 2),
     ("dreieich", "building", "pooled", "appear_per_year", 2),
     *((place, "building", "pooled", "appeared_untold_share", 1) for place in PLACES),
-    ("max", "building", "pooled", "appeared_catch_up_share", 1),
     *((place, "building", "pooled", "vanished_world_share", 1) for place in ("liechtenstein", "andorra", "monaco")),
     ("dreieich", "building", "pooled", "vanished_world_share", 1),
     ("min", "path_track", "pooled", "appear_per_year", 2),
@@ -45,30 +40,13 @@ SAID = [
     ),
     ("andorra-control-edges", "building", "whole", "vanished_share", 1),
     ("andorra", "building", "whole", "vanished_share", 1),
-    ("andorra-control-edges", "parking", "whole", "vanished_share", 1),
-    ("andorra", "parking", "whole", "vanished_share", 1),
-    ("andorra-control-edges", "road_minor", "whole", "vanished_share", 1),
-    ("andorra", "road_minor", "whole", "vanished_share", 1),
     ("andorra-control", "building", "whole", "vanished_share", 1),
-    ("andorra-control", "parking", "whole", "vanished_share", 1),
-    ("andorra-control", "road_minor", "whole", "vanished_share", 1),
     ("andorra-control", "water", "whole", "vanished_share", 1),
-    ("andorra-control", "waterway", "whole", "appeared_share", 1),
     ("set by hand", "field_boundary", "", "appear_per_year", 2),
     ("min", "field_boundary", "pooled", "appear_per_year", 2),
-    ("set by hand", "building", "", "vanish_per_year", 2),
-    ("set by hand", "green", "", "vanish_per_year", 2),
-    ("max", "green", "pooled", "vanish_per_year", 2),
-    ("set by hand", "bridge", "", "vanish_per_year", 2),
-    ("min", "bridge", "pooled", "vanish_per_year", 2),
-    *(
-        ("liechtenstein", "building", span, column, 1)
-        for span in (REDRAW, "whole")
-        for column in ("appeared_number_share", "appeared_share")
-    ),
     *(
         (place, "building", "whole", column, 1)
-        for place in ("faroe", "monaco")
+        for place in ("liechtenstein", "faroe")
         for column in ("appeared_number_share", "appeared_share")
     ),
     *(
@@ -76,12 +54,6 @@ SAID = [
         for name in ("building", "road_minor", "path_track")
         for column in ("ground_lost_per_year", "vanish_per_year")
     ),
-    ("min", "building", "pooled", "ground_lost_per_year", 2),
-    ("max", "building", "pooled", "ground_lost_per_year", 2),
-    ("liechtenstein", "building", "pooled", "ground_gained_per_year", 2),
-    ("liechtenstein", "building", "pooled", "appear_per_year", 2),
-    ("faroe", "road_minor", "pooled", "ground_lost_per_year", 2),
-    ("faroe", "road_minor", "pooled", "vanish_per_year", 2),
 ]
 
 

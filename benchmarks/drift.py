@@ -179,7 +179,7 @@ def print_survey() -> None:
 
 
 def main() -> None:
-    """Print the tables of docs/concepts/odometry.md."""
+    """Print the tables of docs/concepts/flights.md."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=os.environ.get("SASGEO_ODOMETRY"))
     parser.add_argument("--write", type=Path, help="folder to write the fitted profiles into")

@@ -162,6 +162,6 @@ checks.rename(columns={"sum": "held", "size": "asked"})
 # %% [markdown]
 # ## Where to go on
 #
-# - [Board](../concepts/board.md) and [scoring](../concepts/scoring.md) define every column.
+# - [How a board is made](../concepts/board.md) and [metrics](../reference/metrics.md) define every column.
 # - [Results](../results/modules.md) says what this experiment shows, in words.
 # - [A matcher, from idea to board row](idea-to-board-row.py) puts a row of your own on a board.

@@ -52,10 +52,14 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Lead links to pages and pictures of the site; what is in the repository alone becomes text with its path."""
-    del config
+    """Lead links to pages and pictures of the site; what is in the repository alone becomes text with its path.
+
+    Pages outside the menu are left out of the search.
+    """
     sources = {page: path for path, page in OUTSIDE.items()}
     own = page.file.src_uri
+    if config.not_in_nav is not None and config.not_in_nav.match_file(own):
+        page.meta["search"] = {"exclude": True}
     folder = Path(sources.get(own, f"docs/{own}")).parent
 
     def lead(link: re.Match[str]) -> str:

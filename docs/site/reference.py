@@ -226,8 +226,8 @@ def _metrics() -> Iterator[str]:
     """Yield the page of the one table of metrics, and of the columns and words next to them."""
     yield "# Metrics and columns"
     yield ""
-    yield "Every metric of a board, as `leaderboard.parquet` names it. [Scoring](../concepts/scoring.md) has the rules"
-    yield "that all of them share. Matchers are ranked by the metric in bold."
+    yield "Every metric of a board, as `leaderboard.parquet` names it. [How a board is made](../concepts/board.md) has"
+    yield "the rules that all of them share. Matchers are ranked by the metric in bold."
     for track in TRACKS:
         yield f"\n## {track.capitalize()}"
         yield from _metric_rows(item for item in METRICS if isinstance(item, MeanMetric) and track in item.tracks)

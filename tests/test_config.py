@@ -96,7 +96,7 @@ def test_faults_are_told_in_plain_words(text, said):
 
 def test_a_folder_in_place_of_a_file_is_called_one(tmp_path):
     with pytest.raises(ConfigError, match=r"is a folder: name a region file in it \("):
-        find_document(str(tmp_path), "region", "list-regions shows all", dict)
+        find_document(str(tmp_path), "region", "list regions shows all", dict)
 
 
 def test_a_number_where_a_table_is_wanted_is_shown():

@@ -308,6 +308,6 @@ def test_the_commands_of_a_document_do_what_they_say(
     enter_suites(document, monkeypatch)
     for line in commands(document):
         if RUN.get(line.text) is not None and RUN[line.text] == line:
-            with nullcontext() if line.words[1] == "check-matcher" else threaded():
+            with nullcontext() if line.words[1] == "check" else threaded():
                 code, said = told(by_one_process(line.words), monkeypatch)
             assert code == 0, f"{document}:{line.number}: {line.text}\n{said}"

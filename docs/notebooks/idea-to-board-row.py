@@ -134,12 +134,12 @@ class RareClass:
 # %% [markdown]
 # ## Check it
 #
-# `check-matcher` asks what every matcher must hold to: finite scores in order, the same answer twice, no answer where
+# `check` asks what every matcher must hold to: finite scores in order, the same answer twice, no answer where
 # everything is unknown. `module:Class` names a matcher that is not installed; a package of your own begins with
-# `sasgeo-bench new-matcher`.
+# `sasgeo-bench new matcher`.
 
 # %% magic_args="-e" language="bash"
-# sasgeo-bench check-matcher rare_class:RareClass
+# sasgeo-bench check rare_class:RareClass
 
 # %% [markdown]
 # ## Ask it questions

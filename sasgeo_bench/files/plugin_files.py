@@ -50,7 +50,7 @@ def import_paths(spec: str) -> list[str]:
 def find_module(name: str, paths: Sequence[str]) -> ModuleSpec | None:
     """Find a module as `import` would on some paths; no code of it, nor of the packages around it, is run.
 
-    >>> found = find_module("sasgeo_bench.matching.plugins", [])
+    >>> found = find_module("sasgeo_bench.files.plugins", [])
     >>> found is not None and found.origin == str(Path(__file__).with_name("plugins.py"))
     True
     """

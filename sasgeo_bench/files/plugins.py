@@ -203,8 +203,9 @@ def unknown(name: str, *groups: str, others: Collection[str] = ()) -> MatchError
     hint = f", did you mean {near[0]!r}?" if near else ""
     kinds = [KINDS[group] for group in groups]
     shown = f"{' and '.join(f'list {kind}s' for kind in kinds)} show{'s' if len(kinds) == 1 else ''} all"
+    shown = shown if len(kinds) <= 2 else "list shows all of a kind"  # noqa: PLR2004 - more are not read
     return MatchError(
-        f"there is no {' or '.join(kinds)} {name!r}{hint} ({shown}; or module:{_WHAT.get(groups[0], 'Class')})"
+        f"there is no {', '.join(kinds[:-1])}{' or ' if kinds[1:] else ''}{kinds[-1]} {name!r}{hint} ({shown}; or module:{_WHAT.get(groups[0], 'Class')})"
     )
 
 

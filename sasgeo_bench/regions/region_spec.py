@@ -288,4 +288,4 @@ def find_region_file(id_or_path: str, *, folders: Sequence[Path] = ()) -> Path:
         ...
     sasgeo_bench.errors.ConfigError: there is no region 'vadus', did you mean 'vaduz'? (list regions shows all)
     """
-    return find_document(id_or_path, "region", "list-regions shows all", lambda: list_region_files(folders=folders))
+    return find_document(id_or_path, "region", "list regions shows all", lambda: list_region_files(folders=folders))

@@ -292,7 +292,7 @@ def make_split(spec: SplitFile, grids: Mapping[str, Grid]) -> Split:
     """
     unknown = [region for region in spec.region_ids if region not in grids]
     if unknown:
-        own = "list-regions shows all that ship; --region-files names a folder of your own"
+        own = "list regions shows all that ship; --region-files names a folder of your own"
         mend = "a block stands under 'blocks'" if "/" in unknown[0] else own
         raise ConfigError(f"split {spec.id!r} names the unknown region {unknown[0]!r}: {mend}")
     blocks = {place.name: _blocks_of_place(spec, place, grids) for place in spec.place}

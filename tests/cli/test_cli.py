@@ -35,7 +35,10 @@ def test_a_process_ends_with_the_exit_code_and_keeps_results_and_messages_apart(
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     ended = [
         subprocess.run([*PROGRAM, *words], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)  # noqa: S603 - our own program
-        for words in (["list-regions"], ["build-region", "vadus", "--quiet"])  # the second: one line however slow it is
+        for words in (
+            ["list", "regions"],
+            ["build-region", "vadus", "--quiet"],
+        )  # the second: one line however slow it is
     ]
     assert [item.returncode for item in ended] == [0, 2]
     assert "vaduz" in ended[0].stdout
@@ -129,7 +132,7 @@ def test_a_region_is_built_inspected_and_verified(program, tmp_path):
 
 def test_the_towns_of_the_demo_are_a_line_and_your_own_are_listed_whatever_their_name(program, tmp_path):
     small_town(tmp_path, **{'id = "town-suburb"': 'id = "demo-mine"'})
-    code, out, err = program("list-regions", "--region-files", tmp_path)
+    code, out, err = program("list", "regions", "--region-files", tmp_path)
     assert code == 0, err
     assert [line.split()[0] for line in out.splitlines() if line.startswith("demo-")] == ["demo-mine"]
     assert "and 36 small towns of `leaderboard demo`, demo-..." in err
@@ -155,7 +158,7 @@ def test_a_dry_run_tells_and_writes_nothing(program, tmp_path):
 
 
 def test_lists_and_findings_go_to_stdout(program):
-    code, listed, err = program("list-regions")
+    code, listed, err = program("list", "regions")
     assert code == 0, err
     assert "vaduz" in listed
     assert "2013-08-03 .. 2025-09-19 (9)" in listed

@@ -227,7 +227,7 @@ def test_an_out_without_the_right_to_write_gets_one_line(mistake, tmp_path):
 
 
 def test_all_suites_are_listed_with_what_they_separate(program):
-    code, told, err = program("list-suites")
+    code, told, err = program("list", "suites")
     assert (code, err) == (0, "")
     lines = told.splitlines()
     assert [line.split()[0] for line in lines[1:] if line.strip()] == list(EVERY_SUITE)

@@ -58,7 +58,7 @@ def check(program, out, tiny, monkeypatch):
     """The command check on the place that is there already."""
     del out
     monkeypatch.setattr("sasgeo_bench.running.testing.check_matcher", partial(check_matcher, place=tiny))
-    return partial(program, "check-matcher")
+    return partial(program, "check")
 
 
 @pytest.fixture
@@ -87,7 +87,7 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: x-own\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(f"[{MATCHERS}]\nmine = nowhere.to_be:Found\n")
     monkeypatch.syspath_prepend(str(about.parent))
-    code, told, err = program("list-matchers")
+    code, told, err = program("list", "matchers")
     assert (code, err) == (0, "")
     head, *rows = (line.split() for line in told.splitlines() if line)
     assert head == ["matcher", "package", "class"]
@@ -97,25 +97,42 @@ def test_matchers_are_listed_with_where_they_come_from(program, tmp_path, monkey
 
 
 @pytest.mark.parametrize(
-    ("command", "name", "said"),
+    ("kind", "name", "said"),
     [
-        ("list-matchers", "road_2rit", "title: "),
-        ("list-trackers", "swapf", "source: "),
-        ("list-rejectors", "sue", "is calibrated: "),
-        ("list-segmenters", "colour_thresholds", "classes: "),
-        ("list-matchers", "oracle_pose", "oracle_pose: a control, given the truth, and has no card"),
+        ("matchers", "road_2rit", "title: "),
+        ("trackers", "swapf", "source: "),
+        ("rejectors", "sue", "is calibrated: "),
+        ("segmenters", "colour_thresholds", "classes: "),
+        ("matchers", "oracle_pose", "oracle_pose: a control, given the truth, and has no card"),
     ],
 )
-def test_the_card_of_one_is_shown_field_by_field(command, name, said, program) -> None:
-    code, told, err = program(command, name)
+def test_the_card_of_one_is_shown_field_by_field(kind, name, said, program) -> None:
+    code, told, err = program("list", kind, name)
     assert (code, err) == (0, "")
     lines = told.splitlines()
     assert lines[0].startswith(f"name: {name}" if len(lines) > 1 else said)
     assert any(line.startswith(said) and len(line) > len(said) - 1 for line in lines)
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (["list-matchers", "random"], ["list", "matchers", "random"]),
+        (["check-tracker", "x"], ["check", "--kind", "tracker", "x"]),
+    ],
+)
+def test_the_names_of_before_still_work(old, new, program) -> None:
+    assert program(*old) == program(*new)
+
+
+def test_a_name_that_nothing_has_is_not_checked(check, mistake) -> None:
+    del check
+    words = "there is no matcher, tracker, segmenter or suite 'raster_uniformm', did you mean 'raster_uniform'?"
+    assert words in mistake("check", "raster_uniformm")
+
+
 def test_a_card_that_nobody_has_is_told_in_one_line(program) -> None:
-    code, told, err = program("list-matchers", "road_2ri")
+    code, told, err = program("list", "matchers", "road_2ri")
     assert (code, told) == (2, "")
     assert "there is no matcher 'road_2ri', did you mean 'road_2rit'" in err
 
@@ -126,13 +143,13 @@ def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, m
     pip.touch(mode=0o755)
     monkeypatch.setattr(sys, "executable", str(pip.with_name("python")))
     monkeypatch.setenv("PATH", str(pip.parent))
-    code, told, err = program("new-matcher", "my-matcher")
+    code, told, err = program("new", "matcher", "my-matcher")
     assert code == 0
     assert "enter docs/results/systems-objects --matcher my-matcher" in err
     assert told == "my-matcher: 6 files; next: pip install -e my-matcher && sasgeo-bench check my-matcher\n"
     assert (tmp_path / "my-matcher" / "src" / "my_matcher" / "matcher.py").is_file()
     monkeypatch.setenv("PATH", "")  # a pip that would install for another Python is not named
-    code, told, _ = program("new-matcher", "other", "--into", "deep/er")
+    code, told, _ = program("new", "matcher", "other", "--into", "deep/er")
     assert f"next: {pip} install -e deep/er && " in told
     assert (code, told.split(":")[0]) == (0, "deep/er")
     assert (tmp_path / "deep" / "er" / "pyproject.toml").is_file()
@@ -153,7 +170,7 @@ def test_a_new_matcher_is_written_and_the_next_step_is_told(program, tmp_path, m
 def test_a_matcher_that_cannot_be_made_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, told) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("")
-    assert told in mistake("new-matcher", *words)
+    assert told in mistake("new", "matcher", *words)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
 
 
@@ -169,7 +186,6 @@ def test_a_good_matcher_gets_a_table_and_exit_0(check) -> None:
     ("spec", "words"),
     [
         ("faulty:NoCard", "faulty:NoCard: card is a NoneType, expected a sasgeo_bench.matching.matcher.MatcherCard"),
-        ("raster_uniformm", "there is no matcher or tracker 'raster_uniformm', did you mean 'raster_uniform'?"),
     ],
 )
 def test_a_matcher_with_a_fault_gets_its_row_a_line_on_stderr_and_exit_2(check, spec, words) -> None:

@@ -8,7 +8,7 @@ from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
 
 
 def test_segmenters_are_listed_with_the_control(program) -> None:
-    code, told, err = program("list-segmenters")
+    code, told, err = program("list", "segmenters")
     assert (code, err) == (0, "")
     head, *rows = (line.split() for line in told.splitlines() if line)
     assert head == ["segmenter", "package", "class"]
@@ -16,7 +16,7 @@ def test_segmenters_are_listed_with_the_control(program) -> None:
 
 
 def test_a_new_segmenter_is_written_and_the_next_step_is_told(program, tmp_path) -> None:
-    code, told, err = program("new-segmenter", "my-segmenter", "--into", "deep/er")
+    code, told, err = program("new", "segmenter", "my-segmenter", "--into", "deep/er")
     assert (code, err) == (0, "")
     assert told.startswith("deep/er: 5 files; next: ")
     assert told.endswith(" install -e deep/er && sasgeo-bench check my-segmenter\n")
@@ -35,7 +35,7 @@ def test_a_new_segmenter_is_written_and_the_next_step_is_told(program, tmp_path)
 def test_a_segmenter_that_cannot_be_made_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, told) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("")
-    assert told in mistake("new-segmenter", *words)
+    assert told in mistake("new", "segmenter", *words)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
 
 
@@ -44,10 +44,10 @@ def test_a_check_prints_every_row_and_a_failed_one_is_the_users(program, tmp_pat
     files = segmenter_files("my-checked")
     write_plugin(tmp_path / "plugin", files)
     monkeypatch.syspath_prepend(str(tmp_path / "plugin" / "src"))
-    code, told, err = program("check-segmenter", "my_checked.segmenter:MyChecked")
+    code, told, err = program("check", "--kind", "segmenter", "my_checked.segmenter:MyChecked")
     assert (code, err) == (0, "")
     assert "the same answer twice" in told
-    code, told, err = program("check-segmenter", "no_such_segmenter")
+    code, told, err = program("check", "--kind", "segmenter", "no_such_segmenter")
     assert code == 2
     assert "there is no segmenter 'no_such_segmenter'" in told
     assert err == "no_such_segmenter: 1 check failed\n"

@@ -68,9 +68,9 @@ def test_a_log_gets_every_line_and_keeps_what_it_held(tmp_path, monkeypatch, qui
 
 
 def test_every_command_has_both_flags_and_they_end_with_it(program, tmp_path):
-    code, out, err = program("list-regions", "--quiet", "--log", "all.log")
+    code, out, err = program("list", "regions", "--quiet", "--log", "all.log")
     assert (code, len(out.splitlines()), err) == (0, 1, "")
-    assert len(program("list-regions")[1].splitlines()) > 20
+    assert len(program("list", "regions")[1].splitlines()) > 20
     code, out, err = program("build-region", "vadus", "--quiet", "--log", "all.log")
     assert (code, out) == (2, "")
     assert "did you mean 'vaduz'" in err
@@ -97,8 +97,8 @@ def test_two_processes_of_a_quiet_command_build_a_region_each_and_are_quiet_and_
 
 @pytest.mark.parametrize("log", ["none/all.log", "."])
 def test_a_log_that_cannot_be_written_is_one_line(mistake, log):
-    assert "cannot be written" in mistake("list-suites", "--log", log)
-    assert "name a file in a folder of yours" in mistake("list-suites", "--log", log)
+    assert "cannot be written" in mistake("list", "suites", "--log", log)
+    assert "name a file in a folder of yours" in mistake("list", "suites", "--log", log)
 
 
 def test_a_log_that_can_no_longer_be_written_stops_once_and_then_is_left_alone(tmp_path, capsys):

@@ -59,7 +59,7 @@ def test_a_package_is_complete_and_names_its_class_everywhere_alike(tmp_path, na
     (own,) = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     assert value == f"{module}.matcher:{own}"
     assert f'check_matcher("{value}")' in (folder / "tests" / "test_conforms.py").read_text()
-    assert f"check-matcher {name}" in (folder / "README.md").read_text()
+    assert f"check {name}" in (folder / "README.md").read_text()
 
 
 @pytest.mark.parametrize("name", ACCEPTED)

@@ -35,7 +35,7 @@ def test_a_package_is_complete_and_names_its_class_everywhere_alike(name) -> Non
     (own,) = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     assert value == f"{module}.segmenter:{own}"
     assert f'check_segmenter("{value}")' in files["tests/test_conforms.py"]
-    assert f"check-segmenter {name}" in files["README.md"]
+    assert f"check {name}" in files["README.md"]
     assert not any(re.search(r"\{(name|module|cls|title|distribution)\}", text) for text in files.values())
     found: dict[str, object] = {}
     exec(files[f"src/{module}/segmenter.py"], found)  # noqa: S102 - our own text

@@ -32,7 +32,7 @@ def test_a_package_is_complete_and_names_its_class_everywhere_alike(tmp_path, na
     (own,) = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
     assert value == f"{module}.tracker:{own}"
     assert f'check_tracker("{value}")' in files["tests/test_conforms.py"]
-    assert f"check-tracker {name}" in files["README.md"]
+    assert f"check {name}" in files["README.md"]
     assert not any(re.search(r"\{(name|module|cls|title|distribution)\}", text) for text in files.values())
     write_plugin(tmp_path / "plugin", files)
     found: dict[str, object] = {"__file__": str(tmp_path / "plugin" / "src" / module / "tracker.py")}

@@ -202,11 +202,10 @@ def unknown(name: str, *groups: str, others: Collection[str] = ()) -> MatchError
     near = difflib.get_close_matches(name, known, n=1)
     hint = f", did you mean {near[0]!r}?" if near else ""
     kinds = [KINDS[group] for group in groups]
-    shown = f"{' and '.join(f'list {kind}s' for kind in kinds)} show{'s' if len(kinds) == 1 else ''} all"
-    shown = shown if len(kinds) <= 2 else "list shows all of a kind"  # noqa: PLR2004 - more are not read
-    return MatchError(
-        f"there is no {', '.join(kinds[:-1])}{' or ' if kinds[1:] else ''}{kinds[-1]} {name!r}{hint} ({shown}; or module:{_WHAT.get(groups[0], 'Class')})"
-    )
+    kind = " or ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
+    lists = " and ".join(f"list {one}s" for one in kinds) if len(kinds) <= 2 else "list"  # noqa: PLR2004 - to be read
+    shown = f"{lists} show{'s' if ' and ' not in lists else ''} all"
+    return MatchError(f"there is no {kind} {name!r}{hint} ({shown}; or module:{_WHAT.get(groups[0], 'Class')})")
 
 
 def check_names(*, matchers: Sequence[str] = (), rejectors: Sequence[str] = (), segmenters: Sequence[str] = ()) -> None:

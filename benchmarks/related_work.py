@@ -33,7 +33,7 @@ import pandas as pd
 
 from benchmarks.sim_to_real import estimate, line
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.leaderboard.board_files import MEND, check_shape, read_scores
+from sasgeo_bench.leaderboard.board_files import MEND, SCHEMAS, read_scores
 from sasgeo_bench.leaderboard.board_files import read_board as read_table
 from sasgeo_bench.scoring.intervals import LEAST_CLUSTERS, difference_interval, wilson_share
 from sasgeo_bench.texts import markdown_code
@@ -89,12 +89,12 @@ NUMBERS = {"strength": np.inf, "view_cells": np.inf, "position_error_m": np.inf,
 def read_board(board: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return scores of views and flights, with `hit` and `is_control`, and the leaderboard's rows of two columns."""
     _, rows = read_table(board)
-    check_shape("leaderboard", rows)
+    SCHEMAS["leaderboard"].check(rows)
     scores = read_scores(board)
     scores = scores.reindex(columns=scores.columns.union([WAY]))  # a board without flights has none
     text = ("matcher", "suite", "track", "kind", "role", "place", *TEXTS)
     scores = scores.astype({name: object for name in text if name in scores})
-    check_shape("scores", scores)
+    SCHEMAS["scores"].check(scores)
     check_columns(scores)
     is_control = scores["matcher"].isin(rows.loc[rows["is_control"], "matcher"])
     hit = (scores["position_error_m"] <= 25.0).astype(float)  # noqa: PLR2004 - the radius

@@ -10,13 +10,14 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.canvas import page
-from sasgeo_bench.leaderboard.board_files import ANSWER_COLUMNS, Extra, write_board
+from sasgeo_bench.leaderboard.board_files import ANSWER_SCHEMA, Extra, write_board
 from sasgeo_bench.leaderboard.board_plots import BoardPage
-from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame, hold_contrasts
-from sasgeo_bench.scoring.controls import Verdict, verdict_frame
-from sasgeo_bench.scoring.rows import RUN_HERE, EntryLabel, Row, to_frame, with_entry_labels
+from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, RUN_HERE, EntryLabel, Row, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
 from tests.scoring.test_tables import scores
 
 HOSTILE = "<script>alert(1)</script>"
@@ -90,7 +91,7 @@ def about_of(entries, **changes):
 
 def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), scored=None, extras=(), **about):
     """Write a board of these parts."""
-    table = to_frame([]) if table is None else table
+    table = FIGURE_SCHEMA.frame([]) if table is None else table
     named = {entry["name"]: EntryLabel(entry["version"], entry["hash"], RUN_HERE) for entry in entries}
     nobody = EntryLabel("1", "", RUN_HERE)
     write_board(
@@ -98,8 +99,8 @@ def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), score
         tables={
             "leaderboard": with_entry_labels(table, dict.fromkeys(table["matcher"], nobody) | named),
             "scores": pd.DataFrame() if scored is None else scored,
-            "contrasts": contrast_frame(findings),
-            "controls": verdict_frame(verdicts),
+            "contrasts": CONTRAST_SCHEMA.frame(findings),
+            "controls": CONTROL_SCHEMA.frame(verdicts),
         },
         texts={"leaderboard.md": "# Board\n", "leaderboard.tex": "% board\n"},
         about=about_of(list(entries), **about),
@@ -147,7 +148,7 @@ def full_board(folder, *, shares=SHARES, holds=True, tested="graph", changes=Non
     known = [item for item in CONTRASTS if {item.first, item.second} <= shares.keys()]
     return put_board(
         folder,
-        table=pd.concat([leaderboard(scored, draws=200), to_frame([*judged, *costs])], ignore_index=True),
+        table=pd.concat([leaderboard(scored, draws=200), FIGURE_SCHEMA.frame([*judged, *costs])], ignore_index=True),
         entries=[entry_of(name, **(changes or {}).get(name, {})) for name in shares],
         findings=hold_contrasts(known, scored, {}, draws=200),
         verdicts=[replace(verdict(holds=holds), matcher=tested)],
@@ -179,7 +180,7 @@ def answers_of(names, **changes):
     facts = {"suite": "real-age", "region": "vaduz@2015-07-27", "kind": "S1", "role": "stress", "status": "ok"}
     facts |= {"is_present": True, "view_m": 128.0}
     table = pd.DataFrame([facts | row | {"matcher": name} for name in names for row in rows])
-    return table[list(ANSWER_COLUMNS)].assign(**changes)
+    return table[list(ANSWER_SCHEMA.names)].assign(**changes)
 
 
 BOUNDS_M = [540000.0, 5220000.0, 541000.0, 5220800.0]  # of the handmade map
@@ -212,7 +213,7 @@ def put_pictures(folder, *, failures=("aliased", "occluded", "odd one"), **chang
 def many_rows(count):
     """Rows of so many matchers, two of them with hostile names."""
     names = [HOSTILE, MARKUP, *(f"matcher-{at:03d}" for at in range(count - 2))][:count]
-    return to_frame(
+    return FIGURE_SCHEMA.frame(
         [
             Row(
                 matcher=name,

@@ -36,7 +36,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.importers.kinds import read_dataset
 from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
-from sasgeo_bench.leaderboard.board_files import check_shape
+from sasgeo_bench.leaderboard.board_files import SCHEMAS
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.learned_file import read_learned
@@ -244,9 +244,9 @@ def read_pack(folder: Path) -> object:
 
 def read_board(folder: Path) -> object:
     files = read_board_files(folder / "board")
-    check_shape("leaderboard", files.board)
+    SCHEMAS["leaderboard"].check(files.board)
     for name, table in files.tables.items():
-        check_shape(name, table)
+        SCHEMAS[name].check(table)
     return files
 
 

@@ -19,7 +19,7 @@ from sasgeo_bench.cli import program
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.files.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
 from sasgeo_bench.geometry.pose import Prior
-from sasgeo_bench.leaderboard.board_files import BOARD
+from sasgeo_bench.leaderboard.board_files import BOARD, SCHEMAS
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, TERMS
 from sasgeo_bench.leaderboard.pipeline_spec import (
     ContrastSpec,
@@ -41,11 +41,9 @@ from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 from sasgeo_bench.running.prediction_rows import PART_SCHEMA
-from sasgeo_bench.scoring.contrasts import Finding
-from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.metric import CostMetric, MeanMetric, Metric, QuantileMetric, RejectionMetric, ThresholdMetric
 from sasgeo_bench.scoring.metrics import METRICS, TRACKS
-from sasgeo_bench.scoring.rows import Row, is_unranked
+from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.split import Place, SplitFile
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
@@ -90,6 +88,15 @@ _TABLES: Final[dict[str, tuple[str, pa.Schema, tuple[type, ...]]]] = {
     "Queries": ("`out/tasks/<suite>/<region>/queries.parquet`", FILE_SCHEMA, (Query, Evidence, Prior)),
     "Truths": ("`out/truth/<suite>/<region>/truth.parquet`", TRUTH_SCHEMA, (Truth,)),
     "Predictions": ("`part-*.parquet` of a run, or a file of predictions", PART_SCHEMA, (Prediction,)),
+}
+_KINDS: Final = {  # of columns of a board's tables
+    str: "text",
+    bool: "bool",
+    int: "int",
+    float: "float",
+    int | None: "int or missing",
+    float | None: "float",
+    str | None: "text or missing",
 }
 _PARAMETER: Final = re.compile(r"^    ([a-z_][\w, ]*?) : .*\n((?: {8}.*\n?|\n(?= {8}))+)", re.MULTILINE)
 
@@ -243,13 +250,10 @@ def _metrics() -> Iterator[str]:
     for title, words in (("Other columns of tables", others), ("Terms", TERMS), ("Marks next to names", MARKS)):
         yield f"\n## {title}"
         yield from table(("Word", "Meaning"), ((f"`{name}`", text) for name, text in words.items()))
-    for title, kind in (
-        ("`leaderboard.parquet`", Row),
-        ("`contrasts.parquet`", Finding),
-        ("`controls.parquet`", Verdict),
-    ):
-        yield f"## {title}"
-        yield from table(("Column", "What it holds"), ((f"`{name}`", text) for name, text in meanings([kind]).items()))
+    for name, schema in SCHEMAS.items():
+        yield f"## `{name}.parquet`"
+        rows = ((f"`{one.name}`", f"`{_KINDS[one.kind]}`", one.meaning) for one in schema.columns)
+        yield from table(("Column", "Type", "What it holds"), rows)
 
 
 def _metric_rows(metrics: Iterable[Metric]) -> list[str]:

@@ -25,13 +25,13 @@ from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.running.stored_answers import StoredAnswers
-from sasgeo_bench.scoring.contrasts import Contrast, contrast_frame
-from sasgeo_bench.scoring.controls import Falsifier, Verdict, failed_controls, falsifier_frame, verdict_frame
+from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA, Falsifier, Verdict, failed_controls
 from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
-from sasgeo_bench.scoring.verdicts import Finding
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, Truth
 from sasgeo_bench.tasks.split import Split
@@ -157,9 +157,9 @@ def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra], ca
         tables={
             "leaderboard": board.table,
             "scores": scores,
-            "contrasts": contrast_frame(board.findings),
-            "falsifiers": falsifier_frame(board.falsifiers),
-            "controls": verdict_frame(board.verdicts),
+            "contrasts": CONTRAST_SCHEMA.frame(board.findings),
+            "falsifiers": FALSIFIER_SCHEMA.frame(board.falsifiers),
+            "controls": CONTROL_SCHEMA.frame(board.verdicts),
             **({PROTECTION: board.protection} if len(board.protection) else {}),
             **({ACCEPTANCE: board.acceptance} if len(board.acceptance) else {}),
         },

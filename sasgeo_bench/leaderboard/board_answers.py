@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_files import ANSWER_COLUMNS
+from sasgeo_bench.leaderboard.board_files import ANSWER_SCHEMA
 from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.pose import columns_of
@@ -15,7 +15,7 @@ from sasgeo_bench.scoring.score import single_views
 
 
 def answers_frame(board: Board, failures: pd.DataFrame, names: Sequence[str]) -> pd.DataFrame:
-    """Return a row for each answer of some matchers to a single view, with the columns `ANSWER_COLUMNS`.
+    """Return a row for each answer of some matchers to a single view, with the columns of `ANSWER_SCHEMA`.
 
     `failures` are all of these matchers, as of `cases.find_cases`; `failure` is empty where there is none. Falsifiers
     are left out: nothing is asked of them than another answer. `view_m` is the side of a view. True is where it was
@@ -23,7 +23,7 @@ def answers_frame(board: Board, failures: pd.DataFrame, names: Sequence[str]) ->
     """
     frames = [_answers_of(board, name, failures) for name in names if name in board.scores]
     some = [frame for frame in frames if len(frame)]
-    return pd.concat(some, ignore_index=True) if some else pd.DataFrame(columns=list(ANSWER_COLUMNS))
+    return pd.concat(some, ignore_index=True) if some else ANSWER_SCHEMA.empty()
 
 
 def _answers_of(board: Board, name: str, failures: pd.DataFrame) -> pd.DataFrame:
@@ -42,7 +42,7 @@ def _answers_of(board: Board, name: str, failures: pd.DataFrame) -> pd.DataFrame
         **_numbers("true", true),
         **_numbers("fix", _fixes(board.predictions[name], ids)),
     }
-    return pd.DataFrame(columns)[list(ANSWER_COLUMNS)]
+    return pd.DataFrame(columns)[list(ANSWER_SCHEMA.names)]
 
 
 def _fixes(answers: StoredAnswers, ids: Sequence[str]) -> Floats:

@@ -2,7 +2,7 @@
 """Boards on disk: `leaderboard.parquet` is the master; tables of unknown origin are checked when read."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -26,10 +26,13 @@ from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.files.paths import read_bounded
 from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.scoring import acceptance, controls, protection
-from sasgeo_bench.scoring.controls import Verdict
-from sasgeo_bench.scoring.rows import Row
-from sasgeo_bench.scoring.verdicts import Finding
+from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA
+from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA
+from sasgeo_bench.scoring.flights import SCORE_SCHEMA
+from sasgeo_bench.scoring.frames import Column, Schema
+from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA
+from sasgeo_bench.scoring.rows import LEADERBOARD_SCHEMA
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
 from sasgeo_bench.texts import csv_cell, json_text, one_line
 
 LEADERBOARD: Final = "leaderboard"
@@ -189,64 +192,24 @@ def read_scores(folder: Path) -> pd.DataFrame:
     return read_frame(folder / f"{SCORES}.parquet", mend=MEND)
 
 
-_TEXTS: Final = frozenset(
-    {
-        *("contrast", "suite", "kind", "matcher", "prior_group", "method", "supports"),
-        *("rejector", "track", "mixture", "absence"),
-    }
+_OF_SCORES: Final = ("query_id", "matcher", "suite", "region", "kind", "role", "is_present", "status")
+ANSWER_SCHEMA: Final = Schema(
+    ANSWERS,
+    (
+        *map(SCORE_SCHEMA.__getitem__, _OF_SCORES),
+        Column("failure", str, "Class of the failure; empty where there is none"),
+        Column("view_m", float, "Side of the view"),
+        *(
+            Column(f"{what}_{name}", float, f"{title}, to a tenth; NaN without one")
+            for what, title in (("true", "True pose, also of an absent place"), ("fix", "Pose of the fix"))
+            for name in ("easting_m", "northing_m", "yaw_deg")
+        ),
+    ),
 )
-_FINDING: Final = {item.name: item.type for item in fields(Finding)} | {"outcome": str, "verdict": str}
-ANSWER_COLUMNS: Final = (
-    *("query_id", "matcher", "suite", "region", "kind", "role", "is_present", "status", "failure", "view_m"),
-    *("true_easting_m", "true_northing_m", "true_yaw_deg", "fix_easting_m", "fix_northing_m", "fix_yaw_deg"),
-)
-_SHAPES: Final[Mapping[str, Mapping[str, Any]]] = {
-    "leaderboard": {item.name: item.type for item in fields(Row)},
-    "contrasts": _FINDING,
-    "falsifiers": {name: str if name in _TEXTS else _FINDING[name] for name in controls.FALSIFIER_COLUMNS},
-    "controls": {item.name: item.type for item in fields(Verdict)},
-    "acceptance": {name: str if name in _TEXTS else float for name in acceptance.COLUMNS},
-    "protection": {name: str if name in _TEXTS else float for name in protection.COLUMNS},
-    "scores": {
-        **dict.fromkeys(("query_id", "matcher", "suite", "track", "kind", "role", "place"), str),
-        "is_present": bool,
-    },
-    ANSWERS: {
-        name: bool if name == "is_present" else float if name.endswith(("_m", "_deg")) else str
-        for name in ANSWER_COLUMNS
-    },
+SCHEMAS: Final[Mapping[str, Schema]] = {
+    schema.name: schema
+    for schema in (
+        *(LEADERBOARD_SCHEMA, SCORE_SCHEMA, CONTRAST_SCHEMA, FALSIFIER_SCHEMA, CONTROL_SCHEMA),
+        *(ACCEPTANCE_SCHEMA, PROTECTION_SCHEMA, ANSWER_SCHEMA),
+    )
 }
-
-
-def check_shape(name: str, table: pd.DataFrame) -> None:
-    """Refuse a table, as "leaderboard", with a column that is missing, of another type, or without a required value.
-
-    A table that is optional on a board may be without columns. Raise StoreError naming the file and the column.
-
-    >>> check_shape("controls", pd.DataFrame({"control": ["blind"]}))
-    Traceback (most recent call last):
-        ...
-    sasgeo_bench.errors.StoreError: controls.parquet has no column 'matcher': score it again
-    """
-    if name != "leaderboard" and not len(table.columns):
-        return
-    for column, kind in _SHAPES[name].items():
-        if list(table.columns).count(column) != 1:
-            fault = "two columns" if column in table else "no column"
-            raise StoreError(f"{name}.parquet has {fault} {column!r}: score it again")
-        if len(table) and not _is_of(table[column], kind):
-            raise StoreError(
-                f"{name}.parquet: {column} holds something else than it should, or nothing: score it again"
-            )
-
-
-def _is_of(values: "pd.Series[Any]", kind: object) -> bool:
-    """Return whether a column holds texts, booleans or whole numbers without a gap, or numbers with gaps."""
-    if kind is str:
-        return bool(values.map(lambda one: isinstance(one, str)).all())
-    if kind is bool:
-        return bool(pd.api.types.is_bool_dtype(values)) and not values.isna().any()
-    is_number = pd.api.types.is_numeric_dtype(values) and not pd.api.types.is_bool_dtype(values)
-    if kind is int:
-        return bool(pd.api.types.is_integer_dtype(values)) and not values.isna().any()
-    return bool(is_number) or bool(values.isna().all())

@@ -30,8 +30,7 @@ from sasgeo_bench.scoring.controls import gains_without_stress, hold_controls, h
 from sasgeo_bench.scoring.cost import COLUMNS as COST_COLUMNS
 from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.entries import find_entries, leave_out, set_apart
-from sasgeo_bench.scoring.protection import COLUMNS as PROTECTION_COLUMNS
-from sasgeo_bench.scoring.protection import protection_frame
+from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA, protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, evaluate_rejectors, rules_of
 from sasgeo_bench.scoring.rows import EntryLabel, name_alone, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
@@ -260,7 +259,7 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
         acceptance=rejection.acceptance,
         findings=findings,
         falsifiers=falsifiers,
-        protection=pd.concat(some, ignore_index=True) if some else pd.DataFrame(columns=list(PROTECTION_COLUMNS)),
+        protection=pd.concat(some, ignore_index=True) if some else PROTECTION_SCHEMA.empty(),
     )
 
 

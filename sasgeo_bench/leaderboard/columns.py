@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.leaderboard.board_files import SCHEMAS
 from sasgeo_bench.leaderboard.tables import DAGGER, Column, Mark
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE
@@ -14,47 +15,31 @@ from sasgeo_bench.tasks.suites.all_suites import known_suite
 from sasgeo_bench.tasks.suites.base import SuiteCard
 
 _UNKNOWN: Final = "no meaning is written down for this column"
+_HEADS: Final = {one.head: one.meaning for schema in SCHEMAS.values() for one in schema.columns if one.head}
+
+
+def _said(*heads: str) -> dict[str, str]:
+    """Return what the schemas of tables say of some columns, by the titles of these."""
+    return {head: _HEADS[head] for head in heads}
+
+
 _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
-    "matcher": "Name of the entry. Controls have no rank: they show what a figure means that nobody earned",
+    **_said("matcher"),
     "rank": "Ranks that the matcher can have, all pairs compared at once. Matchers that share a rank cannot be "
     f"distinguished. With fewer than {LEAST_PLACES} places nobody is ranked (-)",
     "control": "The same figure at the same places without the stress",
     "false fixes": "Share of absent places that were answered; each such answer is a false fix. Lower is better",
-    "detectable": "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf "
-    "if none, - where nobody is ranked",
-    "n": "Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones",
+    **_said("detectable", "n"),
     "mean": "Mean of the suites beside it in which somebody is ranked, which weigh alike; of entries that were asked "
     "about all suites",
-    "missing": "Queries without a row; they count as misses",
-    "blocks": "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
-    "places, then blocks in them",
-    "suite": "What is done to a view or a map",
-    "part": "Which of the suite's queries: a role, a kind of stress, one of its steps at one size of view, or a bin "
-    "of what was measured at the truth",
-    "kind": "Kind of stress, or of its absence",
+    **_said("missing", "blocks", "suite", "part", "kind"),
     "risk kept": "Whether at most 5 % of all answers are false: yes or no where the whole interval says so, else open",
-    "rejector": "Estimates of each answer how likely it is false; own: the matcher's own confidence, fitted to nothing",
-    "track": "localization: find the place on the map; retrieval: pick it among candidates; sequence: follow a flight",
-    "contrast": "Pair of entries that was registered before anything was run",
-    "first": "First entry of the pair, and what it reaches",
-    "second": "Second entry of the pair, and what it reaches",
-    "difference": "First less second on the same queries, with its 95 % interval by places",
+    **_said("rejector", "track", "contrast", "first", "second", "difference"),
     "by blocks": "The interval of the difference if blocks, not places, are resampled: of these places alone",
     "by countries": "The interval of the difference if countries are resampled, then places in them",
-    "attainable": "The most by which the first could be better than the second: up to the ceiling of these queries, or "
-    "to a perfect order",
-    "matters": "The least difference that was registered as mattering",
-    "p (Holm)": "Chance of a difference as large if there were none, by flipping the sides of whole places; adjusted "
-    "by Holm for the number of registered contrasts",
+    **_said("attainable", "matters", "p (Holm)"),
     "discordant": "Queries that only the first got right, and only the second",
-    "verdict": "Which is better at 5 %, and whether by as much as matters; null where a difference that matters is "
-    "ruled out; cause open where the first gains without the stress, too; not decided where neither is shown, where "
-    f"less can be gained than was to matter, and with fewer than {LEAST_PLACES} places",
-    "control query": "Queries whose right score is known beforehand",
-    "outcome": "held, or FAILED: then do not trust the rows of the matcher, nor the board if it is itself a control",
-    "found": "How many were right, or were answered where none must be",
-    "expected": "How many are right by guessing, or how many there must be",
-    "p": "Chance of finding as many or more by guessing; a control fails below 0.0001",
+    **_said("verdict", "control query", "outcome", "found", "expected", "p"),
     "fails at": "How many right ones fail the control; never: even if all were right, guessing could have done it",
     "figure": "Success or recall under stress, or false fixes at absent places",
     "public": "The figure on the public seed of this board",
@@ -79,17 +64,19 @@ _OTHER_COLUMNS: Final = {  # all but the metrics, which bring their own
     "suites": "Suites that were drawn there",
     "scenes": "Kind of place, as its region file says",
     "kind of place": "Places of one kind, as their region files say; a place with several kinds counts in each",
-    "method": "How the level is computed",
-    "absence": "Kind of absent places, suite: kind; all: all of them",
-    "absent": "Absent places among the queries",
-    "coverage": "Share of queries with an accepted fix, where absent places have the share named",
-    "risk of fixes": "Share of false fixes among the accepted ones, where absent places have the share named",
-    "risk": "How often the error may exceed the level, as was promised",
-    "available": "Share of queries whose level is within the alert limit, with its 95 % interval",
-    "misleading": "Share that is available and has an error beyond its level, with its 95 % interval",
-    "hazardous": "Share that is misleading and has an error beyond the alert limit, with its 95 % interval",
-    "exceeded": "Share with an error beyond the level, available or not, with its 95 % interval",
-    "supports": "Risk that the misleading ones among the available support",
+    **_said(
+        "method",
+        "absence",
+        "absent",
+        "coverage",
+        "risk of fixes",
+        "risk",
+        "available",
+        "misleading",
+        "hazardous",
+        "exceeded",
+        "supports",
+    ),
 }
 _OF_CONTRASTS: Final = {  # metrics of registered contrasts alone
     "primary": "Share of queries that are right",

@@ -13,14 +13,14 @@ from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.leaderboard import board_files
-from sasgeo_bench.leaderboard.board_files import ANSWERS, MEND, SCORES, TABLES
+from sasgeo_bench.leaderboard.board_files import ANSWERS, MEND, SCHEMAS, SCORES, TABLES
 from sasgeo_bench.leaderboard.plot_tables import MOST_MATCHERS, ranked_matchers, risk_frame, shown_matchers
 from sasgeo_bench.leaderboard.plots import draw_risk
 from sasgeo_bench.leaderboard.pooled_plots import draw_contrasts, draw_tradeoff
 from sasgeo_bench.leaderboard.pooled_tables import price_frame
 from sasgeo_bench.scoring.rejection import OWN, own_confidence
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
-from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
+from sasgeo_bench.scoring.rows import ALL_SUITES, LEADERBOARD_SCHEMA, is_unranked
 from sasgeo_bench.texts import html_facts
 
 
@@ -163,6 +163,6 @@ def read_board(path: str | Path) -> StoredBoard:
         file = folder / f"{name}.parquet"
         tables[name] = read_frame(file, mend=MEND) if file.is_file() else pd.DataFrame()
         if name in (SCORES, "contrasts", ANSWERS):
-            board_files.check_shape(name, tables[name])
-    board_files.check_shape("leaderboard", leaderboard)
+            SCHEMAS[name].check(tables[name])
+    LEADERBOARD_SCHEMA.check(leaderboard)
     return StoredBoard(folder=folder, about=about, leaderboard=leaderboard, **tables)

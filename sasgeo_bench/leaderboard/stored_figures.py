@@ -2,7 +2,7 @@
 """Figures of a stored board that hold whoever is scored beside its entries, so that nothing is fitted twice."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -10,13 +10,13 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.leaderboard.board_files import ACCEPTANCE, MEND, check_shape, read_board
+from sasgeo_bench.leaderboard.board_files import ACCEPTANCE, MEND, read_board
 from sasgeo_bench.matching.matcher import RejectorCard
-from sasgeo_bench.scoring.acceptance import COLUMNS as ACCEPTANCE_COLUMNS
+from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA
 from sasgeo_bench.scoring.rejection import RejectionResult
-from sasgeo_bench.scoring.rows import COLUMNS
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, LEADERBOARD_SCHEMA
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.scoring.verdicts import Finding
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
 
 _CARD: Final = ("name", "version")  # of a rejector: another version fits otherwise
 
@@ -47,7 +47,7 @@ class StoredFigures:
 
 
 def _by_name(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
-    whole = pd.concat(parts, ignore_index=True)
+    whole = pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
     return whole.iloc[np.argsort(whole["matcher"].to_numpy(str), kind="stable")].reset_index(drop=True)
 
 
@@ -72,17 +72,13 @@ def read_stored_figures(folder: Path) -> StoredFigures:
     """Read the figures of a stored board; raise `StoreError` if a table is missing or damaged."""
     about, table = read_board(folder)
     contrasts = read_frame(folder / "contrasts.parquet", mend=MEND)
-    check_shape("leaderboard", table)
-    check_shape("contrasts", contrasts)
+    LEADERBOARD_SCHEMA.check(table)
+    CONTRAST_SCHEMA.check(contrasts)
     acceptance = folder / f"{ACCEPTANCE}.parquet"
-    known = [field.name for field in fields(Finding) if field.name in contrasts]
-    findings = ({str(name): value for name, value in row.items()} for row in contrasts[known].to_dict("records"))
     return StoredFigures(
         names=frozenset(str(entry["name"]) for entry in about["entries"]),
-        rows=table.loc[table["rejector"] != "", list(COLUMNS)],
-        acceptance=read_frame(acceptance, mend=MEND)
-        if acceptance.is_file()
-        else pd.DataFrame(columns=ACCEPTANCE_COLUMNS),
+        rows=table.loc[table["rejector"] != "", list(FIGURE_SCHEMA.names)],
+        acceptance=read_frame(acceptance, mend=MEND) if acceptance.is_file() else ACCEPTANCE_SCHEMA.empty(),
         remarks=tuple(about.get("remarks", ())),
-        findings=tuple(Finding(**row) for row in findings),
+        findings=tuple(CONTRAST_SCHEMA.rows(Finding, contrasts)),
     )

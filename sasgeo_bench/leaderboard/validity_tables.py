@@ -24,7 +24,7 @@ from sasgeo_bench.leaderboard.tables import (
     text_cells,
 )
 from sasgeo_bench.scoring.contrasts import AREAS
-from sasgeo_bench.scoring.controls import Falsifier, Verdict, verdicts_of
+from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Falsifier, Verdict
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.verdicts import Finding
 
@@ -72,10 +72,10 @@ def seed_table(about: Mapping[str, Any]) -> Table | None:
 
 
 def control_table(controls: pd.DataFrame) -> Table | None:
-    """Return every control of every matcher, from `controls.verdict_frame`; None where none was drawn."""
+    """Return every control of every matcher; None where none was drawn."""
     if not len(controls):
         return None
-    verdicts = verdicts_of(controls)
+    verdicts = CONTROL_SCHEMA.rows(Verdict, controls)
     rows = tuple(
         Row(
             cells=(

@@ -21,8 +21,8 @@ from sasgeo_bench.leaderboard.board_files import (
     BOARD_FILES,
     FIGURES,
     LEADERBOARD,
+    SCHEMAS,
     SCORES,
-    check_shape,
     csv_text,
     read_board,
 )
@@ -101,7 +101,7 @@ def publish(
         check_public(files.about.get(PRIVATE), str(board))
         with _sound(board):
             for name, table in {LEADERBOARD: files.board, **files.tables}.items():
-                check_shape(name, table)
+                SCHEMAS[name].check(table)
             scenes = _scenes(files)
             files = replace(files, downloads=(*files.downloads, *_scenes_file(scenes)))
             source = replace(_source(files, tell), scenes=scenes)

@@ -43,7 +43,7 @@ from sasgeo_bench.publishing.site_pages import (
 )
 from sasgeo_bench.publishing.site_source import Case, SiteSource
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.controls import Verdict, verdicts_of
+from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.verdicts import LOWER
 from sasgeo_bench.tasks.query import SEQUENCE, base_of
 from sasgeo_bench.texts import plain
@@ -303,7 +303,7 @@ def _map_files(templates: Environment, scripts: Mapping[str, str]) -> dict[str, 
 
 def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
     """Return what the first page shows."""
-    controls = verdicts_of(source.controls)
+    controls = CONTROL_SCHEMA.rows(Verdict, source.controls)
     overview = tuple(table for table in summary(book) if _has_rivals(table))
     contrasts = contrasts_of(source)
     prices = {table.name.replace("summary", "price", 1) for table in overview}

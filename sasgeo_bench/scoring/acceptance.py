@@ -8,7 +8,7 @@ calibration places (`prior_shift`), and Eq. 14 decides.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import pandas as pd
@@ -17,14 +17,39 @@ from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.controls import EVERY
 from sasgeo_bench.scoring.decisions import COST_RATIOS, Answers, accept_by_cost
 from sasgeo_bench.scoring.draws import seed_of_text
-from sasgeo_bench.scoring.intervals import BoardDraws
+from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, Share, answers_of, mixtures_of, share_intervals
 
-SHARES: Final = ("coverage", "risk", "right_present", "absent_accepted")
-COLUMNS: Final = (
-    *("matcher", "rejector", "track", "prior_group", "mixture", "absence", "cost_ratio", "n", "absent", "places"),
-    *(f"{name}{end}" for name in SHARES for end in ("", "_lo", "_hi")),
-)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Accepted:
+    """What Eq. 14 accepts of a matcher's answers at one kind of absence, mixture and cost ratio."""
+
+    matcher: Annotated[str, MATCHER]
+    rejector: Annotated[str, REJECTOR]
+    track: Annotated[str, TRACK]
+    prior_group: Annotated[str, PRIOR_GROUP]
+    mixture: Annotated[str, "Share of present places, as drawn or as declared"]
+    absence: Annotated[str, Shown("Kind of absent places, suite: kind; all: all of them")]
+    cost_ratio: Annotated[float, "Cost of a false fix, in costs of a place without an accepted fix"]
+    n: Annotated[int, "Queries"]
+    absent: Annotated[int, Shown("Absent places among the queries")]
+    places: Annotated[int, "Places of the queries"]
+    coverage: Annotated[
+        BoardInterval, Shown("Share of queries with an accepted fix, where absent places have the share named")
+    ]
+    risk: Annotated[
+        BoardInterval,
+        Shown(
+            "Share of false fixes among the accepted ones, where absent places have the share named", "risk of fixes"
+        ),
+    ]
+    right_present: Annotated[BoardInterval, "Share of present places that are rightly accepted"]
+    absent_accepted: Annotated[BoardInterval, "Share of absent places with an accepted fix"]
+
+
+ACCEPTANCE_SCHEMA: Final = Schema("acceptance", row_columns(Accepted))
 
 
 def acceptance_frame(matcher: str, rejector: str, judged: pd.DataFrame) -> pd.DataFrame:
@@ -35,19 +60,16 @@ def acceptance_frame(matcher: str, rejector: str, judged: pd.DataFrame) -> pd.Da
     group, as drawn and at the declared shares. Without present or absent places there is no row, nor where the
     calibration cannot correct chances for a share.
 
-    Shares are in [0, 1], each with its 95 % interval by places: `coverage`, accepted queries; `risk`, false ones among
-    the accepted; `right_present`, present places that are rightly accepted; `absent_accepted`, absent ones with an
-    accepted fix. `risk` is NaN where nothing is accepted.
+    Shares are in [0, 1], each with its 95 % interval by places. `risk` is NaN where nothing is accepted.
 
     The SASGeo paper, Eqs. (12)-(14).
     """
-    rows = [
-        {"matcher": matcher, "rejector": rejector, "track": track, "prior_group": prior_group, **row}
+    return ACCEPTANCE_SCHEMA.frame(
+        row
         for (track, prior_group), part in judged.groupby(["track", "prior_group"], sort=True)
         for pool in _pools(part)
-        for row in _rows(pool, f"{track}/{prior_group}/{pool.absence}")
-    ]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+        for row in _rows(pool, matcher=matcher, rejector=rejector, track=str(track), prior_group=str(prior_group))
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,10 +91,12 @@ def _pools(part: pd.DataFrame) -> Iterator[_Pool]:
         yield _Pool(absence=kind, rows=part[present | (kinds == kind)])
 
 
-def _rows(pool: _Pool, text: str) -> Iterator[dict[str, Any]]:
+def _rows(pool: _Pool, *, matcher: str, rejector: str, track: str, prior_group: str) -> Iterator[Accepted]:
     part = pool.rows
     place, block, site = (codes_of(part[name]) for name in ("place", "block", "pair_id"))
-    drawn = BoardDraws.of(place, block, site, seed=seed_of_text(text), draws=SLOW_DRAWS)
+    drawn = BoardDraws.of(
+        place, block, site, seed=seed_of_text(f"{track}/{prior_group}/{pool.absence}"), draws=SLOW_DRAWS
+    )
     plain = answers_of(part)
     cases = [
         (mixture, cost_ratio, _shares(answers, mass, cost_ratio))
@@ -81,13 +105,23 @@ def _rows(pool: _Pool, text: str) -> Iterator[dict[str, Any]]:
         for cost_ratio in COST_RATIOS
     ]
     intervals = iter(share_intervals([share for *_, shares in cases for share in shares], site, drawn))
-    counts = {"n": len(part), "absent": int((~part["is_present"].astype(bool)).sum()), "places": len(set(place))}
     for mixture, cost_ratio, _ in cases:
-        found: dict[str, float] = {}
-        for name in SHARES:
-            one = next(intervals)
-            found |= {name: one.value, f"{name}_lo": one.lo, f"{name}_hi": one.hi}
-        yield {"mixture": mixture, "absence": pool.absence, "cost_ratio": cost_ratio, **counts, **found}
+        yield Accepted(
+            matcher=matcher,
+            rejector=rejector,
+            track=track,
+            prior_group=prior_group,
+            mixture=mixture,
+            absence=pool.absence,
+            cost_ratio=cost_ratio,
+            n=len(part),
+            absent=int((~part["is_present"].astype(bool)).sum()),
+            places=len(set(place)),
+            coverage=next(intervals),  # in the order of `_shares`
+            risk=next(intervals),
+            right_present=next(intervals),
+            absent_accepted=next(intervals),
+        )
 
 
 def _is_complete(plain: Answers, shifted: Answers) -> bool:
@@ -97,7 +131,7 @@ def _is_complete(plain: Answers, shifted: Answers) -> bool:
 
 
 def _shares(answers: Answers, mass: Floats, cost_ratio: float) -> list[Share]:
-    """Return the shares of `SHARES`, in their order."""
+    """Return coverage, risk, and what is accepted of present and of absent places."""
     accepted = accept_by_cost(answers, cost_ratio).astype(float)
     right, present = answers.is_right.astype(float), answers.is_present.astype(float)
     return [

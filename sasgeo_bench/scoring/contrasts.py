@@ -33,7 +33,6 @@ from sasgeo_bench.scoring.intervals import (
 from sasgeo_bench.scoring.metrics import THRESHOLDS, mean_of, primary_of
 from sasgeo_bench.scoring.rejection_rows import SLOW_DRAWS, answers_of
 from sasgeo_bench.scoring.verdicts import (
-    COLUMNS,
     LEAST_PLACES,
     LESS,
     LOWER,
@@ -454,8 +453,3 @@ def _with_countries(found: Finding, rows: pd.DataFrame, draws: Floats | None) ->
 def _around(first: Interval, second: Interval) -> Interval:
     """Return the interval around two; NaN counts as inside."""
     return Interval(value=first.value, lo=float(np.fmin(first.lo, second.lo)), hi=float(np.fmax(first.hi, second.hi)))
-
-
-def contrast_frame(findings: Sequence[Finding]) -> pd.DataFrame:
-    """Return findings as a table with a column per field, and what follows from them."""
-    return pd.DataFrame([item.to_row() for item in findings], columns=list(COLUMNS))

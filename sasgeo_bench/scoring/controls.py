@@ -2,9 +2,9 @@
 """Controls of a board, compared with what is known about them in advance; falsifiers of registered contrasts."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Final
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Annotated, Final
 
 import numpy as np
 import pandas as pd
@@ -13,10 +13,11 @@ from sasgeo_bench.errors import counted
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.contrasts import PRIMARY, Contrast, both_on, mean_finding
 from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.frames import MATCHER, Column, Schema, Shown, row_columns
 from sasgeo_bench.scoring.metrics import is_present, primary_of
 from sasgeo_bench.scoring.rows import UNRANKED, name_alone
 from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
-from sasgeo_bench.scoring.verdicts import LEAST_PLACES, Finding
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, LEAST_PLACES, Finding
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 
 ORACLE: Final = "oracle_pose"
@@ -32,20 +33,25 @@ _AT_CHANCE: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Result of one control, as "shuffled map at chance", for one matcher on n queries.
+    """Result of one control, as "shuffled map at chance", for one matcher on n queries."""
 
-    `found` counts right answers (a tie by its chance), or answers where none is expected. `expected` is their number by
-    chance, at least, or at most, as `control` says. `p` is the chance of as many or more under pure chance; NaN without
-    a test.
-    """
-
-    control: str
-    matcher: str
-    n: int
-    found: float
-    expected: float
-    p: float
-    holds: bool
+    control: Annotated[str, Shown("Queries whose right score is known beforehand", "control query")]
+    matcher: Annotated[str, MATCHER]
+    n: Annotated[int, "Its queries"]
+    found: Annotated[
+        float, Shown("How many were right, or were answered where none must be")
+    ]  # a tie counts by its chance
+    expected: Annotated[float, Shown("How many are right by guessing, or how many there must be")]
+    p: Annotated[
+        float, Shown("Chance of finding as many or more by guessing; a control fails below 0.0001")
+    ]  # NaN without a test
+    holds: Annotated[
+        bool,
+        Shown(
+            "held, or FAILED: then do not trust the rows of the matcher, nor the board if it is itself a control",
+            "outcome",
+        ),
+    ]
 
     @property
     def is_of_board(self) -> bool:
@@ -90,6 +96,9 @@ class Verdict:
         return f"{self.control}: {word} by {self.matcher}, {figures}"
 
 
+CONTROL_SCHEMA: Final = Schema("controls", row_columns(Verdict))
+
+
 def is_control(scores: pd.DataFrame) -> Bools:
     """Return a mask of the scored rows in the suite of controls."""
     return (scores["suite"] == CONTROLS).to_numpy(bool)
@@ -132,23 +141,6 @@ def knows_too_much(verdicts: Sequence[Verdict], matcher: str) -> str | None:
             guessed = f"where guessing is right {item.expected:.3g} times"
             return f'right {item.found:g} of {item.n} times at the control "{item.control}", {guessed}'
     return None
-
-
-def verdict_frame(verdicts: Sequence[Verdict]) -> pd.DataFrame:
-    """Return verdicts as a table with the columns of `Verdict`."""
-    columns = [field.name for field in fields(Verdict)]
-    return pd.DataFrame([{name: getattr(item, name) for name in columns} for item in verdicts], columns=columns)
-
-
-def verdicts_of(table: pd.DataFrame) -> list[Verdict]:
-    """Return the verdicts of a table of `verdict_frame`."""
-    kinds: dict[str, Callable[[Any], Any]] = {
-        **dict.fromkeys(("control", "matcher"), str),
-        "n": int,
-        **dict.fromkeys(("found", "expected", "p"), float),
-        "holds": bool,
-    }
-    return [Verdict(**{name: kind(row[name]) for name, kind in kinds.items()}) for row in table.to_dict("records")]
 
 
 def hits(scores: pd.DataFrame) -> Floats:
@@ -239,17 +231,12 @@ EVERY: Final = "all"  # suites, or kinds
 class Falsifier:
     """Result of a contrast on queries where its methods should not differ.
 
-    Parameters
-    ----------
-    contrast, suite, kind : str
-        "all" suites together, or one suite with a kind of falsifier, or "control" for the same places without stress.
-    finding : Finding
-        Result there; its p-values are not adjusted, since this is not part of the registered test.
+    The finding's p-values are not adjusted, since this is not part of the registered test.
     """
 
-    contrast: str
-    suite: str
-    kind: str
+    contrast: Annotated[str, "Name of the contrast"]
+    suite: Annotated[str, 'One suite, or "all" together']
+    kind: Annotated[str, 'A kind of falsifier, or "control": the same places without stress']
     finding: Finding
 
     @property
@@ -301,10 +288,17 @@ def _unstressed(frame: pd.DataFrame) -> "pd.Series[bool]":
 
 
 _TOLD: Final = (
-    *("first_value", "second_value", "difference", "lo", "hi", "lo_blocks", "hi_blocks"),
+    *("first", "second", "first_value", "second_value", "difference", "lo", "hi", "lo_blocks", "hi_blocks"),
     *("n", "blocks", "places", "first_only", "second_only"),
 )
-FALSIFIER_COLUMNS: Final = ("contrast", "suite", "kind", "first", "second", *_TOLD, "verdict")
+FALSIFIER_SCHEMA: Final = Schema(
+    "falsifiers",
+    (
+        *row_columns(Falsifier)[:3],
+        *(replace(CONTRAST_SCHEMA[name], source=f"finding.{name}") for name in _TOLD),
+        Column("verdict", str, "Whether the first gains where it should not"),
+    ),
+)
 
 
 def gains_without_stress(falsifiers: Sequence[Falsifier]) -> dict[str, bool]:
@@ -313,13 +307,3 @@ def gains_without_stress(falsifiers: Sequence[Falsifier]) -> dict[str, bool]:
     for item in falsifiers:  # the first of a contrast is of all its suites
         found.setdefault(item.contrast, item.finding.places >= LEAST_PLACES and item.finding.lo > 0)
     return found
-
-
-def falsifier_frame(found: Sequence[Falsifier]) -> pd.DataFrame:
-    """Return falsifiers as a table with the columns `FALSIFIER_COLUMNS`."""
-    rows = [
-        {name: getattr(item.finding, name) for name in ("first", "second", *_TOLD)}
-        | {"contrast": item.contrast, "suite": item.suite, "kind": item.kind, "verdict": item.verdict}
-        for item in found
-    ]
-    return pd.DataFrame(rows, columns=list(FALSIFIER_COLUMNS))

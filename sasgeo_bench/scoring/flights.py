@@ -6,9 +6,9 @@ A flight is the unit of all figures: its views are answered one after the other,
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,8 +20,10 @@ from sasgeo_bench.geometry.pose import reckon, wrap_deg
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.tracker import SIDE
 from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.frames import Schema, row_columns
 from sasgeo_bench.scoring.pose import first_pose
-from sasgeo_bench.scoring.score import COLUMNS, FIX_M, MISSING, NOT_APPLICABLE, truths_of
+from sasgeo_bench.scoring.rows import LEADERBOARD_SCHEMA
+from sasgeo_bench.scoring.score import COLUMNS, FIX_M, MISSING, NOT_APPLICABLE, Score, truths_of
 from sasgeo_bench.tasks.query import Head, Truth, base_of
 
 WITHIN_M: Final = (25.0, 10.0, 50.0)  # the first is the primary one
@@ -40,82 +42,72 @@ Complexes = NDArray[np.complex128]  # east + i north, metres
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightScore:
-    """What a scored row of a flight has besides `Score`; every view is in every figure, unless it says other views.
+    """What a scored row of a flight has besides `Score`; every view is in every figure, unless it says other views."""
 
-    Parameters
-    ----------
-    views : int
-        Number of views.
-    length_m : float
-        Flown between the first view and the last.
-    distance_within_10m, distance_within_25m, distance_within_50m : float
-        Share of the flown distance with an estimate so near, accepted or not. A view stands for half the way to either
-        neighbour.
-    reckoned_250m, reckoned_500m, reckoned_1000m, reckoned_2000m : float
-        Share within 25 m if, of the tracker's accepted fixes, one is used in so many metres at most and the odometer
-        says the rest; no part before the first fix. The tracker itself was shown every view.
-    accepted, right_accepted, false_accepted : float
-        Share of the views with an accepted fix; with one within 25 m; and with one beyond.
-    false_of_accepted : float
-        Share of the accepted fixes that are false; 0 where none is accepted.
-    right_per_km, false_per_km : float
-        Accepted fixes within 25 m, and beyond, over kilometres.
-    longest_without_fix_m : float
-        The longest stretch without an accepted fix within 25 m; the whole flight if there is none.
-    first_fix_m, first_fix_s : float
-        Distance and time to the first accepted fix within 25 m; infinite without one.
-    reacquired_m : float
-        The same distance from the first view after being carried, or else after the longest gap or stretch off the map,
-        of two views at least; NaN where the flight has none, or ends in it.
-    divergences : int
-        Number of stretches of more than 500 m with accepted fixes all beyond 100 m.
-    ate_m : float
-        Root mean square of the position errors of all views, nothing aligned; infinite if a view has no estimate.
-    error_p50_m, error_p95_m : float
-        Quantiles of the position errors of all views.
-    nees : float
-        Mean normalized estimation error squared of the views with an estimate, over its 3 degrees of freedom: 1 for an
-        honest covariance, more for an optimistic one. Infinite if an estimate has no covariance, or one without an
-        inverse.
-    nees_off : float
-        Its absolute logarithm: 0 for an honest covariance.
-    inside_95 : float
-        Share of the views with an estimate whose true position lies in its ellipse of 95 %; without one it does not.
-    odometer_drift : float
-        Of the odometer, not of the tracker: its mean error 500 m after a true pose, over the way flown, 1 at most; of
-        the stretches on which it was not lost and the drone not carried. NaN without such a stretch.
-    """
-
-    views: int
-    length_m: float
-    distance_within_25m: float
-    distance_within_10m: float
-    distance_within_50m: float
-    reckoned_250m: float
-    reckoned_500m: float
-    reckoned_1000m: float
-    reckoned_2000m: float
-    accepted: float
-    right_accepted: float
-    false_accepted: float
-    false_of_accepted: float
-    right_per_km: float
-    false_per_km: float
-    longest_without_fix_m: float
-    first_fix_m: float
-    first_fix_s: float
-    reacquired_m: float
-    divergences: int
-    ate_m: float
-    error_p50_m: float
-    error_p95_m: float
-    nees: float
-    nees_off: float
-    inside_95: float
-    odometer_drift: float
+    views: Annotated[int, "Number of views"]
+    length_m: Annotated[float, "Flown between the first view and the last"]
+    distance_within_25m: Annotated[
+        float,
+        "Share of the flown distance with an estimate within 25 m, accepted or not; a view stands for half the way to "
+        "either neighbour",
+    ]
+    distance_within_10m: Annotated[float, "The same within 10 m"]
+    distance_within_50m: Annotated[float, "The same within 50 m"]
+    reckoned_250m: Annotated[
+        float,
+        "Share within 25 m if, of the tracker's accepted fixes, one is used in 250 m at most and the odometer says the "
+        "rest; no part before the first fix. The tracker itself was shown every view",
+    ]
+    reckoned_500m: Annotated[float, "The same with one in 500 m"]
+    reckoned_1000m: Annotated[float, "The same with one in 1000 m"]
+    reckoned_2000m: Annotated[float, "The same with one in 2000 m"]
+    accepted: Annotated[float, "Share of the views with an accepted fix"]
+    right_accepted: Annotated[float, "Share of the views with one within 25 m"]
+    false_accepted: Annotated[float, "Share of the views with one beyond"]
+    false_of_accepted: Annotated[float, "Share of the accepted fixes that are false; 0 where none is accepted"]
+    right_per_km: Annotated[float, "Accepted fixes within 25 m over kilometres"]
+    false_per_km: Annotated[float, "Those beyond over kilometres"]
+    longest_without_fix_m: Annotated[
+        float, "The longest stretch without an accepted fix within 25 m; the whole flight if there is none"
+    ]
+    first_fix_m: Annotated[float, "Distance to the first accepted fix within 25 m; infinite without one"]
+    first_fix_s: Annotated[float, "Time to it"]
+    reacquired_m: Annotated[
+        float,
+        "The same distance from the first view after being carried, or else after the longest gap or stretch off the "
+        "map, of two views at least; NaN where the flight has none, or ends in it",
+    ]
+    divergences: Annotated[int, "Number of stretches of more than 500 m with accepted fixes all beyond 100 m"]
+    ate_m: Annotated[
+        float,
+        "Root mean square of the position errors of all views, nothing aligned; infinite if a view has no estimate",
+    ]
+    error_p50_m: Annotated[float, "Median of the position errors of all views"]
+    error_p95_m: Annotated[float, "Their 95th percentile"]
+    nees: Annotated[
+        float,
+        "Mean normalized estimation error squared of the views with an estimate, over its 3 degrees of freedom: 1 for "
+        "an honest covariance, more for an optimistic one. Infinite if an estimate has no covariance, or one without "
+        "an inverse",
+    ]
+    nees_off: Annotated[float, "Its absolute logarithm: 0 for an honest covariance"]
+    inside_95: Annotated[
+        float,
+        "Share of the views with an estimate whose true position lies in its ellipse of 95 %; without one it does not",
+    ]
+    odometer_drift: Annotated[
+        float,
+        "Of the odometer, not of the tracker: its mean error 500 m after a true pose, over the way flown, 1 at most; "
+        "of the stretches on which it was not lost and the drone not carried. NaN without such a stretch",
+    ]
 
 
-FLIGHT_COLUMNS: Final = tuple(field.name for field in fields(FlightScore))
+FLIGHT_COLUMNS: Final = tuple(column.name for column in row_columns(FlightScore))
+SCORE_SCHEMA: Final = Schema(
+    "scores",
+    (*row_columns(Score), *row_columns(FlightScore), LEADERBOARD_SCHEMA["matcher"]),
+    needed=("query_id", "matcher", "suite", "track", "kind", "role", "place", "is_present"),
+)
 _OF_HEAD: Final = ("query_id", "track", "suite", "suite_version", "part", "region", "prior_group", "view_cells")
 _OF_TRUTH: Final = ("pair_id", "role", "kind", "strength", "strength_unit", "block", "scene", "detector")
 _MEANS: Final = ("unknown_share", "changed_share", "feature_density")

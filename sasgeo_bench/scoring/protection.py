@@ -4,7 +4,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Annotated, Final
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.conformal import METHODS, RISKS, SCALE, level_name
 from sasgeo_bench.scoring.base import Bools, Floats, check_column, codes_of, weighted_mean
 from sasgeo_bench.scoring.decisions import stanford
+from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import LEVEL, Interval, effective_count, wilson_share
 from sasgeo_bench.scoring.rejection import turns
 from sasgeo_bench.scoring.score import FIX_M, NOT_APPLICABLE
@@ -141,12 +142,35 @@ ALERT_LIMITS_M: Final = (10.0, FIX_M, 50.0)
 CONFORMAL: Final = "conformal"  # the method whose levels are fitted here
 Strings = NDArray[np.str_]
 
-_AREAS: Final = ("available", "unavailable", "misleading", "hazardous", "exceeded")
-COLUMNS: Final = (
-    *("matcher", "prior_group", "method", "risk", "alert_limit_m", "n", "sites"),
-    *(f"{area}{end}" for area in _AREAS for end in ("", "_lo", "_hi")),
-    "supports",
-)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Protection:
+    """How the levels of one method held at one risk and alert limit."""
+
+    matcher: Annotated[str, MATCHER]
+    prior_group: Annotated[str, PRIOR_GROUP]
+    method: Annotated[str, Shown("How the level is computed")]
+    risk: Annotated[float, Shown("How often the error may exceed the level, as was promised")]
+    alert_limit_m: Annotated[float, "The error beyond which a fix is of no use"]
+    n: Annotated[int, "Queries"]
+    sites: Annotated[float, "Their sites, the trials of the intervals"]
+    available: Annotated[
+        Interval, Shown("Share of queries whose level is within the alert limit, with its 95 % interval")
+    ]
+    unavailable: Annotated[Interval, "Share of queries whose level is not, or without a level or an answer"]
+    misleading: Annotated[
+        Interval, Shown("Share that is available and has an error beyond its level, with its 95 % interval")
+    ]
+    hazardous: Annotated[
+        Interval, Shown("Share that is misleading and has an error beyond the alert limit, with its 95 % interval")
+    ]
+    exceeded: Annotated[
+        Interval, Shown("Share with an error beyond the level, available or not, with its 95 % interval")
+    ]
+    supports: Annotated[str, Shown("Risk that the misleading ones among the available support")]
+
+
+PROTECTION_SCHEMA: Final = Schema("protection", row_columns(Protection))
 
 
 def protection_frame(
@@ -159,12 +183,9 @@ def protection_frame(
     absent place has an infinite error. Intervals are Wilson's over sites. `supports` states which risk the counts
     support. `split` assigns the places that calibrate conformal levels; of a hold-out split the test part counts.
     """
-    rows = [
-        {"matcher": matcher, "prior_group": item.prior_group, **row}
-        for item in protection_levels(scores, predictions, split)
-        for row in _counted(item)
-    ]
-    return pd.DataFrame(rows, columns=list(COLUMNS))
+    return PROTECTION_SCHEMA.frame(
+        row for levels in protection_levels(scores, predictions, split) for row in _counted(matcher, levels)
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,19 +266,28 @@ def _conformal(
     return level_m, is_fitted
 
 
-def _counted(levels: ProtectionLevels) -> Iterator[dict[str, Any]]:
+def _counted(matcher: str, levels: ProtectionLevels) -> Iterator[Protection]:
     """Yield a row for each alert limit; none without queries."""
     if not len(levels.level_m):
         return
     sites = effective_count(codes_of(levels.sites))
     for limit_m in ALERT_LIMITS_M:
         counts = stanford_counts(levels.level_m, levels.error_m, limit_m, trials=sites)
-        row: dict[str, Any] = {"method": levels.method, "risk": levels.risk, "alert_limit_m": limit_m}
-        row |= {"n": len(levels.level_m), "sites": sites}
-        for area in _AREAS:
-            interval = getattr(counts, area)
-            row |= {area: interval.value, f"{area}_lo": interval.lo, f"{area}_hi": interval.hi}
         # The misleading among the available, both counted in sites.
         available = counts.available.value * sites
         misleading = min(counts.misleading.value * sites, available)
-        yield row | {"supports": statement(misleading, available, risk=levels.risk)}
+        yield Protection(
+            matcher=matcher,
+            prior_group=levels.prior_group,
+            method=levels.method,
+            risk=levels.risk,
+            alert_limit_m=limit_m,
+            n=len(levels.level_m),
+            sites=sites,
+            available=counts.available,
+            unavailable=counts.unavailable,
+            misleading=counts.misleading,
+            hazardous=counts.hazardous,
+            exceeded=counts.exceeded,
+            supports=statement(misleading, available, risk=levels.risk),
+        )

@@ -19,15 +19,14 @@ from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.running.failures import Failures
-from sasgeo_bench.scoring.acceptance import COLUMNS as ACCEPTANCE_COLUMNS
-from sasgeo_bench.scoring.acceptance import acceptance_frame
+from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA, acceptance_frame
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept
 from sasgeo_bench.scoring.integrity_metric import choose_absent_threshold, choose_threshold
 from sasgeo_bench.scoring.metrics import THRESHOLDS
 from sasgeo_bench.scoring.prior_shift import at_share
 from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows, shifted_column
-from sasgeo_bench.scoring.rows import to_frame
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, some_rows
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.texts import message_of
@@ -192,10 +191,6 @@ def own_confidence(scores: pd.DataFrame, split: Split | None = None, *, is_taugh
     if split is not None and split.spec.kind == "holdout":
         is_given &= (usable["part"] == "test").to_numpy(bool)
     return some_rows(usable.assign(p_right=p_right, **accepted), is_given)
-
-
-def _together(frames: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -380,9 +375,8 @@ def evaluate_rejectors(
             raise listed[0]
     for remark in remarks:
         tell(remark)
-    return RejectionResult(
-        judged=judged, rows=rows, acceptance=_together(accepted, ACCEPTANCE_COLUMNS), remarks=tuple(remarks)
-    )
+    acceptance = pd.concat(accepted, ignore_index=True) if accepted else ACCEPTANCE_SCHEMA.empty()
+    return RejectionResult(judged=judged, rows=rows, acceptance=acceptance, remarks=tuple(remarks))
 
 
 def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame] | Exception]:
@@ -396,7 +390,7 @@ def _evaluated(task: RejectionTask) -> dict[str, tuple[pd.DataFrame, pd.DataFram
                 rule = task.rules[name]
                 frame = judge(task.scores, task.predictions, rule.make, rule.split, is_taught=task.is_taught)
                 is_calibrated = rule.card.is_calibrated
-            figures = to_frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
+            figures = FIGURE_SCHEMA.frame(list(integrity_rows(task.matcher, name, frame, is_calibrated=is_calibrated)))
             taken = acceptance_frame(task.matcher, name, frame if is_calibrated else frame[:0])
             results[name] = frame, figures, taken
         except Exception as error:  # noqa: BLE001 - only this entry with this rejector is skipped

@@ -6,11 +6,21 @@ import os
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, fields
-from typing import Any, Final, NamedTuple, Self, TypeVar
+from typing import Annotated, Any, Final, NamedTuple, Self, TypeVar
 
 import pandas as pd
 
 from sasgeo_bench.files.plugins import YARDSTICK
+from sasgeo_bench.scoring.frames import (
+    MATCHER,
+    PRIOR_GROUP,
+    REJECTOR,
+    TRACK,
+    Column,
+    Schema,
+    Shown,
+    row_columns,
+)
 from sasgeo_bench.scoring.intervals import BoardInterval
 from sasgeo_bench.scoring.metric import Metric
 from sasgeo_bench.scoring.score import MISSING
@@ -41,31 +51,38 @@ class GroupKey(NamedTuple):
 class RowKey:
     """Matcher, queries and counts of a row; rows of one matcher on the same queries share them.
 
-    Parameters
-    ----------
-    matcher, rejector : str
-        Names; the rejector is "" for metrics that take every answer.
-    suite, track, prior_group, stratum : str
-        Set of queries. Values of two prior groups are never ranked against each other.
-    n : int
-        Queries in the denominator: all that the matcher was asked.
-    answered, missing : int
-        Of these: with an answer, and without any row.
-    blocks, places : int
-        Numbers of blocks and places of the queries.
+    The rejector is "" for metrics that take every answer.
     """
 
-    matcher: str
-    rejector: str = ""
-    suite: str
-    track: str
-    prior_group: str
-    stratum: str
-    n: int
-    answered: int
-    missing: int
-    blocks: int
-    places: int
+    matcher: Annotated[str, MATCHER]
+    rejector: Annotated[str, REJECTOR] = ""
+    suite: Annotated[str, Shown("What is done to a view or a map")]
+    track: Annotated[str, TRACK]
+    prior_group: Annotated[str, PRIOR_GROUP]
+    stratum: Annotated[
+        str,
+        Shown(
+            "Which of the suite's queries: a role, a kind of stress, one of its steps at one size of view, or a bin "
+            "of what was measured at the truth",
+            "part",
+        ),
+    ]
+    n: Annotated[
+        int,
+        Shown(
+            "Queries, or flights, in the denominator. Rows with different n do not compare: they are of different ones"
+        ),
+    ]
+    answered: Annotated[int, "Queries with an answer"]
+    missing: Annotated[int, Shown("Queries without a row; they count as misses")]
+    blocks: Annotated[
+        int,
+        Shown(
+            "Pieces of ground of about 1 km that the queries come from, and in how many places: intervals resample "
+            "places, then blocks in them"
+        ),
+    ]
+    places: Annotated[int, "Places of the queries"]
 
     @classmethod
     def of(cls, scores: pd.DataFrame, group: GroupKey, *, matcher: str, stratum: str, rejector: str = "") -> Self:
@@ -92,43 +109,38 @@ class RowKey:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row(RowKey):
-    """One metric of one matcher.
+    """One metric of one matcher; its definition is in `metrics.METRICS`."""
 
-    Parameters
-    ----------
-    metric, unit, better : str
-        Definition, see `metrics.Metric`.
-    value, lo, hi : float
-        The value and its 95 % interval by places; NaN if missing.
-    lo_blocks, hi_blocks : float
-        Its interval by blocks: of the places that were asked, rather than of places like them.
-    interval : str
-        What lies farthest out: "places" (bootstrap over places, then blocks, then sites), "blocks" (over blocks, then
-        sites: few places), "wilson" (Wilson's over sites: few sites, or nothing varies), or "".
-    is_applicable : bool
-        False if the matcher's card excludes the task; then there is no value.
-    rank_best, rank_worst : int
-        Rank interval among the ranked matchers; None for others, and with fewer than `LEAST_PLACES` places.
-    detectable : float
-        Least difference from the best rival that these queries can show (alpha 5 %, power 80 %); NaN without a rank.
-    """
-
-    metric: str
-    unit: str
-    better: str
-    value: float
-    lo: float = math.nan
-    hi: float = math.nan
-    lo_blocks: float = math.nan
-    hi_blocks: float = math.nan
-    interval: str = ""
-    is_applicable: bool = True
-    rank_best: int | None = None
-    rank_worst: int | None = None
-    detectable: float = math.nan
+    metric: Annotated[str, "Name of the metric"]
+    unit: Annotated[str, "Its unit; 1 for none"]
+    better: Annotated[str, "Which values are better: higher or lower ones"]
+    value: Annotated[float, "The value; NaN if missing"]
+    lo: Annotated[float, "Lower end of its 95 % interval by places; NaN if missing"] = math.nan
+    hi: Annotated[float, "Upper end of that"] = math.nan
+    lo_blocks: Annotated[
+        float, "Lower end of its interval by blocks: of the places that were asked, rather than of places like them"
+    ] = math.nan
+    hi_blocks: Annotated[float, "Upper end of that"] = math.nan
+    interval: Annotated[
+        str,
+        'What lies farthest out: "places" (bootstrap over places, then blocks, then sites), "blocks" (over blocks, '
+        'then sites: few places), "wilson" (Wilson\'s over sites: few sites, or nothing varies), or ""',
+    ] = ""
+    is_applicable: Annotated[bool, "False if the matcher's card excludes the task; then there is no value"] = True
+    rank_best: Annotated[
+        int | None, "Best rank it can have; missing of who is not ranked, and with fewer than `LEAST_PLACES` places"
+    ] = None
+    rank_worst: Annotated[int | None, "Worst rank it can have"] = None
+    detectable: Annotated[
+        float,
+        Shown(
+            "Smallest difference from the best other matcher that so many places can show (5 %, power 80 %); inf if "
+            "none, - where nobody is ranked"
+        ),
+    ] = math.nan
 
 
-COLUMNS: Final = tuple(field.name for field in fields(Row))
+FIGURE_SCHEMA: Final = Schema("leaderboard", row_columns(Row))
 
 
 def in_threads(
@@ -170,37 +182,40 @@ def bare(value: float) -> BoardInterval:
     return BoardInterval(value=value)
 
 
-def to_frame(rows: list[Row]) -> pd.DataFrame:
-    """Return rows as a table with the columns of `Row`."""
-    frame = pd.DataFrame({name: [getattr(row, name) for row in rows] for name in COLUMNS}, columns=list(COLUMNS))
-    return frame.astype(dict.fromkeys(("rank_best", "rank_worst"), "Int64"))  # integers or missing
-
-
 @dataclass(frozen=True, slots=True)
 class EntryLabel:
-    """Shared fields of an entry's rows: version, hash of code and settings ("" for a file), source of the answers.
+    """Shared fields of an entry's rows; `set_apart` is None if it is ranked."""
 
-    `set_apart` is the reason for excluding it from ranks; None if it is ranked.
-    """
+    version: Annotated[str, "Version of the matcher"]
+    hash: Annotated[str, "Hash of its code and settings; missing of a file of answers"]
+    how: Annotated[str, "Where the answers come from"]
+    set_apart: Annotated[str | None, "Why it is excluded from ranks; missing if it is not"] = None
 
-    version: str
-    hash: str
-    how: str
-    set_apart: str | None = None
+
+LEADERBOARD_SCHEMA: Final = Schema(
+    FIGURE_SCHEMA.name,
+    (
+        FIGURE_SCHEMA["matcher"],
+        *row_columns(EntryLabel)[:3],
+        Column("is_control", bool, "It shows what a figure means that nobody earned, and has no rank"),
+        *row_columns(EntryLabel)[3:],
+        *FIGURE_SCHEMA.columns[1:],
+    ),
+    needed=FIGURE_SCHEMA.names,
+    is_required=True,
+)
 
 
 def with_entry_labels(board: pd.DataFrame, contestants: Mapping[str, EntryLabel]) -> pd.DataFrame:
-    """Return the board with the columns version, hash, how, is_control and set_apart after the matcher.
-
-    The hash is missing for a file, and `set_apart` for ranked entries.
-    """
-    board = board.copy()
-    for at, name in enumerate(("version", "hash", "how")):
-        board.insert(1 + at, name, [getattr(contestants[matcher], name) or None for matcher in board["matcher"]])
-    board.insert(4, "is_control", board["matcher"].map(is_unranked).astype(bool))
-    reasons = [contestants[matcher].set_apart for matcher in board["matcher"]]
-    board.insert(5, "set_apart", pd.Series(reasons, index=board.index, dtype=object))
-    return board
+    """Return figures with the labels of their matchers, as the columns of `LEADERBOARD_SCHEMA`."""
+    labels = [contestants[matcher] for matcher in board["matcher"]]
+    texts = {
+        name: pd.Series([getattr(label, name) or None for label in labels], index=board.index)
+        for name in ("version", "hash", "how")
+    }
+    is_control = board["matcher"].map(is_unranked).astype(bool)
+    set_apart = pd.Series([label.set_apart for label in labels], index=board.index, dtype=object)
+    return board.assign(**texts, is_control=is_control, set_apart=set_apart)[list(LEADERBOARD_SCHEMA.names)]
 
 
 def is_apart(board: pd.DataFrame) -> "pd.Series[bool]":

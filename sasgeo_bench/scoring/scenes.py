@@ -10,7 +10,7 @@ import pandas as pd
 
 from sasgeo_bench.regions.region_spec import Scene
 from sasgeo_bench.scoring.base import Bools
-from sasgeo_bench.scoring.rows import is_unranked, to_frame
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, is_unranked
 from sasgeo_bench.scoring.strata import ALL, STRESS, is_counted, primary_rows, step_name
 from sasgeo_bench.scoring.tables import asked_alike, leaderboard
 from sasgeo_bench.tasks.query import BY
@@ -50,7 +50,7 @@ def scene_frame(scores: Mapping[str, pd.DataFrame], *, draws: int, excluded: Col
     ranked = {name: rows for name, rows in scores.items() if not is_unranked(name) and name not in excluded}
     some = {name: rows[is_as_used(rows)] for name, rows in ranked.items()}
     found = [leaderboard(alike, draws=draws, parts=scene_parts) for alike in asked_alike(some)]
-    rows = primary_rows(pd.concat(found, ignore_index=True)) if found else to_frame([])
+    rows = primary_rows(pd.concat(found, ignore_index=True)) if found else FIGURE_SCHEMA.empty()
     return rows.assign(stratum=rows["stratum"].where(rows["stratum"].isin(SCENES), ALL)).reset_index(drop=True)
 
 

@@ -3,7 +3,7 @@
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from typing import Final, Self
+from typing import Annotated, Final, Self
 
 import numpy as np
 import pandas as pd
@@ -14,6 +14,7 @@ from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import AnswerColumns, predictions_of, table_of
 from sasgeo_bench.scoring.base import Bools, Floats, Ints
+from sasgeo_bench.scoring.frames import PRIOR_GROUP, TRACK, Shown, row_columns
 from sasgeo_bench.scoring.pose import check_candidate, columns_of, pose_errors, rank_candidate, ranks_of_lists
 from sasgeo_bench.tasks.query import CEILING, COPIES, SEQUENCE, Head, Truth, base_of
 
@@ -28,79 +29,63 @@ RETRIEVAL: Final = "retrieval"  # the track
 class Score:
     """One scored query of one matcher.
 
-    Parameters
-    ----------
-    query_id, track, suite, suite_version, part, region, prior_group, view_cells, cell_size_m
-        Of the query.
-    pool : int
-        Number of candidates; 0 for localization.
-    place, country : str
-        Unit of the split, the region without a split; the country that the split gives it, else the place.
-    block, pair_id, role, kind, strength, strength_unit, scene
-        Of the truth; so are unknown_share, changed_share, feature_density, alias_index and detector.
-    is_present : bool
-        The place is on the map.
-    status : str
-        Of the prediction, or "missing". "not applicable" must cover all queries of a suite, track and prior group, so
-        that a submission cannot choose its queries.
-    ceiling : float
-        The most that any matcher can expect of the primary metric: 0 for an absent place, 1 in k where k places are the
-        same, else 1.
-    is_answered : bool
-        There is a fix that could be accepted.
-    above, tied, right : int
-        Rank of the right candidate (`pose.Rank`); 0, 0, 0 for a miss and for localization.
-    position_error_m, yaw_error_deg, log_scale_error : float
-        Of the first pose, for localization of a present place; infinite without an answer, else NaN.
-    is_right : bool
-        The fix lies within `FIX_M` of the true position (Eq. 12); never for an absent place. In retrieval too: a wrong
-        candidate within that distance is no hit, but no false fix either.
-    confidence : float
-        Of the prediction; NaN if missing.
-    latency_s : float
-        NaN if unknown.
+    What a column says of the query, of the truth or of the prediction is said there.
     """
 
-    query_id: str
-    track: str
-    suite: str
-    suite_version: int
-    part: str
-    region: str
-    place: str
-    country: str
-    block: str
-    prior_group: str
-    view_cells: int
-    cell_size_m: float
-    pool: int
-    pair_id: str
-    role: str
-    kind: str
-    strength: float
-    strength_unit: str
-    unknown_share: float
-    changed_share: float
-    feature_density: float | None
-    alias_index: float | None
-    scene: str
-    detector: str
-    is_present: bool
-    status: str
-    ceiling: float
-    is_answered: bool
-    above: int
-    tied: int
-    right: int
-    position_error_m: float
-    yaw_error_deg: float
-    log_scale_error: float
-    is_right: bool
-    confidence: float
-    latency_s: float
+    query_id: Annotated[str, "Id of the query"]
+    track: Annotated[str, TRACK]
+    suite: Annotated[str, "Suite of the query"]
+    suite_version: Annotated[int, "Its version"]
+    part: Annotated[str, "Part of the split, of the query"]
+    region: Annotated[str, "Region of the query"]
+    place: Annotated[str, "Unit of the split, the region without a split"]
+    country: Annotated[str, "Country that the split gives the place, else the place"]
+    block: Annotated[str, "Block of the truth"]
+    prior_group: Annotated[str, PRIOR_GROUP]
+    view_cells: Annotated[int, "Side of the view, in cells"]
+    cell_size_m: Annotated[float, "Side of a cell"]
+    pool: Annotated[int, "Number of candidates; 0 for localization"]
+    pair_id: Annotated[str, "Site, which queries of the same ground share"]
+    role: Annotated[str, "Stress, control or falsifier"]
+    kind: Annotated[str, Shown("Kind of stress, or of its absence")]
+    strength: Annotated[float, "Strength of the stress"]
+    strength_unit: Annotated[str, "Unit of the strength"]
+    unknown_share: Annotated[float, "Share of the view of which nothing is known"]
+    changed_share: Annotated[float, "Share of the map that was changed there"]
+    feature_density: Annotated[float | None, "Share of the map that has something there"]
+    alias_index: Annotated[float | None, "How alike the likest other place is"]
+    scene: Annotated[str, "Kind of place"]
+    detector: Annotated[str, "Detector that made the evidence"]
+    is_present: Annotated[bool, "The place is on the map"]
+    status: Annotated[
+        str,
+        'Of the prediction, or "missing"; "not applicable" must cover all queries of a suite, track and prior group, '
+        "so that a submission cannot choose its queries",
+    ]
+    ceiling: Annotated[
+        float,
+        "The most that any matcher can expect of the primary metric: 0 for an absent place, 1 in k where k places are "
+        "the same, else 1",
+    ]
+    is_answered: Annotated[bool, "There is a fix that could be accepted"]
+    above: Annotated[int, "Candidates that are scored above the right one; 0 for a miss and for localization"]
+    tied: Annotated[int, "Candidates with its score, itself included; 0 as above"]
+    right: Annotated[int, "How many of these are right; 0 as above"]
+    position_error_m: Annotated[
+        float, "Of the first pose, for localization of a present place; infinite without an answer, else NaN"
+    ]
+    yaw_error_deg: Annotated[float, "Error of its heading"]
+    log_scale_error: Annotated[float, "Error of the logarithm of its scale"]
+    is_right: Annotated[
+        bool,
+        "The fix lies within 25 m of the true position (Eq. 12); never for an absent place. In retrieval, too: a wrong "
+        "candidate so near is no hit, but no false fix either",
+    ]
+    confidence: Annotated[float, "Of the prediction; NaN if missing"]
+    latency_s: Annotated[float, "Time of the answer; NaN if unknown"]
 
 
-COLUMNS: Final = tuple(field.name for field in fields(Score))
+COLUMNS: Final = tuple(column.name for column in row_columns(Score))
 _HEAD_COLUMNS: Final = tuple(field.name for field in fields(Head) if field.name in COLUMNS)
 _TRUTH_COLUMNS: Final = tuple(
     field.name for field in fields(Truth) if field.name in COLUMNS and field.name not in _HEAD_COLUMNS

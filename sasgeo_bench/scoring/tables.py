@@ -20,7 +20,7 @@ from sasgeo_bench.scoring.draws import DRAWS, seed_of_text
 from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, amount_interval, widest_intervals, wilson_ends
 from sasgeo_bench.scoring.metric import MeanMetric, QuantileMetric
 from sasgeo_bench.scoring.metrics import COSTS, means_of, primary_of, quantiles_of
-from sasgeo_bench.scoring.rows import ALL_SUITES, GroupKey, Row, RowKey, bare, in_threads, is_unranked, to_frame
+from sasgeo_bench.scoring.rows import ALL_SUITES, FIGURE_SCHEMA, GroupKey, Row, RowKey, bare, in_threads, is_unranked
 from sasgeo_bench.scoring.score import MISSING, NOT_APPLICABLE
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, strata
 from sasgeo_bench.scoring.verdicts import LEAST_PLACES
@@ -45,7 +45,7 @@ def leaderboard(
     strata of the queries of one of these. Raise MetricError if two matchers were scored on different queries.
     """
     if not scored:
-        return to_frame([])
+        return FIGURE_SCHEMA.empty()
     first = next(iter(scored))
     orders = {name: np.argsort(frame["query_id"].to_numpy(object), kind="stable") for name, frame in scored.items()}
     queries = scored[first][["query_id", *GROUP]].iloc[orders[first]]
@@ -60,7 +60,7 @@ def leaderboard(
         frames = {name: frame.iloc[orders[name][places[key]]] for name, frame in scored.items()}
         return _rows_of_group(GroupKey(*key), frames, draws, unranked, parts)
 
-    return to_frame(in_threads(rows_of, sorted(places), done))
+    return FIGURE_SCHEMA.frame(in_threads(rows_of, sorted(places), done))
 
 
 def leaderboards(
@@ -333,4 +333,4 @@ def cost_figures(matcher: str, costs: Costs) -> pd.DataFrame:
         mine = replace(costs, scores=part)
         key = RowKey.of(part, GroupKey(ALL_SUITES, track, "all"), matcher=matcher, stratum="all")
         rows += [key.row(one, bare(one.compute(mine))) for one in COSTS if one.is_by_track == (track != "all")]
-    return to_frame(rows)
+    return FIGURE_SCHEMA.frame(rows)

@@ -3,10 +3,11 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from typing import Final, Literal, Self
+from dataclasses import dataclass, replace
+from typing import Annotated, Final, Literal
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.scoring.frames import Column, Schema, Shown, row_columns
 
 ALPHA: Final = 0.05
 # With fewer clusters there are no ranks and no decisions: an exact sign test cannot reach 5 %, since 2 / 2^5 > 5 %.
@@ -88,69 +89,57 @@ def unreachable(name: str, metric: ContrastMetric, *, gain: float, least: float)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """Result of a contrast.
+    """Result of a contrast."""
 
-    Parameters
-    ----------
-    name, first, second, metric : str
-        Of the contrast.
-    n, blocks, places, countries : int
-        Queries and their clusters; places are the unit of intervals and tests. Fewer than `LEAST_PLACES` decide
-        nothing.
-    first_value, second_value : float
-        The metric of both sides.
-    best : float
-        The best value that the first side could have on these queries: the mean ceiling, or that of a perfect order.
-    difference, lo, hi, lo_blocks, hi_blocks, lo_countries, hi_countries : float
-        First less second, its paired 95 % interval by places, by blocks, and by countries where the split names some;
-        NaN without draws.
-    first_only, second_only : int
-        Discordant queries: better for one side only; 0 for areas.
-    p_exact, p_clustered, p_places, p_holm : float
-        McNemar's exact test, which assumes independent queries; Obuchowski's for blocks; the sign-flip test over
-        places; the latter adjusted by Holm over all registered contrasts. The first two are NaN where they do not
-        apply.
-    detectable : float
-        Least difference that as many places can show; NaN for areas and for too few places.
-    least : float
-        Least difference that matters, in units of the metric.
-    is_lower_better : bool
-        The metric is one of which less is better.
-    note : str
-        Why it was not tested or decided, if a side failed or there is no query.
-    gains_without_stress : bool
-        The first side is better without the stress, too, so the stress is not shown to be the cause.
-    """
-
-    name: str
-    first: str
-    second: str
-    metric: str
-    n: int = 0
-    blocks: int = 0
-    places: int = 0
-    countries: int = 0
-    first_value: float = math.nan
-    second_value: float = math.nan
-    best: float = math.nan
-    difference: float = math.nan
-    lo: float = math.nan
-    hi: float = math.nan
-    lo_blocks: float = math.nan
-    hi_blocks: float = math.nan
-    lo_countries: float = math.nan
-    hi_countries: float = math.nan
-    first_only: int = 0
-    second_only: int = 0
-    p_exact: float = math.nan
-    p_clustered: float = math.nan
-    p_places: float = math.nan
-    p_holm: float = math.nan
-    detectable: float = math.nan
-    least: float = math.nan
-    is_lower_better: bool = False
-    note: str = ""
-    gains_without_stress: bool = False
+    name: Annotated[str, Shown("Pair of entries that was registered before anything was run", "contrast")]
+    first: Annotated[str, Shown("First entry of the pair, and what it reaches")]
+    second: Annotated[str, Shown("Second entry of the pair, and what it reaches")]
+    metric: Annotated[str, "What is compared"]
+    n: Annotated[int, "Queries"] = 0
+    blocks: Annotated[int, "Their blocks"] = 0
+    places: Annotated[
+        int, "Their places, the unit of intervals and tests; fewer than `LEAST_PLACES` decide nothing"
+    ] = 0
+    countries: Annotated[int, "Their countries"] = 0
+    first_value: Annotated[float, "The metric of the first side"] = math.nan
+    second_value: Annotated[float, "The metric of the second side"] = math.nan
+    best: Annotated[
+        float,
+        "The best value that the first side could have on these queries: the mean ceiling, or that of a perfect order",
+    ] = math.nan
+    difference: Annotated[float, Shown("First less second on the same queries, with its 95 % interval by places")] = (
+        math.nan
+    )
+    lo: Annotated[float, "Lower end of its 95 % interval by places; NaN without draws"] = math.nan
+    hi: Annotated[float, "Upper end of that"] = math.nan
+    lo_blocks: Annotated[float, "Lower end of its interval by blocks"] = math.nan
+    hi_blocks: Annotated[float, "Upper end of that"] = math.nan
+    lo_countries: Annotated[float, "Lower end of its interval by countries, where the split names some"] = math.nan
+    hi_countries: Annotated[float, "Upper end of that"] = math.nan
+    first_only: Annotated[int, "Discordant queries: better for the first side only; 0 for areas"] = 0
+    second_only: Annotated[int, "Those that are better for the second side only"] = 0
+    p_exact: Annotated[
+        float, "McNemar's exact test, which assumes independent queries; NaN where it does not apply"
+    ] = math.nan
+    p_clustered: Annotated[float, "Obuchowski's test for blocks; NaN where it does not apply"] = math.nan
+    p_places: Annotated[float, "The sign-flip test over places"] = math.nan
+    p_holm: Annotated[
+        float,
+        Shown(
+            "Chance of a difference as large if there were none, by flipping the sides of whole places; adjusted by "
+            "Holm for the number of registered contrasts",
+            "p (Holm)",
+        ),
+    ] = math.nan
+    detectable: Annotated[
+        float, "Least difference that as many places can show; NaN for areas and for too few places"
+    ] = math.nan
+    least: Annotated[float, Shown("The least difference that was registered as mattering", "matters")] = math.nan
+    is_lower_better: Annotated[bool, "The metric is one of which less is better"] = False
+    note: Annotated[str, "Why it was not tested or decided, if a side failed or there is no query"] = ""
+    gains_without_stress: Annotated[
+        bool, "The first side is better without the stress, too, so the stress is not shown to be the cause"
+    ] = False
 
     @property
     def attainable(self) -> float:
@@ -246,17 +235,31 @@ class Finding:
             return "not decided: one that matters is ruled out by places, not by countries"
         return "not decided: no difference shown, and one that matters is not ruled out"
 
-    def to_row(self) -> dict[str, object]:
-        """Return all fields and what follows from them, as a row of `contrasts.parquet`."""
-        return {name: getattr(self, name) for name in COLUMNS}
 
-    @classmethod
-    def of_row(cls, row: Mapping[str, object]) -> Self:
-        """Return the finding of a row of `to_row`."""
-        return cls(**{field.name: row[field.name] for field in fields(cls)})  # type: ignore[arg-type]
-
-
-COLUMNS: Final = (*(field.name for field in fields(Finding)), "attainable", "gained_share", "outcome", "verdict")
+CONTRAST_SCHEMA: Final = Schema(
+    "contrasts",
+    (
+        *row_columns(Finding),
+        Column(
+            "attainable",
+            float,
+            "The most by which the first could be better than the second: up to the ceiling of these queries, or to a "
+            "perfect order",
+            "attainable",
+        ),
+        Column("gained_share", float, "What the first gains, as a share of what it could gain; negative for a loss"),
+        Column("outcome", str, "The verdict in a word"),
+        Column(
+            "verdict",
+            str,
+            "Which is better at 5 %, and whether by as much as matters; null where a difference that matters is ruled "
+            "out; cause open where the first gains without the stress, too; not decided where neither is shown, where "
+            f"less can be gained than was to matter, and with fewer than {LEAST_PLACES} places",
+            "verdict",
+        ),
+    ),
+    needed=(*(column.name for column in row_columns(Finding)), "outcome", "verdict"),
+)
 
 
 def with_causes(findings: tuple[Finding, ...], gains: Mapping[str, bool]) -> tuple[Finding, ...]:

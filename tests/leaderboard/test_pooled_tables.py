@@ -23,7 +23,7 @@ from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.rejection import own_confidence
 from sasgeo_bench.scoring.rejection_rows import integrity_rows
-from sasgeo_bench.scoring.rows import to_frame
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks.query import Truth
 from tests.scoring.test_tables import scores
@@ -117,7 +117,7 @@ def test_a_curve_of_costs_passes_through_the_figures_of_the_board():
     frame = answered(np.where(AT % 3 == 0, 300.0, 4.0)).assign(is_right=AT % 3 > 0)
     frame = frame.assign(confidence=np.where(AT % 3, 0.97, 0.4), is_answered=True)
     judged = {("one", "own"): own_confidence(frame)}
-    board = to_frame(list(integrity_rows("one", "own", judged["one", "own"])))
+    board = FIGURE_SCHEMA.frame(list(integrity_rows("one", "own", judged["one", "own"])))
     rows = cost_frame(judged, {("one", "own")}, ["one"])
     for ratio in COST_RATIOS:
         said = board[(board["metric"] == f"cost_{ratio:g}_place") & (board["suite"] == "all suites")]["value"].iloc[0]

@@ -10,7 +10,7 @@ import pytest
 from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.leaderboard.board_files import BOARD
 from sasgeo_bench.publishing.elsewhere import asked_elsewhere, elsewhere_lines, elsewhere_tables
-from sasgeo_bench.scoring.rows import Row, to_frame
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, Row
 from tests.handmade import entry_of, put_board
 
 KEY = ("clean", "localization", "r500-weak-s3")
@@ -22,7 +22,7 @@ def stored(folder: Path, shares: dict[str, float], asked: list[str | None]) -> P
     facts |= {"n": 2, "answered": 2, "missing": 0, "blocks": 2, "places": 2, "unit": "1", "better": "higher"}
     ends = {"lo": 0.0, "hi": 1.0, "interval": "places", "rejector": ""}
     rows = [Row(matcher=name, value=value, **facts, **ends) for name, value in shares.items()]
-    put_board(folder, table=to_frame(rows), entries=[entry_of(name) for name in shares])
+    put_board(folder, table=FIGURE_SCHEMA.frame(rows), entries=[entry_of(name) for name in shares])
     (folder / "pack.json").write_text("{}", encoding="utf-8")
     queries = pd.DataFrame({"asked_sha256": asked}, dtype="string")
     for name, value in zip(("suite", "track", "prior_group"), KEY, strict=True):

@@ -25,10 +25,9 @@ from sasgeo_bench.publishing.site_maps import place_maps
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import Case, Pictures, RegionMap, SiteSource, Spot
-from sasgeo_bench.scoring.contrasts import contrast_frame
-from sasgeo_bench.scoring.controls import Falsifier, falsifier_frame
-from sasgeo_bench.scoring.rows import ALL_SUITES, Row, to_frame
-from sasgeo_bench.scoring.verdicts import Finding
+from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, Falsifier
+from sasgeo_bench.scoring.rows import ALL_SUITES, FIGURE_SCHEMA, Row
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
 from tests.handmade import BOUNDS_M, HOSTILE, MARKUP, about_of, answers_of, card_of, entry_of, many_rows
 
 FINDING = Finding(
@@ -60,7 +59,7 @@ def source(table=None, findings=(), entries=(), **changes):
     board = many_rows(6) if table is None else table
     about = about_of([entry_of(name, **said) for name, said in dict(entries).items()])
     made = SiteSource(name="mine", title="Mine", about=about, board=board, rates=load_ratebook())
-    return replace(made, contrasts=contrast_frame(findings), **changes)
+    return replace(made, contrasts=CONTRAST_SCHEMA.frame(findings), **changes)
 
 
 def book_of(given):
@@ -259,7 +258,7 @@ def test_rejectors_of_controls_come_last_however_good_their_order_is():
     rows = [
         Row(matcher=name[0], rejector=name[1], metric="aurc", value=value, **facts) for name, value in areas.items()
     ]
-    (table,) = rejection_tables(to_frame(rows))
+    (table,) = rejection_tables(FIGURE_SCHEMA.frame(rows))
     assert [(row.cells[0].text, row.tone) for row in table.rows] == [
         ("graph", "plain"),
         ("raster", "plain"),
@@ -283,7 +282,7 @@ def test_of_each_ranked_matcher_the_rejector_with_the_best_order_says_what_is_an
         for name, values in figures.items()
         for metric, value in zip(metrics, values, strict=True)
     ]
-    (table,) = risk_tables(to_frame(rows))
+    (table,) = risk_tables(FIGURE_SCHEMA.frame(rows))
     assert [[cell.text for cell in row.cells][:2] for row in table.rows] == [["graph", "own"], ["raster", "margin"]]
     assert [[text_of(cell) for cell in row.cells][2:] for row in table.rows] == [
         ["0.800", "0.040", "-", "9"],
@@ -301,9 +300,9 @@ def test_whether_the_risk_was_kept_is_said_by_its_interval_and_where_it_was_not_
         Row(metric="risk_reached_at_0.05", value=0.2, suite="all suites", stratum="present 0.5", **facts),
         Row(metric="risk_reached_at_0.05", value=0.3, suite="twins", stratum="as drawn", **facts),
     ]
-    (table,) = risk_tables(to_frame(rows))
+    (table,) = risk_tables(FIGURE_SCHEMA.frame(rows))
     assert table.rows[0].cells[4].text == "open"
-    (table,) = risk_tables_by_suite(to_frame(rows))
+    (table,) = risk_tables_by_suite(FIGURE_SCHEMA.frame(rows))
     said = {one.name: text_of(cell) for one, cell in zip(table.columns, table.rows[0].cells, strict=True)}
     assert said | {"50 % of places absent": "0.200", "30 % of places absent": "-", "twins": "0.300"} == said
 
@@ -319,14 +318,14 @@ def test_a_contrast_says_how_both_fare_where_they_should_not_differ():
         Falsifier(contrast="other", suite="all", kind="all", finding=FINDING),
     ]
     gained = replace(FINDING, gains_without_stress=True)
-    (told,) = contrasts_of(source(findings=[gained], falsifiers=falsifier_frame(rows)))
+    (told,) = contrasts_of(source(findings=[gained], falsifiers=FALSIFIER_SCHEMA.frame(rows)))
     assert told.unstressed.startswith("Without the stress, where they should not differ: ")
     assert "(n = 80, 9 blocks). What it gains there is not owed" in told.unstressed
     assert told.outcome == "cause open"
     (silent,) = contrasts_of(source(findings=[FINDING]))
     assert silent.unstressed == ""
     none = replace(rows[0], finding=replace(FINDING, lo=-0.1))
-    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=falsifier_frame([none])))
+    (told,) = contrasts_of(source(findings=[FINDING], falsifiers=FALSIFIER_SCHEMA.frame([none])))
     assert "no gain shown" in told.unstressed
     assert "not owed" not in told.unstressed
     assert told.outcome == "decided"

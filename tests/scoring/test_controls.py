@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Verdicts on controls: what must be at chance, perfect or withheld, and that each can fail."""
 
-import math
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +14,6 @@ from sasgeo_bench.scoring.controls import (
     hits,
     hold_controls,
     knows_too_much,
-    verdict_frame,
 )
 from sasgeo_bench.tasks.query import BLIND, NOISE_FREE, SHUFFLED, TURNED, TWINS
 
@@ -161,18 +158,3 @@ def test_a_rival_that_fails_a_control_spoils_its_own_rows_alone():
         'right 8 of 8 times at the control "shuffled map at chance", where guessing is right 0.8 times'
     )
     assert knows_too_much(verdicts, "yours 2 (ab12cd)") is None
-
-
-def test_verdicts_become_a_table():
-    table = verdict_frame(hold_controls({"mine": rows(BLIND, [0], is_answered=False)}))
-    assert table.iloc[0].to_dict() | {"p": 0} == {
-        "control": "blind views withheld",
-        "matcher": "mine",
-        "n": 1,
-        "found": 0.0,
-        "expected": 0.0,
-        "p": 0,
-        "holds": True,
-    }
-    assert math.isnan(table["p"].iloc[0])
-    assert next(iter(verdict_frame([]).columns)) == "control"

@@ -14,7 +14,7 @@ from sasgeo_bench.scoring.integrity_metric import aurc
 from sasgeo_bench.scoring.intervals import bootstrap_statistic, percentile_interval, wilson
 from sasgeo_bench.scoring.rejection import OWN, own_confidence, turns, why_not
 from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows
-from sasgeo_bench.scoring.rows import to_frame
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA
 from sasgeo_bench.tasks.split import SplitFile, make_split
 from tests.scoring.test_tables import scores as one_place_a_block
 
@@ -28,7 +28,7 @@ def scores(errors_m, **changes):
 
 
 def rows_of(table, split=None):
-    return to_frame(list(integrity_rows("mine", OWN, own_confidence(table, split))))
+    return FIGURE_SCHEMA.frame(list(integrity_rows("mine", OWN, own_confidence(table, split))))
 
 
 def pooled(table, split=None):

@@ -19,7 +19,7 @@ from sasgeo_bench.scoring.cost import Costs
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.scoring.rejection import own_confidence
 from sasgeo_bench.scoring.rejection_rows import integrity_rows
-from sasgeo_bench.scoring.rows import COLUMNS, EntryLabel, to_frame, with_entry_labels
+from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, with_entry_labels
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
 from sasgeo_bench.scoring.tables import cost_figures, leaderboard
@@ -96,7 +96,6 @@ def ranks(row):
 
 def test_figures_are_what_they_are_by_hand():
     board = leaderboard({"mine": scores([1.0, 8.0, 20.0, 40.0, math.inf, 25.0, 25.1, 5.0])}, draws=200)
-    assert tuple(board.columns) == COLUMNS
     assert pick(board, "mine", "success_25m")["value"] == 5 / 8
     assert pick(board, "mine", "success_10m")["value"] == 3 / 8
     assert pick(board, "mine", "success_5m")["value"] == 2 / 8
@@ -362,7 +361,7 @@ def test_the_board_says_what_each_of_its_columns_is():
     tables["mine"]["is_right"] &= tables["mine"]["is_present"]
     views = dict.fromkeys(tables["mine"]["query_id"], 1)
     costs = cost_figures("mine", Costs(scores=tables["mine"], runs=[], view_bytes=views, area_km2={}))
-    rows = to_frame(list(integrity_rows("mine", "own", own_confidence(tables["mine"]))))
+    rows = FIGURE_SCHEMA.frame(list(integrity_rows("mine", "own", own_confidence(tables["mine"]))))
     board = pd.concat([leaderboard(tables, draws=200), costs, rows], ignore_index=True)
     text = board_markdown(board, ABOUT).split("## How to read")[1]
     terms = {line.split("**")[1] for line in text.splitlines() if line}
@@ -392,7 +391,7 @@ def test_one_of_something_is_told_in_the_singular():
 
 
 def test_a_board_of_nothing_is_an_empty_table():
-    assert to_frame([]).empty
+    assert FIGURE_SCHEMA.frame([]).empty
     assert leaderboard({}).empty
     assert warnings_of(leaderboard({})) == []
 

@@ -2,7 +2,7 @@
 """The tables behind the figures of a board: one row for each point, bar or cell that is drawn."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -104,6 +104,15 @@ def stress_frame(table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
 # --- what is known of the answers -------------------------------------------------------------------------------------
 
 
+class JudgedKey(NamedTuple):
+    """Whose answers, of which queries, by which rejector."""
+
+    track: str
+    prior_group: str
+    matcher: str
+    rejector: str
+
+
 def risk_frame(judged: Mapping[tuple[str, str], pd.DataFrame], shown: Sequence[str]) -> pd.DataFrame:
     """Return risk against coverage by matcher and rejector, of each suite with absent places and of all together.
 
@@ -111,23 +120,24 @@ def risk_frame(judged: Mapping[tuple[str, str], pd.DataFrame], shown: Sequence[s
     mixture, matcher, rejector, n, answered, aurc, coverage and risk: points of a curve by growing coverage. All suites
     together also come in the declared mixtures of present and absent places.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[tuple[str | float, ...]] = []
     for key, whole in _parts(judged, shown):
         for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]:
             is_pooled = suite == ALL_SUITES
             if is_pooled or not part["is_present"].to_numpy(bool).all():
-                rows += _curves({"suite": suite, **key}, answers_of(part), is_pooled=is_pooled)
+                rows += _curves(str(suite), key, answers_of(part), is_pooled=is_pooled)
     columns = [*GROUP, "mixture", "matcher", "rejector", "n", "answered", "aurc", "coverage", "risk"]
     return pd.DataFrame(rows, columns=columns)
 
 
-def _curves(key: Mapping[str, Any], some: Answers, *, is_pooled: bool) -> Iterator[dict[str, Any]]:
+def _curves(suite: str, key: JudgedKey, some: Answers, *, is_pooled: bool) -> Iterator[tuple[str | float, ...]]:
+    """Yield rows of `risk_frame`."""
     for mixture, mass in mixtures_of(some, is_pooled=is_pooled):
         curve = risk_coverage(some, mass)
-        about = {**key, "mixture": mixture, "n": len(some), "answered": int(some.is_answered.sum())}
-        about["aurc"] = aurc(some, mass)
+        about = (suite, key.track, key.prior_group, mixture, key.matcher, key.rejector)
+        figures = (len(some), int(some.is_answered.sum()), aurc(some, mass))
         for at in _thinned(curve.coverage):
-            yield {**about, "coverage": curve.coverage[at], "risk": curve.risk[at]}
+            yield (*about, *figures, curve.coverage[at], curve.risk[at])
 
 
 def _thinned(coverage: Floats) -> Ints:
@@ -147,34 +157,33 @@ def reliability_frame(
     are track, prior_group, matcher, rejector, predicted, observed, lo, hi, n and sites: bins of equal mass, of the
     answers alone, with Wilson's intervals of as many trials as there are sites.
     """
-    rows: list[dict[str, Any]] = []
+    rows: list[tuple[str | float, ...]] = []
     for key, part in calibrated_parts(judged, calibrated, shown):
         answered = part[part["is_answered"].to_numpy(bool)]
         p_false = 1.0 - answered["p_right"].to_numpy(float)
         if len(answered) and not np.isnan(p_false).any():
-            rows += [{**key, **one} for one in _bins(answered, p_false)]
-    columns = ["track", "prior_group", "matcher", "rejector", "predicted", "observed", "lo", "hi", "n", "sites"]
-    return pd.DataFrame(rows, columns=columns)
+            rows.extend((*key, *one) for one in _bins(answered, p_false))
+    return pd.DataFrame(rows, columns=[*JudgedKey._fields, "predicted", "observed", "lo", "hi", "n", "sites"])
 
 
 def calibrated_parts(
     judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
-) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
+) -> Iterator[tuple[JudgedKey, pd.DataFrame]]:
     """Yield the answers with probabilities by track and prior group, with their keys."""
     yield from _parts({key: frame for key, frame in judged.items() if key in calibrated}, shown)
 
 
 def _parts(
     judged: Mapping[tuple[str, str], pd.DataFrame], shown: Sequence[str]
-) -> Iterator[tuple[dict[str, Any], pd.DataFrame]]:
+) -> Iterator[tuple[JudgedKey, pd.DataFrame]]:
     for (matcher, rejector), frame in judged.items():
         if matcher in shown:
             for (track, prior_group), part in frame.groupby(["track", "prior_group"], sort=True):
-                key = {"track": track, "prior_group": prior_group, "matcher": matcher, "rejector": rejector}
-                yield key, part
+                yield JudgedKey(str(track), str(prior_group), matcher, rejector), part
 
 
-def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[dict[str, float]]:
+def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[tuple[float, ...]]:
+    """Yield predicted, observed, lo, hi, n and sites of each bin."""
     is_false = ~answered["is_right"].to_numpy(bool)
     sites = codes_of(answered["pair_id"])
     at = equal_mass_bins(1.0 - p_false)
@@ -183,8 +192,7 @@ def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[dict[str, float]]
         share, trials = float(is_false[mine].mean()), effective_count(sites[mine])
         found = wilson_share(share, trials)
         predicted = float(p_false[mine].mean())
-        counts = {"n": int(mine.sum()), "sites": trials}
-        yield {"predicted": predicted, "observed": share, "lo": found.lo, "hi": found.hi, **counts}
+        yield predicted, share, found.lo, found.hi, int(mine.sum()), trials
 
 
 # --- protection levels ------------------------------------------------------------------------------------------------

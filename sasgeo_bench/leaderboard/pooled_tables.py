@@ -7,12 +7,12 @@ asked.
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.leaderboard.plot_tables import calibrated_parts
+from sasgeo_bench.leaderboard.plot_tables import JudgedKey, calibrated_parts
 from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
@@ -36,16 +36,29 @@ MOST_ERROR_M: Final = 2000.0
 _RADII_M: Final = np.unique(np.concatenate((np.geomspace(LEAST_ERROR_M, MOST_ERROR_M, 87), [5.0, 10.0, FIX_M])))
 _RATIOS: Final = np.unique(np.concatenate((np.geomspace(1.0, 200.0, 47), COST_RATIOS)))
 _NO_INTERVAL: Final = (np.nan, np.nan)
-_FIGURE: Final = ("n", "blocks", "value", "lo", "hi")
 
 
-def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[dict[str, Any]]:
+class _Panel(NamedTuple):
+    suite: str
+    track: str
+    prior_group: str
+    stratum: str
+
+
+class _Figure(NamedTuple):
+    n: int
+    blocks: int
+    value: float
+    lo: float
+    hi: float
+
+
+def _figures(rows: pd.DataFrame, table: Floats, text: str) -> list[_Figure]:
     """Return means of columns of values in [0, 1] with intervals as of a board; the same queries share draws."""
     names = (codes_of(rows[name]) for name in ("place", "block", "pair_id"))
     drawn = BoardDraws.of(*names, seed=seed_of_text(text), draws=SLOW_DRAWS)
     found = intervals_of_columns(table.mean(axis=0), drawn.means(table), drawn.trials)
-    counts = {"n": len(rows), "blocks": drawn.by_block.units_count}
-    return [{**counts, "value": one.value, "lo": one.lo, "hi": one.hi} for one in found]
+    return [_Figure(len(rows), drawn.by_block.units_count, one.value, one.lo, one.hi) for one in found]
 
 
 def _alike(frames: Mapping[str, pd.DataFrame]) -> dict[str, pd.DataFrame]:
@@ -61,8 +74,8 @@ def _is_able(frame: pd.DataFrame) -> bool:
     return bool((frame["status"] != NOT_APPLICABLE).any())
 
 
-def _suites(scores: Scores, shown: Sequence[str]) -> Iterator[tuple[dict[str, Any], dict[str, pd.DataFrame]]]:
-    """Yield the keys of a panel and the rows of its matchers, for each suite, track and prior group."""
+def _suites(scores: Scores, shown: Sequence[str]) -> Iterator[tuple[_Panel, dict[str, pd.DataFrame]]]:
+    """Yield a panel and the rows of its matchers, for each suite, track and prior group."""
     mine = {name: scores[name] for name in shown if name in scores}
     keys = {key for frame in mine.values() for key in zip(*(frame[name] for name in GROUP), strict=True)}
     for key in sorted(keys):
@@ -75,7 +88,8 @@ def _suites(scores: Scores, shown: Sequence[str]) -> Iterator[tuple[dict[str, An
         if alike:
             first = next(iter(alike.values()))
             part = STRESS if (first["role"] == STRESS).all() else ALL
-            yield {**dict(zip(GROUP, key, strict=True)), "stratum": part}, alike
+            suite, track, prior_group = key
+            yield _Panel(suite, track, prior_group, part), alike
 
 
 # --- arms side by side ------------------------------------------------------------------------------------------------
@@ -88,18 +102,17 @@ def ablation_frame(scores: Scores, contrasts: Sequence[Contrast], shown: Sequenc
     one; without any, all suites are one pool for each track. The columns are pool, suites, track, prior_group, matcher,
     n, blocks, value, lo and hi: present places under stress.
     """
-    rows: list[dict[str, Any]] = []
+    rows = []
     for pool in _pools(contrasts, scores):
         some = {name: chosen_rows(pool, scores[name]) for name in shown if name in scores}
         for group in sorted({group for frame in some.values() for group in frame["prior_group"]}):
             alike = _alike({name: frame[frame["prior_group"] == group] for name, frame in some.items()})
             suites = sorted({suite for frame in alike.values() for suite in frame["suite"]})
-            keys = {"pool": pool.name, "suites": ", ".join(suites), "track": pool.track, "prior_group": group}
             for name, frame in alike.items():
                 values = primary_of(pool.track).values(frame)[:, None]
-                text = f"{pool.name}/{pool.track}/{group}"
-                rows += [{**keys, "matcher": name, **one} for one in _figures(frame, values, text)]
-    return pd.DataFrame(rows, columns=["pool", "suites", "track", "prior_group", "matcher", *_FIGURE])
+                (found,) = _figures(frame, values, f"{pool.name}/{pool.track}/{group}")
+                rows.append((pool.name, ", ".join(suites), pool.track, group, name, *found))
+    return pd.DataFrame(rows, columns=["pool", "suites", "track", "prior_group", "matcher", *_Figure._fields])
 
 
 def _pools(contrasts: Sequence[Contrast], scores: Scores) -> Iterator[Contrast]:
@@ -134,20 +147,20 @@ def recall_frame(
     has a second pose. Right is the right candidate in retrieval, and in localization a pose within 25 m, whatever the
     heading.
     """
-    rows: list[dict[str, Any]] = []
-    for group, frames in _suites(scores, shown):
+    rows: list[tuple[str | float, ...]] = []
+    for panel, frames in _suites(scores, shown):
         lists = {name: _lists(frame, predictions[name], truths) for name, frame in frames.items()}
         longest = max(count for count, _ in lists.values())
         steps = [k for k in RANKS if k <= longest]
         if len(steps) < 2:  # noqa: PLR2004 - a point is no curve
             continue
-        text = "/".join((*group.values(), "recall"))
+        text = "/".join((*panel, "recall"))
         for name, frame in frames.items():
-            ranks = ranks_of(frame) if group["track"] == "retrieval" else lists[name][1]
+            ranks = ranks_of(frame) if panel.track == "retrieval" else lists[name][1]
             table = np.column_stack([hits(ranks, k) for k in steps])
             found = _figures(frame, table, text)
-            rows += [{**group, "matcher": name, "k": k, **one} for k, one in zip(steps, found, strict=True)]
-    return pd.DataFrame(rows, columns=[*GROUP, "stratum", "matcher", "k", *_FIGURE])
+            rows.extend((*panel, name, k, *one) for k, one in zip(steps, found, strict=True))
+    return pd.DataFrame(rows, columns=[*_Panel._fields, "matcher", "k", *_Figure._fields])
 
 
 def _lists(frame: pd.DataFrame, answers: StoredAnswers, truths: Mapping[str, Truth]) -> tuple[int, Ranks]:
@@ -178,24 +191,23 @@ def errors_frame(scores: Scores, table: pd.DataFrame, shown: Sequence[str]) -> p
     those of the leaderboard `table` at 25 m, elsewhere NaN. A query without an answer is within no distance, and in the
     denominator.
     """
-    rows: list[dict[str, Any]] = []
+    rows = []
     within = table[(table["metric"] == WITHIN_M) & (table["rejector"] == "")]
     keys = zip(*(within[name] for name in (*GROUP, "stratum", "matcher")), strict=True)
     both = zip(within["lo"].to_numpy(float), within["hi"].to_numpy(float), strict=True)
     ends = dict(zip(keys, both, strict=True))
-    for group, frames in _suites(scores, shown):
-        if group["track"] == "retrieval":
+    for panel, frames in _suites(scores, shown):
+        if panel.track == "retrieval":
             continue
         for name, frame in frames.items():
             errors_m = np.sort(frame["position_error_m"].fillna(np.inf).to_numpy(float))
             shares = np.searchsorted(errors_m, _RADII_M, side="right") / len(errors_m)
-            counts = {"n": len(frame), "blocks": int(frame["block"].nunique())}
-            end = ends.get((*group.values(), name), _NO_INTERVAL)
+            blocks = int(frame["block"].nunique())
+            end = ends.get((*panel, name), _NO_INTERVAL)
             for radius_m, value in zip(_RADII_M.tolist(), shares.tolist(), strict=True):
                 lo, hi = end if radius_m == FIX_M else _NO_INTERVAL
-                point = {"radius_m": radius_m, "value": value, "lo": lo, "hi": hi}
-                rows.append({**group, "matcher": name, **counts, **point})
-    return pd.DataFrame(rows, columns=[*GROUP, "stratum", "matcher", "radius_m", *_FIGURE])
+                rows.append((*panel, name, radius_m, len(frame), blocks, value, lo, hi))
+    return pd.DataFrame(rows, columns=[*_Panel._fields, "matcher", "radius_m", *_Figure._fields])
 
 
 # --- what decisions and answers cost ----------------------------------------------------------------------------------
@@ -210,16 +222,15 @@ def cost_frame(
     ratio, cost, accept_all and withhold_all: all suites together. As `cost_20_place` of a board: a present place
     without an accepted fix costs 1, a false fix `ratio`.
     """
-    rows: list[dict[str, Any]] = []
-    for group, part in calibrated_parts(judged, calibrated, shown):
+    rows = []
+    for key, part in calibrated_parts(judged, calibrated, shown):
         some = answers_of(part)
         withhold = float(some.is_present.mean())
         for ratio in _RATIOS.tolist():
             cost = decision_cost(some, ratio, charged="place")
             all_accepted = float(cost_values(some, some.is_answered, ratio, charged="place").mean())
-            costs = {"cost": cost, "accept_all": all_accepted, "withhold_all": withhold}
-            rows.append({**group, "n": len(some), "ratio": ratio, **costs})
-    columns = ["track", "prior_group", "matcher", "rejector", "n", "ratio", "cost", "accept_all", "withhold_all"]
+            rows.append((*key, len(some), ratio, cost, all_accepted, withhold))
+    columns = [*JudgedKey._fields, "n", "ratio", "cost", "accept_all", "withhold_all"]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -233,7 +244,7 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
     and map_kb_per_km2, from the leaderboard `table`; NaN where a cost is unknown. The queries are those that the
     first figure counts, of the suites of the track that all of these matchers were asked.
     """
-    rows: list[dict[str, Any]] = []
+    rows = []
     mine = {name: _counted(scores[name]) for name in shown if name in scores}
     groups = {key for one in mine.values() for key in zip(one["track"], one["prior_group"], strict=True)}
     for track, prior_group in sorted(groups):
@@ -243,12 +254,12 @@ def price_frame(table: pd.DataFrame, scores: Scores, shown: Sequence[str]) -> pd
         }
         some = {name: frame for name, frame in some.items() if _is_able(frame)}
         some, shared = _of_most(some)
-        group = {"suites": ", ".join(sorted(shared)), "track": track, "prior_group": prior_group}
+        suites = ", ".join(sorted(shared))
         for name, frame in _alike({name: one[one["suite"].isin(shared)] for name, one in some.items()}).items():
             values = primary_of(track).values(frame)[:, None]
-            (found,) = _figures(frame, values, f"{group['suites']}/{track}/{prior_group}")
-            rows.append({**group, "matcher": name, **found, **_costs_of(table, name, track)})
-    columns = ["suites", "track", "prior_group", "matcher", *_FIGURE, *COSTS.values()]
+            (found,) = _figures(frame, values, f"{suites}/{track}/{prior_group}")
+            rows.append((suites, track, prior_group, name, *found, *_costs_of(table, name, track)))
+    columns = ["suites", "track", "prior_group", "matcher", *_Figure._fields, *COSTS.values()]
     return pd.DataFrame(rows, columns=columns)
 
 
@@ -267,11 +278,11 @@ def _of_most(frames: Scores) -> tuple[dict[str, pd.DataFrame], set[str]]:
     return chosen, set.intersection(*(suites[name] for name in chosen)) if chosen else set()
 
 
-def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> dict[str, float]:
-    """Return the costs of one matcher from the leaderboard."""
+def _costs_of(table: pd.DataFrame, matcher: str, track: str) -> list[float]:
+    """Return the `COSTS` of one matcher from the leaderboard."""
     costs = table[(table["matcher"] == matcher) & table["track"].isin([track, "all"]) & (table["suite"] == ALL_SUITES)]
     known = dict(zip(costs["metric"], costs["value"], strict=True))
-    return {column: float(known.get(metric, np.nan)) for metric, column in COSTS.items()}
+    return [float(known.get(metric, np.nan)) for metric in COSTS]
 
 
 def front_of(cost: Floats, value: Floats) -> Bools:

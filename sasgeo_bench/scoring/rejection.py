@@ -116,7 +116,7 @@ def judge(
     """
     usable = some_rows(scores, (scores["status"] != NOT_APPLICABLE).to_numpy(bool))
     needed = usable[[*_NEEDED]].astype(dict.fromkeys(_NAMES, object))
-    columns: dict[str, Any] = {
+    columns: dict[str, np.ndarray] = {
         **{name: np.full(len(usable), np.nan) for name in ("p_right", *_DECIDED)},
         "remark": np.full(len(usable), "", dtype=object),
         **{name: np.zeros(len(usable), dtype=bool) for name in ("is_calibrated", "is_own_calibration")},

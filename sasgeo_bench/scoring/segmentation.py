@@ -8,7 +8,7 @@ replacement, then images within them, and never pixels.
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 import pandas as pd
@@ -236,23 +236,22 @@ def told_classes(counts: Sequence[PixelCounts]) -> tuple[str, ...]:
     return tuple(name for name in names if any(one.of_class(name)[:, :SILENT].any() for one in counts))
 
 
-def _rows(group: str, name: str, counts: list[PixelCounts], draws: int) -> Iterator[dict[str, Any]]:
+def _rows(group: str, name: str, counts: list[PixelCounts], draws: int) -> Iterator[tuple[str | float, ...]]:
+    """Yield rows with the columns of `segmentation_scores`."""
     places = [one.place for one in counts]
     for told in told_classes(counts):
         table = np.stack([one.of_class(told) for one in counts]).astype(np.float64)
         used = table.sum(axis=(1, 2)) > 0
         where = [place for place, is_used in zip(places, used, strict=True) if is_used]
-        head = {"group": group, "name": name, "class": told}
-        tail = {"images": len(where), "places": len(set(where)), "pixels": int(table.sum())}
+        tail = len(where), len(set(where)), int(table.sum())
         seed = seed_of_text(f"{group}/{name}/{told}")
         by_image = _drawn(table[used], ["all"] * len(where), seed, draws)
-        has_others = tail["places"] > 1  # one place says nothing of others
+        has_others = len(set(where)) > 1  # one place says nothing of others
         by_place = _drawn(table[used], where, seed, draws) if has_others else np.full_like(by_image, np.nan)
         for metric, first, second in zip(PIXEL_METRICS, by_place, by_image, strict=True):
             value = float(metric.compute(table.sum(axis=0)))
             outer, inner = percentile_interval(value, first), percentile_interval(value, second)
-            ends = {"lo": outer.lo, "hi": outer.hi, "lo_images": inner.lo, "hi_images": inner.hi}
-            yield head | {"metric": metric.name, "value": value} | ends | tail
+            yield group, name, told, metric.name, value, outer.lo, outer.hi, inner.lo, inner.hi, *tail
 
 
 def _drawn(table: Floats, blocks: list[str], seed: int, draws: int) -> Floats:

@@ -2,8 +2,9 @@
 """Strata of a suite and steps of its ladders of strengths; neither depends on an answer."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
 from itertools import pairwise
-from typing import Any, Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -157,21 +158,33 @@ def primary_rows(rows: pd.DataFrame) -> pd.DataFrame:
     return rows[(rows["metric"] == rows["track"].map(wanted)).to_numpy(bool)]
 
 
-def _ladders(queries: pd.DataFrame) -> Iterator[dict[str, Any]]:
-    """Yield the stratum name of each step of each kind, with its kind, strength and view size."""
+class _Step(NamedTuple):
+    """The stratum of one step of a kind at one view size."""
+
+    suite: str
+    track: str
+    prior_group: str
+    kind: str
+    strength_unit: str
+    stratum: str
+    strength: float
+    view_cells: int
+
+
+def _ladders(queries: pd.DataFrame) -> Iterator[_Step]:
+    """Yield every step of each kind that has several."""
     some = queries[queries["is_present"].to_numpy(bool)]
     for key, group in some.groupby(list(GROUP), sort=True):
         sizes = sorted(set(group.loc[group["role"] == CONTROL, "view_cells"]))
         stress = group[group["role"] == STRESS]
+        suite, track, prior_group = map(str, key)
         for kind, mine in stress.groupby("kind", sort=True):
             if mine["strength"].nunique() < 2:  # noqa: PLR2004 - one step is no ladder
                 continue
-            columns = dict(zip(GROUP, key, strict=True))
-            columns |= {"kind": kind, "strength_unit": mine["strength_unit"].iloc[0]}
+            step = partial(_Step, suite, track, prior_group, str(kind), str(mine["strength_unit"].iloc[0]))
             steps = sorted({*zip(mine["strength"], mine["view_cells"], strict=True)})
             for strength, size in steps:
-                name = step_name(str(kind), strength, size)
-                yield {**columns, "stratum": name, "strength": strength, "view_cells": size}
+                yield step(stratum=step_name(str(kind), strength, size), strength=strength, view_cells=size)
             for size in sorted({size for _, size in steps} & {*sizes}):
                 name = control_name(size) if len(sizes) > 1 else CONTROL
-                yield {**columns, "stratum": name, "strength": 0.0, "view_cells": size}
+                yield step(stratum=name, strength=0.0, view_cells=size)

@@ -151,7 +151,7 @@ def find_plugin(spec: str, group: str) -> Any:  # noqa: ANN401 - any plugin
         return _from_entry_point(spec, group)
     module, _, name = spec.partition(":")
     try:
-        return getattr(importlib.import_module(module), name)  # type: ignore[no-any-return]
+        return getattr(importlib.import_module(module), name)
     except (Exception, SystemExit) as error:
         raise _failed(one_line(spec), "cannot be imported", error) from error
 

@@ -73,7 +73,7 @@ ONLY_PARSED = {
 # Commands of other programs that are not run, each with its reason.
 OTHERS = {
     r"^pip install -e my-(matcher|segmenter|tracker)$": "done by hand: an installation needs the package registry",
-    r"^(sha256sum|install -m 600|source \.venv/bin/activate$)": "programs of the system, and of the shell",
+    r"^(sha256sum |install -m 600 |source \.venv/bin/activate$)": "programs of the system, and of the shell",
     r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
     r"^bash findings/": "installs packages from the registry",
     r"^python docs/figures/rendered\.py ": "writes into docs/; tests/sensing/test_rendering.py renders small scenes",

@@ -22,76 +22,24 @@ from sasgeo_baselines.vojir_instance_rays import (
     open_ground,
 )
 
-from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import WITHHELD, Training, check_match
-from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Training
+from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.search.plan import Disc
+from tests.baselines.worlds import suburb
 from tests.made_up import error_m
 
-MATCHERS = (VojirInstanceRays, OuyangShapeVotes)
-HERE = Pose(easting_m=1330.0, northing_m=8660.0, yaw_deg=77.0)
-PRIOR = Prior(center_m=(1300.0, 8690.0), radius_m=120.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
-ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
+HERE, PRIOR = suburb().here, suburb().prior
 
 
 @pytest.fixture(scope="module")
-def region(made):
-    """Detached houses of many shapes on a lattice of 32 m, some with a wing."""
-    rng = np.random.default_rng(3)
-    layers = np.zeros((1, 640, 640), dtype=np.uint8)
-    for top, left in np.ndindex(20, 20):
-        row, col = np.array((top, left)) * 32 + rng.integers(0, 10, 2)
-        height, width = rng.integers(6, 20, 2)
-        if rng.random() < 0.7:
-            layers[0, row : row + height, col : col + width] = 1
-            if rng.random() < 0.5:
-                layers[0, row : row + height // 2, col : col + width + 5] = 1
-    return made.region_of(layers, classes=("building",))
-
-
-@pytest.fixture(scope="module", params=MATCHERS, ids=lambda kind: kind.card.name)
-def matcher(request, region):
-    found = request.param()
-    found.prepare(region, None)
-    return found
+def region():
+    return suburb().region
 
 
 @pytest.fixture(scope="module")
-def seen(made, region):
-    return made.view_of(region, HERE, size_cells=192)
-
-
-@pytest.mark.parametrize("prior", [PRIOR, ANYWHERE], ids=["disc", "anywhere"])
-def test_a_view_is_found_on_the_map(made, matcher, seen, prior):
-    query = made.query_of(seen, prior)
-    answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
-    assert error_m(answer, HERE) < 6
-    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 6
-
-
-def test_candidates_are_ranked_and_copies_tie(made, matcher, seen):
-    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (90.0, 0.0, -90.0, 0.0))
-    query = made.query_of(seen, replace(PRIOR, center_m=None, radius_m=None), candidates=places)
-    answer = check_match(matcher.match(query, top_k=4), query, top_k=4)
-    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
-    assert answer.scores[0] == answer.scores[1]
-    assert all(score < answer.scores[0] for score in answer.scores[2:])
-
-
-def test_a_view_without_buildings_is_withheld(made, matcher, seen):
-    for state in (UNKNOWN, ABSENT):
-        blank = seen.replace(np.full_like(seen.cells, state))
-        assert matcher.match(made.query_of(blank, PRIOR), top_k=1) == WITHHELD
-    alien = Evidence(classes=("water",), cells=seen.cells, cell_size_m=1.0)
-    assert matcher.match(made.query_of(alien, PRIOR), top_k=1) == WITHHELD
-
-
-@pytest.mark.parametrize("kind", MATCHERS)
-def test_a_map_without_buildings_names_no_place(made, seen, kind):
-    empty = made.region_of(np.zeros((1, 64, 64), dtype=np.uint8), classes=("water",))
-    found = kind()
-    found.prepare(empty, None)
-    assert found.match(made.query_of(seen, PRIOR), top_k=3) == WITHHELD
+def seen():
+    return suburb().seen(192)
 
 
 # Rays
@@ -227,11 +175,12 @@ def test_components_are_the_answer_and_their_heights_the_scores(made, region, se
     assert 0 < answer.diagnostics["credibility"] < 1
 
 
-def test_credibility_does_not_depend_on_how_many_poses_are_asked_for(made, matcher, seen):
-    query = made.query_of(seen, PRIOR)
+def test_credibility_does_not_depend_on_how_many_poses_are_asked_for(region):
+    matcher, query = OuyangShapeVotes(), suburb().query(192)
+    matcher.prepare(region, None)
     one, many = (matcher.match(query, top_k=count).diagnostics for count in (1, 8))
     assert one == many
-    assert ("credibility" in one) == isinstance(matcher, OuyangShapeVotes)
+    assert "credibility" in one
 
 
 @given(

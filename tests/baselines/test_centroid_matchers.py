@@ -1,119 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Matchers of the centres of objects: cases worked by hand, the property that each must have, and what they find."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from sasgeo_baselines.stfm_centroids import Patterns, StfmCentroids, clear_m
-from sasgeo_baselines.triangle_rsim import TriangleRsim, Triangles, differences, shapes_of
+from sasgeo_baselines.triangle_rsim import Triangles, differences, shapes_of
 
-from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import WITHHELD, check_match
+from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.sasgeo.nodes import INDEX
-from sasgeo_bench.tasks.vectors import as_features, vector_table
-from tests.made_up import HERE, error_m
+from tests.baselines.worlds import hidden, houses
 
-PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
-ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
-SIDE, VIEW = 420, 176
-MATCHERS = (TriangleRsim, StfmCentroids)
-
-
-def houses_of(seed, *, count=110):
-    """Rows, columns and sides of houses of many sizes, none of which touch."""
-    rng = np.random.default_rng(seed)
-    kept = []
-    for _ in range(count * 4):
-        row, col = rng.integers(4, SIDE - 40, 2).tolist()
-        house = (row, col, *rng.integers(7, 26, 2).tolist())
-        if all(_apart(house, other) for other in kept) and len(kept) < count:
-            kept.append(house)
-    return kept
-
-
-def _apart(house, other, gap=4):
-    row, col, height, width = house
-    other_row, other_col, other_height, other_width = other
-    return (
-        row + height + gap <= other_row
-        or other_row + other_height + gap <= row
-        or col + width + gap <= other_col
-        or other_col + other_width + gap <= col
-    )
-
-
-@pytest.fixture(scope="module")
-def region(made):
-    """A map of houses alone."""
-    layers = np.zeros((3, SIDE, SIDE), dtype=np.uint8)
-    shapes = []
-    for row, col, height, width in houses_of(1):
-        layers[0, row : row + height, col : col + width] = 1
-        shapes.append(shapely.box(1000 + col, 9000 - row - height, 1000 + col + width, 9000 - row))
-    found = made.region_of(layers)
-    found.features = as_features(vector_table([("building", 0, False, shape) for shape in shapes]))
-    found.graph = build_graph(found.features)
-    return found
-
-
-@pytest.fixture(scope="module", params=MATCHERS, ids=lambda kind: kind.card.name)
-def matcher(request, region):
-    found = request.param()
-    found.prepare(region, None)
-    return found
-
-
-@pytest.fixture
-def query(made, region):
-    return made.query_of(made.view_of(region, HERE, size_cells=VIEW), PRIOR)
-
-
-def hidden(query, cols):
-    """The same view with some columns unknown."""
-    cells = query.evidence.cells.copy()
-    cells[:, :, cols] = UNKNOWN
-    return replace(query, evidence=query.evidence.replace(cells))
-
-
-def test_a_view_is_found(query, matcher):
-    answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
-    assert error_m(answer) < 3
-    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 3
-    assert answer == check_match(matcher.match(query, top_k=5), query, top_k=5)
-
-
-def test_a_view_is_found_with_no_prior_and_a_part_unknown(query, matcher):
-    asked = replace(hidden(query, slice(36)), prior=ANYWHERE)
-    assert error_m(matcher.match(asked, top_k=1)) < 5
-
-
-def test_candidates_are_ranked_and_copies_tie(query, matcher):
-    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (70.0, 5.0, -60.0, 5.0))
-    asked = replace(query, candidates=places, track="retrieval", prior=replace(PRIOR, center_m=None, radius_m=None))
-    answer = check_match(matcher.match(asked, top_k=4), asked, top_k=4)
-    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m + 5.0] * 2
-    assert answer.scores[0] == answer.scores[1]
-    assert len(answer.scores) == 2 or answer.scores[1] > answer.scores[2]
-
-
-def test_a_view_of_few_whole_houses_is_withheld(query, matcher):
-    assert matcher.match(hidden(query, slice(VIEW)), top_k=1) == WITHHELD
-    assert matcher.match(hidden(query, slice(30, VIEW)), top_k=1) == WITHHELD
-
-
-def test_a_place_without_houses_is_withheld(made, query, matcher):
-    bare = made.region_of(np.zeros((3, SIDE, SIDE), dtype=np.uint8))
-    bare.features = as_features(vector_table([]))
-    bare.graph = build_graph(bare.features)
-    lost = type(matcher)()
-    lost.prepare(bare, None)
-    assert lost.match(query, top_k=1) == WITHHELD
+VIEW = 176
 
 
 def test_a_triangle_by_hand():
@@ -186,10 +86,10 @@ def test_patterns_do_not_depend_on_heading_and_scale(yaw_deg, scale, seed):
     np.testing.assert_allclose(other.reach_m, scale * one.reach_m)
 
 
-def test_an_object_whose_neighbours_may_be_out_of_sight_says_nothing(query, region):
+def test_an_object_whose_neighbours_may_be_out_of_sight_says_nothing():
     """Half of the view is hidden: no object that speaks has its farthest neighbour beyond the edge of what is known."""
-    matcher = StfmCentroids()
-    matcher.prepare(region, None)
+    matcher, query = StfmCentroids(), houses().query(VIEW)
+    matcher.prepare(houses().region, None)
     whole, half = matcher.look(query), matcher.look(hidden(query, slice(60)))
     assert len(half.patterns.kind) < len(whole.patterns.kind)
     right_m = half.patterns.corners_m[:, 0, 0] - half.patterns.reach_m

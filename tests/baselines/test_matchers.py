@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Every registered matcher on an embedded town: its card, its answers, and that they depend on the query alone."""
+"""What every matcher holds: its card, its answers on an embedded town, what it finds on a made-up map that suits it."""
 
 import tomllib
+from collections.abc import Callable
 from copy import deepcopy
 from dataclasses import replace
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -16,9 +18,12 @@ from sasgeo_baselines.map_density_prior import MapDensityPrior
 from sasgeo_bench.files.plugins import YARDSTICK
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match
-from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
+from tests.baselines import worlds
+from tests.baselines.worlds import World
+from tests.made_up import error_m
 from tests.slow import rest_slow
 
 ROOT = Path(__file__).parents[2]
@@ -34,18 +39,57 @@ REGISTERED = {name: value for name, value in LIBRARY.items() if ".controls." in 
     for name, value in BASELINES.items()
     if ".image." not in value and name not in NEEDS_TRAINING and not name.startswith(YARDSTICK)
 }
-VARIANTS = ("raster_graph", "raster_graph_stability", "full_unknown")
-DENSE = ("fft_vote", "raster_soft", "raster_uniform", *VARIANTS)
-OVERLAPPING = ("popov_roadplane", "schmidt_segcorr", "ubev_template", "vecmap_phasecorr", "zilke_semantic_mi")
 # These withhold where a view shows few whole objects.
 OF_OBJECTS = (
     *("liu_object_graph", "ouyang_shape_votes", "road_2rit", "spatial_graph_clique", "stfm_centroids"),
     "triangle_rsim",
 )
-OF_PLACES = ("brm_grid", "maplocnet_regress", "polar_vsc", "vojir_instance_rays", "zhang_hier_consensus")
-OF_TILES = ("anyvisloc_pipeline", "lcm_balanced", "sues_multi_height", "u1652_instance_retrieval")
-SYSTEMS = (*OVERLAPPING, *OF_OBJECTS, *OF_PLACES, *OF_TILES)
 CONTROLS = ("random", "prior_centre", "map_density_prior")
+
+
+class Case(NamedTuple):
+    """A map, how many cells a view has, how near it is found, and how many of its columns may be hidden."""
+
+    world: Callable[[], World]
+    view_cells: int
+    within_m: float
+    within_deg: float
+    hidden: int
+
+
+DENSE = Case(worlds.things, 96, 1.0, 1.5, 40)
+OBJECTS = Case(worlds.houses, 176, 3.0, 3.0, 36)
+TILES = Case(worlds.things, 192, 17.0, 8.0, 80)  # 17 m: half a diagonal of the lattice
+CASES = {
+    "anyvisloc_pipeline": Case(worlds.things, 160, 3.0, 8.0, 56),
+    "brm_grid": Case(worlds.things, 192, 4.0, 3.0, 84),
+    "fft_vote": DENSE,
+    "full_unknown": DENSE,
+    "lcm_balanced": TILES._replace(within_deg=15.0),
+    "liu_object_graph": Case(worlds.village, 192, 2.0, 2.0, 80),
+    "maplocnet_regress": Case(worlds.things, 160, 12.0, 8.0, 56),
+    "ouyang_shape_votes": Case(worlds.suburb, 192, 6.0, 6.0, 70),
+    "polar_vsc": Case(worlds.things, 192, 4.0, 3.0, 84),
+    "popov_roadplane": Case(worlds.streets, 176, 3.0, 1.0, 50),
+    "raster_graph": DENSE,
+    "raster_graph_stability": DENSE,
+    "raster_soft": DENSE,
+    "raster_uniform": DENSE,
+    "road_2rit": Case(worlds.streets, 176, 2.0, 1.0, 50),
+    "schmidt_segcorr": Case(worlds.things, 128, 3.0, 2.0, 56),
+    "spatial_graph_clique": OBJECTS,
+    "stfm_centroids": OBJECTS,
+    "sues_multi_height": TILES,
+    "triangle_rsim": OBJECTS,
+    "u1652_instance_retrieval": TILES,
+    "ubev_template": Case(worlds.things, 160, 3.0, 2.0, 56),
+    "vecmap_phasecorr": Case(worlds.things, 128, 3.0, 2.0, 56),
+    "vojir_instance_rays": Case(worlds.suburb, 192, 6.0, 6.0, 70),
+    "zhang_hier_consensus": Case(worlds.things, 160, 3.0, 2.0, 70),
+    "zilke_semantic_mi": Case(worlds.things, 128, 3.0, 2.0, 56),
+}
+BEYOND_M = 10.0  # a pose is refined after its search, and may leave the disc by that
+NEEDS_NO_CLASS = ("zilke_semantic_mi",)  # mutual information needs none in common
 
 
 def make(name: str):
@@ -105,7 +149,7 @@ def test_a_matcher_is_registered_under_the_name_of_its_card(name) -> None:
 
 
 def test_every_matcher_is_registered() -> None:
-    assert set(REGISTERED) == {"global_descriptor", "graph_only", *SYSTEMS, *DENSE, *CONTROLS}
+    assert set(REGISTERED) == {"global_descriptor", "graph_only", *CASES, *CONTROLS}
 
 
 @pytest.fixture(scope="module")
@@ -142,28 +186,12 @@ LEARNERS = (
 )
 
 
-@pytest.mark.parametrize("text", ["x", "", "null", "[]", '{"spread": [0]}', '{"building": "much"}'])
 @pytest.mark.parametrize("name", LEARNERS)
-def test_a_damaged_learned_text_is_refused_in_one_line(name, text, region) -> None:
-    with pytest.raises(ValueError, match=f"^{name}: the learned text is damaged.*learn again$"):
-        make(name).prepare(region, text)
-
-
-@pytest.mark.parametrize("name", [*SYSTEMS, *DENSE])
-def test_no_candidates_have_no_answer_and_views_of_few_cells_are_borne(name, prepared, two) -> None:
-    asked = two[1]
-    nobody = prepared(name).match(replace(asked, candidates=()), top_k=5)
-    assert not check_match(nobody, replace(asked, candidates=()), top_k=5).poses
-    for rows in (1, 6):
-        tiny = replace(asked, evidence=asked.evidence.replace(asked.evidence.cells[:, 48 : 48 + rows, 48:49].copy()))
-        check_match(prepared(name).match(tiny, top_k=5), tiny, top_k=5)
-
-
-@pytest.mark.parametrize("name", [*SYSTEMS, *DENSE])
-def test_a_view_of_classes_that_no_map_has_is_withheld(name, prepared, two) -> None:
-    seen = two[0].evidence
-    strange = replace(two[0], evidence=Evidence(classes=("orchard",), cells=seen.cells[:1], cell_size_m=1.0))
-    assert not prepared(name).match(strange, top_k=5).poses
+def test_a_damaged_learned_text_is_refused_in_one_line(name, region) -> None:
+    matcher = make(name)
+    for text in ("x", "", "null", "[]", '{"spread": [0]}', '{"building": "much"}'):
+        with pytest.raises(ValueError, match=f"^{name}: the learned text is damaged.*learn again$"):
+            matcher.prepare(region, text)
 
 
 @pytest.mark.parametrize("name", [name for name in REGISTERED if name not in {"graph_only", *OF_OBJECTS}])
@@ -174,7 +202,7 @@ def test_a_map_of_three_rows_is_borne(name, made, two) -> None:
     check_match(matcher.match(query, top_k=5), query, top_k=5)
 
 
-@pytest.mark.parametrize("name", rest_slow(DENSE, but=3))
+@pytest.mark.parametrize("name", rest_slow((name for name in CASES if CASES[name] is DENSE), but=3))
 def test_dense_matchers_find_what_has_no_errors(name, prepared, queries, truths) -> None:
     asked = {
         query.track: (query, truths[query.query_id])
@@ -236,3 +264,94 @@ def test_the_fullest_place_and_the_likest_shares_are_found_on_a_map_made_for_it(
     for matcher in (full, likest):
         best = matcher.match(query, top_k=1).poses[0]
         assert np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) <= 25.0
+
+
+# On a made-up map that suits it
+
+
+@pytest.fixture(scope="module")
+def suited():
+    """A matcher by its name, prepared once on its map."""
+
+    @cache
+    def of_name(name):
+        made = worlds.LiuOnMadeUp() if name == "liu_object_graph" else make(name)
+        made.prepare(CASES[name].world().region, None)
+        return made
+
+    return of_name
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_view_is_found_twice_alike_and_no_answer_is_beyond_the_prior(name, suited) -> None:
+    case = CASES[name]
+    here, prior = case.world().here, case.world().prior
+    query = case.world().query(case.view_cells)
+    answer = check_match(suited(name).match(query, top_k=5), query, top_k=5)
+    assert error_m(answer, here) < case.within_m
+    assert abs(answer.poses[0].yaw_deg - here.yaw_deg) < case.within_deg
+    assert answer == check_match(suited(name).match(query, top_k=5), query, top_k=5)
+    for pose in answer.poses:
+        away_m = np.hypot(pose.easting_m - prior.center_m[0], pose.northing_m - prior.center_m[1])
+        assert away_m <= prior.radius_m + BEYOND_M
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_view_is_found_half_hidden_and_without_a_prior(name, suited) -> None:
+    case = CASES[name]
+    query = worlds.hidden(case.world().query(case.view_cells, prior=worlds.ANYWHERE), slice(case.hidden))
+    answer = suited(name).match(query, top_k=1)
+    assert error_m(answer, case.world().here) < case.within_m
+    assert abs(answer.poses[0].yaw_deg % 360 - case.world().here.yaw_deg) < case.within_deg
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_candidates_are_ranked_and_copies_tie(name, suited) -> None:
+    case = CASES[name]
+    here, anywhere = case.world().here, replace(case.world().prior, center_m=None, radius_m=None)
+    places = tuple(replace(here, easting_m=here.easting_m + off_m) for off_m in (90.0, 0.0, -90.0, 0.0))
+    query = case.world().query(case.view_cells, candidates=places, track="retrieval", prior=anywhere)
+    answer = check_match(suited(name).match(query, top_k=4), query, top_k=4)
+    assert [pose.easting_m for pose in answer.poses[:2]] == [here.easting_m] * 2
+    assert answer.scores[0] == answer.scores[1]
+    assert all(score < answer.scores[0] for score in answer.scores[2:])
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_what_shows_nothing_or_lies_beyond_the_map_is_withheld(name, suited) -> None:
+    case = CASES[name]
+    query = case.world().query(case.view_cells)
+    cells = query.evidence.cells
+    alien = Evidence(classes=("railway", "green", "farmland")[: len(cells)], cells=cells, cell_size_m=1.0)
+    asked = [
+        replace(query, evidence=query.evidence.replace(np.full_like(cells, UNKNOWN))),
+        replace(query, prior=replace(query.prior, center_m=(90_000.0, 90_000.0))),
+    ]
+    if name not in NEEDS_NO_CLASS:
+        asked.append(replace(query, evidence=alien))
+    asked.append(replace(query, evidence=Evidence(classes=("orchard",), cells=cells[:1], cell_size_m=1.0)))
+    asked.append(replace(query, candidates=(), track="retrieval"))
+    for one in asked:
+        answer = suited(name).match(one, top_k=3)
+        assert not answer.poses
+        assert not answer.scores
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_views_of_few_cells_are_borne(name, suited) -> None:
+    query = CASES[name].world().query(CASES[name].view_cells)
+    for rows in (1, 6):
+        tiny = replace(query, evidence=query.evidence.replace(query.evidence.cells[:, 48 : 48 + rows, 48:49].copy()))
+        check_match(suited(name).match(tiny, top_k=5), tiny, top_k=5)
+
+
+@pytest.mark.parametrize("name", [*OF_OBJECTS, "vojir_instance_rays"])
+def test_matchers_of_objects_withhold_where_a_view_or_a_map_has_too_few(name, suited) -> None:
+    query = CASES[name].world().query(CASES[name].view_cells)
+    bare = make(name)
+    bare.prepare(worlds.bare().region, None)
+    absent = replace(query, evidence=query.evidence.replace(np.zeros_like(query.evidence.cells)))
+    assert not suited(name).match(absent, top_k=3).poses
+    assert not bare.match(query, top_k=3).poses
+    if name in OF_OBJECTS:
+        assert not suited(name).match(worlds.hidden(query, slice(24, None)), top_k=3).poses

@@ -9,31 +9,12 @@ from sasgeo_baselines.object_matcher import Pairs, Sight, fitted
 from sasgeo_baselines.spatial_graph_clique import SpatialGraphClique, largest_clique
 from scipy.spatial.distance import pdist
 
-from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.sasgeo.nodes import INDEX, MOST_ARMS, Nodes
+from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.search.plan import Disc
+from tests.baselines.worlds import PRIOR, MadeUpMap, nodes
+from tests.made_up import HERE
 
-HERE = Pose(easting_m=1210.0, northing_m=8790.0, yaw_deg=77.0)
-PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
 DISC = Disc(center_m=PRIOR.center_m, radius_m=100.0)
-
-
-def nodes(places_m, names=None):
-    """Objects at places, of one kind or several."""
-    places_m = np.asarray(places_m, dtype=np.float64).reshape(-1, 2)
-    count = len(places_m)
-    kinds = [INDEX[name] for name in names or ["building patch"] * count]
-    return Nodes(
-        places_m=places_m,
-        kind=np.array(kinds, dtype=np.int64),
-        degree=np.zeros(count, dtype=np.int64),
-        area_m2=np.full(count, 100.0),
-        reach_m=np.zeros(count),
-        arms_deg=np.full((count, MOST_ARMS), np.nan),
-        pairs=np.zeros((0, 2), dtype=np.int64),
-        relation=np.zeros(0, dtype=np.int64),
-        feature=np.full(count, -1),
-    )
 
 
 def scattered(count, *, half_m=90.0, seed=1):
@@ -104,19 +85,9 @@ def test_the_largest_clique_is_the_pose():
     matcher = SpatialGraphClique()
     seen = nodes(scattered(12))
     lost = HERE.to_map(seen.places_m) + np.array([[0.0, 0.0]] * 9 + [[30.0, 0.0], [0.0, 30.0], [-30.0, 0.0]])
-    matcher.mapped = MadeUpMap(np.concatenate([lost, np.array(PRIOR.center_m) + scattered(30, half_m=200.0)]))
+    matcher.mapped = MadeUpMap(nodes=nodes([*lost, *(np.array(PRIOR.center_m) + scattered(30, half_m=200.0))]))
     first, *rest = matcher.modes(Sight(nodes=seen, prior=PRIOR), DISC, count=3)
     assert int(first.score) == 9
     assert np.hypot(first.pose.easting_m - HERE.easting_m, first.pose.northing_m - HERE.northing_m) < 1e-6
     assert first.pose.yaw_deg == pytest.approx(HERE.yaw_deg)
     assert all(mode.score < first.score for mode in rest)
-
-
-class MadeUpMap:
-    """A map of nodes alone."""
-
-    def __init__(self, places_m):
-        self.nodes = nodes(places_m)
-
-    def around(self, place_m, radius_m):
-        return np.flatnonzero(np.hypot(*(self.nodes.places_m - place_m).T) <= radius_m)

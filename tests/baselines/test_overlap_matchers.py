@@ -11,64 +11,12 @@ from sasgeo_baselines.schmidt_segcorr import SchmidtSegcorr
 from sasgeo_baselines.vecmap_phasecorr import VecmapPhasecorr, phases, signed
 from sasgeo_baselines.zilke_semantic_mi import LABELS, NAMES, ZilkeSemanticMi
 
-from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import WITHHELD, Training, check_match
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.search.shifts import Overlaps
-from tests.made_up import HERE, error_m
-
-MATCHERS = (SchmidtSegcorr, ZilkeSemanticMi, VecmapPhasecorr)
-PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
-
-
-@pytest.fixture(scope="module")
-def region(made):
-    return made.region_of(made.textured(5))
-
-
-@pytest.fixture(scope="module", params=MATCHERS, ids=lambda kind: kind.card.name)
-def matcher(request, region):
-    found = request.param()
-    found.prepare(region, None)
-    return found
-
-
-def seen_from(made, region, pose, **more):
-    return made.view_of(region, pose, size_cells=128, **more)
-
-
-def test_a_view_is_found_on_the_map(made, region, matcher):
-    query = made.query_of(seen_from(made, region, HERE), PRIOR)
-    answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
-    assert error_m(answer) < 3
-    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 2
-    assert answer == check_match(matcher.match(query, top_k=5), query, top_k=5)
-
-
-def test_a_half_hidden_view_is_found_and_one_that_shows_nothing_is_withheld(made, region, matcher):
-    seen = seen_from(made, region, HERE)
-    cells = seen.cells.copy()
-    cells[:, :, :56] = UNKNOWN
-    assert error_m(matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=1)) < 5
-    blank = seen.replace(np.full_like(cells, UNKNOWN))
-    assert matcher.match(made.query_of(blank, PRIOR), top_k=1) == WITHHELD
-
-
-def test_candidates_are_ranked_and_copies_tie(made, region, matcher):
-    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (60.0, 0.0, -50.0, 0.0))
-    anywhere = replace(PRIOR, center_m=None, radius_m=None)
-    query = made.query_of(seen_from(made, region, HERE), anywhere, candidates=places)
-    answer = check_match(matcher.match(query, top_k=4), query, top_k=4)
-    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
-    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
-
-
-def test_a_view_of_other_classes_is_withheld(made, region, matcher):
-    if isinstance(matcher, ZilkeSemanticMi):
-        pytest.skip("mutual information needs no class in common")
-    seen = seen_from(made, region, HERE)
-    alien = Evidence(classes=("railway", "green", "coastline"), cells=seen.cells, cell_size_m=1.0)
-    assert matcher.match(made.query_of(alien, PRIOR), top_k=1) == WITHHELD
+from tests.baselines.worlds import PRIOR, things
+from tests.made_up import error_m
 
 
 def overlaps_of(matcher, evidence, layers, names):
@@ -167,14 +115,14 @@ def test_signed_distances_are_truncated_and_even_where_nothing_is_known():
     assert found[95] == round(float(found[:90].mean()))
 
 
-def test_weights_are_learned_from_where_classes_stand_out(made, region):
+def test_weights_are_learned_from_where_classes_stand_out(made):
     """Water is removed from the map and drawn anew at random: it says nothing."""
-    rng = np.random.default_rng(7)
+    region, rng = things().region, np.random.default_rng(7)
     poses = [
         Pose(easting_m=1210.0 + rng.uniform(-60, 60), northing_m=8790.0 + rng.uniform(-60, 60), yaw_deg=yaw)
         for yaw in (10.0, 100.0, 250.0)
     ]
-    views = [seen_from(made, region, pose) for pose in poses]
+    views = [made.view_of(region, pose, size_cells=128) for pose in poses]
     layers = region.layers.copy()
     layers[2] = made.textured(99)[2]
     queries = [replace(made.query_of(view, PRIOR), region="made-up") for view in views]
@@ -186,5 +134,4 @@ def test_weights_are_learned_from_where_classes_stand_out(made, region):
     assert text == VecmapPhasecorr().learn(training)
     taught = VecmapPhasecorr()
     taught.prepare(training.regions["made-up"], text)
-    query = made.query_of(seen_from(made, region, HERE), PRIOR)
-    assert error_m(taught.match(query, top_k=1)) < 3
+    assert error_m(taught.match(things().query(128), top_k=1)) < 3

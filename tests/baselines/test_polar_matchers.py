@@ -14,23 +14,20 @@ from sasgeo_baselines.rejectors.ks_gate import KsGate
 from sasgeo_baselines.visual_context import RINGS, SECTORS, Context, ContextMap, Shares
 from scipy import special
 
-from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import WITHHELD, check_match, check_p_false
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import check_p_false
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.search.plan import Disc
-from tests.made_up import HERE, error_m
-from tests.slow import rest_slow
+from tests.baselines.worlds import PRIOR, things
+from tests.made_up import HERE
 
-MATCHERS = (PolarVsc, BrmGrid)
-PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
-ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
 ALL = np.ones(len(GROUPS), dtype=bool)
 
 
 @pytest.fixture(scope="module")
-def region(made):
-    return made.region_of(made.textured(5))
+def region():
+    return things().region
 
 
 @pytest.fixture(scope="module")
@@ -38,42 +35,9 @@ def described(region):
     return ContextMap.of(region)
 
 
-@pytest.fixture(scope="module", params=MATCHERS, ids=lambda kind: kind.card.name)
-def matcher(request, region):
-    found = request.param()
-    found.prepare(region, None)
-    return found
-
-
 @pytest.fixture(scope="module")
-def seen(made, region):
-    return made.view_of(region, HERE, size_cells=192)
-
-
-@pytest.mark.parametrize("prior", rest_slow([PRIOR, ANYWHERE]), ids=["disc", "anywhere"])
-def test_a_view_is_found_on_the_map(made, matcher, seen, prior):
-    query = made.query_of(seen, prior)
-    answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
-    assert error_m(answer) < 4
-    assert abs(answer.poses[0].yaw_deg - HERE.yaw_deg) < 3
-
-
-def test_a_half_hidden_view_is_found_and_one_that_shows_nothing_is_withheld(made, matcher, seen):
-    cells = seen.cells.copy()
-    cells[:, :, :84] = UNKNOWN
-    assert error_m(matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=1)) < 6
-    blank = seen.replace(np.full_like(cells, UNKNOWN))
-    assert matcher.match(made.query_of(blank, PRIOR), top_k=1) == WITHHELD
-    alien = Evidence(classes=("railway", "green", "farmland"), cells=seen.cells, cell_size_m=1.0)
-    assert matcher.match(made.query_of(alien, PRIOR), top_k=1) == WITHHELD
-
-
-def test_candidates_are_ranked_and_copies_tie(made, matcher, seen):
-    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (60.0, 0.0, -50.0, 0.0))
-    query = made.query_of(seen, replace(PRIOR, center_m=None, radius_m=None), candidates=places)
-    answer = check_match(matcher.match(query, top_k=4), query, top_k=4)
-    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
-    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
+def seen():
+    return things().seen(192)
 
 
 # Rings and sectors

@@ -13,19 +13,18 @@ from sasgeo_baselines.polar import CELL_M, described, view_descriptor
 from sasgeo_baselines.sues_multi_height import SuesMultiHeight
 from sasgeo_baselines.u1652_instance_retrieval import U1652InstanceRetrieval
 
-from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.matching.matcher import MOST_LEARNED_BYTES, WITHHELD, Training, check_match
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.matcher import MOST_LEARNED_BYTES, Training, check_match
+from tests.baselines.worlds import PRIOR, things
 from tests.made_up import HERE, error_m
 
 MATCHERS = (U1652InstanceRetrieval, SuesMultiHeight, LcmBalanced)
-PRIOR = Prior(center_m=(1240.0, 8760.0), radius_m=100.0, yaw_deg=80.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
 WITHIN_M = STRIDE * CELL_M * 0.71  # half a diagonal of the lattice
 
 
 @pytest.fixture(scope="module")
-def region(made):
-    return made.region_of(made.textured(5))
+def region():
+    return things().region
 
 
 @pytest.fixture(scope="module")
@@ -148,11 +147,10 @@ def test_a_card_names_the_numbers_in_use(kind):
 
 
 @pytest.mark.parametrize("kind", MATCHERS)
-@pytest.mark.parametrize("is_taught", [False, True], ids=["untaught", "taught"])
-def test_a_view_is_found_on_another_map_than_those_of_training(made, region, learned, kind, is_taught):
+def test_a_view_is_found_on_another_map_than_those_of_training(region, learned, kind):
     matcher = kind()
-    matcher.prepare(region, learned[kind] if is_taught else None)
-    query = made.query_of(seen_from(made, region, HERE), PRIOR)
+    matcher.prepare(region, learned[kind])
+    query = things().query(192)
     answer = check_match(matcher.match(query, top_k=5), query, top_k=5)
     assert error_m(answer) < WITHIN_M
     assert answer == check_match(matcher.match(query, top_k=5), query, top_k=5)
@@ -209,37 +207,3 @@ def test_turned_copies_teach_to_bear_turns_and_heights_to_bear_heights(ground, l
     plain = learned[U1652InstanceRetrieval]
     assert likeness(learned[LcmBalanced], upright, turned) > 2 * likeness(plain, upright, turned)
     assert likeness(learned[SuesMultiHeight], upright, higher) > 1.1 * likeness(plain, upright, higher)
-
-
-@pytest.fixture(scope="module")
-def matcher(region):
-    found = U1652InstanceRetrieval()
-    found.prepare(region, None)
-    return found
-
-
-def test_a_view_is_found_anywhere_and_heading_anyhow(made, region, matcher):
-    anywhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.03)
-    answer = matcher.match(made.query_of(seen_from(made, region, HERE), anywhere), top_k=1)
-    assert error_m(answer) < WITHIN_M
-    assert abs(answer.poses[0].yaw_deg % 360.0 - HERE.yaw_deg) < 8
-
-
-def test_candidates_are_ranked_and_copies_tie(made, region, matcher):
-    places = tuple(replace(HERE, easting_m=HERE.easting_m + off_m) for off_m in (60.0, 0.0, -50.0, 0.0))
-    anywhere = replace(PRIOR, center_m=None, radius_m=None)
-    query = made.query_of(seen_from(made, region, HERE), anywhere, candidates=places)
-    answer = check_match(matcher.match(query, top_k=4), query, top_k=4)
-    assert [pose.easting_m for pose in answer.poses[:2]] == [HERE.easting_m] * 2
-    assert answer.scores[0] == answer.scores[1] > answer.scores[2]
-
-
-def test_a_half_hidden_view_is_found_and_what_tells_nothing_is_withheld(made, region, matcher):
-    seen = seen_from(made, region, HERE)
-    cells = seen.cells.copy()
-    cells[:, :, :80] = UNKNOWN
-    assert error_m(matcher.match(made.query_of(seen.replace(cells), PRIOR), top_k=1)) < WITHIN_M
-    blank = seen.replace(np.full_like(cells, UNKNOWN))
-    alien = Evidence(classes=("railway", "green", "coastline"), cells=seen.cells, cell_size_m=1.0)
-    for evidence in (blank, alien):
-        assert matcher.match(made.query_of(evidence, PRIOR), top_k=1) == WITHHELD

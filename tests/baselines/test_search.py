@@ -11,8 +11,7 @@ from sasgeo_baselines.raster import FullUnknown, RasterGraph, RasterUniform
 
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.matching.controls.fft_vote import FftVote
-from sasgeo_bench.matching.matcher import WITHHELD, check_match
-from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.matching.matcher import check_match
 from sasgeo_bench.search.plan import Disc
 from sasgeo_bench.search.view import Patch, View
 from sasgeo_bench.search.vote_search import VotePlan, VoteSearch, turns
@@ -162,31 +161,6 @@ def test_the_same_place_twice_scores_the_same_and_keeps_its_order(made, matcher)
     assert shown == [1309.5, 1509.5, 1109.5]
     assert len(set(match.scores[:3])) == 1
     assert match.scores[3] < match.scores[0]
-
-
-def test_a_candidate_given_twice_ties_with_itself(made) -> None:
-    region = made.region_of(made.textured(1))
-    pose = SOME[0]
-    matcher = FftVote()
-    matcher.prepare(region, None)
-    near = Prior(center_m=None, radius_m=None, yaw_deg=pose.yaw_deg, yaw_sigma_deg=5.0, scale_sigma=0.03)
-    query = made.query_of(made.view_of(region, pose, size_cells=64), near, candidates=(SOME[1], pose, pose))
-    match = check_match(matcher.match(query, top_k=3), query, top_k=3)
-    assert [(found.easting_m, found.northing_m) for found in match.poses] == [
-        (item.easting_m, item.northing_m) for item in (pose, pose, SOME[1])
-    ]
-    assert match.scores[0] == match.scores[1] > match.scores[2]
-
-
-@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform(), RasterGraph(), FullUnknown()])
-def test_an_answer_is_withheld_where_nothing_was_seen_or_no_map_is_near(made, matcher) -> None:
-    region = made.region_of(made.textured(1))
-    matcher.prepare(region, None)
-    seen = made.view_of(region, SOME[0], size_cells=64)
-    blind = seen.replace(np.full_like(seen.cells, UNKNOWN))
-    assert matcher.match(made.query_of(blind, prior_near(SOME[0])), top_k=5) == WITHHELD
-    far = replace(prior_near(SOME[0]), center_m=(90_000.0, 90_000.0))
-    assert matcher.match(made.query_of(seen, far), top_k=5).poses == []
 
 
 def test_headings_reach_as_far_as_in_all_searches_and_scales_two_standard_deviations() -> None:

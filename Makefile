@@ -17,12 +17,12 @@ SOURCES := sasgeo_bench baselines benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help install demo head-start list-regions build-region queries leaderboard test test-quick test-torch test-oldest test-wheel check bench ageing figures docs lock clean
+.PHONY: help install demo head-start list-regions build-region queries leaderboard test test-of test-quick test-torch test-oldest test-wheel check bench ageing figures docs lock clean
 
 help: ## print this list
 	@printf 'sasgeo-bench: make TARGET\n\n'
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
-	@printf '\nVariables: REGION=<id> PIPELINE=<id> RESULTS=<folder to store a board in> DATE=<yyyy-mm-dd> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
+	@printf '\nVariables: REGION=<id> PIPELINE=<id> RESULTS=<folder to store a board in> DATE=<yyyy-mm-dd> OF=<folder or file of tests> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
 
 # Rebuilt when the lock or the packages' own metadata change; otherwise nothing runs, so a second call is quick.
 $(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
@@ -73,13 +73,19 @@ leaderboard: $(STAMP) ## carry out the registered experiment, or PIPELINE=demo, 
 
 # Three workers for two processors: now and then a test waits for a process that it has started.
 # Hundreds of processes import the same modules: none of them compiles them again.
-test test-quick test-torch test-oldest test-wheel: export PYTHONDONTWRITEBYTECODE :=
+test test-of test-quick test-torch test-oldest test-wheel: export PYTHONDONTWRITEBYTECODE :=
 # The workers fill the processors already: threads of linear algebra and of image warps would wait for each other.
-test test-quick test-torch test-oldest test-wheel: export OMP_NUM_THREADS := 1
-test test-quick test-torch test-oldest test-wheel: export OPENCV_FOR_THREADS_NUM := 1
+test test-of test-quick test-torch test-oldest test-wheel: export OMP_NUM_THREADS := 1
+test test-of test-quick test-torch test-oldest test-wheel: export OPENCV_FOR_THREADS_NUM := 1
 
 test: $(STAMP) ## run the tests and every example in the docstrings; says what it skips and why
 	$(VENV_PYTHON) -m pytest -n 3 --dist loadfile -p no:benchmark -rs $(ARGS)
+
+# One process: a few tests are over before several have begun.
+test-of: $(STAMP) ## run the tests and examples of one folder or file: make test-of OF=osm, or OF=tests/osm/test_sea.py
+	@test -n "$(OF)" || { echo "name a folder or a file: make test-of OF=osm, or OF=tests/osm/test_sea.py" >&2; exit 2; }
+	$(VENV_PYTHON) -m pytest -p no:benchmark -rs \
+	  $(foreach each,$(OF),$(or $(wildcard tests/$(each) sasgeo_bench/$(each)),$(each))) $(ARGS)
 
 test-quick: $(STAMP) ## run, for a first look, the tests that need nothing built for several of them
 	$(VENV_PYTHON) -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)

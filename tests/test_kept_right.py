@@ -38,26 +38,15 @@ def test_a_node_at_exactly_0_0_belongs_to_its_ring(tmp_path):
 CUTS = {
     "level": [shapely.box(0, 0, 10, 5.5), shapely.box(0, 5.5, 10, 10)],
     "upright": [shapely.box(0, 0, 5.5, 10), shapely.box(5.5, 0, 10, 10)],
-    "quarters": [
-        shapely.box(*west, *east)
-        for west, east in (
-            ((0, 0), (3.5, 2.5)),
-            ((3.5, 0), (10, 2.5)),
-            ((0, 2.5), (3.5, 10)),
-            ((3.5, 2.5), (10, 10)),
-        )
-    ],
+    "quarters": [shapely.box(*west, *east) for west, east in (((0, 0), (3.5, 2.5)), ((3.5, 0), (10, 2.5)), ((0, 2.5),
+     (3.5, 10)), ((3.5, 2.5), (10, 10)))],
     "diagonal": [shapely.Polygon([(0, 0), (10, 0), (10, 10)]), shapely.Polygon([(0, 0), (10, 10), (0, 10)])],
     "falling": [shapely.Polygon([(0, 10), (0, 0), (10, 0)]), shapely.Polygon([(0, 10), (10, 0), (10, 10)])],
-    "aslant": [
-        shapely.Polygon([(0, 0), (10, 0), (10, 3.3), (9.9, 3.3)]),
-        shapely.Polygon([(0, 0), (9.9, 3.3), (10, 3.3), (10, 10), (0, 10)]),
-    ],
-    "fan": [
-        shapely.Polygon([(4.5, 4.5), first, second])
-        for first, second in (((0, 0), (10, 0)), ((10, 0), (10, 10)), ((10, 10), (0, 10)), ((0, 10), (0, 0)))
-    ],
-}
+    "aslant": [shapely.Polygon([(0, 0), (10, 0), (10, 3.3), (9.9, 3.3)]), shapely.Polygon([(0, 0), (9.9, 3.3), (10,
+     3.3), (10, 10), (0, 10)])],
+    "fan": [shapely.Polygon([(4.5, 4.5), first, second]) for first, second in (((0, 0), (10, 0)), ((10, 0), (10, 10)),
+     ((10, 10), (0, 10)), ((0, 10), (0, 0)))],
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("parcels", CUTS.values(), ids=CUTS)

@@ -113,15 +113,12 @@ def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(
         ("a.gpx", _gpx(_points()).replace("<time>", "<ele>480</ele><time>"), "elevations, which are above the sea"),
         ("a.kml", LINE.format("9.52,47.14,80 9.52,47.15,90"), "altitudes, which are not relative to the ground"),
         ("a.csv", "lat,lon,height_furlong,heading_mil\n1,1,2,3\n1,2,2,3", "'height_furlong', 'heading_mil'"),
-        (
-            "b.csv",
-            "lat,lon,date,altitude_m,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
-            "'date', 'altitude_m'; altitudes above",
-        ),
+        ("b.csv", "lat,lon,date,altitude_m,time_s,\n1,1,x,2,1,\n1,1.00001,y,2,3,",
+         "'date', 'altitude_m'; altitudes above"),
         ("c.csv", "lat,lon,pitch_deg,\x1b[31m\n1,1,2,3\n1,2,2,3", "'pitch_deg', '?[31m'"),
         ("d.csv", "lat,lon," + ",".join(f"c{at:0>99}" for at in range(99)), "'c000"),
     ],
-)
+)  # fmt: skip
 def test_what_of_a_file_is_not_read_is_told_in_one_line(written: Callable, name: str, text: str, told: str) -> None:
     if name == "d.csv":
         text += "".join(f"\n1,{at + 1}" + ",5" * 99 for at in range(2))
@@ -190,39 +187,26 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
         (_csv("lat,lon", "47.14,9.52", "47.14,189.5"), "line 3: latitude 47.14, longitude 189.5 are no degrees"),
         (_csv("lat_e7,lon_e7", "471400000,95200000", "1900000000,95200000"), "line 3: latitude 190, longitude 9.52"),
         (_csv("lat,lon", "47.14,9.52", "0,0"), "line 3: latitude and longitude are 0, which is no fix"),
-        (
-            _csv("lat;lon", "47.14;9.52", "47,14;9,52"),
-            "line 3: latitude is no number, .*decimals with a point",
-        ),
+        (_csv("lat;lon", "47.14;9.52", "47,14;9,52"), "line 3: latitude is no number, .*decimals with a point"),
         (_csv("lat,lon", "47.14,9.52", "47.14"), "line 3: 1 cells, the head has 2"),
         (_csv("lat,lon", "47.14,9.52", '47.1,"9.5'), "line 3: no sound CSV"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "47.1401,9.52,2"), "line 3: time goes back by 1 s: sort"),
         (_csv("lat,lon,time_s", "47.14,9.52,-1e308", "47.1401,9.52,1e308"), "line 2: time is no number, '-1e308'"),
-        (
-            _csv("lat,lon,time", "47.14,9.52,01/05/2025 10:00", "47.1401,9.52,3"),
-            "line 2: time is no date and time like",
-        ),
+        (_csv("lat,lon,time", "47.14,9.52,01/05/2025 10:00", "47.1401,9.52,3"),
+         "line 2: time is no date and time like"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "47.1401,9.52,"), "line 3: time is missing"),
         (_csv("lat,lon,time", "47.14,9.52,2025-05-01T10:00:00", "47.2,9.52,6"), "line 3: time is no date and time"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "48.14,9.52,4"), "line 3: moves at 111183 m/s since the point before"),
-        (
-            _csv("lat,lon,hdg_cdeg", "47.14,9.52,65535", "47.15,9.52,9000"),
-            "line 2: yaw, column 'hdg_cdeg', cdeg, is 655.35 degrees, bey",
-        ),
-        (
-            _csv("lat,lon,yaw_rad", "47.14,9.52,1", "47.15,9.52,190"),
-            "line 3: yaw, column 'yaw_rad', rad, is 10886.2 deg",
-        ),
-        (
-            _csv("lat_e7,lon", "471400000.5,9.52", "47,9"),
-            "'lat_e7' has decimals, .* of 1e-7 degrees: name it by its unit",
-        ),
-        (
-            _csv("lat,lon,height_m", "47.14,9.52,2e4", "47.15,9.52,80"),
-            "line 2: height, column 'height_m', m, is 20000 m, beyond 10000",
-        ),
+        (_csv("lat,lon,hdg_cdeg", "47.14,9.52,65535", "47.15,9.52,9000"),
+         "line 2: yaw, column 'hdg_cdeg', cdeg, is 655.35 degrees, bey"),
+        (_csv("lat,lon,yaw_rad", "47.14,9.52,1", "47.15,9.52,190"),
+         "line 3: yaw, column 'yaw_rad', rad, is 10886.2 deg"),
+        (_csv("lat_e7,lon", "471400000.5,9.52", "47,9"),
+         "'lat_e7' has decimals, .* of 1e-7 degrees: name it by its unit"),
+        (_csv("lat,lon,height_m", "47.14,9.52,2e4", "47.15,9.52,80"),
+         "line 2: height, column 'height_m', m, is 20000 m, beyond 10000"),
     ],
-)
+)  # fmt: skip
 def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
     written: Callable, text: str, match: str
 ) -> None:
@@ -252,22 +236,16 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
         ("a.gpx", _gpx(_points()).replace("2025-05-01T10:00:02Z", "&#9;noon"), "point 3: time is no date and time"),
         ("a.gpx", _gpx(_points()).replace('lat="47.1402"', 'lat="NaN"'), "point 3: latitude is no number, 'NaN'"),
         ("a.gpx", _gpx(_points()).replace('lat="47.1402"', ""), "point 3: latitude is missing"),
-        (
-            "a.gpx",
-            _gpx(_points()).replace('lat="47.1402"', 'lat="-91"'),
-            "point 3: latitude -91, longitude 9.52 are no",
-        ),
+        ("a.gpx", _gpx(_points()).replace('lat="47.1402"', 'lat="-91"'),
+         "point 3: latitude -91, longitude 9.52 are no"),
         ("a.kml", "<kml/>", "0 lines or tracks, one is read"),
         ("a.kml", LINE.format("9,47 9,48").replace("</Document>", "<LineString/></Document>"), "2 lines or tracks"),
         ("a.kml", LINE.format("9.52, 47.14"), "point 1: longitude is no number|latitude is missing|is no longitude"),
         ("a.kml", LINE.format("9.52 47.14"), "point 1: '9.52' is no longitude, latitude and altitude"),
-        (
-            "a.kmz",
-            "PK",
-            r"no flight log that is read: .gpx, .kml, .csv, .pos, .tum, .*\(unzip a .kmz, export a .ulg by ulog2csv",
-        ),
+        ("a.kmz", "PK",
+         r"no flight log that is read: .gpx, .kml, .csv, .pos, .tum, .*\(unzip a .kmz, export a .ulg by ulog2csv"),
     ],
-)
+)  # fmt: skip
 def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(
     written: Callable, name: str, text: str, match: str
 ) -> None:

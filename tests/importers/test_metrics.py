@@ -318,18 +318,10 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 1]}, "without a gap or a tie"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 3]}, "without a gap or a tie"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g1"], "rank": [1, 2]}, "ranks 'g1' twice for query 'q'"),
-        (
-            pa.table(
-                {
-                    "query_id": pa.array([], pa.string()),
-                    "gallery_id": pa.array([], pa.string()),
-                    "rank": pa.array([], pa.int64()),
-                }
-            ),
-            "has no row",
-        ),
+        (pa.table({"query_id": pa.array([], pa.string()), "gallery_id": pa.array([], pa.string()), "rank": pa.array([],
+         pa.int64())}), "has no row"),
     ],
-)
+)  # fmt: skip
 def test_a_wrong_ranking_is_refused_in_one_line(columns, told, tmp_path):
     dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a", "g2": "b"})
     pq.write_table(pa.table(columns) if isinstance(columns, dict) else columns, tmp_path / "r.parquet")

@@ -190,20 +190,14 @@ def closed(shape):
     [
         (closed(HOUSE), {"building": "yes"}, "closed line that is no polygon"),
         (closed(HOUSE), {"name": "a"}, "LineString without a class"),
-        (
-            shapely.LineString(HOUSE.exterior.coords[:3]),
-            {"building": "yes"},
-            "LineString with the tags of a line or an area",
-        ),
-        (
-            shapely.GeometryCollection([HOUSE]),
-            {"building": "yes"},
-            "GeometryCollection with the tags of a line or an area",
-        ),
+        (shapely.LineString(HOUSE.exterior.coords[:3]), {"building": "yes"},
+         "LineString with the tags of a line or an area"),
+        (shapely.GeometryCollection([HOUSE]), {"building": "yes"},
+         "GeometryCollection with the tags of a line or an area"),
         (HOUSE.centroid, {"building": "yes"}, "Point with the tags of a line or an area"),
         (HOUSE.centroid, {"shop": "bakery"}, "Point without a class"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_object_is_counted_as_what_it_is(shape, properties, reason, tmp_path):
     path = written(tmp_path / "a.geojson", feature(shape, **properties), feature(SHED, building="yes"))
     assert read(path, tags={}).drops == {reason: 1}

@@ -60,56 +60,31 @@ CASES = {
     "alike by class on both": ([(SQUARE, WOOD), (YARD, {})], BARE | FOREST, {"green": [HOLED]}),
     "a name on the relation": ([(SQUARE, HOUSE), (YARD, {})], BARE | {"name": "Palace"}, {"building": [HOLED]}),
     "a note on the relation": ([(SQUARE, HOUSE), (YARD, {})], BARE | {"FIXME": "what?"}, {"building": [HOLED]}),
-    "names that differ": (
-        [(SOUTH, FOREST | {"name": "A"}), (NORTH, FOREST | {"name": "B"})],
-        BARE,
-        {"green": [WHOLE]},
-    ),
+    "names that differ": ([(SOUTH, FOREST | {"name": "A"}), (NORTH, FOREST | {"name": "B"})], BARE,
+     {"green": [WHOLE]}),
     "tags that differ within a class": ([(SOUTH, FOREST), (NORTH, WOOD)], BARE, {"green": [WHOLE]}),
     "an outer way without tags": ([(SOUTH, FOREST), (NORTH, {"source": "survey"})], BARE, {"green": [WHOLE]}),
     "an outer way that is a track": ([(SOUTH, FOREST), (NORTH, ROAD)], BARE, {}),
     "outer ways of two classes": ([(SOUTH, FOREST), (NORTH, WATER)], BARE, {}),
     "an inner way with the same tags": ([(SQUARE, HOUSE), (YARD, HOUSE)], BARE, {"building": [HOLED]}),
-    "the same but for the source": (
-        [(SQUARE, HOUSE | {"source": "a"}), (YARD, HOUSE | {"source": "b", "note:de": "?"})],
-        BARE,
-        {"building": [HOLED]},
-    ),
+    "the same but for the source": ([(SQUARE, HOUSE | {"source": "a"}), (YARD, HOUSE | {"source": "b",
+     "note:de": "?"})], BARE, {"building": [HOLED]}),
     "an inner way with other tags": ([(SQUARE, FOREST), (YARD, WOOD)], BARE, {"green": [IN_YARD, HOLED]}),
     "an inner way of another class": ([(SQUARE, FOREST), (YARD, WATER)], BARE, {"green": [HOLED], "water": [IN_YARD]}),
-    "in the new style an inner way is its own": (
-        [(SQUARE, {}), (YARD, FOREST)],
-        BARE | FOREST,
-        {"green": [IN_YARD, HOLED]},
-    ),
-    "an outer way of another class": (
-        [(SQUARE, FOREST), (YARD, {})],
-        BARE | WATER,
-        {"green": [WHOLE], "water": [HOLED]},
-    ),
-    "a part of a building": (
-        [(SQUARE, HOUSE), (YARD, {})],
-        BARE | {"building:part": "yes"},
-        {"building": [WHOLE]},
-    ),
-    "a site with a class of its own": (
-        [(SQUARE, HOUSE), (YARD, {})],
-        BARE | {"amenity": "school"},
-        {"building": [WHOLE]},
-    ),
+    "in the new style an inner way is its own": ([(SQUARE, {}), (YARD, FOREST)], BARE | FOREST, {"green": [IN_YARD,
+     HOLED]}),
+    "an outer way of another class": ([(SQUARE, FOREST), (YARD, {})], BARE | WATER, {"green": [WHOLE],
+     "water": [HOLED]}),
+    "a part of a building": ([(SQUARE, HOUSE), (YARD, {})], BARE | {"building:part": "yes"}, {"building": [WHOLE]}),
+    "a site with a class of its own": ([(SQUARE, HOUSE), (YARD, {})], BARE | {"amenity": "school"},
+     {"building": [WHOLE]}),
     "a boundary without a word": ([(SQUARE, WOOD), (YARD, {})], {"type": "boundary"}, {"green": [HOLED]}),
-    "a boundary of its own": (
-        [(SQUARE, WOOD), (YARD, {})],
-        {"type": "boundary", "boundary": "administrative"},
-        {"green": [WHOLE]},
-    ),
-    "a square to walk on": (
-        [(SQUARE, {"highway": "pedestrian", "area": "yes"}), (YARD, {})],
-        BARE,
-        {"road_minor": [HOLED]},
-    ),
+    "a boundary of its own": ([(SQUARE, WOOD), (YARD, {})], {"type": "boundary", "boundary": "administrative"},
+     {"green": [WHOLE]}),
+    "a square to walk on": ([(SQUARE, {"highway": "pedestrian", "area": "yes"}), (YARD, {})], BARE,
+     {"road_minor": [HOLED]}),
     "an outer way that says it is none": ([(SQUARE, HOUSE | {"area": "no"}), (YARD, {})], BARE, {}),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize(("ways", "tags", "expected"), CASES.values(), ids=CASES)

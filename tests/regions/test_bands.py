@@ -100,12 +100,8 @@ WHOLE = {
     "blue, green, red": Made((RGB[::-1],), BGR),
     "with infrared": Made((RGB, INFRARED), (Is.red, Is.green, Is.blue, NO)),
     "infrared first": Made((INFRARED, RGB), (NO, Is.red, Is.green, Is.blue)),
-    "by the names of the bands": Made(
-        (RGB[::-1], INFRARED, INFRARED),
-        (*GREY, NO),
-        names=("blue_band", "Green", "Band 3 (red)", "Red_Edge", "Near Infrared"),
-        profile=MINISBLACK,
-    ),
+    "by the names of the bands": Made((RGB[::-1], INFRARED, INFRARED), (*GREY, NO), names=("blue_band", "Green",
+     "Band 3 (red)", "Red_Edge", "Near Infrared"), profile=MINISBLACK),
     "by letters": Made((RGB[::-1],), GREY[:3], names=("B", "G", "R"), profile=MINISBLACK),
     "alpha everywhere, black is empty": Made((RGB, FULL), RGB_ALPHA, profile={"nodata": 0}),
     "rows from south to north": Made((RGB[:, ::-1],), transform=Affine(1, 0, WEST, 0, 1, NORTH - SIDE)),
@@ -113,7 +109,7 @@ WHOLE = {
     "both": Made((RGB[:, ::-1, ::-1],), transform=Affine(-1, 0, WEST + SIDE, 0, 1, NORTH - SIDE)),
     "rows are columns": Made((RGB.transpose(0, 2, 1),), transform=Affine(0, 1, WEST, -1, 0, NORTH)),
     "with heights in its CRS": Made((RGB,), profile={"crs": "EPSG:25832+5783"}),
-}
+}  # fmt: skip
 CUT = {
     "alpha first": Made((SHOWN, RGB), ALPHA_RGB),
     "alpha first, black is empty too": Made((SHOWN, RGB), ALPHA_RGB, profile={"nodata": 0}),
@@ -136,17 +132,13 @@ CUT = {
     ),
 }
 NOTED = {
-    "infrared that calls itself alpha": (
-        Made((RGB, INFRARED), RGB_ALPHA),
-        "band 4 calls itself alpha and holds a picture",
-    ),
+    "infrared that calls itself alpha": (Made((RGB, INFRARED), RGB_ALPHA),
+     "band 4 calls itself alpha and holds a picture"),
     "bands of one level and water": (Made((RGB, np.where(B == 60, 0, 130).astype(np.uint8)), RGB_ALPHA), "infrared"),
-    "names that say no colour": (
-        Made((RGB,), (*GREY[:3],), names=("B4", "B3", "B2"), profile=MINISBLACK),
-        r"its bands are called B4, B3, B2: bands \(1, 2, 3\) are taken as red",
-    ),
+    "names that say no colour": (Made((RGB,), (*GREY[:3],), names=("B4", "B3", "B2"), profile=MINISBLACK),
+     r"its bands are called B4, B3, B2: bands \(1, 2, 3\) are taken as red"),
     "bands without a word": (Made((RGB, INFRARED), GREY, profile=MINISBLACK), r"bands \(1, 2, 3\) are taken as red"),
-}
+}  # fmt: skip
 
 
 def lay(folder, made):
@@ -219,26 +211,18 @@ REFUSED = {
     "4 bits": (Made((RGB // 16,), profile={"nbits": 4}), "colours of 4 bits"),
     "two alphas": (Made((RGB, FULL, FULL), (*RGB_ALPHA, Is.alpha)), "alpha, alpha"),
     "two reds": (Made((RGB, R), (*RGB_ALPHA[:3], Is.red)), "blue, red"),
-    "names against colours": (
-        Made((RGB[::-1],), names=("Blue", "Green", "Red")),
-        r"\(1, 2, 3\) by their colour interpretation, \(3, 2, 1\) by their names",
-    ),
-    "infrared, red, green": (
-        Made((INFRARED, R, G), GREY[:3], names=("nir", "red", "green"), profile=MINISBLACK),
-        "its bands are called nir, red, green",
-    ),
-    "infrared, red, green in the place of colours": (
-        Made((INFRARED, R, G), names=("nir", "red", "green")),
-        r"\(1, 2, 3\) by their colour interpretation, nir, red, green by their names",
-    ),
+    "names against colours": (Made((RGB[::-1],), names=("Blue", "Green", "Red")),
+     r"\(1, 2, 3\) by their colour interpretation, \(3, 2, 1\) by their names"),
+    "infrared, red, green": (Made((INFRARED, R, G), GREY[:3], names=("nir", "red", "green"), profile=MINISBLACK),
+     "its bands are called nir, red, green"),
+    "infrared, red, green in the place of colours": (Made((INFRARED, R, G), names=("nir", "red", "green")),
+     r"\(1, 2, 3\) by their colour interpretation, nir, red, green by their names"),
     "a building site": (Made((RGB,), profile={"crs": rasterio.crs.CRS.from_wkt(SITE)}), "'site', which is neither"),
     "metres from the Earth's centre": (Made((RGB,), profile={"crs": "EPSG:4978"}), "neither geographic nor projected"),
-    "the Moon": (
-        Made((RGB,), transform=Affine(1e-5, 0, 11, 0, -1e-5, 49), profile={"crs": "IAU_2015:30100"}),
-        "cannot be projected to EPSG:32632",
-    ),
+    "the Moon": (Made((RGB,), transform=Affine(1e-5, 0, 11, 0, -1e-5, 49), profile={"crs": "IAU_2015:30100"}),
+     "cannot be projected to EPSG:32632"),
     "pixels without height": (Made((RGB,), transform=Affine(1, 0, WEST, 0, 0, NORTH)), "pixels of 0 m"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", REFUSED)

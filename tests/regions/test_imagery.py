@@ -221,23 +221,15 @@ BAD = {
     "no transform": (lambda path: write_picture(path, GROUND), "says no place"),
     "16-bit": (lambda path: write_picture(path, GROUND.astype(np.uint16), **THERE), "uint16, imagery is 8-bit red"),
     "one band": (lambda path: write_picture(path, GROUND[:1], **THERE), r"1 band\(s\) of uint8"),
-    "elsewhere": (
-        lambda path: write_picture(path, GROUND, transform=Affine(1.0, 0, 4e6, 0, -1.0, 5e6)),
-        r"the region is .*: leave it out",
-    ),
+    "elsewhere": (lambda path: write_picture(path, GROUND, transform=Affine(1.0, 0, 4e6, 0, -1.0, 5e6)),
+     r"the region is .*: leave it out"),
     "empty": (lambda path: path.write_bytes(b""), "cannot be read as a GeoTIFF"),
     "no raster": (lambda path: path.write_text("<html>not found</html>"), "cannot be read as a GeoTIFF"),
-    "absurd scale": (
-        lambda path: write_picture(path, GROUND, transform=Affine(5e4, 0, 0, 0, -5e4, 7e6)),
-        "check its georeference",
-    ),
-    "absurdly fine": (
-        lambda path: write_picture(
-            path, np.zeros((3, 1, 1), np.uint8), transform=Affine(1e-4, 0, 1_000_900, 0, -1e-4, 5_959_000)
-        ),
-        "check its georeference",
-    ),
-}
+    "absurd scale": (lambda path: write_picture(path, GROUND, transform=Affine(5e4, 0, 0, 0, -5e4, 7e6)),
+     "check its georeference"),
+    "absurdly fine": (lambda path: write_picture(path, np.zeros((3, 1, 1), np.uint8), transform=Affine(1e-4, 0,
+     1_000_900, 0, -1e-4, 5_959_000)), "check its georeference"),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("fault", BAD)

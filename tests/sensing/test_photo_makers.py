@@ -205,14 +205,10 @@ EXTENTS = [
     ("zoom of 0/0", {"make": "X", "inner": {ZOOM: IFDRational(0, 0)}}, gimbal(), FILM_M),
     ("sensor", {"film": None, "inner": sensor(40.0)}, gimbal(), (113.6, 85.2)),
     ("sensor in inches", {"film": None, "inner": sensor(40.0, unit=2, units_mm=25.4)}, gimbal(), (113.6, 85.2)),
-    (
-        "sensor, scaled down",
-        {"film": None, "size": HALF, "inner": sensor(40.0) | dict(zip(PIXELS, FULL, strict=True))},
-        gimbal(),
-        (113.6, 85.2),
-    ),
+    ("sensor, scaled down", {"film": None, "size": HALF, "inner": sensor(40.0) | dict(zip(PIXELS, FULL, strict=True))},
+     gimbal(), (113.6, 85.2)),
     ("turned upright", {"orientation": 6, "size": HALF}, CALIBRATED, (81.8, 109.1)),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("how", "facts", "expected_m"), [row[1:] for row in EXTENTS], ids=[row[0] for row in EXTENTS])
@@ -244,15 +240,11 @@ UNFIT = [
     ("zoom out", {"make": "DJI", "inner": {ZOOM: 0.5}}, gimbal(), "digital zoom of 0.5"),
     ("zoom of a calibrated one", {"make": "DJI", "inner": {ZOOM: 2.0}}, CALIBRATED, "digital zoom of 2"),
     ("film against sensor", {"inner": sensor(80.0)}, gimbal(), "two focal lengths, 277 px by 35 mm film and 704 px"),
-    (
-        "calibrated, of no size",
-        {"size": HALF},
-        gimbal(CalibratedFocalLength="277"),
-        "139 px by 35 mm film and 277 px by calibration",
-    ),
+    ("calibrated, of no size", {"size": HALF}, gimbal(CalibratedFocalLength="277"),
+     "139 px by 35 mm film and 277 px by calibration"),
     ("nothing", {"film": None}, gimbal(), "no focal length"),
     ("no unit", {"film": None, "inner": sensor(40.0, unit=1)}, gimbal(), "no focal length"),
-]
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("how", "facts", "words"), [row[1:] for row in UNFIT], ids=[row[0] for row in UNFIT])

@@ -30,14 +30,9 @@ def inner_imports(text):
     return [name for name in (*froms, *plain) if name.startswith("sasgeo_bench.")]
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_every_public_name_is_there(name):
-    assert getattr(sgb, name) is not None
-    assert name in dir(sgb)
-    assert name in sgb.__all__
-
-
-def test_a_name_that_is_none_is_refused_as_of_any_module():
+def test_every_public_name_is_there_and_no_other():
+    assert [name for name in NAMES if getattr(sgb, name) is None] == []
+    assert set(NAMES) <= set(dir(sgb)) & set(sgb.__all__)
     with pytest.raises(AttributeError, match="Posse"):
         _ = sgb.Posse
 
@@ -48,14 +43,11 @@ def test_importing_the_package_imports_none_of_its_libraries():
     assert ended.stdout == "set()\n"
 
 
-@pytest.mark.parametrize(
-    "path", sorted(Path(sasgeo_baselines.__file__).parent.rglob("*.py")), ids=lambda path: path.name
-)
-def test_baselines_need_public_names_alone_as_any_plugin_does(path):
-    assert inner_imports(path.read_text(encoding="utf-8")) == []
-
-
-def test_a_new_plugin_begins_with_public_names_alone():
+def test_baselines_and_a_new_plugin_need_public_names_alone():
+    baselines = sorted(Path(sasgeo_baselines.__file__).parent.rglob("*.py"))
+    assert [
+        (path.name, found) for path in baselines if (found := inner_imports(path.read_text(encoding="utf-8")))
+    ] == []
     files = plugin_files("my-matcher")
     assert not [name for path, text in files.items() if path.endswith(".py") for name in inner_imports(text)]
     assert any("from sasgeo_bench import" in text for text in files.values())
@@ -154,29 +146,17 @@ def test_features_and_graph_of_a_stored_region_are_read_when_they_are_first_aske
 
 
 READERS = (
-    "read_board",
-    "read_card",
-    "read_imagery",
-    "read_predictions",
-    "read_queries",
-    "read_region",
-    "read_task",
-    "read_truths",
-    "build_region",
-    "load_matcher",
-    "load_rejector",
-    "load_segmenter",
-    "load_tracker",
-    "plot_region",
+    *("read_board", "read_card", "read_imagery", "read_predictions", "read_queries", "read_region", "read_task"),
+    *("read_truths", "build_region", "load_matcher", "load_rejector", "load_segmenter", "load_tracker", "plot_region"),
 )
 
 
 @pytest.mark.parametrize("name", READERS)
-@pytest.mark.parametrize("given", [5, 1.5, None, b"x", object(), "nowhere", "a\0b", "file", "folder"])
-def test_what_is_no_folder_or_no_name_is_refused_in_a_line_of_ours(tmp_path, monkeypatch, name, given):
+def test_what_is_no_folder_or_no_name_is_refused_in_a_line_of_ours(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("x", encoding="utf-8")
     (tmp_path / "folder").mkdir()
-    with pytest.raises(SasgeoError) as refused:
-        next(iter(getattr(sgb, name)(given)))  # a reader of rows begins when the first is asked for
-    assert "\n" not in str(refused.value)
+    for given in (5, 1.5, None, b"x", object(), "nowhere", "a\0b", "file", "folder"):
+        with pytest.raises(SasgeoError) as refused:
+            next(iter(getattr(sgb, name)(given)))  # a reader of rows begins when the first is asked for
+        assert "\n" not in str(refused.value)

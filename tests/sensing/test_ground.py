@@ -174,17 +174,15 @@ def test_a_file_that_is_no_raster_is_refused(tmp_path):
             read_dem(tmp_path / name, GRID)
 
 
-def test_heights_of_a_nodata_value_are_refused():
-    with pytest.raises(CameraError, match="nodata"):
-        Dem(grid=GRID, cells_m=np.full((10, 12), -32768.0, dtype=np.float32))
-
-
-def test_heights_of_another_shape_are_refused():
-    with pytest.raises(CameraError, match="shape"):
-        Dem(grid=GRID, cells_m=np.zeros((3, 3), dtype=np.float32))
-
-
-@pytest.mark.parametrize("height_m", [float("nan"), 1e9])
-def test_a_plane_at_no_height_is_refused(height_m):
-    with pytest.raises(CameraError, match="ground lies"):
-        Plane(height_m=height_m)
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Dem(grid=GRID, cells_m=np.full((10, 12), -32768.0, dtype=np.float32)), "nodata"),
+        (lambda: Dem(grid=GRID, cells_m=np.zeros((3, 3), dtype=np.float32)), "shape"),
+        (lambda: Plane(height_m=float("nan")), "ground lies"),
+        (lambda: Plane(height_m=1e9), "ground lies"),
+    ],
+)
+def test_ground_that_cannot_be_is_refused(make, words):
+    with pytest.raises(CameraError, match=words):
+        make()

@@ -193,7 +193,9 @@ FILM_M = (144.2, 108.2)  # 24 mm on film, from 100 m
 EXTENTS = [
     ("film", {}, gimbal(), FILM_M),
     ("film, scaled down", {"size": HALF, "inner": dict(zip(PIXELS, FULL, strict=True))}, gimbal(), FILM_M),
+    ("film, 16 : 9", {"size": (400, 225)}, gimbal(), (144.2, 81.1)),
     ("calibrated", {}, CALIBRATED, (109.1, 81.8)),
+    ("calibrated, whatever the film says", {"film": 30}, CALIBRATED, (109.1, 81.8)),
     ("calibrated, scaled down", {"size": HALF}, CALIBRATED, (109.1, 81.8)),
     ("its EXIF kept", {"size": HALF, "inner": dict(zip(PIXELS, FULL, strict=True))}, CALIBRATED, (109.1, 81.8)),
     ("its EXIF renewed", {"size": HALF, "inner": dict(zip(PIXELS, HALF, strict=True))}, CALIBRATED, (109.1, 81.8)),

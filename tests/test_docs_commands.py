@@ -18,16 +18,10 @@ import typer
 
 from sasgeo_bench import cli
 from sasgeo_bench.cli import program
-from sasgeo_bench.leaderboard.board import ScoreRequest
-from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.scaffold import plugin_files
 from sasgeo_bench.publishing.archive import pack_board
-from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.runner import run
-from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from tests import world
 from tests.threaded import threaded
 
 ROOT = Path(__file__).parents[1]
@@ -220,23 +214,8 @@ def desk(towns: Path, lay_towns: Callable[..., Path], tmp_path_factory: pytest.T
     """A folder as a reader has it after `make demo`, on a smaller scale: towns built, tasks drawn, results stored."""
     out = tmp_path_factory.mktemp("desk") / "out"
     lay_towns(Path(shutil.copytree(towns, out)), "town-suburb")
-    wanted = Wanted(
-        suites=("clean",), regions=("town-riverside", "town-suburb"), split="crossfit", count=1, seed=0, out=out
-    )
-    for request in plan_requests(wanted, tell=lambda _: None):
-        make_tasks(request, tell=lambda _: None)
-    asked = [out / "tasks" / "clean" / name for name in ("town-riverside", "town-suburb")]
-    with threaded():
-        run(plan_run(RunRequest(spec="random", tasks=asked, out=out)), tell=lambda _: None)
-    request = ScoreRequest(
-        predictions=[out / "runs"],
-        root=out,
-        board=out / "boards" / "demo",
-        split=find_split("crossfit"),
-        draws=100,
-        pipeline={"id": "demo", "sha256": "0"},
-    )
-    pack_board(make_board(request, tell=lambda _: None), request, out / "results" / "demo")
+    world.answered(out, "random", world.drawn(out, "clean", "town-riverside", "town-suburb"))
+    pack_board(*world.scored(out, "demo", pipeline={"id": "demo", "sha256": "0"}), out / "results" / "demo")
     return out.parent
 
 

@@ -14,9 +14,9 @@ from sasgeo_baselines.image.deep_retrieval import DeepRetrieval
 
 import sasgeo_bench as sgb
 from sasgeo_bench.matching.matcher import check_match, lacks
-from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.tasks.frames import encode_webp
+from tests import world
 from tests.regions.imagery_place import SOUTH, WEST, make_hamlet
 
 NAMES = (
@@ -35,9 +35,8 @@ def region(tmp_path_factory: pytest.TempPathFactory) -> sgb.Region:
     """A hamlet with imagery."""
     hamlet = make_hamlet(tmp_path_factory.mktemp("hamlet"))
     out = tmp_path_factory.mktemp("out")
-    plan = plan_build(hamlet.spec(), out=out, extract_folders=[hamlet.folder], imagery_folders=[hamlet.folder])
-    build_region(plan, tell=lambda _: None)
-    return sgb.read_region(plan.folder)
+    folders = {"extract_folders": [hamlet.folder], "imagery_folders": [hamlet.folder]}
+    return sgb.read_region(world.built(hamlet.spec(), out, **folders))
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -53,7 +54,8 @@ FUSING = (EkfLoose, FoundlocRansac, SatlocLayers, Se2Trajectory)
 
 
 def made(name: str, *, count: int = PARTICLES) -> sgb.Tracker:
-    found = sgb.load_tracker(name)
+    module, _, attribute = REGISTERED[name].partition(":")
+    found = getattr(import_module(module), attribute)()
     if hasattr(found, "count"):
         found.count = count
     return found

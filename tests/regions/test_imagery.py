@@ -23,6 +23,7 @@ from sasgeo_bench.regions.region_files import (
     read_region,
 )
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from tests import world
 from tests.regions.imagery_place import GSD_M, SOUTH, WEST, Hamlet, make_hamlet, write_picture
 
 OFF_M = (1.3, -0.7)
@@ -41,10 +42,7 @@ def built(hamlet: Hamlet, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def build(hamlet: Hamlet, out: Path) -> Path:
-    folders = {"extract_folders": [hamlet.folder], "imagery_folders": [hamlet.folder]}
-    plan = plan_build(hamlet.spec(), out=out, **folders)
-    build_region(plan, tell=lambda _: None)
-    return plan.folder
+    return world.built(hamlet.spec(), out, extract_folders=[hamlet.folder], imagery_folders=[hamlet.folder])
 
 
 def refusal(hamlet: Hamlet, out: Path) -> str:

@@ -13,18 +13,15 @@ from rasterio.features import rasterize
 
 from sasgeo_bench.errors import ConfigError, ImageryError, StoreError
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sensing import reference_imagery
 from sasgeo_bench.sensing.reference_imagery import Look, render_imagery, render_place
 from tests.regions.imagery_place import make_hamlet
+from tests.world import built, quiet
 
 TOWN = "town-suburb"
 COARSE = Look(gsd_m=1.0)
-
-
-def silent(line: str) -> None:
-    del line
 
 
 def spec():
@@ -32,7 +29,7 @@ def spec():
     return read_region_file(find_region_file(TOWN)).model_copy(update={"size_m": (512.0, 512.0)})
 
 
-def render(out, look=COARSE, date=None, tell=silent):
+def render(out, look=COARSE, date=None, tell=quiet):
     return render_place(spec(), look=look, out=out, date=date, tell=tell)
 
 
@@ -49,7 +46,7 @@ def state_of(folder):
 @pytest.fixture(scope="module")
 def rendered(tmp_path_factory):
     out = tmp_path_factory.mktemp("rendered")
-    build_region(plan_build(spec(), out=out), tell=silent)
+    built(spec(), out)
     before = region_files.read_manifest(out / "regions" / TOWN)
     render(out)
     return out, before
@@ -191,18 +188,17 @@ def test_a_region_that_is_not_built_is_refused_and_no_file_is_made(tmp_path):
         render(tmp_path)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(StoreError, match=r"holds no region\.json"):
-        render_imagery(tmp_path / "regions" / "nowhere", tmp_path, COARSE, tell=silent)
+        render_imagery(tmp_path / "regions" / "nowhere", tmp_path, COARSE, tell=quiet)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_real_imagery_is_not_replaced(tmp_path):
     hamlet = make_hamlet(tmp_path / "files")
-    plan = plan_build(hamlet.spec(), out=tmp_path, extract_folders=(hamlet.folder,), imagery_folders=(hamlet.folder,))
-    build_region(plan, tell=silent)
-    before = state_of(plan.folder)
+    folder = built(hamlet.spec(), tmp_path, extract_folders=(hamlet.folder,), imagery_folders=(hamlet.folder,))
+    before = state_of(folder)
     with pytest.raises(ImageryError, match="hamlet has imagery of its own"):
-        render_imagery(plan.folder, plan.folder, COARSE, tell=silent)
-    assert state_of(plan.folder).items() >= before.items()
+        render_imagery(folder, folder, COARSE, tell=quiet)
+    assert state_of(folder).items() >= before.items()
 
 
 def test_a_map_without_anything_to_draw_is_refused(rendered, tmp_path, monkeypatch):

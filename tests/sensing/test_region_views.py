@@ -10,10 +10,10 @@ import rasterio
 import shapely
 
 from sasgeo_bench.errors import ImageryError
-from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.sensing.region_views import part_bounds_m, region_views, split_bounds
+from tests import world
 from tests.regions.imagery_place import EPSG, GSD_M, SIDE_M, SOUTH, WEST, make_hamlet
 
 SIDE_PX = 128  # 64 m
@@ -26,9 +26,7 @@ def hamlet(tmp_path_factory):
 
 def built(place, out):
     folders = {"extract_folders": [place.folder], "imagery_folders": [place.folder]}
-    plan = plan_build(place.spec(), out=out, **folders)
-    build_region(plan, tell=lambda _: None)
-    return read_region(plan.folder)
+    return read_region(world.built(place.spec(), out, **folders))
 
 
 @pytest.fixture(scope="module")

@@ -104,11 +104,13 @@ def off_m(pose: sgb.Pose, truth: sgb.Pose = TRUTH) -> float:
     return math.hypot(pose.easting_m - truth.easting_m, pose.northing_m - truth.northing_m)
 
 
-def test_each_finds_a_darker_noisier_view_within_ten_metres(matcher, window):
+def test_each_finds_a_darker_noisier_view_twice_alike_and_says_no_more_than_is_asked(matcher, window):
     query = query_of(picture(window, TRUTH))
     match = check_match(matcher.match(query, top_k=5), query, top_k=5)
     assert off_m(match.poses[0]) < 10.0
     assert match.diagnostics["margin"] >= 0.0
+    assert matcher.match(query, top_k=5) == match
+    assert matcher.match(query, top_k=1).poses == match.poses[:1]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -123,17 +125,6 @@ def test_each_finds_views_at_drawn_places(matcher, window, seed):
     )
     match = matcher.match(query_of(picture(window, truth, seed=seed)), top_k=1)
     assert off_m(match.poses[0], truth) < 10.0
-
-
-def test_each_gives_the_same_answer_twice(matcher, window):
-    query = query_of(picture(window, TRUTH))
-    assert matcher.match(query, top_k=5) == matcher.match(query, top_k=5)
-
-
-def test_each_gives_no_more_than_top_k(matcher, window):
-    query = query_of(picture(window, TRUTH))
-    assert len(matcher.match(query, top_k=1).poses) == 1
-    assert matcher.match(query, top_k=1).poses[0] == matcher.match(query, top_k=5).poses[0]
 
 
 def test_each_withholds_where_the_picture_is_flat(matcher):
@@ -173,19 +164,14 @@ def test_each_searches_the_whole_map_without_a_disc(matcher, window):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_needs_a_picture_and_imagery(name, window):
-    card = sgb.load_matcher(name).card
-    query = query_of(picture(window, TRUTH))
+def test_each_needs_a_picture_and_imagery_and_withholds_on_a_map_without(name, window, drawn_file):
+    card, query = sgb.load_matcher(name).card, query_of(picture(window, TRUTH))
     assert lacks(card, query, is_pictured=True) is None
     assert lacks(card, query) == "no imagery"
     assert lacks(card, replace(query, frames=()), is_pictured=True) == "no image"
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_each_prepares_a_map_without_imagery_and_withholds(name, window, drawn_file):
     made = made_of(name, drawn_file)
     made.prepare(SimpleNamespace(imagery=None), None)
-    assert made.match(query_of(picture(window, TRUTH)), top_k=5) == sgb.WITHHELD
+    assert made.match(query, top_k=5) == sgb.WITHHELD
 
 
 def test_a_made_up_place_without_imagery_leaves_no_query(tiny: sgb.TinyPlace):

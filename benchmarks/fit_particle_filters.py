@@ -165,7 +165,7 @@ def whitening(centred: Floats) -> Floats:
 def write_embedding(embedding: zhou_smc.Embedding, path: Path) -> str:
     """Write an embedding in half precision, the same bytes for the same numbers; return its hash."""
     arrays = {item.name: getattr(embedding, item.name).astype(np.float16) for item in fields(embedding)}
-    np.savez(path, **arrays)
+    np.savez(path, groups=np.array(zhou_smc.group_names()), **arrays)
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 

@@ -6,9 +6,19 @@ from typing import Final
 import numpy as np
 
 from sasgeo_baselines.global_descriptor import Sums, lattice_m, separate
-from sasgeo_bench import WITHHELD, Match, MatcherCard, Query, Region, at_place, is_blind, points_of, ranked_candidates
+from sasgeo_bench import (
+    WITHHELD,
+    Match,
+    MatcherCard,
+    Query,
+    Region,
+    at_place,
+    is_blind,
+    load_taxonomy,
+    points_of,
+    ranked_candidates,
+)
 
-DRAWN: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
 STEP_M: Final = 16.0
 APART_M: Final = 25.0
 
@@ -36,7 +46,7 @@ class MapDensityPrior:
     def prepare(self, region: Region, learned: str | None) -> None:
         """Sum the drawn classes of the map."""
         del learned
-        self._sums = Sums.of(region, DRAWN)
+        self._sums = Sums.of(region, load_taxonomy().having("drawn"))
         self._grid = region.grid
 
     def match(self, query: Query, *, top_k: int) -> Match:

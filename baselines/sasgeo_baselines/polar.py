@@ -12,14 +12,12 @@ from scipy import sparse
 
 import sasgeo_bench as sgb
 
-GROUPS: Final = (
-    ("building",),
-    ("road_major", "road_minor"),
-    ("path_track",),
-    ("railway",),
-    ("water", "waterway", "coastline"),
-    ("green",),
-    ("farmland", "field_boundary"),
+# Buildings first; without bridges, which lie on roads.
+GROUPS: Final = tuple(
+    sorted(
+        (names for group, names in sgb.load_taxonomy().groups.items() if group != "bridge"),
+        key=lambda names: "building" not in names,
+    )
 )
 RINGS: Final = 8
 SECTORS: Final = 16  # the first begins straight ahead, clockwise

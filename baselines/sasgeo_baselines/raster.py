@@ -83,9 +83,7 @@ class GraphCheck:
         return Descriptor.of([components(layer, cell_size_m=cell_m) for layer in layers], reach_m=reach_m)
 
 
-THIN: Final = (
-    *("road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"),
-)
+THIN: Final = load_taxonomy().lines
 REACH_M: Final = 4.0
 
 # Texts that the cards share.

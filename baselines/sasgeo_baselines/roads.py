@@ -12,9 +12,9 @@ from scipy.spatial import cKDTree
 from skimage.morphology import skeletonize
 
 from sasgeo_baselines.object_matcher import fitted
-from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Disc, Evidence, Grid, Pose, Query, Region, inverse
+from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Disc, Evidence, Grid, Pose, Query, Region, inverse, load_taxonomy
 
-ROADS: Final = ("road_major", "road_minor", "path_track")
+ROADS: Final = load_taxonomy().of_graph("road")
 NEAR_M: Final = 5.0  # of a road: a point this near lies on it
 STEP_M: Final = 3.0  # between points of vectors
 MOST_SEEN: Final = 400  # points of a view; of more, every n-th is taken

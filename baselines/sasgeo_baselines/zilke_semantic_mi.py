@@ -8,15 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.shift_matcher import ShiftMatcher
-from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlaps, Region
+from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlaps, Region, load_taxonomy
 
 # Where several classes hold in a cell the first is its label: what is small or thin before what covers ground.
+_OF: Final = load_taxonomy().groups
 LABELS: Final = (
-    ("building",),
-    ("road_major", "road_minor", "bridge", "parking"),
-    ("railway", "path_track"),
-    ("water", "waterway", "coastline"),
-    ("green", "farmland", "field_boundary"),
+    _OF["building"],
+    (*_OF["street"], *_OF["bridge"], "parking"),
+    (*_OF["railway"], *_OF["path"]),
+    _OF["water"],
+    (*_OF["green"], *_OF["field"]),
 )
 REST: Final = "rest"  # known cells without a label
 NAMES: Final = (*(group[0] for group in LABELS), REST)

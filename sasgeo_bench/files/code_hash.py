@@ -347,9 +347,10 @@ def _public() -> Mapping[str, str]:
 
 
 def _room_files(room: str) -> list[Path]:
-    """Return the files of a module or folder of this package."""
+    """Return the files of a module, with the data of its name, or of a folder of this package."""
     place: Any = _PACKAGE.joinpath(*room.split("."))
-    return sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
+    files = place.rglob("*.py") if place.is_dir() else (place.with_suffix(end) for end in (_PYTHON, ".toml"))
+    return sorted(path for path in files if path.is_file())
 
 
 def _shown(path: Path) -> str:

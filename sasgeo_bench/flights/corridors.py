@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from sasgeo_bench.geometry.pose import wrap_deg
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.network import ROAD, WATER, make_chains, make_network
 
 Floats = NDArray[np.float64]
@@ -19,7 +20,10 @@ Ints = NDArray[np.int64]
 Ways = Literal["road", "water"]
 
 # Classes of the map, and their layer of the network. Paths are left out: they wind more than a drone follows.
-_CLASSES: Final = {"road": (("road_major", "road_minor"), ROAD), "water": (("waterway",), WATER)}
+_CLASSES: Final = {
+    "road": (load_taxonomy().having("street"), ROAD),
+    "water": (load_taxonomy().of_graph("water"), WATER),
+}
 _LINE_DIMENSION: Final = 1
 _PASSING_DEGREE: Final = 2
 _STEP_M: Final = 2.0  # between points of a corridor

@@ -17,10 +17,9 @@ from sasgeo_bench.osm.scan import Scan
 from sasgeo_bench.osm.snapshot import elements
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 
-# Lines that lead somewhere: where they end at the edge of the data, the extract was cut there. Of 191 extracts with a
-# box, those cut along a border have 2 to 11 such ends beyond the estimated area, or more than 0.38 at its edge for each
-# crossing of the box; those cut by a box have none beyond it and at most 0.25.
-_THROUGH: Final = ("road_major", "railway", "waterway", "coastline")
+# Lines with the trait "through" lead somewhere: where they end at the edge of the data, the extract was cut there. Of
+# 191 extracts with a box, those cut along a border have 2 to 11 such ends beyond the estimated area, or more than 0.38
+# at its edge for each crossing of the box; those cut by a box have none beyond it and at most 0.25.
 _MOST_OUTSIDE: Final = 1
 _MOST_ENDS: Final = 0.3
 # The box around a country or a town is crossed far less often than lines a little further inside.
@@ -65,7 +64,7 @@ def cuts_by_box(path: Path, scan: Scan, objects: Geometries) -> Callable[[shapel
 def _through_ways(path: Path, flat: Callable[[Any], Any]) -> list[tuple[shapely.Geometry, list[shapely.Point]]]:
     """Return open ways of the classes that lead somewhere, each with the ends at which it should meet another."""
     taxonomy = load_taxonomy()
-    rules = [rule for name in _THROUGH for rule in taxonomy[name].rules if rule.geometry == "line"]
+    rules = [rule for name in taxonomy.having("through") for rule in taxonomy[name].rules if rule.geometry == "line"]
     wanted = osmium.filter.TagFilter(*((rule.key, value) for rule in rules for value in (*rule.widths, *rule.values)))
     ways = osmium.FileProcessor(str(path)).with_locations()
     found = []

@@ -9,10 +9,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+
 FAMILIES: Final = {
-    "roads": ("road_major", "road_minor", "path_track"),
-    "buildings": ("building",),
-    "land cover": ("water", "green", "farmland", "parking"),
+    "roads": load_taxonomy().of_graph("road"),
+    "buildings": load_taxonomy().of_graph("building"),
+    "land cover": load_taxonomy().of_graph("area"),
 }
 _ROAD_KM: Final = 5.0  # of roads a square kilometre: villages have more, fields and mountains less
 _HOUSES: Final = 50  # buildings a square kilometre

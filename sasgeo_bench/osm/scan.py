@@ -13,7 +13,7 @@ import osmium
 import shapely
 
 from sasgeo_bench.osm.multipolygons import Kind, Tags, kind_keys
-from sasgeo_bench.osm.taxonomy import Classification, Label, Taxonomy, classify
+from sasgeo_bench.osm.taxonomy import Classification, Label, Taxonomy, classify, load_taxonomy
 
 LANE_WIDTH_M: Final = 3.25  # between the 2.75 m and 3.75 m lanes of the German RAS-Q 96 cross sections
 DEFAULT_BRIDGE_WIDTH_M: Final = 4.0
@@ -24,8 +24,8 @@ _HIDING: Final = ("tunnel", "layer", "location", "covered", "indoor", "cutting")
 _AREA_MODIFIERS: Final = (*_HIDING, "parking", "width")
 _LINE_MODIFIERS: Final = (*_HIDING, "width", "lanes")
 BUILT_UP: Final = ("residential", "commercial", "retail", "industrial", "garages")  # values of landuse without a class
-_ROOFED: Final = ("building", "bridge")
-_OPEN: Final = ("water", "waterway", "coastline")  # with layer=-1 they lie below bridges, in the open
+_ROOFED: Final = load_taxonomy().having("roofed")
+_OPEN: Final = load_taxonomy().having("open")  # with layer=-1 they lie below bridges, in the open
 
 # Where the first point lies in the WKB of a line and of a multipolygon's first ring, and readers of N points.
 _FIRST_POINT: Final = {2: 9, 6: 22}

@@ -148,7 +148,7 @@ def _inputs_sha256(spec: RegionFile, extract: Extract, source_sha256: str) -> st
         "region": spec.model_dump(mode="json", exclude={"extract"}),
         "extract": extract.model_dump(mode="json", exclude={"urls", "sha256"}),
         "source": source_sha256,
-        "taxonomy": load_taxonomy().model_dump(mode="json"),
+        "taxonomy": load_taxonomy().of_maps(),
         "versions": [SCHEMA_VERSION, DATA_VERSION, package_version()],
     }
     return hashlib.sha256(json.dumps(inputs, sort_keys=True).encode()).hexdigest()

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.osm.features import SEA, check_features
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.network import (
     LAYERS,
     RAIL,
@@ -36,7 +37,6 @@ KINDS: Final = (
     *("level_crossing", "river_bend", "road_rail_crossing", "road_water_crossing"),
 )
 RELATIONS: Final = ("adjacency", "connectivity", "crossing", "membership")
-AREA_CLASSES: Final = ("farmland", "green", "parking", "water")
 # Kinds of crossings of two layers; that of a railway with a river or a railway is a plain crossing.
 CROSSING_KIND: Final = {(ROAD, RAIL): "road_rail_crossing", (ROAD, WATER): "road_water_crossing"}
 
@@ -91,7 +91,9 @@ def build_graph(features: gpd.GeoDataFrame, *, bounds_m: Bounds | None = None) -
     is_seen = features["is_visible"].to_numpy()
     _draw_buildings(draft, _sorted(features[is_seen & (names == "building").to_numpy()]), bounds_m)
     # The centroid of the sea depends on where the extract was cut, not on the place.
-    is_area = is_seen & names.isin(AREA_CLASSES).to_numpy() & (features["osm_type"] != SEA).to_numpy()
+    is_area = (
+        is_seen & names.isin(load_taxonomy().of_graph("area")).to_numpy() & (features["osm_type"] != SEA).to_numpy()
+    )
     _draw_areas(draft, _sorted(features[is_area]))
     return draft.finish(features.crs, bounds_m)
 

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.shapes import overlapping
 
 Floats = NDArray[np.float64]
@@ -18,7 +19,11 @@ Lines = NDArray[np.object_]
 
 ROAD, RAIL, WATER = 0, 1, 2
 # In order of rank: where several ways meet, the first of their classes names the node.
-LAYERS: Final = {"road_major": ROAD, "road_minor": ROAD, "path_track": ROAD, "railway": RAIL, "waterway": WATER}
+LAYERS: Final = {
+    name: layer
+    for layer, names in enumerate(load_taxonomy().of_graph(part) for part in ("road", "rail", "water"))
+    for name in names
+}
 
 # Ways that share an OSM node share equal coordinates; a millimetre absorbs what a rotation does to the last bits.
 VERTEX_M: Final = 0.001

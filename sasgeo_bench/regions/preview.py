@@ -23,11 +23,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
 from sasgeo_bench.regions.region import Manifest, Region
 
-# Painted in this order: land first, then what lies on it, then what runs over it.
-PAINT_ORDER: Final = (
-    *("farmland", "green", "bare", "water", "parking", "building", "field_boundary", "path_track", "waterway"),
-    *("coastline", "road_minor", "road_major", "railway", "bridge"),
-)
+PAINT_ORDER: Final = load_taxonomy().painted
 GROUND: Final = "#fbfaf5"
 _UNMAPPED: Final = ("#d9d9d9", "#c4c4c4")
 _STRIPE_CELLS: Final = 12

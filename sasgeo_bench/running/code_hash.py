@@ -8,8 +8,8 @@ from sasgeo_bench.files.plugins import MATCHERS, SEGMENTERS, TRACKERS
 
 # Modules of this package that answers depend on, if a plugin imports them: after a change there, it is asked anew.
 TOOLS: Final = (
-    *("matching.controls", "matching.follower", "regions.evidence", "regions.graph", "regions.network", "search"),
-    *("sasgeo", "tasks.vectors"),
+    *("matching.controls", "matching.follower", "osm.taxonomy", "regions.evidence", "regions.graph", "regions.network"),
+    *("search", "sasgeo", "tasks.vectors"),
 )
 _ALWAYS: Final = ("regions.evidence",)  # what every query is made of
 # The same of segmentations; whoever segments looks at pictures by all of them.

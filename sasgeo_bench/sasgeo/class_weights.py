@@ -29,17 +29,7 @@ from sasgeo_bench.sasgeo.weights import SEASONS, information
 CELL_M: Final = 4.0  # of a configuration: each sector of a ring holds some cells
 RINGS_M: Final = (16.0, 48.0)  # a junction; a junction and the next houses
 SECTORS: Final = 8
-# Classes of a configuration; interchangeable classes form one group.
-GROUPS: Final = (
-    ("road_major", "road_minor"),
-    ("path_track",),
-    ("railway",),
-    ("building",),
-    ("water", "waterway", "coastline"),
-    ("green",),
-    ("farmland", "field_boundary"),
-    ("bridge",),
-)
+GROUPS: Final = tuple(load_taxonomy().groups.values())  # classes of a configuration
 WORDS: Final = 64  # kinds of configurations
 EPSILON: Final = 1e-3  # of Eq. 6
 LEAST: Final = 0.25  # of a weight, in means of the map

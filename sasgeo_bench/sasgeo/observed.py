@@ -37,7 +37,7 @@ from sasgeo_bench.tasks.query import Query
 from sasgeo_bench.tasks.vectors import as_features, instances_of_mask, vector_table
 
 # Classes thinned together, and the class of their lines: crossings do not depend on the class of a road.
-SKELETON_LAYERS: Final = {"road_minor": ROADS, "railway": ("railway",), "waterway": ("waterway",)}
+SKELETON_LAYERS: Final = {"road_minor": ROADS} | {name: (name,) for name in LAYERS if name not in ROADS}
 SPUR_M: Final = 8.0  # shorter branches are corners of a broad line
 _ROUGH_CELLS: Final = 0.75  # tolerance of the simplification of stairs
 _FORK: Final = 3

@@ -32,9 +32,7 @@ from sasgeo_bench.tasks.vectors import as_features
 if TYPE_CHECKING:
     import geopandas as gpd
 
-THIN: Final = frozenset(
-    {"road_major", "road_minor", "path_track", "railway", "waterway", "coastline", "field_boundary", "bridge"}
-)
+THIN: Final = frozenset(load_taxonomy().lines)
 BRIDGE: Final = "bridge"
 REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
 DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same

@@ -8,12 +8,13 @@ ratios, which tend to 0 as a class loses its information.
 import datetime as dt
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Final, Self
+from typing import Final, Self, get_args
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import Season, load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT
 from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
@@ -112,23 +113,10 @@ def information(rates: ClassRates, *, age_years: float, persists: float = 1.0) -
     return rates.mapped * where_mapped + (1 - rates.mapped) * elsewhere
 
 
-# Visible share of a mapped class: our guesses, for want of a source; 1 for classes not named.
+# Visible share of a mapped class, by hand; 1 for classes not named.
 SEASON_SHARES: Final[Mapping[str, Mapping[str, float]]] = {
-    "leaf_on": {"road_minor": 0.8, "path_track": 0.5, "railway": 0.9, "waterway": 0.7, "field_boundary": 0.8},
-    "snow": {
-        "road_minor": 0.6,
-        "path_track": 0.3,
-        "railway": 0.8,
-        "water": 0.7,
-        "waterway": 0.5,
-        "green": 0.6,
-        "farmland": 0.6,
-        "field_boundary": 0.4,
-        "parking": 0.4,
-        "bare": 0.4,
-    },
-    "low_water": {"water": 0.7, "waterway": 0.6, "coastline": 0.8},
-    "harvest": {"farmland": 0.5, "field_boundary": 0.9},
+    season: {item.name: item.seen_share[season] for item in load_taxonomy().classes if season in item.seen_share}
+    for season in get_args(Season)
 }
 SEASONS: Final = tuple(SEASON_SHARES)
 _CELLS_PER_WITNESS: Final = 200.0  # as for rates: a house or a piece of road is right or wrong as a whole

@@ -13,33 +13,20 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence, cell_offsets_m
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.ground import Dem, Ground
 
 Planes = NDArray[np.float32]
 
-# Width of the narrowest things of a class that count as it on the map, metres: pixels wider than that miss them.
+# Width of the narrowest things of a class, and height of what stands up and hides the ground behind it, metres.
 WIDTHS_M: Final[Mapping[str, float]] = MappingProxyType(
-    {
-        "road_major": 6.0,
-        "road_minor": 3.5,
-        "path_track": 1.5,
-        "railway": 3.0,
-        "building": 5.0,
-        "water": 5.0,
-        "waterway": 1.5,
-        "coastline": 3.0,
-        "green": 5.0,
-        "farmland": 10.0,
-        "field_boundary": 0.5,
-        "bridge": 3.0,
-        "parking": 5.0,
-        "bare": 10.0,
-    }
+    {item.name: item.narrowest_m for item in load_taxonomy().classes}
 )
-# Height of what stands up and hides the ground behind it, metres: a house of two floors.
-STANDING_M: Final[Mapping[str, float]] = MappingProxyType({"building": 6.0})
+STANDING_M: Final[Mapping[str, float]] = MappingProxyType(
+    {item.name: item.standing_m for item in load_taxonomy().classes if item.standing_m}
+)
 
 _MOST_CELLS: Final = 4096  # a side of a view
 _HALF: Final = 0.5

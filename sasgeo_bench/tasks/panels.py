@@ -10,13 +10,14 @@ import numpy as np
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, Query, Truth
 from sasgeo_bench.tasks.sheet import TWIN, Panel
-from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import changed_share
 from sasgeo_bench.tasks.suites.mining import describe, mine
 
@@ -137,7 +138,7 @@ def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple
 
 def _drawn(evidence: Evidence) -> Evidence:
     """Return roads, buildings and water without the ground cover that fills most of a view."""
-    return _only(evidence, [name for name in evidence.classes if name in (*DRAWN_CLASSES, "water", "bridge")])
+    return _only(evidence, [name for name in evidence.classes if name in load_taxonomy().having("compared")])
 
 
 def _only(evidence: Evidence, classes: Sequence[str]) -> Evidence:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence, LayerBits, observe
 from sasgeo_bench.regions.layers import read_bits
@@ -23,7 +24,7 @@ from sasgeo_bench.regions.region import Late, MapGraph, Region
 if TYPE_CHECKING:
     import geopandas as gpd
 
-DRAWN_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway", "field_boundary")
+DRAWN_CLASSES: Final = load_taxonomy().having("drawn")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.features import check_features
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 if TYPE_CHECKING:
     import geopandas as gpd
@@ -24,7 +25,7 @@ else:  # loaded when a table is made
 
 Change = Callable[["gpd.GeoDataFrame"], "gpd.GeoDataFrame"]
 
-ROADS: Final = ("road_major", "road_minor", "path_track")
+ROADS: Final = load_taxonomy().of_graph("road")
 
 _ARC_SEGMENTS: Final = 16
 _DECIMALS: Final = 3  # as in `osm.read`: shared vertices stay equal

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 
 from sasgeo_bench.osm.features import DTYPES, make_features
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence, cell_offsets_m
 
 if TYPE_CHECKING:
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 else:  # loaded when a table is made
     gpd = lazy_loader.load("geopandas")
 
-VECTOR_CLASSES: Final = ("road_major", "road_minor", "path_track", "railway", "building", "waterway")
+VECTOR_CLASSES: Final = load_taxonomy().of_graph("road", "rail", "building", "water")
 COLUMNS: Final = ("class", "level", "is_bridge", "geometry")
 _DECIMALS: Final = 1  # decimetres: finer than any detector, and far smaller on disk
 _EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from sasgeo_baselines import polar
-from sasgeo_baselines.trackers import kinnari_mcl
+from sasgeo_baselines.trackers import kinnari_mcl, zhou_smc
 from sasgeo_baselines.trackers.ekf_loose import EkfLoose
 from sasgeo_baselines.trackers.foundloc_ransac import FoundlocRansac
 from sasgeo_baselines.trackers.kinnari_mcl import SHIFTS, Mosaic, Template, surfaces
@@ -283,6 +283,21 @@ def test_another_embedding_is_refused(tmp_path):
     path.write_bytes(EMBEDDING.read_bytes() + b" ")
     with pytest.raises(ValueError, match="install sasgeo-baselines again"):
         Embedding.read(path)
+
+
+@pytest.mark.parametrize(
+    ("groups", "named"),
+    [
+        ((*polar.GROUPS, ("canal",)), "canal"),
+        (tuple((*names, "canal") if "water" in names else names for names in polar.GROUPS), "canal"),
+        (polar.GROUPS[:-2], "green"),
+        (polar.GROUPS[::-1], "farmland"),
+    ],
+)
+def test_weights_of_other_classes_are_refused_in_one_line_that_names_the_class(groups, named, monkeypatch):
+    monkeypatch.setattr(zhou_smc, "GROUPS", groups)
+    with pytest.raises(ValueError, match=rf"^the weights of zhou_smc do not know the class '{named}'.*fit them anew"):
+        Embedding.read()
 
 
 def test_a_correlation_surface_is_that_of_squares_read_one_by_one(region):

@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The taxonomy: exact values only, one label a class, and a file whose faults are told."""
 
+import re
+
 import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.osm.taxonomy import Rule, Taxonomy, classify, load_taxonomy
-from sasgeo_bench.regions.preview import PAINT_ORDER
-from sasgeo_bench.sensing.birdseye import WIDTHS_M
-from sasgeo_bench.tasks.perturbations.measured import MEASURED
-from sasgeo_bench.tasks.perturbations.perception import ERRORS
+from sasgeo_bench.osm.taxonomy import Rule, SemanticClass, Taxonomy, classify, load_taxonomy
 
 WANTED = {
     *("road_major", "road_minor", "path_track", "railway", "building", "water", "waterway", "coastline"),
@@ -23,6 +21,19 @@ title = "A class"
 kind = "area"
 colour = "#101010"
 persistence = {{ prior = 0.5, vanish_per_year = 0.0, appear_per_year = 0.0 }}
+paint = 1{id}
+graph = "none"
+group = "none"
+cover = "none"
+look = "none"
+narrowest_m = 1.0
+standing_m = 0.0
+volatile = 0
+traits = []
+seasons = {{}}
+seen_share = {{}}
+published = {{ recall = 0.5, precision = 0.5 }}
+measured = {{ recall = 0.5, precision = 0.5 }}
 rules = [{{ key = "building", geometry = "area", values = ["yes"] }}]
 """
 
@@ -39,12 +50,17 @@ def test_every_class_that_the_benchmark_promises_is_there():
     assert set(load_taxonomy().names) >= WANTED
 
 
-def test_every_class_is_drawn_and_has_the_errors_of_a_detector():
-    names = set(load_taxonomy().names)
-    assert set(PAINT_ORDER) == names, "PAINT_ORDER in regions/preview.py: docs/howto/class.md"
-    assert set(ERRORS) == names, "ERRORS in tasks/perturbations/perception.py: docs/howto/class.md"
-    assert set(MEASURED) == names, "MEASURED in tasks/perturbations/measured.py: docs/howto/class.md"
-    assert set(WIDTHS_M) == names, "WIDTHS_M in sensing/birdseye.py: docs/howto/class.md"
+@pytest.mark.parametrize("key", [name for name, field in SemanticClass.model_fields.items() if field.is_required()])
+def test_a_class_that_leaves_anything_open_is_refused(key):
+    text = re.sub(rf"^{key} = .*$", "", ONE_CLASS.format(id=0, name="a"), flags=re.MULTILINE)
+    with pytest.raises(ConfigError, match=f"'class.0.{key}' is missing"):
+        parse_toml(text, Taxonomy, source="taxonomy.toml")
+
+
+def test_only_rules_and_what_hides_cells_may_be_left_out():
+    assert {name for name, field in SemanticClass.model_fields.items() if not field.is_required()} == {
+        *("outline_of", "covered_by"),
+    }
 
 
 def test_no_tag_makes_two_classes_of_one_geometry():
@@ -93,6 +109,29 @@ def test_ids_of_older_classes_stay():
         *older,
         *("green", "farmland", "field_boundary", "bridge", "parking", "bare"),
     )
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "fault"),
+    [
+        ('kind = "area"', 'kind = "area"\ncovered_by = "sky"', "covered_by names a class"),
+        ('look = "none"', 'look = "sky"', "look names a class"),
+        ("published = { ", 'published = { confused_with = "sky", ', "confused_with names a class"),
+        ("measured = { ", "measured = { called = { sky = 0.1 }, ", "called names a class"),
+        ("traits = []", 'traits = ["shiny"]', "traits"),
+        ("volatile = 0", "volatile = 7", "volatile"),
+    ],
+)
+def test_a_property_that_the_program_does_not_know_is_refused(old, new, fault):
+    text = ONE_CLASS.format(id=0, name="a").replace(old, new)
+    with pytest.raises(ConfigError, match=fault):
+        parse_toml(text, Taxonomy, source="taxonomy.toml")
+
+
+def test_two_classes_of_one_rank_are_refused():
+    text = ONE_CLASS.format(id=0, name="a") + ONE_CLASS.format(id=1, name="b").replace("paint = 11", "paint = 10")
+    with pytest.raises(ConfigError, match="paint is a rank of each class"):
+        parse_toml(text, Taxonomy, source="taxonomy.toml")
 
 
 def test_a_value_is_matched_whole():

@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 import sasgeo_bench as sgb
 from sasgeo_baselines.trackers.particles import NEAR_M, TRAINED_ON, Floats, Noise, ParticleFilter, Particles
 
+_OF: Final = sgb.load_taxonomy().groups
 GROUPS: Final = (
-    ("building", "parking"),
-    ("road_major", "road_minor", "path_track", "railway", "bridge"),
-    ("water", "waterway", "coastline"),
-    ("green",),
-    ("farmland", "field_boundary"),
+    (*_OF["building"], "parking"),
+    (*_OF["street"], *_OF["path"], *_OF["railway"], *_OF["bridge"]),
+    _OF["water"],
+    _OF["green"],
+    _OF["field"],
 )
 CELL_M: Final = 12.0  # of what is correlated
 SIDE: Final = 16  # cells a side, at most: 192 m

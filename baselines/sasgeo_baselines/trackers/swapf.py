@@ -14,9 +14,10 @@ import sasgeo_bench as sgb
 from sasgeo_baselines.trackers.particles import NEAR_M, Floats, Noise, ParticleFilter, Particles
 
 # Labels of the source with a distance map. Where several classes hold in a cell, the first of them is its label.
-BUILDING: Final = ("building",)
-ROAD: Final = ("bridge", "road_major", "road_minor", "path_track", "railway", "parking")
-VEGETATION: Final = ("green", "farmland", "field_boundary")
+_OF: Final = sgb.load_taxonomy().groups
+BUILDING: Final = _OF["building"]
+ROAD: Final = (*_OF["bridge"], *_OF["street"], *_OF["path"], *_OF["railway"], "parking")
+VEGETATION: Final = (*_OF["green"], *_OF["field"])
 GROUPS: Final = (BUILDING, ROAD, VEGETATION)
 OTHER: Final = len(GROUPS)  # whatever is none of them, water included
 UNLABELLED: Final = OTHER + 1

@@ -3,7 +3,7 @@
 
 import hashlib
 import io
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Final, Self
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.polar import CELL_M, described, turned, view_descriptor
+from sasgeo_baselines.polar import CELL_M, GROUPS, described, turned, view_descriptor
 from sasgeo_baselines.trackers.particles import TRAINED_ON, Floats, Noise, ParticleFilter, Particles
 
 YAWS: Final = 8  # headings for which the map has embeddings
@@ -26,7 +26,7 @@ ACCEPTED_M: Final = 60.0  # spread of the particles: less than that of a disc of
 
 _FULL: Final = 127.0  # of a component of an embedding in int8
 EMBEDDING: Final = Path(__file__).with_name("zhou_embedding.npz")
-EMBEDDING_SHA256: Final = "ec62c737902507dd63b896dc9685d5864c167c825a871043d670c6d16698f101"  # part of the code's hash
+EMBEDDING_SHA256: Final = "73a4f80a7078ed4791b6d0a54d82be5e02ffcc17eacf7c5b3028d217d63a40ab"  # part of the code's hash
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -48,12 +48,39 @@ class Embedding:
         if hashlib.sha256(content).hexdigest() != sha256:
             raise ValueError(f"{path} is another embedding than the program knows of: install sasgeo-baselines again")
         with np.load(io.BytesIO(content)) as arrays:
-            return cls(**{name: arrays[name].astype(np.float32) for name in arrays.files})
+            check_groups(arrays["groups"].tolist())
+            return cls(**{item.name: arrays[item.name].astype(np.float32) for item in fields(cls)})
 
     def of_view(self, evidence: sgb.Evidence) -> NDArray[np.float32]:
         """Return the embedding of a view, shape (DIMENSIONS,); what is unknown counts as average."""
         found = view_descriptor(evidence)
         return np.asarray((np.where(np.isnan(found), self.view_mean, found) - self.view_mean) @ self.view)
+
+
+def group_names() -> list[str]:
+    """Return the names of the classes of each group of a descriptor, with spaces between them."""
+    return [" ".join(names) for names in GROUPS]
+
+
+def check_groups(learned: list[str]) -> None:
+    """Raise `ValueError`, with the class, if an embedding was fitted to other groups of classes than those of today.
+
+    >>> check_groups([names for names in group_names() if names != "green"])  # doctest: +ELLIPSIS
+    Traceback (most recent call last):
+        ...
+    ValueError: the weights of zhou_smc do not know the class 'green' as it is grouped today: fit them anew by ...
+    """
+    was, now = (
+        {name: at for at, one in enumerate(names) for name in one.split()} for names in (learned, group_names())
+    )
+    strange = [name for name in now | was if (name in was) != (name in now)] or [
+        name for name in now if was[name] != now[name]
+    ]
+    if strange:
+        raise ValueError(
+            f"the weights of zhou_smc do not know the class {strange[0]!r} as it is grouped today: fit them anew by "
+            "benchmarks/fit_particle_filters.py"
+        )
 
 
 def unit(vectors: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -122,7 +122,7 @@ def _request_sha256(seed: int, trials: int, private: PrivateSeed | None, crop: C
     """Hash all that decides which trials a seed gives; the recipe itself is in it by its version."""
     record = {
         "suite": [SUITE, VERSION, TASK_VERSION],
-        "region": [SCHEMA_VERSION, DATA_VERSION, load_taxonomy().model_dump(mode="json")],
+        "region": [SCHEMA_VERSION, DATA_VERSION, load_taxonomy().of_maps()],
         "seed": seed,
         "trials": trials,
         "made_by": version("sasgeo-bench"),

@@ -364,7 +364,7 @@ def _agricultural(sketch: Sketch) -> None:
     farms = shapely.union_all([shape for shape in sketch.taken if shape.area > 2500])
     for field in sorted(fields, key=lambda field: (round(field.centroid.x, 1), round(field.centroid.y, 1))):
         if not wood.contains(field.representative_point()) and not farms.intersects(field.representative_point()):
-            kind = str(rng.choice(["farmland", "farmland", "meadow", "orchard", "vineyard"]))
+            kind = str(rng.choice(["farmland"] * 2 + ["meadow", "orchard", "vineyard"]))
             sketch.ground(field, is_free=False, landuse=kind)
     for number, line in enumerate([*across, *along]):
         cut = shapely.get_coordinates(line)

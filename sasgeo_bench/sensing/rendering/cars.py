@@ -8,7 +8,7 @@ import shapely
 
 from sasgeo_bench.sensing.rendering.buildings import rectangles
 from sasgeo_bench.sensing.rendering.plan import CAR, ROAD, Canvas, Raster, fill_boxes
-from sasgeo_bench.sensing.rendering.roads import street_points
+from sasgeo_bench.sensing.rendering.roads import STREETS, street_points
 from sasgeo_bench.sensing.rendering.texture import Numbers, draw
 
 _PAINTS: Final = np.array(
@@ -30,10 +30,10 @@ _LINE: Final = 196
 
 def paint_cars(canvas: Canvas) -> None:
     """Paint cars on roads and in car parks; they stand 1.5 m high."""
-    streets = street_points(canvas, 7.0, -1.1, ("road_minor", "road_major"))
+    streets = street_points(canvas, 7.0, -1.1, STREETS)
     built = _sample(canvas.built, canvas, streets)
     parked = streets[streets[:, 4] < canvas.plan.palette.cars * np.clip(built * 1.6 - 0.06, 0.004, 0.28)]
-    moving = street_points(canvas, 31.0, -1.9, ("road_major", "road_minor"))
+    moving = street_points(canvas, 31.0, -1.9, STREETS[::-1])
     moving = moving[moving[:, 4] < 0.1 * canvas.plan.palette.cars]
     for cars in (parked, moving, _parked_in_bays(canvas)):
         _paint(canvas, cars)

@@ -315,10 +315,7 @@ def _field_rows_m(canvas: Canvas, shapes: Shapes, numbers: Cells) -> Field:
 def _paint_water(canvas: Canvas) -> None:
     """Paint standing and running water and the sea: darker where deep, with a wet or stony edge."""
     grid, palette, seed = canvas.grid, canvas.plan.palette, canvas.plan.seed("water")
-    waters = [canvas.plan.of(name) for name in ("water", "waterway")]
-    water = np.zeros(grid.shape, dtype=bool)
-    for shapes in waters:
-        water |= burn_numbers(shapes.areas(), grid) > 0
+    water = burn_numbers(canvas.plan.of("water").areas(), grid) > 0
     if not water.any():
         return
     depth_m, bank_m = inside_m(water, grid), inside_m(~water, grid)

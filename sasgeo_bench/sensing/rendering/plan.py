@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.features import SEA
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sensing.rendering.palettes import Palette
 from sasgeo_bench.sensing.rendering.seasons import Colour, Season
 from sasgeo_bench.sensing.rendering.texture import Field, Numbers, draw, seed_of
@@ -76,9 +77,9 @@ class Plan:
     salt: int = 0
     corner_m: tuple[float, float] | None = None
 
-    def of(self, class_name: str) -> Shapes:
-        """Return the features of a class; none if the region has no such class."""
-        return self.shapes[class_name] if class_name in self.shapes else no_shapes()
+    def of(self, look: str) -> Shapes:
+        """Return the features of all classes that look like this one; there may be none."""
+        return self.shapes[look] if look in self.shapes else no_shapes()
 
     def seed(self, purpose: str) -> int:
         """Return the seed of the place for one purpose."""
@@ -168,14 +169,15 @@ def no_shapes() -> Shapes:
 
 
 def shapes_of(features: "gpd.GeoDataFrame", box: shapely.Geometry, *, salt: int = 0) -> dict[str, Shapes]:
-    """Return the visible features that reach into a box, by class, ordered by level and identity.
+    """Return the visible features that reach into a box, by the look of their class, ordered by level and identity.
 
     `salt` changes the keys, and with them all that is drawn for a feature; the order stays.
     """
     near = features[features["is_visible"].to_numpy() & shapely.intersects(features.geometry.to_numpy(), box)]
     kind = near["osm_type"].map(_KINDS).fillna(3).to_numpy(dtype=np.int64)
     key = near["osm_id"].to_numpy(dtype=np.int64) * 4 + kind
-    names, level = near["class"].to_numpy(), near["level"].to_numpy(dtype=np.int64)
+    looks = {item.name: item.look for item in load_taxonomy().classes}
+    names, level = near["class"].map(looks).to_numpy(), near["level"].to_numpy(dtype=np.int64)
     order = np.lexsort((key, level))
     found = {}
     for name in sorted(set(names)):

@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sensing.rendering.plan import (
     ROAD,
     WALL,
@@ -25,6 +26,8 @@ from sasgeo_bench.sensing.rendering.plan import (
 )
 from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, fractal, grain, noise
 
+# The larger ones last, which are painted over the smaller ones.
+STREETS: Final = tuple(name for name in load_taxonomy().painted if name in load_taxonomy().having("street"))
 _WHITE: Final = (206, 204, 198)
 _MARKED_M: Final = 5.8  # narrower roads have no line in the middle
 _BALLAST: Final = (122, 112, 102)
@@ -36,7 +39,7 @@ def paint_roads(canvas: Canvas) -> None:
     _paint_parking(canvas)
     _paint_tracks(canvas)
     for level_is_low in (True, False):
-        for name in ("road_minor", "road_major"):
+        for name in STREETS:
             shapes = canvas.plan.of(name)
             _paint_streets(canvas, shapes.part((shapes.level <= 0) == level_is_low), is_major=name == "road_major")
         if level_is_low:
@@ -194,7 +197,7 @@ def _paint_parking(canvas: Canvas) -> None:
 
 def _paint_parapets(canvas: Canvas) -> None:
     """Raise parapets along bridges; the deck itself lies on the ground plane."""
-    for name in ("road_major", "road_minor", "path_track"):
+    for name in load_taxonomy().of_graph("road"):
         shapes = canvas.plan.of(name)
         for line, width_m in zip(shapes.geometry[shapes.is_bridge], shapes.width_m[shapes.is_bridge], strict=True):
             for side in (-1, 1):
@@ -229,7 +232,7 @@ def paint_barriers(canvas: Canvas, edge: Mask, yard: Cells) -> None:
 def _lamps(canvas: Canvas) -> Picture:
     """Return the light of lamps along roads in built-up quarters: 210 below a lamp, nothing 25 m away."""
     lit = np.zeros(canvas.grid.shape, dtype=np.float32)
-    for name in ("road_major", "road_minor"):
+    for name in STREETS:
         for line in canvas.plan.of(name).geometry:
             if shapely.is_empty(line):
                 continue

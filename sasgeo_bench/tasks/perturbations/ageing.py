@@ -21,7 +21,6 @@ from sasgeo_bench.tasks.perturbations.fields import NoisePool, dilated, shifted
 from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects, thin_classes
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
-_BLOCKED_BY: Final = ("building", "water", "railway", "road_major", "road_minor")
 _TRIES: Final = 12  # to find a free place for a new object
 _PIECE_M: Final = 40.0  # length of the pieces in which lines vanish, appear and are redrawn
 _NEAR_M: Final = 60.0  # largest distance of a new object from the one it copies
@@ -29,7 +28,7 @@ _MOST_NEW: Final = 150  # of one class in one view
 _LARGEST_SHARE: Final = 0.1  # of the view, for an object to be copied
 _GROUPS: Final = 4  # of redrawn objects, each with its own shift
 _DOUBLINGS: Final = 5  # of shifts that are too small to lose as much ground as is to be lost
-_CLEARED: Final = dict.fromkeys(("building", "parking", "water"), ("green", "farmland", "bare"))
+_CLEARED: Final = dict.fromkeys(load_taxonomy().having("clears"), load_taxonomy().covering("land"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -239,7 +238,8 @@ def _objects_of(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng:
 
 def _taken(name: str, layers: Mapping[str, Mask]) -> Mask:
     """Return where no new object of a class may stand; a line may cross roads."""
-    blockers = ("building", "water") if name in thin_classes() else (*_BLOCKED_BY, name)
+    known = load_taxonomy()
+    blockers = known.having("blocks_lines") if name in thin_classes() else (*known.having("blocks_areas"), name)
     taken = np.zeros(layers[name].shape, dtype=bool)
     for blocker in blockers:
         if blocker in layers:

@@ -6,94 +6,22 @@ missed more often than large ones, fields are confused as a whole, outlines bulg
 bad view is bad for all classes.
 """
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Final, Literal
+from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import MeasuredErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import SIGMA, Field, NoisePool, dilated, disc, highest_within
 from sasgeo_bench.tasks.perturbations.objects import find_objects, thin_classes
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
-Where = Literal["ground", "roads"]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MeasuredErrors:
-    """Errors on one class, in its own domain, pixel by pixel; for line classes with a cell of tolerance.
-
-    `called` holds the fractions of the class that are seen as other classes; the rest of 1 - `recall` is seen as
-    nothing. `of_yards` is the fraction of the empty ground beside roads and buildings that is seen as this one; where
-    it is given, the precision follows from it and from the view, and `precision` is what towns come near. Else false
-    alarms follow from `precision`, besides those that other classes are called. `small_m2` is the area at which an
-    object is half as likely to be missed as a tiny one; they are `small_share` of the lost cells at most. `outline` is
-    the fraction of the false alarms that continue the outline of something seen, with bulges about `bulge_m` deep.
-    `alarms_on` names where the others lie. `is_ground`: the class is ground that shows nothing, on which false
-    buildings and roads lie as on ground without any class.
-
-    A measured profile (`perception_profile`) has two further rates: `of_ground` is the fraction of all empty ground
-    that is seen as the class, in place of `of_yards`; `also` holds the fractions of the class that are seen as other
-    classes besides.
-    """
-
-    recall: float
-    precision: float
-    called: Mapping[str, float] = field(default_factory=dict)
-    of_yards: float | None = None
-    small_m2: float = 20.0
-    small_share: float = 0.6
-    outline: float = 0.6
-    bulge_m: float = 1.5
-    width_m: float = 3.0  # of a false line
-    alarms_on: Where = "ground"
-    is_ground: bool = False
-    of_ground: float | None = None
-    also: Mapping[str, float] = field(default_factory=dict)
-
-
-# Measured, a 26-class U-Net on drone images of the same ground that it was trained on, so optimistic: recall and
-# precision of building, road, path and bridge; 5.8 % of what is none of the classes becomes building and 5.2 % road;
-# 8-12 % of bridges become road; pools are hardly ever seen. Measured, aerial tiles with a geographic split: recall of
-# water 0.87 (here: beside the pools), forest 0.79, grass 0.73 (our green: the mean), arable 0.47, of which 37 points
-# are called grass.
-# Guessed: that 5 % of either sort of road is called the other, which leaves 0.98 as a road, and how the 5.2 % divide
-# between them; every other class, `called`, precision and share of outlines; all sizes and widths. What is none of 26
-# classes, grass among them, is taken to be ground within YARD_M of a road or building: what a map leaves empty beyond
-# is mostly grass that nobody mapped. With these yards a town has the measured fractions and the measured precision.
-MEASURED: Final[Mapping[str, MeasuredErrors]] = {
-    "road_major": MeasuredErrors(recall=0.93, precision=0.80, called={"road_minor": 0.05}, of_yards=0.007, width_m=6.0),
-    "road_minor": MeasuredErrors(recall=0.93, precision=0.80, called={"road_major": 0.05}, of_yards=0.045, width_m=4.0),
-    "path_track": MeasuredErrors(recall=0.96, precision=0.91, width_m=2.0, outline=0.3),
-    "railway": MeasuredErrors(recall=0.85, precision=0.85, called={"path_track": 0.05}, outline=0.5),
-    "building": MeasuredErrors(recall=0.97, precision=0.86, of_yards=0.058, outline=0.55),
-    "water": MeasuredErrors(
-        recall=0.87,
-        precision=0.90,
-        called={"green": 0.03},
-        small_m2=250.0,
-        small_share=math.inf,
-        outline=0.8,
-        bulge_m=3.0,
-    ),
-    "waterway": MeasuredErrors(recall=0.60, precision=0.75, called={"green": 0.10}, outline=0.3),
-    "coastline": MeasuredErrors(recall=0.87, precision=0.87, outline=1.0),
-    "green": MeasuredErrors(
-        recall=0.76, precision=0.85, called={"farmland": 0.08}, small_m2=60.0, outline=0.5, bulge_m=6.0
-    ),
-    "farmland": MeasuredErrors(
-        recall=0.47, precision=0.85, called={"green": 0.37}, small_m2=200.0, outline=0.5, bulge_m=6.0
-    ),
-    "field_boundary": MeasuredErrors(recall=0.45, precision=0.55, called={"green": 0.15}, width_m=2.0, outline=0.1),
-    "bridge": MeasuredErrors(recall=0.85, precision=0.75, called={"road_minor": 0.10}, alarms_on="roads", outline=0.3),
-    "parking": MeasuredErrors(recall=0.75, precision=0.70, called={"road_minor": 0.12}, outline=0.5),
-    "bare": MeasuredErrors(recall=0.70, precision=0.70, small_m2=100.0, outline=0.5, bulge_m=6.0, is_ground=True),
-}
+MEASURED: Final[Mapping[str, MeasuredErrors]] = {item.name: item.measured for item in load_taxonomy().classes}
 
 QUALITY: Final = 0.35  # spread of the logarithm of the error over views, common to all classes
 CLASS_SPREAD: Final = 0.15  # spread beside it of each class in each view
@@ -111,8 +39,6 @@ _MOST_ERROR: Final = 0.95
 _MOST_GROUND: Final = 0.5
 _OBJECT_SPREAD: Final = 2.0  # how far objects differ in what they look like, in deviations of the noise within them
 _TRIES: Final = 5  # draws of a false object for each that is expected
-_STRUCTURES: Final = ("road_major", "road_minor", "building", "parking")
-_ROADS: Final = ("road_major", "road_minor")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,8 +46,8 @@ class MeasuredPerception:
     """See a clean view with the errors of the detector "measured", or of a segmenter's profile.
 
     `error_factor` multiplies the errors of every class; 0 is a perfect detector. At most 0.95 of a class is lost, and
-    at most half of the yards, or of the ground, becomes one class. `errors` are those of each class, by default the
-    table of this file; a class without any is seen as it is. Those of a segmenter come from its profile:
+    at most half of the yards, or of the ground, becomes one class. `errors` are those of each class, by default those
+    of the taxonomy; a class without any is seen as it is. Those of a segmenter come from its profile:
     `MeasuredPerception(errors=read_profile(path).errors())`.
 
     Notes
@@ -184,7 +110,7 @@ class _View:
         masks, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
         shows = [not (name in errors and errors[name].is_ground) for name in evidence.classes]
         ground = ~(masks | unknown)[shows].any(axis=0)
-        built = [index for index, name in enumerate(evidence.classes) if name in _STRUCTURES]
+        built = [index for index, name in enumerate(evidence.classes) if name in load_taxonomy().having("built")]
         beside = dilated(masks[built].any(axis=0), YARD_M / evidence.cell_size_m)
         return cls(
             cell_m=evidence.cell_size_m,
@@ -276,7 +202,7 @@ class _View:
         if errors.of_ground is not None or errors.of_yards is not None:
             free &= self.ground
         if errors.alarms_on == "roads":
-            free &= self.any_of(_ROADS)
+            free &= self.any_of(load_taxonomy().having("street"))
         if budget < 1 or not free.any():
             return
         before = np.count_nonzero(seen)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import rotation
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, Occlusion
 from sasgeo_bench.tasks.perturbations.fields import (
@@ -128,7 +129,7 @@ def _score(shape: tuple[int, int], index: int) -> NDArray[np.float32]:
     return np.asarray(score, dtype=np.float32)
 
 
-HIDDEN: Final = ("road_major", "road_minor", "path_track", "railway", "waterway", "field_boundary")
+HIDDEN: Final = tuple(name for name in load_taxonomy().lines if name in load_taxonomy().having("drawn"))
 _OVERHANG_M: Final = 4.0  # of crowns over the edge of green
 _SHADOW_M: Final = 8.0  # length of a building's shadow
 _PATCH_M: Final = 8.0  # width of a crown, or of a gap between crowns

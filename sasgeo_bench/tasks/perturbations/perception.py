@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import ClassErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import (
@@ -37,30 +38,6 @@ SPREAD: Final = 0.3  # coefficient of variation of the error over views and clas
 SEEN_ANYWHERE: Final = 0.2  # fraction of the false alarms that occur whether or not the class is in view
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ClassErrors:
-    """Errors of a detector on one class, in its domain, pixel by pixel; for line classes with a cell of tolerance."""
-
-    recall: float
-    precision: float
-    confused_with: str | None = None
-    confused: float = 0.0  # fraction of the lost cells that become that class; the others become absent
-    dropped: float = 0.4  # of areas, fractions of the lost cells lost as whole objects and, `frayed`, at edges;
-    frayed: float = 0.4  # the others are lost in patches
-    usual_share: float = 0.01  # of a usual view that the class covers; sets the false alarms in views without it
-    width_m: float = 3.0  # of a false line
-
-    @property
-    def lost(self) -> float:
-        """Return the fraction of the class's cells that is missed."""
-        return 1 - self.recall
-
-    @property
-    def gained(self) -> float:
-        """Return the false alarms, as a fraction of the class's cells."""
-        return self.recall / self.precision * (1 - self.precision)
-
-
 def with_f1(f1: float, **others: Any) -> ClassErrors:  # noqa: ANN401 - fields of ClassErrors
     """Return errors that are balanced, since only their F1 is known: recall and precision are both equal to it.
 
@@ -70,27 +47,7 @@ def with_f1(f1: float, **others: Any) -> ClassErrors:  # noqa: ANN401 - fields o
     return ClassErrors(recall=f1, precision=f1, **others)
 
 
-# Building, road, water, tree, agriculture and bareland have the scores of U-Net-EfficientNet-B4 on OpenEarthMap. The
-# others are not in it: their scores are set by hand, below that of roads for thinner classes, at or above it for wider
-# ones. Everything but the scores is set by hand too. Bare ground is taken for no other class. A class that is not in
-# this table is seen without error.
-ERRORS: Final[Mapping[str, ClassErrors]] = {
-    "road_major": with_f1(0.77, confused_with="road_minor", confused=0.3, usual_share=0.02, width_m=7.0),
-    "road_minor": with_f1(0.77, confused_with="parking", confused=0.2, usual_share=0.05, width_m=4.5),
-    "path_track": with_f1(0.65, confused_with="field_boundary", confused=0.1, usual_share=0.01, width_m=2.0),
-    "railway": with_f1(0.77, confused_with="path_track", confused=0.1, usual_share=0.003),
-    "building": with_f1(0.89, confused_with="parking", confused=0.15, usual_share=0.12, dropped=0.5),
-    "water": with_f1(0.92, confused_with="green", confused=0.2, usual_share=0.05, dropped=0.2),
-    "waterway": with_f1(0.77, confused_with="path_track", confused=0.1, usual_share=0.008),
-    "coastline": with_f1(0.85, usual_share=0.0),
-    "green": with_f1(0.82, confused_with="farmland", confused=0.3, usual_share=0.15, dropped=0.3),
-    "farmland": with_f1(0.87, confused_with="green", confused=0.5, usual_share=0.10, dropped=0.2),
-    "field_boundary": with_f1(0.60, confused_with="path_track", confused=0.1, usual_share=0.004, width_m=1.5),
-    "bridge": with_f1(0.77, usual_share=0.0005, width_m=6.0),
-    "parking": with_f1(0.77, confused_with="road_minor", confused=0.2, usual_share=0.01, dropped=0.3),
-    "bare": with_f1(0.70, usual_share=0.02, dropped=0.2),
-}
-
+ERRORS: Final[Mapping[str, ClassErrors]] = {item.name: item.published for item in load_taxonomy().classes}
 
 _MOST_ERROR: Final = 0.95
 _SECOND_RING: Final = 0.8  # the noise must be stronger by this for a cell two from the edge than for one at the edge

@@ -8,7 +8,6 @@ rates from train blocks.
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final, Self
 
@@ -18,8 +17,8 @@ from sasgeo_bench.config import Document, Line, Short, parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredErrors
+from sasgeo_bench.osm.taxonomy import MeasuredErrors, load_taxonomy
+from sasgeo_bench.tasks.perturbations.measured import MEASURED
 
 VERSION: Final = 1
 _MEND: Final = "name a .toml file that perception_profile.write_profile has written"
@@ -80,16 +79,17 @@ class PerceptionProfile(Document):
 
 def _errors(name: str, found: ClassConfusions) -> MeasuredErrors:
     recall = min(found.recall, 1 - sum(found.called.values()))
-    return replace(
-        MEASURED.get(name, _PLAIN),
-        recall=recall,
-        precision=found.precision,
-        called=dict(found.called) if recall < 1 else {},
-        also=dict(found.also),
-        of_yards=None,
-        of_ground=found.of_ground,
-        alarms_on="ground",
-        is_ground=False,
+    return MEASURED.get(name, _PLAIN).model_copy(
+        update={
+            "recall": recall,
+            "precision": found.precision,
+            "called": dict(found.called) if recall < 1 else {},
+            "also": dict(found.also),
+            "of_yards": None,
+            "of_ground": found.of_ground,
+            "alarms_on": "ground",
+            "is_ground": False,
+        }
     )
 
 

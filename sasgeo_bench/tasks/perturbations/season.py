@@ -2,31 +2,25 @@
 """Seasons: changes of a view by leaves, snow, drought and harvest, class by class."""
 
 from dataclasses import dataclass
-from typing import Final, Literal, get_args
+from typing import Final, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import PerturbError
+from sasgeo_bench.osm.taxonomy import Season as Kind
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import Field, dilated, highest, smooth_noise, top_share
 from sasgeo_bench.tasks.perturbations.objects import find_objects
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
-Kind = Literal["leaf_on", "snow", "low_water", "harvest"]
 Layers = dict[str, NDArray[np.uint8]]
 
-_UNDER_LEAVES: Final = ("path_track", "road_minor", "waterway", "field_boundary")
-_SNOWED_UNDER: Final = ("path_track", "field_boundary")
-_WHITE: Final = ("farmland", "green", "parking", "bare")
-CHANGED: Final[dict[Kind, tuple[str, ...]]] = {  # classes that a season changes, or hides
-    "leaf_on": _UNDER_LEAVES,
-    "snow": (*_SNOWED_UNDER, *_WHITE),
-    "low_water": ("water", "waterway"),
-    "harvest": ("farmland", "green", "field_boundary"),
-}
+# Classes that a season changes, or hides.
+CHANGED: Final[dict[Kind, tuple[str, ...]]] = {kind: load_taxonomy().touched_by(kind) for kind in get_args(Kind)}
 _PATCH_M: Final = 25.0  # width of the patches that change; fields change as a whole
 _RETREAT_M: Final = 12.0  # of the waterline at strength 1, from a gentle bank
 _LARGEST_MEADOW: Final = 0.25  # of the view
@@ -62,11 +56,11 @@ class Season:
         layers = dict(zip(evidence.classes, cells, strict=True))
         noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
         if self.kind == "leaf_on":
-            _clear(layers, _UNDER_LEAVES, _strongest(noise, _of(layers, "green"), self.strength))
+            _clear(layers, CHANGED[self.kind], _strongest(noise, _of(layers, "green"), self.strength))
         elif self.kind == "snow":
             white = top_share(noise, self.strength)
-            _clear(layers, _SNOWED_UNDER, white)
-            for name in _WHITE:
+            _clear(layers, load_taxonomy().touched_by(self.kind, "lost"), white)
+            for name in load_taxonomy().touched_by(self.kind, "unknown"):
                 if name in layers:
                     layers[name][white] = UNKNOWN
         elif self.kind == "low_water":

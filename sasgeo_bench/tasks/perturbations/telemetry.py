@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence, cell_offsets_m
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.tasks.vectors import as_features, vector_table
@@ -205,7 +206,7 @@ def _junctions(vectors: "gpd.GeoDataFrame") -> Iterator[tuple[tuple[float, float
     features = as_features(vectors)
     nodes = build_graph(features).nodes
     chosen = nodes[(nodes["kind"] == "intersection").to_numpy() & (nodes["degree"] >= _FORK).to_numpy()]
-    is_road = features["class"].isin(("road_major", "road_minor", "path_track")).to_numpy()
+    is_road = features["class"].isin(load_taxonomy().of_graph("road")).to_numpy()
     is_line = shapely.get_dimensions(features.geometry.to_numpy()) == 1  # squares have no arms, and may be invalid
     roads = shapely.union_all(features.geometry.to_numpy()[is_road & is_line])
     for place in chosen.geometry:

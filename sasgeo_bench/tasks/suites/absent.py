@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.state import State
@@ -103,7 +104,7 @@ def strip(evidence: Evidence) -> Evidence:
     """Keep only ground cover, as over open land, forest or water."""
     cells = evidence.cells.copy()
     for index, name in enumerate(evidence.classes):
-        if name not in ("green", "farmland", "bare", "water", "coastline"):
+        if name not in load_taxonomy().covering("land", "water"):
             cells[index][cells[index] == 1] = 0
     return evidence.replace(cells)
 

@@ -12,6 +12,8 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions.network import LAYERS
 from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
 
 if TYPE_CHECKING:
@@ -25,7 +27,7 @@ _COARSE_M: Final = 8.0
 RINGS: Final = 4
 _SECTORS: Final = 12
 _FAR_M: Final = 64.0  # distances are clipped here
-_THIN: Final = ("road_major", "road_minor", "path_track", "railway", "waterway", "building")
+_THIN: Final = (*LAYERS, *load_taxonomy().of_graph("building"))
 _NODE_KINDS: Final = (
     *("intersection", "dead_end", "crossing", "building", "building_cluster", "level_crossing"),
     *("river_bend", "road_rail_crossing", "road_water_crossing"),

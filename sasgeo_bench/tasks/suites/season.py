@@ -3,8 +3,9 @@
 
 from typing import Final, get_args
 
+from sasgeo_bench.osm.taxonomy import Season as Kind
 from sasgeo_bench.tasks.perturbations.base import share_changed
-from sasgeo_bench.tasks.perturbations.season import CHANGED, Kind, Season
+from sasgeo_bench.tasks.perturbations.season import CHANGED, Season
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 STRENGTHS: Final = (0.3, 0.6, 0.9)
@@ -12,7 +13,7 @@ SMALL_STRENGTHS: Final = (0.6, 0.9)
 NEEDS: Final[dict[Kind, tuple[str, ...]]] = {
     "leaf_on": ("green",),
     "snow": (),
-    "low_water": ("water", "waterway"),
+    "low_water": CHANGED["low_water"],
     "harvest": ("farmland",),
 }
 _LEAST_SHARE: Final = 0.003  # of the mapped cells that the classes of a season cover

@@ -9,15 +9,18 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import Evidence
+from sasgeo_bench.regions.network import LAYERS
 from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, SuiteCard, Variant
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import ANCHOR_SPREAD
 from sasgeo_bench.tasks.suites.twins import Places
 
-STABLE: Final = ("road_major", "railway", "waterway")
-VOLATILE: Final = ("green", "farmland", "parking", "field_boundary", "building", "bare")  # in the order of their change
+STABLE: Final = tuple(name for name in LAYERS if name in load_taxonomy().having("through"))
+VOLATILE: Final = {item.name: item.volatile for item in load_taxonomy().classes if item.volatile}  # and when it changes
+STEPS: Final = 6  # of the change: so many however many classes there are
 MOST_ALIASES: Final = 8
 
 _STEP_M: Final = 40.0
@@ -60,7 +63,7 @@ class StableNotDistinctive(Suite):
     def draw(self, shot: Shot) -> Draft:
         """Mirror the layers of some volatile classes within the view: all of them at strength 1."""
         seen = shot.perceived()
-        after = mirrored(seen, round(shot.variant.strength * len(VOLATILE)))
+        after = mirrored(seen, round(shot.variant.strength * STEPS))
         return Draft(evidence=after, measured={"cells_changed": share_changed(seen, after)})
 
 
@@ -76,9 +79,9 @@ def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], spacing_m: f
 def mirrored(evidence: Evidence, count: int) -> Evidence:
     """Mirror the first `count` volatile classes from left to right, which keeps their area."""
     cells = evidence.cells.copy()
-    for name in set(VOLATILE[:count]) & set(evidence.classes):
-        index = evidence.classes.index(name)
-        cells[index] = cells[index][:, ::-1]
+    for index, name in enumerate(evidence.classes):
+        if 0 < VOLATILE.get(name, 0) <= count:
+            cells[index] = cells[index][:, ::-1]
     return evidence.replace(cells)
 
 

@@ -9,10 +9,10 @@ import numpy as np
 from sasgeo_bench.ageing.ratebook import PooledRates
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
+from sasgeo_bench.tasks.vectors import VECTOR_CLASSES
 
 YEARS: Final = (2.0, 5.0, 10.0, 20.0, 40.0)
 _MOST_NEW_PER_OLD: Final = 1.0
-_SHIFTED: Final = ("building", "road_major", "road_minor", "path_track", "waterway", "railway")  # others grow
 _MEDIAN_OF_SHIFT: Final = 1.1774  # of a length whose two components have standard deviation 1: sqrt(2 ln 2)
 
 
@@ -38,7 +38,7 @@ def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
     The shift of redrawn objects is the median over the classes whose centre moves because they were redrawn and not
     because they grew; how many are redrawn follows from the rates of the ground.
     """
-    names = [name for name in _SHIFTED if name in pooled.classes]
+    names = [name for name in VECTOR_CLASSES if name in pooled.classes]
     shifts_m = [shift_m for name in names if (shift_m := pooled.classes[name].shift_median_m) is not None]
     classes = {
         name: Rates(

@@ -10,12 +10,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite
 from sasgeo_bench.tasks.twin import mirror
 
-VOLATILE: Final = ("farmland", "parking", "field_boundary", "building", "green", "bare")
-STABLE: Final = ("road_major", "road_minor", "path_track", "railway", "water", "waterway", "coastline", "bridge")
+VOLATILE: Final = tuple(item.name for item in load_taxonomy().classes if item.volatile)
+STABLE: Final = tuple(item.name for item in load_taxonomy().classes if not item.volatile)
 CHANGED_M: Final = 60.0  # radius of what differs: a third of a view; the rest is the same at both places
 _NEAR_M: Final = 40.0
 

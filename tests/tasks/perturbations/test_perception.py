@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.osm.taxonomy import ClassErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.perturbations import perception
 from sasgeo_bench.tasks.perturbations.fields import dilated, eroded
 from sasgeo_bench.tasks.perturbations.objects import find_objects, thin_classes
-from sasgeo_bench.tasks.perturbations.perception import ERRORS, TOLERANCE_CELLS, ClassErrors, Perception, with_f1
+from sasgeo_bench.tasks.perturbations.perception import ERRORS, TOLERANCE_CELLS, Perception, with_f1
 
 
 @dataclass(frozen=True)

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from sasgeo_bench.osm.taxonomy import MeasuredErrors
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
-from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredErrors, MeasuredPerception
+from sasgeo_bench.tasks.perturbations.measured import MEASURED, MeasuredPerception
 from sasgeo_bench.tasks.perturbations.occlusion import CanopyAndShadow, FalseUnknown, Glare
 from sasgeo_bench.tasks.perturbations.perception import ERRORS, Perception
 from sasgeo_bench.tasks.perturbations.season import Season
@@ -48,7 +49,7 @@ def assert_same(one, two, names):
 @every
 def test_one_more_class_changes_no_other_one(perturbation, view, monkeypatch):
     # The new class has errors, and lies where another class is, so that the ground beside it stays what it was.
-    monkeypatch.setitem(ERRORS, NEW, dataclasses.replace(ERRORS["parking"], confused_with=None, confused=0.0))
+    monkeypatch.setitem(ERRORS, NEW, ERRORS["parking"].model_copy(update={"confused_with": None, "confused": 0.0}))
     monkeypatch.setitem(MEASURED, NEW, MeasuredErrors(recall=0.7, precision=0.7))
     at = len(view.classes) // 2
     names = (*view.classes[:at], NEW, *view.classes[at:])

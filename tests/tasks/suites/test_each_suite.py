@@ -271,7 +271,7 @@ def test_seasons_without_anything_to_change_are_left_out(scene):
 
 def test_mirroring_leaves_stable_classes_and_amounts_as_they_were(carried, root):
     made = carried("stable-not-distinctive", root)
-    moved = {0.4: ("green", "farmland"), 1.0: VOLATILE}
+    moved = {0.4: ("green", "farmland"), 1.0: tuple(VOLATILE)}
     for variant in stresses(made):
         for site in made.sites:
             seen, control = (made.drawn(site, item).evidence for item in (variant, made.control(variant)))

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A class of the map is a row of `taxonomy.toml`: no list of classes stands elsewhere, and a row more changes no other."""
+"""A class of the map is a row of `taxonomy.toml`: no list stands elsewhere, and a row more changes no other."""
 
 import ast
-import os
 import subprocess
 import sys
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 
@@ -14,11 +14,11 @@ import sasgeo_baselines
 from sasgeo_baselines import anyvisloc_pipeline, polar, zilke_semantic_mi
 from sasgeo_baselines.trackers import kinnari_mcl, swapf
 
-import sasgeo_bench
+import sasgeo_bench as sgb
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo import class_weights
 
-PACKAGES = tuple(Path(one.__file__).parent for one in (sasgeo_bench, sasgeo_baselines))
+PACKAGES = tuple(Path(one.__file__).parent for one in (sgb, sasgeo_baselines))
 # Files that name two classes or more in one literal, and why that is no list to be derived.
 ALLOWED = {
     "osm/geojson.py": "keys of OSM, not classes",
@@ -41,24 +41,62 @@ RECIPES = {
     "swapf": (chain(*swapf.GROUPS), "bare coastline water waterway"),
     "zilke_semantic_mi": (chain(*zilke_semantic_mi.LABELS), "bare"),
 }
-# Keys of a class that belong to the generator of queries, and to the scorer, which learns of the other's by nothing.
-OF_GENERATOR, OF_SCORER = ("published", "measured", "seasons", "touched_by", "volatile"), ("seen_share", "prior")
+# Keys of a class that the generator of queries reads, and the scorer may not, and the other way round.
+OF_GENERATOR, OF_SCORER = {"published", "measured", "touched_by", "volatile"}, {"seen_share"}
+# A class that no map has yet, drawn as a detector sees car parks; nothing in a town is one.
+ANOTHER = """
+[[class]]
+id = 14
+name = "solar"
+title = "field of solar panels"
+kind = "area"
+colour = "#101060"
+persistence = { prior = 0.9, vanish_per_year = 0.01, appear_per_year = 0.05 }
+paint = 45
+graph = "none"
+group = "none"
+cover = "none"
+look = "none"
+narrowest_m = 5.0
+standing_m = 0.0
+volatile = 3
+traits = ["drawn", "compared", "built", "blocks_areas", "blocks_lines", "clears", "treeless"]
+seasons = { snow = "unknown" }
+seen_share = { snow = 0.5 }
+published = { recall = 0.7, precision = 0.7 }
+measured = { recall = 0.7, precision = 0.7 }
+rules = [{ key = "power", geometry = "area", values = ["plant", "generator"] }]
+"""
+# Draws queries of a town; `sys.argv` holds the root, and what the taxonomy has besides.
+DRAW = """
+import sys
+from importlib import resources
+from sasgeo_bench.config import parse_toml
+from sasgeo_bench.osm import taxonomy
+text = resources.files("sasgeo_bench.osm").joinpath("taxonomy.toml").read_text(encoding="utf-8")
+known = parse_toml(text + sys.argv[2], taxonomy.Taxonomy, source="grown.toml")
+taxonomy.load_taxonomy = lambda: known
+import sasgeo_bench as sgb
+sgb.make_tasks(suite=sys.argv[3:], regions=["town-riverside"], n=1, up_to=True, skip=True, out=sys.argv[1])
+"""
+SUITES = ("clean", "occlusion", "season", "synthetic-age", "absent")
 
 
-def named(node: ast.AST) -> set[str]:
-    """The classes that a literal list, tuple, set or dictionary names."""
+def names_classes(node: ast.AST, classes: frozenset[str]) -> bool:
+    """Whether a literal list, tuple, set or dictionary names two classes or more."""
     parts = node.keys if isinstance(node, ast.Dict) else getattr(node, "elts", ())
-    return {part.value for part in parts if isinstance(part, ast.Constant)} & set(load_taxonomy().names)
+    return sum(isinstance(part, ast.Constant) and part.value in classes for part in parts) > 1
 
 
 def test_lists_of_classes_are_derived_from_the_taxonomy():
+    classes = frozenset(load_taxonomy().names)
     found = {
-        path.relative_to(root).as_posix(): path
+        path.relative_to(root).as_posix()
         for root in PACKAGES
         for path in root.rglob("*.py")
-        if any(len(named(node)) > 1 for node in ast.walk(ast.parse(path.read_bytes())))
+        if any(names_classes(node, classes) for node in ast.walk(ast.parse(path.read_bytes())))
     }
-    assert set(found) == set(ALLOWED), "derive the list from a key of taxonomy.toml, or give the reason in ALLOWED"
+    assert found == set(ALLOWED), "derive the list from a key of taxonomy.toml, or give the reason in ALLOWED"
 
 
 @pytest.mark.parametrize("name", RECIPES)
@@ -67,14 +105,34 @@ def test_a_recipe_leaves_out_only_the_classes_that_it_says(name):
     assert set(load_taxonomy().names) - set(taken) == set(left_out.split()), f"has {name} a place for the new class?"
 
 
-def test_generator_and_scorer_read_no_key_of_each_other():
-    package = PACKAGES[0]
-    keys = {
-        path.relative_to(package).as_posix(): {
-            node.attr for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.Attribute)
-        }
-        for path in package.rglob("*.py")
-    }
-    scorer = [path for path, found in keys.items() if path.startswith("sasgeo/") and found & {*OF_GENERATOR[:4]}]
-    generator = [path for path, found in keys.items() if path.startswith("tasks/") and found & {*OF_SCORER}]
-    assert scorer == [] == generator
+@pytest.mark.parametrize(("folder", "keys"), [("sasgeo", OF_GENERATOR), ("tasks", OF_SCORER)])
+def test_generator_and_scorer_read_no_key_of_each_other(folder, keys):
+    for path in (PACKAGES[0] / folder).rglob("*.py"):
+        read = {node.attr for node in ast.walk(ast.parse(path.read_bytes())) if isinstance(node, ast.Attribute)}
+        assert not read & keys, path
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory):
+    """Queries and truths by suite, drawn by the taxonomy as it is, and by one with a class more."""
+
+    def draw(more):
+        out = tmp_path_factory.mktemp("out")
+        subprocess.run([sys.executable, "-c", DRAW, str(out), more, *SUITES], check=True)  # noqa: S603
+        where = [(name, out / "tasks" / name / "town-riverside") for name in SUITES]
+        queries = {name: list(sgb.read_queries(folder)) for name, folder in where if folder.is_dir()}
+        return queries, {name: list(sgb.read_truths(out / "truth" / name / "town-riverside")) for name in queries}
+
+    return draw(""), draw(ANOTHER)
+
+
+def test_one_more_class_changes_no_query_in_which_it_is_not_drawn(drawn):
+    (before, truths), (after, truths_after) = drawn
+    assert set(before) == set(after) > {"clean"}
+    plain = [[replace(one, measured={}) for one in chain(*each.values())] for each in (truths, truths_after)]
+    assert plain[0] == plain[1]  # what is measured is a share of the cells of all classes
+    for suite, queries in before.items():
+        for one, two in zip(queries, after[suite], strict=True):
+            assert two.evidence.classes == (*one.evidence.classes, "solar")
+            np.testing.assert_array_equal(two.evidence.cells[:-1], one.evidence.cells)
+            assert (one.id, one.prior, one.candidates) == (two.id, two.prior, two.candidates)

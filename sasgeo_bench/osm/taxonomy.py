@@ -28,7 +28,6 @@ Trait = Literal[
     "blocks_areas",
     "blocks_lines",
     "clears",
-    "treeless",
 ]
 Season = Literal["leaf_on", "snow", "low_water", "harvest"]
 Name = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z_]*$")]

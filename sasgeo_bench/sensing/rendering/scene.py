@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import burn, burn_class, make_paint
 from sasgeo_bench.sensing.rendering.buildings import Buildings, style_buildings
 from sasgeo_bench.sensing.rendering.cars import paint_cars
@@ -230,8 +229,7 @@ def _paint_snow(canvas: Canvas) -> None:
 def _paint_greenery(canvas: Canvas, cover: Cover) -> None:
     """Plant woods, parks, yards, streets, hedges and single trees where no road, roof, water or bare ground is."""
     grid, plan, dense = canvas.grid, canvas.plan, canvas.plan.palette.tree_density
-    treeless = [plan.of(name).areas() for name in load_taxonomy().having("treeless")]
-    is_bare = burn_numbers(np.concatenate(treeless), grid) > 0
+    is_bare = burn_numbers(plan.of("bare").areas(), grid) > 0
     room = cv2.erode(((canvas.kind == GROUND) & ~is_bare).astype(np.uint8), np.ones((5, 5), np.uint8))
     wall_m = inside_m(canvas.kind != ROOF, grid)
     clumps = fractal(grid, 45.0, plan.seed("clumps"))

@@ -32,7 +32,6 @@ from sasgeo_bench.tasks.vectors import as_features
 if TYPE_CHECKING:
     import geopandas as gpd
 
-THIN: Final = frozenset(load_taxonomy().lines)
 BRIDGE: Final = "bridge"
 REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
 DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
@@ -57,7 +56,7 @@ def likeness_by_hand(classes: Sequence[str], *, reach_m: float = REACH_M) -> NDA
     fade = np.exp(-(middles_m**2) / (2 * reach_m**2))
     table = np.zeros((len(classes), FAR + 1))
     table[:, 0] = 1.0
-    table[[name in THIN for name in classes], 1:FAR] = fade
+    table[[name in load_taxonomy().lines for name in classes], 1:FAR] = fade
     return table
 
 
@@ -162,7 +161,7 @@ def doubted(evidence: Evidence) -> Evidence:
     """
     cells = evidence.cells.copy()
     for name, layer in zip(evidence.classes, cells, strict=True):
-        if name in THIN and (layer == PRESENT).any():
+        if name in load_taxonomy().lines and (layer == PRESENT).any():
             off = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
             layer[(layer == ABSENT) & (off * evidence.cell_size_m <= DOUBT_M)] = UNKNOWN
     return Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
@@ -202,7 +201,7 @@ def burnt(vectors: "gpd.GeoDataFrame", evidence: Evidence) -> Evidence | None:
             cells[names.index(name), evidence.layer(cover) == PRESENT] = ABSENT
     unknown = np.stack([evidence.layer(name) == UNKNOWN for name in names])
     if BRIDGE in names:
-        lines = [at for at, name in enumerate(names) if name in THIN and name != BRIDGE]
+        lines = [at for at, name in enumerate(names) if name in load_taxonomy().lines and name != BRIDGE]
         unknown[names.index(BRIDGE)] = ~cells[lines].any(axis=0)
     return Evidence(classes=names, cells=np.where(unknown, np.uint8(UNKNOWN), cells), cell_size_m=cell_m)
 

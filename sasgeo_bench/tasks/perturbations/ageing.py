@@ -18,7 +18,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import NoisePool, dilated, shifted
-from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects, thin_classes
+from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
 _TRIES: Final = 12  # to find a free place for a new object
@@ -175,7 +175,7 @@ class Ageing:
                 return
             left -= new
             layers[name][window] |= footprint
-            taken[window] |= footprint & (name not in thin_classes())
+            taken[window] |= footprint & (name not in load_taxonomy().lines)
             for below in _CLEARED.get(name, ()):
                 if below in layers:
                     layers[below][window] &= ~footprint
@@ -226,7 +226,7 @@ def _sea(layers: Mapping[str, Mask]) -> Mask | None:
 
 def _objects_of(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng: np.random.Generator) -> Objects:
     """Return the components of an area class, or the pieces of a line class between sign changes of smooth noise."""
-    if name not in thin_classes():
+    if name not in load_taxonomy().lines:
         return find_objects(mask)
     hills = pool.take(_PIECE_M / cell_size_m, rng) > 0
     high, low = find_objects(mask & hills), find_objects(mask & ~hills)
@@ -239,7 +239,7 @@ def _objects_of(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng:
 def _taken(name: str, layers: Mapping[str, Mask]) -> Mask:
     """Return where no new object of a class may stand; a line may cross roads."""
     known = load_taxonomy()
-    blockers = known.having("blocks_lines") if name in thin_classes() else (*known.having("blocks_areas"), name)
+    blockers = known.having("blocks_lines") if name in known.lines else (*known.having("blocks_areas"), name)
     taken = np.zeros(layers[name].shape, dtype=bool)
     for blocker in blockers:
         if blocker in layers:

@@ -18,7 +18,7 @@ from sasgeo_bench.osm.taxonomy import MeasuredErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
 from sasgeo_bench.tasks.perturbations.fields import SIGMA, Field, NoisePool, dilated, disc, highest_within
-from sasgeo_bench.tasks.perturbations.objects import find_objects, thin_classes
+from sasgeo_bench.tasks.perturbations.objects import find_objects
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
 MEASURED: Final[Mapping[str, MeasuredErrors]] = {item.name: item.measured for item in load_taxonomy().classes}
@@ -157,7 +157,7 @@ class _View:
         budget = lost * total - (total - np.count_nonzero(kept))
         limit = errors.small_share * max(budget, 1.0)
         kept &= ~self._small(kept, errors.small_m2, min(factor, 1.0), limit, rng)
-        if name in thin_classes():
+        if name in load_taxonomy().lines:
             score = self.noise(HIDDEN_M, rng)
         else:
             kept &= _rounded(mask, _ROUNDED_M * min(factor, 2.0) / self.cell_m)
@@ -210,14 +210,14 @@ class _View:
             score = errors.bulge_m * self.outline(name, rng) - self._depth_m(~seen)
             near = free & ~seen
             seen |= near & (score >= highest_within(score, near, errors.outline * budget, rng))
-            if name not in thin_classes():
+            if name not in load_taxonomy().lines:
                 seen |= mask & _closed(seen)  # a bulge leaves no moat where the outline was
         left = budget - (np.count_nonzero(seen) - before)
         if left < 1:
             return
         if name == "building":
             self._add_blocks(seen, free, left, rng)
-        elif name in thin_classes() and errors.alarms_on == "ground":
+        elif name in load_taxonomy().lines and errors.alarms_on == "ground":
             self._add_bands(seen, free, left, errors.width_m, rng)
         else:
             patch, beyond = self.noise(PATCH_M, rng), free & ~seen

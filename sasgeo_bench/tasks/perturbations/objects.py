@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Objects of a layer as connected components; line classes."""
+"""Objects of a layer as connected components."""
 
 from dataclasses import dataclass
-from functools import cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
-from sasgeo_bench.osm.taxonomy import load_taxonomy
 
 Mask = NDArray[np.bool_]
 
@@ -33,12 +30,6 @@ def find_objects(mask: Mask) -> Objects:
     count, labels = cv2.connectedComponents(mask.view(np.uint8), connectivity=8, ltype=cv2.CV_32S)
     areas = np.bincount(labels[mask], minlength=count)
     return Objects(labels=np.asarray(labels, dtype=np.int32), areas_cells=areas[1:])
-
-
-@cache
-def thin_classes() -> frozenset[str]:
-    """Return the line classes: their errors are gaps and shifts, and they have one cell of tolerance."""
-    return frozenset(item.name for item in load_taxonomy().classes if item.kind == "line")
 
 
 def pick_up_to(areas_cells: NDArray[np.int64], budget_cells: float, rng: np.random.Generator) -> Mask:

@@ -8,7 +8,7 @@ score that the detector reaches on each class.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
@@ -26,7 +26,7 @@ from sasgeo_bench.tasks.perturbations.fields import (
     highest_within,
     smooth_noise,
 )
-from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to, thin_classes
+from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
 TOLERANCE_CELLS: Final = 1.5  # the eight neighbours
@@ -38,22 +38,13 @@ SPREAD: Final = 0.3  # coefficient of variation of the error over views and clas
 SEEN_ANYWHERE: Final = 0.2  # fraction of the false alarms that occur whether or not the class is in view
 
 
-def with_f1(f1: float, **others: Any) -> ClassErrors:  # noqa: ANN401 - fields of ClassErrors
-    """Return errors that are balanced, since only their F1 is known: recall and precision are both equal to it.
-
-    >>> with_f1(0.8).gained == with_f1(0.8).lost
-    True
-    """
-    return ClassErrors(recall=f1, precision=f1, **others)
-
-
 ERRORS: Final[Mapping[str, ClassErrors]] = {item.name: item.published for item in load_taxonomy().classes}
 
 _MOST_ERROR: Final = 0.95
 _SECOND_RING: Final = 0.8  # the noise must be stronger by this for a cell two from the edge than for one at the edge
 _DROPPABLE: Final = 0.25  # an object larger than this fraction of its class in view is frayed rather than dropped
 _MOST_TAKEN: Final = 0.6  # most of a class's false alarms that come from what other classes lose to it
-_FLAWLESS: Final = with_f1(1.0)
+_FLAWLESS: Final = ClassErrors(recall=1.0, precision=1.0)
 _STUB_SPENDS: Final = 0.85  # of the cells of a false line; the others are present already or outside the view
 
 
@@ -145,7 +136,7 @@ class _Look:
     @property
     def is_thin(self) -> bool:
         """Return whether the class is drawn as lines."""
-        return self.name in thin_classes()
+        return self.name in load_taxonomy().lines
 
     def lose(self, rng: np.random.Generator) -> tuple[Mask, Mask | None]:
         """Miss the fraction that goes wrong; return what is still seen, and what is taken for another class."""

@@ -102,7 +102,7 @@ def read_profile(path: Path) -> PerceptionProfile:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} cannot be read as a perception profile ({error}): {_MEND}") from error
     profile = parse_toml(text, PerceptionProfile, source=str(path))
-    known = {item.name for item in load_taxonomy().classes}
+    known = set(load_taxonomy().names)
     named = {name for at, found in profile.classes.items() for name in (at, *found.called, *found.also)}
     if strange := sorted(named - known):
         raise ConfigError(

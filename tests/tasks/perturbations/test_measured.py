@@ -10,7 +10,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.perturbations.fields import dilated
 from sasgeo_bench.tasks.perturbations.measured import MEASURED, YARD_M, MeasuredPerception
-from sasgeo_bench.tasks.perturbations.objects import find_objects, thin_classes
+from sasgeo_bench.tasks.perturbations.objects import find_objects
 from sasgeo_bench.tasks.perturbations.perception import TOLERANCE_CELLS, Perception
 
 BUILT = ("road_major", "road_minor", "building", "parking")
@@ -53,7 +53,7 @@ def rates(pairs, name):
     sums = Counter()
     for before, after in pairs:
         true, seen = before.layer(name) == PRESENT, after.layer(name) == PRESENT
-        near = (dilated(mask, TOLERANCE_CELLS) if name in thin_classes() else mask for mask in (true, seen))
+        near = (dilated(mask, TOLERANCE_CELLS) if name in load_taxonomy().lines else mask for mask in (true, seen))
         near_true, near_seen = near
         sums += Counter(
             true=true.sum(), found=(true & near_seen).sum(), seen=seen.sum(), right=(seen & near_true).sum()
@@ -130,9 +130,6 @@ def test_its_errors_lie_together_over_longer_stretches_than_those_of_the_publish
     assert sizes[1] > 3 * sizes[0]
 
 
-def test_every_class_has_errors_and_is_called_a_class_there_is():
-    names = load_taxonomy().names
-    assert set(MEASURED) == set(names)
+def test_no_class_is_called_others_more_often_than_it_is_missed():
     for errors in MEASURED.values():
-        assert set(errors.called) <= set(names)
         assert sum(errors.called.values()) <= 1 - errors.recall

@@ -34,6 +34,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive import score_all
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import CardRecord, RunManifest
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.tasks import task_files
@@ -174,10 +175,17 @@ def write(root: Path, matchers: int, queries: int) -> None:
             name = f"matcher-{at}"
             run = root / "runs" / name / task.suite / task.region
             prediction_files.write_part(run, answers(task, skill, rng))
-            card = {"name": name, "version": "1"}
-            costs = {"prepare_s": 1.0, "peak_bytes": 10**9, "map_bytes": 10**7, "cpu_s": 60.0}
-            said = {"suite": task.suite, "region": task.region, "queries_sha256": sha256, "hash": name}
-            prediction_files.write_run(run, {"matcher": card, **said, **costs})
+            RunManifest(
+                matcher=CardRecord(name=name, version="1"),
+                hash=name,
+                suite=task.suite,
+                region=task.region,
+                queries_sha256=sha256,
+                map_bytes=10**7,
+                prepare_s=1.0,
+                cpu_s=60.0,
+                peak_bytes=10**9,
+            ).save(run)
 
 
 def score(root: Path, *, is_whole: bool) -> dict[str, float]:

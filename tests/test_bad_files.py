@@ -52,6 +52,7 @@ from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.testing import TinyPlace
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel as Learnt
 from sasgeo_bench.scoring.entries import find_entries
@@ -138,24 +139,24 @@ def answers_of(task: Path) -> list[Prediction]:
     ]
 
 
-def about_of(task: Path) -> dict[str, Any]:
+def about_of(task: Path) -> RunManifest:
     said = task_files.read_task(task)
-    return {
-        "schema_version": 1,
-        "matcher": card_of("mine"),
-        "spec": "mine",
-        "hash": "0123456789ab",
+    return RunManifest(
+        schema_version=1,
+        matcher=card_of("mine"),
+        spec="mine",
+        hash="0123456789ab",
         **{name: said[name] for name in ("suite", "region", "task_version", "map_fingerprint")},
-        "queries_sha256": said["files"][task_files.QUERIES]["sha256"],
-        "top_k": 5,
-        "learned": {"key": "ab", "file": None, "trained_on": ["porto"], "pairs": 3},
-        "cpu_s": 1.5,
-    }
+        queries_sha256=said["files"][task_files.QUERIES]["sha256"],
+        top_k=5,
+        learned={"key": "ab", "file": None, "trained_on": ["porto"], "pairs": 3},
+        cpu_s=1.5,
+    )
 
 
 def make_run(folder: Path, tiny: TinyPlace) -> None:
     task = task_of(tiny)
-    prediction_files.write_run(folder, about_of(task))
+    about_of(task).save(folder)
     prediction_files.write_part(folder, answers_of(task), asked=task_files.read_asked(task)).rename(folder / PART)
 
 
@@ -194,7 +195,7 @@ def make_pack(folder: Path, tiny: TinyPlace) -> None:
         folder / "pack",
         board=board,
         tasks=[TaskFolders(task=task, truth=truth_of(task, tiny), region=tiny.map_folder)],
-        runs={"mine": [StoredRun(about=about_of(task), predictions=answers_of(task))]},
+        runs={"mine": [StoredRun(manifest=about_of(task), predictions=answers_of(task))]},
         settings={"split": None, "rejectors": [], "contrasts": [], "draws": 10, "by_region": [], "pipeline": {}},
     )
 

@@ -34,6 +34,7 @@ from sasgeo_bench.publishing.site import environment
 from sasgeo_bench.publishing.site_files import svg_fault
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks import task_files
@@ -422,7 +423,7 @@ def root(tasks, tmp_path_factory):
         prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
         about = {"matcher": card, "hash": HASH, "suite": suite, "region": region, "isolation": {"network": WORDS}}
         sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
-        prediction_files.write_run(folder, about | {"queries_sha256": sha256})
+        RunManifest(**about, queries_sha256=sha256).save(folder)
     return out
 
 

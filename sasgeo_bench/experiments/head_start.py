@@ -3,7 +3,7 @@
 
 An archive comes from whoever made it. So it holds answers alone, never maps, queries, truths or what was learned: these
 are made here, and an answer to another query than is drawn here counts for nothing. A pipeline file states the SHA-256
-of its archive. What is unpacked is marked for good (`prediction_files.PACKED`), so that no board says "run here" of it.
+of its archive. What is unpacked is marked for good (`run_manifest.PACKED`), so that no board says "run here" of it.
 """
 
 import hashlib
@@ -22,8 +22,8 @@ from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.leak_scan import PACKED
+from sasgeo_bench.running.run_manifest import RUN, mark_packed
 from sasgeo_bench.texts import one_line
 
 FOLDER: Final = "runs"  # below the root of what is built
@@ -182,21 +182,19 @@ def _check_runs(archive: Path, scratch: Path) -> None:
     """Refuse answers without a sound record of their run: it is what tells who gave them."""
     for folder in sorted({path.parent for path in scratch.rglob("*") if path.is_file()}):
         try:
-            about = parse_json(plain_file(folder / prediction_files.RUN).read_bytes())
+            about = parse_json(plain_file(folder / RUN).read_bytes())
         except (OSError, ValueError, RecursionError):
             about = None
         if not isinstance(about, dict):
             where = folder.relative_to(scratch)
-            raise StoreError(
-                f"{archive} holds no sound {prediction_files.RUN} in {where}: pack each run with its record"
-            )
+            raise StoreError(f"{archive} holds no sound {RUN} in {where}: pack each run with its record")
 
 
 def _lay_all(scratch: Path, out: Path, sha256: str) -> int:
     """Move the answers to each task to where none lie, marked; return how many were moved."""
-    units = {run.parent: out / run.parent.relative_to(scratch) for run in scratch.rglob(prediction_files.RUN)}
+    units = {run.parent: out / run.parent.relative_to(scratch) for run in scratch.rglob(RUN)}
     for unit, target in units.items():  # before the first is moved: where one cannot be, none is
-        prediction_files.mark_packed(unit, sha256)
+        mark_packed(unit, sha256)
         target.parent.mkdir(parents=True, exist_ok=True)
     new = {unit: target for unit, target in units.items() if not target.exists()}
     for unit, target in new.items():

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.scoring.entries import CardRecord
+from sasgeo_bench.running.run_manifest import CardRecord
 from sasgeo_bench.scoring.verdicts import ContrastMetric
 from sasgeo_bench.tasks.query import Detector, Track
 from sasgeo_bench.texts import FOLDER, one_line

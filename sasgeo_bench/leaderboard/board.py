@@ -213,7 +213,7 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
                 "card": entry.card,
                 "trained_on": entry.declared,
                 "set_apart": board.apart.get(entry.name),
-                "isolation": joined(run.get("isolation") or {} for run in entry.runs) if entry.runs else None,
+                "isolation": joined(run.isolation or {} for run in entry.runs) if entry.runs else None,
                 "learned": entry.learned(),
                 **({"private": board.on_private.rows[entry.name]} if entry.name in board.on_private.rows else {}),
                 **({"failed_controls": [item.to_text() for item in failed]} if failed else {}),

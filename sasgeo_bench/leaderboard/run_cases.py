@@ -16,7 +16,6 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart, disc_of, seen_at
 from sasgeo_bench.leaderboard.cases import find_cases, operating_rejector, words_of
-from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import Tell
@@ -25,6 +24,7 @@ from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.layers import read_layers
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RUN, RunManifest
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.contestants import AskedTask, ScoredTask, read_scored_task
 from sasgeo_bench.scoring.controls import is_control
@@ -277,7 +277,7 @@ def root_of(run: Path, out: Path) -> Path:
 
 def is_run(folder: Path) -> bool:
     """Return True if a folder is a run, or holds those of a matcher."""
-    patterns = (prediction_files.RUN, f"*/*/{prediction_files.RUN}", f"*/*/*/{prediction_files.RUN}")
+    patterns = (RUN, f"*/*/{RUN}", f"*/*/*/{RUN}")
     return any(next(folder.glob(pattern), None) is not None for pattern in patterns)
 
 
@@ -300,18 +300,19 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     flights: dict[tuple[str, str], ScoredFlights] = {}
     frames = []
     place_of = {} if split is None else split.place_of
-    for source, about in zip(entry.sources, entry.runs, strict=True):
+    for source, manifest in zip(entry.sources, entry.runs, strict=True):
+        name = (manifest.suite, manifest.region)
         try:
-            mine = _answers(source, about, root / "tasks" / about["suite"] / about["region"])
-            task = read_scored_task(root / "tasks" / about["suite"] / about["region"], root / "truth")
+            mine = _answers(source, manifest, root.joinpath("tasks", *name))
+            task = read_scored_task(root.joinpath("tasks", *name), root / "truth")
         except SasgeoError as error:
             lost.append(error)
             continue
         if task.is_of_flights:
-            flights[about["suite"], about["region"]] = score_flights(task.heads, task.truths, mine, place_of=place_of)
+            flights[name] = score_flights(task.heads, task.truths, mine, place_of=place_of)
             continue
         frames.append(score_task(task.heads, task.truths, mine, place_of=place_of))
-        tasks[about["suite"], about["region"]] = task
+        tasks[name] = task
         predictions |= mine
     if not (frames or flights):
         raise lost[0]
@@ -324,10 +325,10 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     return replace(found, scores=scores, judged=_judged(entry, scores, predictions, split, rejectors))
 
 
-def _answers(source: Path, about: Mapping[str, Any], folder: Path) -> dict[str, Prediction]:
+def _answers(source: Path, run: RunManifest, folder: Path) -> dict[str, Prediction]:
     """Return the answers of a run to the queries as they are now."""
     task = AskedTask.of(folder)
-    is_same = about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
+    is_same = run.queries_sha256 == task.about["files"][task_files.QUERIES]["sha256"]
     found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
     if not (found.found or is_same):
         raise StoreError(
@@ -345,7 +346,7 @@ def _judged(
 ) -> dict[tuple[str, str], pd.DataFrame]:
     """Return the results of the matcher's own confidence and of some rejectors, where they apply."""
     usable = scores[~is_control(scores)].reset_index(drop=True)
-    is_taught = any(TrainingRecord.of(about) is not None for about in entry.runs)
+    is_taught = any(run.learned is not None for run in entry.runs)
     found = {OWN: own_confidence(usable, split, is_taught=is_taught)}
     for name, rule in rules_of(rejectors, split).items():
         found[name] = judge(usable, predictions, rule.make, rule.split, is_taught=is_taught)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """Learned text of a matcher on disk, and its record in `run.json`."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Annotated, Final
+
+from pydantic import BaseModel, ConfigDict, Strict
 
 from sasgeo_bench.errors import MatchError, StoreError
 from sasgeo_bench.files.folders import fresh_file
@@ -16,8 +16,16 @@ FOLDER: Final = "learned"  # next to the suites of a run
 WHERE: Final = f"name a .json of out/runs/<matcher>/<hash>/{FOLDER}/"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainingRecord:
+Names = Annotated[list[str], Strict(strict=False)]  # which a tuple may give
+
+
+class Record(BaseModel):
+    """Part of `run.json`; a run of another version may state more."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
+
+
+class TrainingRecord(Record):
     """Record of a training in `run.json`.
 
     `key` ties all rows to it (`task_rows.asked_under`); `file` is that of the learned text, relative to the folder of
@@ -26,31 +34,8 @@ class TrainingRecord:
 
     key: str
     file: str | None
-    trained_on: tuple[str, ...]
+    trained_on: Names
     pairs: int
-
-    @classmethod
-    def of(cls, about: Mapping[str, Any]) -> Self | None:
-        """Read the record from the content of `run.json`; None without training.
-
-        Raise `MatchError` if the record is not sound: anyone may have written it.
-        """
-        record = about.get("learned")
-        if record is None:
-            return None
-        places = record.get("trained_on") if isinstance(record, dict) else None
-        is_sound = (
-            isinstance(record, dict)
-            and isinstance(record.get("key"), str)
-            and "file" in record
-            and isinstance(record["file"], str | None)
-            and isinstance(places, list)
-            and all(isinstance(place, str) for place in places)
-            and type(record.get("pairs")) is int
-        )
-        if not is_sound:
-            raise MatchError(f"learned is {one_line(repr(record))}, expected key, file, trained_on and pairs")
-        return cls(key=record["key"], file=record["file"], trained_on=tuple(places or ()), pairs=record["pairs"])
 
 
 def learned_path(run: Path, training_sha256: str) -> Path:

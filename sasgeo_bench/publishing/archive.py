@@ -17,7 +17,6 @@ from sasgeo_bench.leaderboard.board_files import BOARD, read_board
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
-from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive_file import (
     MOST_BYTES,
@@ -96,11 +95,11 @@ def pack_board(
 
 def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
     answers = board.predictions[entry.name]
-    for source, about in zip(entry.sources, entry.runs, strict=True):
-        training = TrainingRecord.of(about)
-        asked = ids[about["suite"], about["region"]]
+    for source, run in zip(entry.sources, entry.runs, strict=True):
+        training = run.learned
+        asked = ids[run.suite, run.region]
         yield StoredRun(
-            about=about,
+            manifest=run,
             predictions=[answers[name] for name in asked if name in answers],
             learned=None if training is None or training.file is None else source.parents[1] / training.file,
         )

@@ -48,8 +48,8 @@ from sasgeo_bench.publishing.archive_folder import (
 )
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.regions.region_files import MANIFEST
-from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_rows import prediction_row, predictions_of, schema_of
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.task_rows import (
     ASKED,
@@ -89,9 +89,9 @@ class TaskFolders:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredRun:
-    """One run: content of `run.json`, its answers, and the file that was learned for it, if any."""
+    """One run: its manifest, its answers, and the file that was learned for it, if any."""
 
-    about: Mapping[str, Any]
+    manifest: RunManifest
     predictions: Sequence[Prediction]
     learned: Path | None = None
 
@@ -243,7 +243,7 @@ def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
         {
             "contestant": name,
             "rows": len(run.predictions),
-            "about": json.dumps(dict(run.about)),
+            "about": json.dumps(run.manifest.content()),
             LEARNED: None if run.learned is None else _text_of(run.learned),
         }
         for name, listed in runs.items()
@@ -252,9 +252,9 @@ def _write_runs(folder: Path, runs: Mapping[str, Sequence[StoredRun]]) -> None:
     _write_table(pa.Table.from_pylist(rows, schema=RUNS_SCHEMA), folder / RUNS)
 
 
-def _file_of(about: Mapping[str, Any]) -> str:
+def _file_of(run: RunManifest) -> str:
     """Return the folder of a matcher's runs: its name and its hash."""
-    return f"{about['matcher']['name']}-{about['hash']}"
+    return f"{run.matcher.name}-{run.hash}"
 
 
 def _write_predictions(folder: Path, runs: Mapping[str, Sequence[StoredRun]], *, is_lean: bool) -> int:
@@ -379,13 +379,16 @@ def _read_runs(folder: Path) -> pa.Table:
     runs = read_table(folder / RUNS, mend=_MEND)
     if (folder / PREDICTIONS).is_file():
         return runs
-    learned = [_former_learned(folder, parse_json(text)) for text in runs["about"].to_pylist()]
+    learned = [_former_learned(folder, _manifest_of(text)) for text in runs["about"].to_pylist()]
     return runs.append_column(LEARNED, pa.array(learned, pa.string()))
 
 
-def _former_learned(folder: Path, about: Mapping[str, Any]) -> str | None:
-    training = TrainingRecord.of(about)
-    path = folder / FORMER_LEARNED / _folder_name(_file_of(about)) / _learned_name(training)
+def _manifest_of(text: str) -> RunManifest:
+    return RunManifest.model_validate(parse_json(text))
+
+
+def _former_learned(folder: Path, run: RunManifest) -> str | None:
+    path = folder / FORMER_LEARNED / _folder_name(_file_of(run)) / _learned_name(run.learned)
     return _text_of(path)
 
 
@@ -403,7 +406,7 @@ def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
     if (folder / PREDICTIONS).is_file():
         table = read_table(folder / PREDICTIONS, mend=_MEND)
     else:
-        files = {row["contestant"]: _folder_name(_file_of(parse_json(row["about"]))) for row in rows}
+        files = {row["contestant"]: _folder_name(_file_of(_manifest_of(row["about"]))) for row in rows}
         tables = [read_table(folder / FORMER_PREDICTIONS / f"{stem}.parquet", mend=_MEND) for stem in files.values()]
         matchers = [name for name, part in zip(files, tables, strict=True) for _ in range(len(part))]
         table = pa.concat_tables(tables).append_column(MATCHER, pa.array(matchers, pa.string()))
@@ -416,17 +419,15 @@ def _read_predictions(folder: Path, runs: pa.Table) -> pa.Table:
 def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into: Path) -> Iterator[Path]:
     start, answers = 0, answers.drop_columns([MATCHER])
     for row in runs.to_pylist():
-        about, count = parse_json(row["about"]), row["rows"]
-        run = into / "runs" / _folder_name(_file_of(about))
-        place = run / _folder_name(about["suite"]) / _folder_name(about["region"])
-        prediction_files.write_run(place, about)
-        training = TrainingRecord.of(about)
+        manifest, count = _manifest_of(row["about"]), row["rows"]
+        run = into / "runs" / _folder_name(_file_of(manifest))
+        place = run / _folder_name(manifest.suite) / _folder_name(manifest.region)
+        manifest.save(place)
         if row[LEARNED] is not None:
             (run / learned_file.FOLDER).mkdir(exist_ok=True)
-            (run / learned_file.FOLDER / _learned_name(training)).write_text(row[LEARNED], encoding="utf-8")
+            (run / learned_file.FOLDER / _learned_name(manifest.learned)).write_text(row[LEARNED], encoding="utf-8")
         part = answers.slice(start, count)
-        key = prediction_files.key_of(about)
-        ties = [asked_under(asked[name], key) for name in part["query_id"].to_pylist()]
+        ties = [asked_under(asked[name], manifest.key) for name in part["query_id"].to_pylist()]
         write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")
         start += count
         yield place

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
@@ -21,6 +21,7 @@ from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, sc
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RUN, RunManifest
 from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.entries import check_name
 from sasgeo_bench.scoring.rejection import rules_of
@@ -146,37 +147,35 @@ def _hint(unknown: str, split: Split | None) -> str:
 def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Sequence[AskedTask]) -> None:
     """Refuse a card that disagrees with the runs on the matcher or its training places."""
     named = {(task.about["suite"], task.about["region"]) for task in tasks}
-    for about in _runs_in(predictions):
-        matcher = about.get("matcher")
-        found = {name: matcher.get(name) for name in ("name", "version")} if isinstance(matcher, dict) else {}
-        if found != {"name": card.name, "version": card.version}:
+    for run in _runs_in(predictions):
+        name, version = run.matcher.name, run.matcher.version
+        if (name, version) != (card.name, card.version):
             raise ConfigError(
-                f"the card is of {card.name!r} {card.version}, {predictions} holds runs of {found.get('name')!r} "
-                f"{found.get('version')}: make them agree, or name the folder of the runs that the card is of, as in "
-                f"{predictions / str(about.get('hash', '<hash>'))}"
+                f"the card is of {card.name!r} {card.version}, {predictions} holds runs of {name!r} {version}: make "
+                "them agree, or name the folder of the runs that the card is of, as in "
+                f"{predictions / (run.hash or '<hash>')}"
             )
-        if (about.get("suite"), about.get("region")) in named:
-            _check_taught(card, about, split)
+        if (run.suite, run.region) in named:
+            _check_taught(card, run, split)
 
 
-def _runs_in(predictions: Path) -> Iterator[Mapping[str, Any]]:
+def _runs_in(predictions: Path) -> Iterator[RunManifest]:
     prediction_files.check_one_matcher([predictions])
-    for path in sorted(predictions.rglob(prediction_files.RUN)) if predictions.is_dir() else ():
-        about = prediction_files.read_run(path.parent)
-        if about is not None:
-            yield about
+    for path in sorted(predictions.rglob(RUN)) if predictions.is_dir() else ():
+        run = RunManifest.open(path.parent)
+        if run is not None:
+            yield run
 
 
-def _check_taught(card: Card, about: Mapping[str, Any], split: Split | None) -> None:
+def _check_taught(card: Card, run: RunManifest, split: Split | None) -> None:
     """Check that the card states the runner's training, for the half it was asked about."""
-    training = about.get("learned")
-    places_trained = training.get("trained_on", ()) if isinstance(training, dict) else ()
-    places = () if split is None else split.places_in(base_of(str(about["region"])))
+    places_trained = () if run.learned is None else run.learned.trained_on
+    places = () if split is None else split.places_in(base_of(run.region))
     half = split.half_of.get(places[0]) if split is not None and places else None
     lost = sorted(set(places_trained) - set(card.taught(half)))
     if lost:
         raise ConfigError(
-            f"the runs on {about['suite']}/{about['region']} were trained on {lost[0]}, which trained_on of the card "
+            f"the runs on {run.suite}/{run.region} were trained on {lost[0]}, which trained_on of the card "
             f"does not name{'' if half is None else f' for half {half}'}: add it"
         )
 

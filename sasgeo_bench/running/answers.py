@@ -165,9 +165,9 @@ class Cost:
 
     counts: dict[str, int] = field(default_factory=dict)
     prepare_s: float | None = None
-    index_bytes: int | None = None
+    index_bytes: float | None = None
     cpu_s: float = 0.0
-    peak_bytes: int = 0
+    peak_bytes: float = 0
     isolation: dict[str, str] = field(default_factory=dict)
     messages: dict[str, str] = field(default_factory=dict)
 

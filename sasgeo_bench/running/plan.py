@@ -22,6 +22,7 @@ from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.code_hash import matcher_code
 from sasgeo_bench.running.oracle import CARD
+from sasgeo_bench.running.run_manifest import FollowerRecord, RunManifest
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, map_of, plan_training, root_of, truth_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks import task_files
@@ -105,7 +106,7 @@ class RunPart:
     aside: int
     failed: Mapping[str, int] = field(default_factory=dict)
     imagery: str | None = None
-    follower: Mapping[str, Any] | None = None
+    follower: FollowerRecord | None = None
     key: str | None = None
 
 
@@ -157,7 +158,7 @@ class RunPlan:
         has_text = self.training_result is not None and self.training_result.text is not None
         file = path.relative_to(self.run_folder).as_posix() if has_text else None
         key = _key(given, self.training_result)
-        return TrainingRecord(key=key, file=file, trained_on=given.places, pairs=given.count)
+        return TrainingRecord(key=key, file=file, trained_on=list(given.places), pairs=given.count)
 
     def training_lines(self) -> list[str]:
         """Describe the training in a line; no line if none was requested."""
@@ -351,9 +352,9 @@ def _part(
 ) -> RunPart:
     """Find the pending queries of a task; refuse folders that hold other answers, and a map built anew since."""
     folder = _run_folder(request, card, found) / about["suite"] / about["region"]
-    before = prediction_files.read_run(folder)
-    if before is not None and before.get("hash") != found:
-        raise StoreError(f"{folder} holds answers of {before.get('hash')}, not of {found}: move it away")
+    before = RunManifest.open(folder)
+    if before is not None and before.hash != found:
+        raise StoreError(f"{folder} holds answers of {before.hash or 'an unknown run'}, not of {found}: move it away")
     task_files.check_queries(task)
     if task_files.PRIVATE in about and request.out.resolve() != root_of(task):
         raise ConfigError(
@@ -361,12 +362,13 @@ def _part(
         )
     region = map_of(task, about)
     imagery = _rendered_imagery(card, region)
-    follower = follower_record(card) if _is_of_flights(about) else None
-    key = tie_key(key, imagery, None if follower is None else follower["hash"])
+    settings = follower_record(card) if _is_of_flights(about) else None
+    follower = None if settings is None else FollowerRecord(**settings)
+    key = tie_key(key, imagery, None if follower is None else follower.hash)
     drawn = task_files.read_asked(task)
     asked = {name: asked_under(one, key) for name, one in drawn.items()}
     ties = prediction_files.read_ties(folder, since_ns=request.since_ns) if folder.is_dir() else []
-    is_same_task = (before or {}).get("queries_sha256") == about["files"][task_files.QUERIES]["sha256"]
+    is_same_task = before is not None and before.queries_sha256 == about["files"][task_files.QUERIES]["sha256"]
     if not (is_same_task or all(tie.asked for tie in ties)):  # rows of older versions lack the hash of their query
         raise StoreError(
             f"{folder} holds answers of an older version, and not to the queries that {task} holds now: "

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions on disk: parts that are only added, and `run.json`; a file of the same shape is a submission."""
+"""Predictions on disk: parts of a run, which are only added; a file of the same shape is a submission."""
 
 import os
 import re
@@ -11,12 +11,11 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from sasgeo_bench.errors import MatchError, StoreError
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import read_batches, read_schema, read_table, write_table
 from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.prediction_rows import (
     FAR,
@@ -30,15 +29,13 @@ from sasgeo_bench.running.prediction_rows import (
     row_faults,
     schema_of,
 )
-from sasgeo_bench.tasks.task_rows import ASKED, asked_under, tie_key
+from sasgeo_bench.running.run_manifest import RUN, RunManifest
+from sasgeo_bench.tasks.task_rows import ASKED, asked_under
 from sasgeo_bench.texts import MOST_MESSAGE, json_text, one_line
 
-RUN: Final = "run.json"
-PACKED: Final = "packed.json"  # beside it where answers came packed: they were not asked here, whatever `run.json` says
 ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is asked again
 _MEND: Final = "write it again, or remove it where it is a part of a run"
 _MEND_ROUND: Final = "remove it and enter with --again"
-_MEND_RUN: Final = "remove it and run again, its parts are kept"
 _ROWS_AT_ONCE: Final = 64
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
 
@@ -147,7 +144,7 @@ def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True
     """Read answers to some queries from a run's folder; of two for one query, the one that was written last.
 
     `asked` gives the hash of each query, by id (`task_files.read_asked`); a row must carry it, tied to what `run.json`
-    says (`key_of`). `is_tied` states whether rows without a hash are known to answer these queries. A run that was
+    says. `is_tied` states whether rows without a hash are known to answer these queries. A run that was
     killed before its first row has no answers. Raise `StoreError` if a part cannot be read.
     """
     tables: list[pa.Table] = []
@@ -190,7 +187,7 @@ def _joined(tables: Sequence[pa.Table]) -> pa.Table:
 
 
 def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
-    """Return the hash that each row must carry: of its query, and of what `run.json` records (`key_of`).
+    """Return the hash that each row must carry: of its query, and of what `run.json` records.
 
     Raise `StoreError` if `run.json` is damaged.
 
@@ -202,29 +199,8 @@ def asked_in(folder: Path, asked: Mapping[str, str]) -> Mapping[str, str]:
 
 
 def read_key(folder: Path) -> str | None:
-    """Read what rows are tied to besides their queries from `run.json` (`key_of`). Raise as `read_run` does."""
-    try:
-        return key_of(read_run(folder) or {})
-    except MatchError as error:
-        raise StoreError(f"{folder / RUN} is damaged ({error}): {_MEND_RUN}") from error
-
-
-def key_of(about: Mapping[str, Any]) -> str | None:
-    """Return what the rows of a `run.json` are tied to: training, rendered imagery, and how flights are followed.
-
-    Raise `MatchError` if one of them is damaged.
-
-    >>> key_of({}), len(key_of({"rendered_imagery": "ab"}))
-    (None, 64)
-    """
-    record, imagery = TrainingRecord.of(about), about.get("rendered_imagery")
-    if imagery is not None and not isinstance(imagery, str):
-        raise MatchError(f"rendered_imagery is {imagery!r}, expected a hash")
-    follower = about.get("follower")
-    follows = follower.get("hash") if isinstance(follower, dict) else None
-    if follower is not None and not isinstance(follows, str):
-        raise MatchError(f"follower is {one_line(repr(follower))}, expected settings with a hash")
-    return tie_key(None if record is None else record.key, imagery, follows)
+    """Read what rows are tied to besides their queries from `run.json`. Raise as `RunManifest.open` does."""
+    return (RunManifest.open(folder) or RunManifest()).key
 
 
 def read_predictions(path: str | Path) -> Iterator[Prediction]:
@@ -345,13 +321,12 @@ def _to_merge(path: Path, asked: Mapping[str, str] | None) -> Iterable[Predictio
 def check_one_matcher(runs: Sequence[Path]) -> None:
     """Raise `StoreError` if the `run.json` of two folders name different matchers, versions or settings."""
     folders = [run.parent for path in runs if path.is_dir() for run in sorted(path.rglob(RUN))]
-    recorded = [(path, read_run(path)) for path in folders]
-    known = [(path, about) for path, about in recorded if about is not None]
-    for path, about in known[1:]:
+    known = [(path, run) for path in folders if (run := RunManifest.open(path)) is not None]
+    for path, run in known[1:]:
         first, other = known[0]
-        if about.get("hash") != other.get("hash"):
+        if run.hash != other.hash:
             raise StoreError(
-                f"{path} holds answers of {_who(about)}, {first} those of {_who(other)}: "
+                f"{path} holds answers of {_who(run)}, {first} those of {_who(other)}: "
                 "two matchers, versions or settings are never mixed, name the folder of one"
             )
 
@@ -368,10 +343,8 @@ def _check_one_query(runs: Sequence[Path]) -> None:
                 )
 
 
-def _who(about: Mapping[str, Any]) -> str:
-    card = about.get("matcher")
-    name, version = (card.get("name"), card.get("version")) if isinstance(card, dict) else (None, None)
-    return f"{name} {version} ({about.get('hash')})"
+def _who(run: RunManifest) -> str:
+    return f"{run.matcher.name or 'an unknown matcher'} {run.matcher.version} ({run.hash})"
 
 
 def _is_ours(path: Path) -> bool:
@@ -416,34 +389,3 @@ def ids_done(folder: Path, asked: Mapping[str, str], *, again: Iterable[str] = (
     """
     ties = read_ties(folder, since_ns=since_ns) if folder.is_dir() else []
     return {tie.query_id for tie in ties if tie.status not in set(again) and tie.answers(asked)}
-
-
-def write_run(folder: Path, about: Mapping[str, Any]) -> None:
-    """Write `run.json` in place of an older one; raise `StoreError` if the folder cannot be written."""
-    with fresh_file(folder / RUN, mend="check your rights and the free space") as scratch:
-        scratch.write_text(json_text(dict(about)), encoding="utf-8")
-
-
-def read_run(folder: Path) -> dict[str, Any] | None:
-    """Read `run.json`, marked as `packed` where answers came in an archive; None if there is no run.
-
-    Raise `StoreError` if it is damaged.
-    """
-    path = folder / RUN
-    if not path.is_file():
-        return None
-    content = read_json(path, mend=_MEND_RUN)
-    if not isinstance(content, dict):
-        raise StoreError(f"{path} is damaged (it holds {str(content)[:40]!r}): {_MEND_RUN}")
-    mark = folder / PACKED
-    if mark.exists():
-        content["packed"] = True
-    return content
-
-
-def mark_packed(folder: Path, sha256: str) -> None:
-    """Mark the answers of a run for good as such that came in an archive of this hash.
-
-    The mark has a file of its own: `run.json` is written anew when more is asked, and may be removed.
-    """
-    (folder / PACKED).write_text(json_text({"archive_sha256": sha256}), encoding="utf-8")

@@ -9,10 +9,10 @@ from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 from uuid import uuid4
 
-from sasgeo_bench.errors import StoreError, counted
+from sasgeo_bench.errors import counted
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.follower import card_on_flights
 from sasgeo_bench.progress import Lines, Progress, Tell, connected, done_on
@@ -23,6 +23,7 @@ from sasgeo_bench.running import prediction_files, prediction_rows
 from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Watch, answer, pool_costs
 from sasgeo_bench.running.patience import Patience
 from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map, unit_of_task, whole_units
+from sasgeo_bench.running.run_manifest import CardRecord, RunManifest
 from sasgeo_bench.running.training import trained
 from sasgeo_bench.tasks import task_files
 
@@ -82,7 +83,6 @@ def _patience_of(token: str) -> Patience:
 
 
 MOST_LOCKED: Final = 128  # tasks at once: each lock is an open file, and some systems give a process 256
-_COSTS: Final = ("prepare_s", "index_bytes", "cpu_s", "peak_bytes")  # of earlier runs, in run.json
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,17 +229,13 @@ def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tel
 
 def _begin(plan: RunPlan, part: RunPart) -> Cost:
     """Write `run.json` as a task begins; return the cost of earlier runs of it."""
-    recorded = prediction_files.read_run(part.folder) or {}
-    wrong = next((name for name in _COSTS if not isinstance(recorded.get(name), int | float | None)), None)
-    if wrong is not None:
-        path = part.folder / prediction_files.RUN
-        raise StoreError(f"{path} is damaged ({wrong} is no number): remove it and run again, its parts are kept")
+    recorded = RunManifest.open(part.folder) or RunManifest()
     before = Cost(
-        prepare_s=recorded.get("prepare_s"),
-        index_bytes=recorded.get("index_bytes"),
-        cpu_s=recorded.get("cpu_s", 0.0),
-        peak_bytes=recorded.get("peak_bytes", 0),
-        isolation=recorded.get("isolation", {}),
+        prepare_s=recorded.prepare_s,
+        index_bytes=recorded.index_bytes,
+        cpu_s=recorded.cpu_s or 0.0,
+        peak_bytes=recorded.peak_bytes or 0,
+        isolation=recorded.isolation or {},
     )
     _write_run(plan, part, before, Cost())
     return before
@@ -255,30 +251,30 @@ def map_bytes(part: RunPart) -> int:
 
 def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: the run, and its cost together with that of earlier runs."""
-    about = part.about
-    cost_fields: dict[str, Any] = asdict(pool_costs([before, cost]))
-    del cost_fields["counts"], cost_fields["messages"]
-    prediction_files.write_run(
-        part.folder,
-        {
-            "schema_version": prediction_rows.SCHEMA_VERSION,
-            "matcher": asdict(plan.card if part.follower is None else card_on_flights(plan.card)),
-            "spec": plan.request.spec,
-            "hash": plan.hash,
-            "suite": about["suite"],
-            "region": about["region"],
-            "task_version": about["task_version"],
-            "queries_sha256": about["files"][task_files.QUERIES]["sha256"],
-            "map_fingerprint": about["map_fingerprint"],
-            "top_k": plan.request.top_k,
-            "limits": asdict(plan.request.limits),
-            "warm_up": "one query of each process is asked twice and timed the second time",
-            "learned": None if plan.training_record is None else asdict(plan.training_record),
-            **({} if part.imagery is None else {"rendered_imagery": part.imagery}),
-            **({} if part.follower is None else {"follower": dict(part.follower)}),
-            "map_bytes": map_bytes(part),
-            **cost_fields,
-            "licence": LICENCE,
-            "attribution": ATTRIBUTION,
-        },
+    about, total = part.about, pool_costs([before, cost])
+    run = RunManifest(
+        schema_version=prediction_rows.SCHEMA_VERSION,
+        matcher=CardRecord(**asdict(plan.card if part.follower is None else card_on_flights(plan.card))),
+        spec=plan.request.spec,
+        hash=plan.hash,
+        suite=about["suite"],
+        region=about["region"],
+        task_version=about["task_version"],
+        queries_sha256=about["files"][task_files.QUERIES]["sha256"],
+        map_fingerprint=about["map_fingerprint"],
+        top_k=plan.request.top_k,
+        limits=asdict(plan.request.limits),
+        warm_up="one query of each process is asked twice and timed the second time",
+        learned=plan.training_record,
+        map_bytes=map_bytes(part),
+        prepare_s=total.prepare_s,
+        index_bytes=total.index_bytes,
+        cpu_s=total.cpu_s,
+        peak_bytes=total.peak_bytes,
+        isolation=total.isolation,
+        licence=LICENCE,
+        attribution=ATTRIBUTION,
     )
+    looks = {} if part.imagery is None else {"rendered_imagery": part.imagery}
+    follows = {} if part.follower is None else {"follower": part.follower}
+    run.model_copy(update=looks | follows).save(part.folder)

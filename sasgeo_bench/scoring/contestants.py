@@ -15,6 +15,7 @@ from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_rows import predictions_of, table_of
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.scoring.controls import hold_controls
 from sasgeo_bench.scoring.entries import Entry
@@ -171,7 +172,7 @@ def read_entry_answers(
 
 def _answered_folders(entries: Sequence[Entry], files: Collection[pa.Table], root: Path) -> Iterator[Path]:
     """Yield the task folders that runs were made on, then those for which files hold an answer."""
-    for suite, region in sorted({(about["suite"], about["region"]) for entry in entries for about in entry.runs}):
+    for suite, region in sorted({(run.suite, run.region) for entry in entries for run in entry.runs}):
         if (root / "tasks" / suite / region / task_files.TASK).is_file():
             yield root / "tasks" / suite / region
     held = {name for rows in files for name in rows["query_id"].to_pylist()}
@@ -224,15 +225,15 @@ def _read_runs(
     """
     by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
     read: dict[Path, Callable[[], pa.Table]] = {}
-    runs: list[tuple[Path, Mapping[str, Any]]] = []
+    runs: list[tuple[Path, RunManifest]] = []
     asked: set[Path] = set()
     stale: list[Path] = []
-    for source, about in zip(entry.sources, entry.runs, strict=True):
-        task = by_name.get((about["suite"], about["region"]))
+    for source, run in zip(entry.sources, entry.runs, strict=True):
+        task = by_name.get((run.suite, run.region))
         if task is None:
             stale.append(source)
             continue
-        is_same = about["queries_sha256"] == task.about["files"][task_files.QUERIES]["sha256"]
+        is_same = run.queries_sha256 == task.about["files"][task_files.QUERIES]["sha256"]
         found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
         if not (len(found.table) or is_same):
             stale.append(source)
@@ -240,8 +241,8 @@ def _read_runs(
         mine = room.keep(found.table, partial(_rows_of_run, source, task.asked, is_tied=is_same))
         read[task.folder] = partial(_both, read[task.folder], mine) if task.folder in read else mine  # as of shards
         asked.add(task.folder)
-        runs.append((source, _share_of(about, found)))
-    left = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(about for _, about in runs))
+        runs.append((source, _share_of(run, found)))
+    left = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(run for _, run in runs))
     answers = StoredAnswers(read, task_of)
     return EntryAnswers(entry=left, predictions=answers, held=frozenset(asked), asked=frozenset(asked)), stale
 
@@ -254,11 +255,11 @@ def _rows_of_run(source: Path, asked: Mapping[str, str], *, is_tied: bool) -> pa
     return prediction_files.read_answers(source, asked, is_tied=is_tied).table
 
 
-def _share_of(about: Mapping[str, Any], answers: prediction_files.Answers) -> Mapping[str, Any]:
+def _share_of(run: RunManifest, answers: prediction_files.Answers) -> RunManifest:
     """Return the run record with CPU time scaled to the fraction of answers that count."""
-    if not answers.aside or not isinstance(about.get("cpu_s"), int | float):
-        return about
-    return {**about, "cpu_s": about["cpu_s"] * len(answers.table) / (len(answers.table) + answers.aside)}
+    if not answers.aside or run.cpu_s is None:
+        return run
+    return run.model_copy(update={"cpu_s": run.cpu_s * len(answers.table) / (len(answers.table) + answers.aside)})
 
 
 def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[ScoredTask]:

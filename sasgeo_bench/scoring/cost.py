@@ -2,77 +2,35 @@
 """Cost of answers: time, memory, map storage, and bytes to send for one fix."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import MetricError
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 
 BYTES_PER_KB: Final = 1e3
 BYTES_PER_MB: Final = 1e6
 COLUMNS: Final = ("query_id", "track", "status", "is_answered", "latency_s", "block", "place")  # of the rows it reads
-_MOST: Final = 1e18  # seconds or bytes of a run: more is no measurement
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunCost:
-    """Cost of a run on one map; NaN where `run.json` does not state it.
-
-    `prepare_s` excludes answers, `peak_rss_mb` includes child processes (1 MB = 10^6 bytes), `index_mb` are the
-    matcher's files and `map_mb` the region's, `cpu_s` is that of all answers together.
-    """
-
-    prepare_s: float
-    peak_rss_mb: float
-    index_mb: float
-    map_mb: float
-    cpu_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Costs:
     """Input of the cost metrics of one matcher.
 
-    `scores` are its scored rows, `runs` the contents of each `run.json`; none for a file of predictions. `view_bytes`
+    `scores` are its scored rows, `runs` the manifests of its runs; none for a file of predictions. `view_bytes`
     are by query: two bits per cell and class, one byte per confidence, WKB per vector. `area_km2` is the mapped area by
     region, where known.
     """
 
     scores: pd.DataFrame
-    runs: Sequence[Mapping[str, Any]]
+    runs: Sequence[RunManifest]
     view_bytes: Mapping[str, int]
     area_km2: Mapping[str, float]
-
-
-def run_cost(about: Mapping[str, Any]) -> RunCost:
-    """Read the cost of a run from the content of `run.json`, empty for a submission without code.
-
-    Raise MetricError if an entry is no number.
-
-    >>> cost = run_cost({"prepare_s": 2.5, "peak_bytes": 3_000_000})
-    >>> cost.prepare_s, cost.peak_rss_mb, cost.cpu_s
-    (2.5, 3.0, nan)
-    """
-    return RunCost(
-        prepare_s=_number(about, "prepare_s"),
-        peak_rss_mb=_number(about, "peak_bytes") / BYTES_PER_MB,
-        index_mb=_number(about, "index_bytes") / BYTES_PER_MB,
-        map_mb=_number(about, "map_bytes") / BYTES_PER_MB,
-        cpu_s=_number(about, "cpu_s"),
-    )
-
-
-def _number(about: Mapping[str, Any], name: str) -> float:
-    value = about.get(name)
-    if value is None:
-        return math.nan
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= _MOST:
-        raise MetricError(f"{name} of a run is {value!r}, expected a number from 0 to {_MOST:.0e}")
-    return float(value)
 
 
 def latency_quantile(costs: Costs, share: float) -> float:
@@ -86,26 +44,30 @@ def latency_quantile(costs: Costs, share: float) -> float:
     return float(np.quantile(timed_s, share, method="inverted_cdf")) if len(timed_s) else math.nan
 
 
-def most(costs: Costs, name: str) -> float:
-    """Return the largest value of a field of `RunCost` over all maps; NaN if no run states it."""
-    values = [getattr(run_cost(about), name) for about in costs.runs]
-    return max((value for value in values if not math.isnan(value)), default=math.nan)
+def most(costs: Costs, measured: Callable[[RunManifest], float | None], unit: float = 1.0) -> float:
+    """Return the largest value of a figure of runs over all maps, in a unit; NaN if no run states it."""
+    values = [value / unit for run in costs.runs if (value := measured(run)) is not None]
+    return max(values, default=math.nan)
 
 
 def map_kb_per_km2(costs: Costs) -> float:
     """Return kilobytes of maps and the matcher's files for them per square kilometre; each map counts once."""
-    stored = {about["region"]: run_cost(about) for about in costs.runs if about["region"] in costs.area_km2}
-    size_kb = {name: 1e3 * (cost.map_mb + np.nan_to_num(cost.index_mb)) for name, cost in stored.items()}
-    known = [name for name, size in size_kb.items() if not math.isnan(size)]
-    area_km2 = sum(costs.area_km2[name] for name in known)
-    return float(sum(size_kb[name] for name in known) / area_km2) if area_km2 > 0 else math.nan
+    stored = {run.region: run for run in costs.runs if run.region in costs.area_km2}
+    size_kb = {
+        name: 1e3 * (run.map_bytes / BYTES_PER_MB + (run.index_bytes or 0) / BYTES_PER_MB)
+        for name, run in stored.items()
+        if run.map_bytes is not None
+    }
+    area_km2 = sum(costs.area_km2[name] for name in size_kb)
+    return float(sum(size_kb.values()) / area_km2) if area_km2 > 0 else math.nan
 
 
 def cpu_s_per_fix(costs: Costs) -> float:
     """Return CPU-seconds of all queries per answered query; NaN if no run states it."""
     if not costs.runs:
         return math.nan
-    return per_fix(sum(run_cost(about).cpu_s for about in costs.runs), int(costs.scores["is_answered"].sum()))
+    spent_s = sum(math.nan if run.cpu_s is None else run.cpu_s for run in costs.runs)
+    return per_fix(spent_s, int(costs.scores["is_answered"].sum()))
 
 
 def sent_kb_per_fix(costs: Costs) -> float:

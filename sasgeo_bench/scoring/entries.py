@@ -4,23 +4,20 @@
 import re
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from itertools import compress
 from pathlib import Path
 from typing import Any, Final
 
 import pandas as pd
-from pydantic import BaseModel, ConfigDict, ValidationError
 
-from sasgeo_bench.errors import ConfigError, MatchError, MetricError, StoreError, named
+from sasgeo_bench.errors import ConfigError, MatchError, StoreError, named
 from sasgeo_bench.files.plugins import ORACLE, shipped_names
-from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
-from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.running.run_manifest import RUN, RunManifest, damaged
 from sasgeo_bench.scoring.controls import Verdict, knows_too_much
-from sasgeo_bench.scoring.cost import run_cost
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, PACKED, RUN_HERE, is_unranked
 from sasgeo_bench.scoring.submission_files import predictions_name, read_submission
 from sasgeo_bench.tasks.query import base_of
@@ -28,40 +25,15 @@ from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.texts import one_line
 
 FILE_NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-_RUN_SAYS: Final = ("hash", "suite", "region", "queries_sha256")
 
-_ByRun = dict[tuple[str, str, str], list[tuple[Path, dict[str, Any]]]]  # folders and run.json by name, version, hash
-
-
-class CardRecord(BaseModel):
-    """Texts of a card that boards and pages show; a card of an older version may lack some."""
-
-    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
-
-    title: str | None = None
-    source: str | None = None
-    ours: str | None = None
-    licence: str | None = None
-    limits: str | None = None
-    tracks: list[str] | None = None
-    needs: list[str] | None = None
-    trained_on: list[str] | dict[str, list[str] | str] | str | None = None
-
-
-class _RunRecord(BaseModel):
-    """Fields of a `run.json` that a board takes over as they are."""
-
-    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
-
-    matcher: CardRecord
-    isolation: dict[str, str] | None = None
+_ByRun = dict[tuple[str, str, str], list[tuple[Path, RunManifest]]]  # folders and manifests by name, version, hash
 
 
 @dataclass(frozen=True, kw_only=True)
 class Entry:
     """One entry of a board: the runs of a matcher, a file of predictions, or a submission.
 
-    `runs` are the contents of each `run.json`; `sources` the folder or file of predictions for each of them.
+    `runs` are the manifests of its runs; `sources` the folder or file of predictions for each of them.
     `submission` is the content of `submission.json`.
     """
 
@@ -70,7 +42,7 @@ class Entry:
     hash: str
     how: str
     sources: tuple[Path, ...]
-    runs: tuple[Mapping[str, Any], ...] = ()
+    runs: tuple[RunManifest, ...] = ()
     submission: Submission | None = None
 
     @property
@@ -78,15 +50,15 @@ class Entry:
         """Return the card of the matcher or submission; None for a file of predictions."""
         if self.submission is not None:
             return self.submission.card.model_dump(mode="json")
-        return dict(self.runs[0]["matcher"]) if self.runs else None
+        return self.runs[0].matcher.model_dump(mode="json", exclude_unset=True) if self.runs else None
 
     @property
     def declared(self) -> list[str] | None:
         """Return the training places that the entry declares itself; None if it declares nothing."""
         if self.submission is not None:
             return list(self.submission.card.places)
-        places = self.runs[0]["matcher"].get("trained_on") if self.runs else None
-        return [str(place) for place in places] if isinstance(places, list) else None
+        places = self.runs[0].matcher.trained_on if self.runs else None
+        return list(places) if isinstance(places, list) else None
 
     @property
     def is_taught(self) -> bool:
@@ -96,12 +68,10 @@ class Entry:
     def learned(self) -> list[dict[str, Any]]:
         """Return each training by the runner once: its source, its training places and the tasks asked under it."""
         found: dict[str, dict[str, Any]] = {}
-        for about in self.runs:
-            training = TrainingRecord.of(about)
-            if training is not None:
-                fields = asdict(training) | {"trained_on": list(training.trained_on), "asked": []}
-                one = found.setdefault(training.key, fields)
-                one["asked"].append(f"{about['suite']}/{about['region']}")
+        for run in self.runs:
+            if run.learned is not None:
+                one = found.setdefault(run.learned.key, run.learned.model_dump() | {"asked": []})
+                one["asked"].append(f"{run.suite}/{run.region}")
         return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 
 
@@ -124,12 +94,10 @@ def find_entries(
             if _is_new(path, seen):
                 files.append(_file_entry(path))
             continue
-        found = sorted(path.rglob(prediction_files.RUN))
+        found = sorted(path.rglob(RUN))
         for folder in sorted({part.parent for part in path.rglob("part-*.parquet")} - {run.parent for run in found}):
             with _noted(failures, str(folder)):
-                raise StoreError(
-                    f"{folder} holds answers and no {prediction_files.RUN}: run the matcher again, they are kept"
-                )
+                raise StoreError(f"{folder} holds answers and no {RUN}: run the matcher again, they are kept")
         if not found:
             raise StoreError(
                 f"{path} holds no run: name the folder of a run, one with runs in it, or a predictions file"
@@ -141,7 +109,7 @@ def find_entries(
     if twice is not None:
         raise ConfigError(f"two entries are named {twice!r}: rename the file of one")
     # A submission may not have the name of a matcher shown as several versions: readers would confuse them.
-    taken = {*listed, *(entry.runs[0]["matcher"]["name"] for entry in entries if entry.runs)}
+    taken = {*listed, *(entry.runs[0].matcher.name for entry in entries if entry.runs)}
     entries += _submitted(submissions, taken, failures)
     return tuple(sorted(entries, key=lambda entry: entry.name))
 
@@ -159,7 +127,7 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
         raise ConfigError(
             f"{file.sources[0]} is a file of predictions, of which no region can be left out: name runs alone"
         )
-    known = {base_of(about["region"]) for entry in entries for about in entry.runs}
+    known = {base_of(run.region) for entry in entries for run in entry.runs}
     unknown = sorted(set(regions) - known)
     if unknown:
         raise ConfigError(f"no run is on {unknown[0]!r}: regions that can be left out are {', '.join(sorted(known))}")
@@ -167,7 +135,7 @@ def leave_out(entries: tuple[Entry, ...], regions: Collection[str]) -> tuple[Ent
         raise ConfigError(
             "there is nothing to score: every run is on a region that is left out, leave fewer out (--without)"
         )
-    kept = [[base_of(about["region"]) not in regions for about in entry.runs] for entry in entries]
+    kept = [[base_of(run.region) not in regions for run in entry.runs] for entry in entries]
     return tuple(
         replace(entry, sources=tuple(compress(entry.sources, keep)), runs=tuple(compress(entry.runs, keep)))
         for entry, keep in zip(entries, kept, strict=True)
@@ -189,9 +157,9 @@ def _entries_of_runs(by_run: _ByRun) -> list[Entry]:
                 name=shown,
                 version=number,
                 hash=digest,
-                how=PACKED if any(about.get("packed") for _, about in found) else RUN_HERE,
+                how=PACKED if any(run.packed for _, run in found) else RUN_HERE,
                 sources=tuple(folder for folder, _ in found),
-                runs=tuple(about for _, about in found),
+                runs=tuple(run for _, run in found),
             )
         )
     return entries
@@ -199,16 +167,15 @@ def _entries_of_runs(by_run: _ByRun) -> list[Entry]:
 
 def _by_run(paths: Sequence[Path], failures: Failures | None) -> _ByRun:
     """Return runs by name, version and hash; skip matchers with an unreadable run, which would be ranked on a part."""
-    read: dict[Path, dict[str, Any]] = {}
+    read: dict[Path, RunManifest] = {}
     for path in paths:
         with _noted(failures, str(path.parent)):
             read[path] = _read_run(path)
     lost = {_root_of(path) for path in paths if path not in read}
     found: _ByRun = {}
-    for path, about in read.items():
+    for path, run in read.items():
         if _root_of(path) not in lost:
-            card = about["matcher"]
-            found.setdefault((card["name"], card["version"], about["hash"]), []).append((path.parent, about))
+            found.setdefault((run.matcher.name, run.matcher.version, run.hash), []).append((path.parent, run))
     return found
 
 
@@ -291,30 +258,22 @@ def _entry_of(folder: Path, submission: Submission) -> Entry:
     )
 
 
-def _read_run(path: Path) -> dict[str, Any]:
-    """Read a `run.json` and check every field that a board uses: its author is not trusted."""
-    about = prediction_files.read_run(path.parent) or {}
-    card = about.get("matcher")
-    stated = {"matcher.name": None, "matcher.version": None} | {name: about.get(name) for name in _RUN_SAYS}
-    if isinstance(card, dict):
-        stated |= {f"matcher.{name}": card.get(name) for name in ("name", "version")}
-    wrong = (f"{name} is {value!r}" for name, value in stated.items() if not value or type(value) is not str)
-    fault = next(wrong, None)
+def _read_run(path: Path) -> RunManifest:
+    """Read a `run.json` that must identify its matcher and queries: its author is not trusted."""
+    run = RunManifest.open(path.parent) or RunManifest()
+    name, version = run.matcher.name, run.matcher.version
+    stated = {"matcher.name": name, "matcher.version": version, "hash": run.hash, "suite": run.suite}
+    stated |= {"region": run.region, "queries_sha256": run.queries_sha256}
+    fault = next((f"{field} is {value!r}" for field, value in stated.items() if not value), None)
     try:
-        _RunRecord.model_validate(about)
-        check_identity(str(stated["matcher.name"]), str(stated["matcher.version"]))
-        run_cost(about)
-        TrainingRecord.of(about)
-    except ValidationError as error:
-        first = error.errors()[0]
-        fault = fault or f"{'.'.join(map(str, first['loc']))} is {first['input']!r}: {first['msg']}"
-    except (MatchError, MetricError) as error:
+        check_identity(name, version)
+    except MatchError as error:
         fault = fault or str(error)
-    if stated["matcher.name"] == ORACLE != about.get("spec", ORACLE):
-        fault = f"it has the name of the control {ORACLE}, and was run as {about['spec']!r}"
+    if name == ORACLE != (run.spec or ORACLE):
+        fault = f"it has the name of the control {ORACLE}, and was run as {run.spec!r}"
     if fault is not None:
-        raise StoreError(f"{path} is damaged ({one_line(fault)}): remove it and run again, its parts are kept")
-    return about
+        raise damaged(path, fault)
+    return run
 
 
 def set_apart(
@@ -347,10 +306,9 @@ def _overlaps(entry: Entry, scores: pd.DataFrame, split: Split | None) -> Iterat
     for place in dict.fromkeys(scores["place"]):
         if place in _declared(entry, str(place), split):
             yield str(place)
-    for about in entry.runs:
-        learned = TrainingRecord.of(about)
-        is_mine = (scores["suite"] == about["suite"]) & (scores["region"] == about["region"])
-        yield from set() if learned is None else set(scores.loc[is_mine, "place"]) & set(learned.trained_on)
+    for run in entry.runs:
+        is_mine = (scores["suite"] == run.suite) & (scores["region"] == run.region)
+        yield from set() if run.learned is None else set(scores.loc[is_mine, "place"]) & set(run.learned.trained_on)
 
 
 def _declared(entry: Entry, place: str, split: Split | None) -> Sequence[str]:

@@ -5,6 +5,7 @@ To add a metric, write its function and add one row to `METRICS`.
 """
 
 from functools import partial
+from operator import attrgetter
 from typing import Final
 
 import numpy as np
@@ -312,25 +313,25 @@ COSTS: Final = (
         name="prepare",
         meaning="Seconds to make a map ready, once; the longest of all maps",
         unit="s",
-        compute=partial(cost.most, name="prepare_s"),
+        compute=partial(cost.most, measured=attrgetter("prepare_s")),
     ),
     _cost(
         name="peak_memory",
         meaning="Memory of all processes of the matcher together, the most of all maps (1 MB = 10^6 bytes)",
         unit="MB",
-        compute=partial(cost.most, name="peak_rss_mb"),
+        compute=partial(cost.most, measured=attrgetter("peak_bytes"), unit=cost.BYTES_PER_MB),
     ),
     _cost(
         name="index",
         meaning="Memory that preparing a map adds to the matcher's process, the most of all maps",
         unit="MB",
-        compute=partial(cost.most, name="index_mb"),
+        compute=partial(cost.most, measured=attrgetter("index_bytes"), unit=cost.BYTES_PER_MB),
     ),
     _cost(
         name="map",
         meaning="Files of a map, the most of all maps",
         unit="MB",
-        compute=partial(cost.most, name="map_mb"),
+        compute=partial(cost.most, measured=attrgetter("map_bytes"), unit=cost.BYTES_PER_MB),
     ),
     _cost(
         name="map_per_km2",

@@ -15,6 +15,7 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.files.plugins import MATCHERS
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RUN, RunManifest
 from sasgeo_bench.running.testing import TOWN, check_matcher
 from sasgeo_bench.tasks import task_files
 
@@ -405,19 +406,19 @@ def test_a_run_whose_folder_is_damaged_or_another_one_gets_one_line(mistake, run
     shutil.copy(TASK / task_files.QUERIES, run_folder / "part-9.parquet")
     assert "part-9.parquet holds no predictions: move it out of the run's folder" in mistake(*ORACLE)
     (run_folder / "part-9.parquet").unlink()
-    about = run_folder / prediction_files.RUN
-    sound = prediction_files.read_run(run_folder)
+    about = run_folder / RUN
+    sound = json.loads(about.read_text())
     for text in ("{", "[]", "null", '"run"'):
         about.write_text(text)
         told = mistake(*ORACLE)
         assert "run.json is damaged" in told
         assert told.endswith("remove it and run again, its parts are kept")
     about.write_text("{}")
-    assert "holds answers of None, not of" in mistake(*ORACLE)
+    assert "holds answers of an unknown run, not of" in mistake(*ORACLE)
     about.write_text(json.dumps(sound | {"cpu_s": "long"}))
     rows = pq.read_table(part)
     pq.write_table(rows.slice(1), part)
-    assert "run.json is damaged (cpu_s is no number)" in mistake(*ORACLE)
+    assert "run.json is damaged (cpu_s of a run is 'long', expected a number from 0 to 1e+18)" in mistake(*ORACLE)
     about.unlink()
     pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
     told = mistake(*ORACLE)
@@ -435,13 +436,18 @@ def test_a_file_where_rows_would_go_gets_one_line(mistake, run_folder) -> None:
     assert run_folder.read_text() == "mine"
 
 
+def edit_run(folder: Path, **card: str) -> None:
+    """Make a run one of another matcher."""
+    about = RunManifest.open(folder)
+    about.model_copy(update={"hash": "0" * 12, "matcher": about.matcher.model_copy(update=card)}).save(folder)
+
+
 # --- merge ----------------------------------------------------------------------------------------------------------
 
 
 def test_runs_of_two_versions_of_a_matcher_are_not_merged(mistake, run_folder) -> None:
     other = Path(shutil.copytree(run_folder, "other"))
-    about = prediction_files.read_run(other)
-    prediction_files.write_run(other, about | {"hash": "0" * 12, "matcher": about["matcher"] | {"version": "0"}})
+    edit_run(other, version="0")
     told = mistake("merge", "--runs", run_folder, "--runs", other, "--into", "both.parquet")
     assert "other holds answers of oracle_pose 0 (000000000000)" in told
     assert "two matchers, versions or settings are never mixed" in told
@@ -544,8 +550,7 @@ def test_a_path_that_no_disk_takes_gets_one_line(mistake, mine) -> None:
 
 def test_the_runs_of_two_matchers_are_not_validated_as_one(mistake, run_folder) -> None:
     other = Path(shutil.copytree(run_folder, run_folder.parents[3] / "other" / "x" / SUITE / TOWN))
-    about = prediction_files.read_run(other)
-    prediction_files.write_run(other, about | {"hash": "0" * 12, "matcher": about["matcher"] | {"name": "other"}})
+    edit_run(other, name="other")
     told = mistake("validate", "--predictions", run_folder.parents[3], "--tasks", TASK)
     assert told.endswith("two matchers, versions or settings are never mixed, name the folder of one")
 

@@ -14,7 +14,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.experiments import head_start
 from sasgeo_bench.experiments.head_start import unpack_head_start
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, PipelineFile
-from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RunManifest
 
 RUN = "runs/random/abc/clean/one"
 PART = f"{RUN}/part-{1:020d}-7.parquet"
@@ -60,9 +60,9 @@ def test_all_is_laid_down_whole_marked_for_good_and_told_once(tmp_path):
     (line,) = lines
     assert line.startswith("answers to 2 tasks came packed in mine.tar.xz")
     folder = tmp_path / "out" / RUN
-    assert prediction_files.read_run(folder) == {"packed": True}
-    prediction_files.write_run(folder, {"hash": "abc"})  # as when more is asked
-    assert prediction_files.read_run(folder) == {"hash": "abc", "packed": True}
+    assert RunManifest.open(folder) == RunManifest(packed=True)
+    RunManifest(hash="abc").save(folder)  # as when more is asked
+    assert RunManifest.open(folder) == RunManifest(hash="abc", packed=True)
 
 
 def test_what_was_there_stays_unmarked_and_is_not_mixed_with_what_is_packed(tmp_path):
@@ -71,7 +71,7 @@ def test_what_was_there_stays_unmarked_and_is_not_mixed_with_what_is_packed(tmp_
     (own / "run.json").write_bytes(b'{"own": 1}')
     unpack(whole(tmp_path))
     assert found(own) == {"run.json": b'{"own": 1}'}
-    assert prediction_files.read_run(own) == {"own": 1}
+    assert RunManifest.open(own) == RunManifest(own=1)
 
 
 def test_without_a_stated_hash_nothing_is_unpacked_and_a_line_says_so(tmp_path):

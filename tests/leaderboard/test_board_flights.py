@@ -14,6 +14,7 @@ from sasgeo_bench.leaderboard.board_pictures import FLIGHT_BYTES
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.tasks import flight_choice, task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -46,7 +47,7 @@ def run(out, name, *, off_m, accepts):
     prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
     about = {"matcher": {"name": name, "version": "1"}, "hash": HASH, "suite": SUITE, "region": REGION}
     sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
-    prediction_files.write_run(folder, about | {"queries_sha256": sha256, "cpu_s": 3.0})
+    RunManifest(**about, queries_sha256=sha256, cpu_s=3.0).save(folder)
 
 
 @pytest.fixture(scope="module")

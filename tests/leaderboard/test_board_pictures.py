@@ -30,6 +30,7 @@ from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split
 from tests.plain_boards import plain_boards
@@ -76,7 +77,7 @@ def root(tasks, tmp_path_factory):
         prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
         about = {"matcher": {"name": "mine", "version": "1"}, "hash": HASH, "suite": suite, "region": region}
         sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
-        prediction_files.write_run(folder, about | {"queries_sha256": sha256})
+        RunManifest(**about, queries_sha256=sha256).save(folder)
     return out
 
 

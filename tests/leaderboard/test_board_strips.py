@@ -14,6 +14,7 @@ from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.sensing.tiny_images import tiny_images
 from sasgeo_bench.tasks import task_files
@@ -57,7 +58,7 @@ def run(out, task, pairs, name, rights):
     prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
     about = {"matcher": {"name": name, "version": "1"}, "hash": HASH, "suite": SUITE, "region": REGION}
     sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
-    prediction_files.write_run(folder, about | {"queries_sha256": sha256})
+    RunManifest(**about, queries_sha256=sha256).save(folder)
 
 
 @pytest.fixture(scope="module")

@@ -31,7 +31,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.prediction_files import mark_packed
+from sasgeo_bench.running.run_manifest import RunManifest, mark_packed
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.scoring import contestants, tables
 from sasgeo_bench.scoring.contrasts import Contrast
@@ -527,10 +527,9 @@ def copy_run(out, name, towns, *, asked=None):
         hashes = task_files.read_asked(out / "tasks" / "clean" / town) if asked is None else asked
         rows = list(prediction_files.read_predictions(run))
         prediction_files.write_part(folder, rows, asked={row.query_id: hashes[row.query_id] for row in rows})
-        about = prediction_files.read_run(run)
-        sha256 = about["queries_sha256"] if asked is None else "0" * 64
-        card = about["matcher"] | {"name": name}
-        prediction_files.write_run(folder, about | {"matcher": card, "hash": "0123456789ab", "queries_sha256": sha256})
+        about = RunManifest.open(run)
+        other = {"matcher": about.matcher.model_copy(update={"name": name}), "hash": "0123456789ab"}
+        about.model_copy(update=other | ({} if asked is None else {"queries_sha256": "0" * 64})).save(folder)
         folders.append(folder)
     return folders
 
@@ -569,7 +568,7 @@ def test_rows_to_other_queries_beside_the_answers_are_never_scored(out):
     pd.testing.assert_frame_equal(before.scores["oracle_pose"], after.scores["oracle_pose"])
     (entry,) = after.entries
     share = (len(rows)) / (len(rows) + len(strangers))
-    assert entry.runs[0]["cpu_s"] == pytest.approx(share * prediction_files.read_run(run)["cpu_s"])
+    assert entry.runs[0].cpu_s == pytest.approx(share * RunManifest.open(run).cpu_s)
 
 
 def test_who_was_asked_nothing_of_a_task_is_not_on_the_board_of_its_suite(out):

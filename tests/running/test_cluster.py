@@ -15,6 +15,7 @@ from sasgeo_bench.running import prediction_files, runner
 from sasgeo_bench.running.answers import pool_costs
 from sasgeo_bench.running.patience import Patience
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks import task_files
@@ -51,9 +52,9 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     report = run(spread, tell=told.append)
     assert report.counts == {"ok": len(task_files.read_ids(task))}
     assert rows(spread.parts[0].folder) == rows(alone.parts[0].folder)
-    about = prediction_files.read_run(spread.parts[0].folder)
-    assert about["isolation"] == prediction_files.read_run(alone.parts[0].folder)["isolation"]
-    assert about["prepare_s"] >= 0
+    about = RunManifest.open(spread.parts[0].folder)
+    assert about.isolation == RunManifest.open(alone.parts[0].folder).isolation
+    assert about.prepare_s >= 0
     again = plan_run(request_of(task, tmp_path / "two", dask="local:2"))
     assert run(again, tell=told.append).counts == {}
     assert "nothing left" in told[-1]

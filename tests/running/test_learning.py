@@ -18,6 +18,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.matching.matcher import check_learned
 from sasgeo_bench.running import prediction_files, sandbox, training
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.training_tasks import Lessons, _Pair, check_apart, plan_training, spread, truth_of
 from sasgeo_bench.running.worker import Limits
@@ -79,9 +80,9 @@ def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_
     assert lines[1] == f"  to be trained on {count} queries of 1 place (town-grid)"
     assert report.counts == {"ok": 2}
     assert told(request, folder) == {float(count)}
-    said = prediction_files.read_run(folder)["learned"]
-    assert (said["trained_on"], said["pairs"]) == (["town-grid"], count)
-    text = (plan.run_folder / said["file"]).read_text(encoding="utf-8")
+    said = RunManifest.open(folder).learned
+    assert (said.trained_on, said.pairs) == (["town-grid"], count)
+    text = (plan.run_folder / said.file).read_text(encoding="utf-8")
     assert json.loads(text)["suites"] == ["alias"]
     assert plan_run(request).to_text().splitlines()[1].startswith("  trained on ")
     assert next(validate(folder, request.tasks)).is_missing_row  # the rest was not asked, and no row is strange
@@ -131,7 +132,7 @@ def test_whoever_fails_to_learn_loses_its_rows_and_nothing_else(request_of, name
     _, report, folder = carry_out(request)
     assert report.counts == {status: 2}
     assert report.messages[status].startswith(words)
-    assert prediction_files.read_run(folder)["learned"]["file"] is None
+    assert RunManifest.open(folder).learned.file is None
     assert {item.status for item in answers(request, folder).values()} == {status}
     assert plan_run(request).parts[0].left == ()  # asked and answered, if badly: --again asks once more
     assert len(plan_run(replace(request, again=(status,))).parts[0].left) == 2
@@ -152,7 +153,7 @@ def test_a_matcher_that_does_not_learn_passes_the_training_over(request_of):
     plan, report, folder = carry_out(request_of(spec="hostile:Plain"))
     assert (plan.training_set, report.counts) == (None, {"ok": 2})
     assert "has no learn()" in plan.to_text()
-    assert prediction_files.read_run(folder)["learned"] is None
+    assert RunManifest.open(folder).learned is None
 
 
 @pytest.mark.usefixtures("in_threads")

@@ -13,6 +13,7 @@ from sasgeo_bench.progress import Lines
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.tasks import task_files
 
@@ -32,9 +33,9 @@ def test_every_answer_is_the_true_pose(task, truths, tmp_path):
     for item in answers:
         ((pose, score),) = item.candidates
         assert (pose, score, item.confidence) == (truths[item.query_id].pose, 1.0, 1.0)
-    about = prediction_files.read_run(plan.parts[0].folder)
-    assert about["matcher"]["name"] == "oracle_pose"
-    assert about["isolation"] == {"truth": "given, as this control needs it"}
+    about = RunManifest.open(plan.parts[0].folder)
+    assert about.matcher.name == "oracle_pose"
+    assert about.isolation == {"truth": "given, as this control needs it"}
 
 
 def test_an_absent_place_is_withheld_and_a_right_candidate_is_chosen(task, truths):

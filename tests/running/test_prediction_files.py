@@ -13,6 +13,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files, prediction_rows
+from sasgeo_bench.running.run_manifest import RUN, CardRecord, RunManifest
 from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.tasks.task_rows import POSE_FIELDS
 
@@ -180,7 +181,7 @@ def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows
     folders = [tmp_path / name for name in ("one", "two", "three")]
     for folder, found in zip(folders, ("aa", "aa", "bb"), strict=True):
         prediction_files.write_part(folder, [FULL])
-        prediction_files.write_run(folder, {"hash": found, "matcher": {"name": "mine", "version": found[0]}})
+        RunManifest(hash=found, matcher=CardRecord(name="mine", version=found[0])).save(folder)
     into = tmp_path / "all.parquet"
     assert prediction_files.merge_runs(folders[:2], into) == 1
     assert prediction_files.merge_runs([folders[2], write(rows)], into) == 2  # a file does not say whose it is
@@ -188,31 +189,31 @@ def test_only_runs_of_one_matcher_version_and_settings_are_merged(tmp_path, rows
     assert "never mixed" in refusal(prediction_files.merge_runs, folders[1:], into)
     told = refusal(prediction_files.merge_runs, folders, into)
     assert f"{folders[2]} holds answers of mine b (bb), {folders[0]} those of mine a (aa)" in told
-    (folders[2] / prediction_files.RUN).write_text('{"hash": 1, "matcher": 2}')
-    assert "None None (1)" in refusal(prediction_files.merge_runs, folders, into)
+    (folders[2] / RUN).write_text('{"hash": "cc"}')
+    assert "an unknown matcher (cc)" in refusal(prediction_files.merge_runs, folders, into)
     assert into.read_bytes() == whole
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "null", "3", "[" * 100_000, "\x00", '{"a": NaN}', '{"a": 1, "a": 2}'])
 def test_a_damaged_run_json_is_told_in_one_line(tmp_path, text):
-    (tmp_path / prediction_files.RUN).write_text(text)
-    line = refusal(prediction_files.read_run, tmp_path)
+    (tmp_path / RUN).write_text(text)
+    line = refusal(RunManifest.open, tmp_path)
     assert "run.json is damaged (" in line
     assert line.endswith("remove it and run again, its parts are kept")
 
 
 def test_what_a_run_says_of_itself_is_read_back_and_replaced_whole(tmp_path):
-    assert prediction_files.read_run(tmp_path) is None
-    for about in ({"hash": "aa"}, {"hash": "bb", "title": "Köln"}):
-        prediction_files.write_run(tmp_path / "run", about)
-        assert prediction_files.read_run(tmp_path / "run") == about
-    assert [path.name for path in (tmp_path / "run").iterdir()] == [prediction_files.RUN]
+    assert RunManifest.open(tmp_path) is None
+    for about in (RunManifest(hash="aa"), RunManifest(hash="bb", title="Köln")):
+        about.save(tmp_path / "run")
+        assert RunManifest.open(tmp_path / "run") == about
+    assert [path.name for path in (tmp_path / "run").iterdir()] == [RUN]
 
 
 def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path / "file", tmp_path / "file" / "deep"):
-        assert f"{folder}/run.json cannot be written (" in refusal(prediction_files.write_run, folder, {})
+        assert f"{folder}/run.json cannot be written (" in refusal(RunManifest().save, folder)
         part = refusal(prediction_files.write_part, folder, [FULL])
         assert part.startswith(f"{folder}/part-")
         assert " cannot be written (" in part
@@ -220,16 +221,16 @@ def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):
 
 
 def test_a_full_disk_leaves_the_run_json_that_was_there(tmp_path, monkeypatch):
-    prediction_files.write_run(tmp_path, {"hash": "aa"})
+    RunManifest(hash="aa").save(tmp_path)
 
     def full(self, text, **_):
         self.write_bytes(text[:4].encode())
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)
-    assert "No space left on device" in refusal(prediction_files.write_run, tmp_path, {"hash": "bb"})
-    assert prediction_files.read_run(tmp_path) == {"hash": "aa"}
-    assert [path.name for path in tmp_path.iterdir()] == [prediction_files.RUN]
+    assert "No space left on device" in refusal(RunManifest(hash="bb").save, tmp_path)
+    assert RunManifest.open(tmp_path) == RunManifest(hash="aa")
+    assert [path.name for path in tmp_path.iterdir()] == [RUN]
 
 
 # Rows in tables

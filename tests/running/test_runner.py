@@ -19,6 +19,7 @@ from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.sandbox import PROMISES
 from sasgeo_bench.running.worker import Limits
@@ -79,11 +80,11 @@ def test_every_query_has_a_row_and_run_json_says_how(task, undisturbed):
     ids = task_files.read_ids(task)
     assert [item.query_id for item in table(folder)] == sorted(ids)
     assert report.counts == {"ok": len(ids)}
-    about = prediction_files.read_run(folder)
-    assert about["matcher"]["name"] == "plain"
-    assert about["queries_sha256"] == task_files.read_task(task)["files"]["queries.parquet"]["sha256"]
-    assert about["peak_bytes"] > 0
-    assert about["prepare_s"] >= 0
+    about = RunManifest.open(folder)
+    assert about.matcher.name == "plain"
+    assert about.queries_sha256 == task_files.read_task(task)["files"]["queries.parquet"]["sha256"]
+    assert about.peak_bytes > 0
+    assert about.prepare_s >= 0
     assert all(item.latency_s > 0.009 for item in prediction_files.read_predictions(folder))
 
 
@@ -209,8 +210,8 @@ def test_a_run_without_isolation_is_another_run_and_says_what_it_lacked(task, tm
     _, shut_in = run_all(request_of(task, tmp_path, limit=1))
     report, trusted = run_all(request_of(task, tmp_path, name="Raises", limit=1, is_shut_in=False))
     assert shut_in.parent != trusted.parent
-    said = prediction_files.read_run(trusted)["isolation"]
-    assert set(said) == set(prediction_files.read_run(shut_in)["isolation"]) == set(PROMISES)
+    said = RunManifest.open(trusted).isolation
+    assert set(said) == set(RunManifest.open(shut_in).isolation) == set(PROMISES)
     assert {words for name, words in said.items() if name != "memory"} == {"trusted code, not shut in"}
     assert list(report.messages) == ["crash"]
     same = plan_run(request_of(task, tmp_path, limit=1, is_shut_in=False)).parts[0].folder
@@ -271,8 +272,7 @@ def test_rows_of_an_older_program_are_taken_for_the_task_that_its_run_json_names
     for part in prediction_files.parts_of(folder):  # how many there are depends on how fast the machine is
         pq.write_table(pq.read_table(part).drop_columns(["asked_sha256"]), part)
     assert plan_run(request_of(task, tmp_path, limit=2)).parts[0].left == ()
-    about = prediction_files.read_run(folder)
-    prediction_files.write_run(folder, about | {"queries_sha256": "0" * 64})
+    RunManifest.open(folder).model_copy(update={"queries_sha256": "0" * 64}).save(folder)
     with pytest.raises(
         StoreError, match=r"answers of an older version, and not to the queries that .* holds now: move"
     ):
@@ -313,7 +313,7 @@ def test_hostile_matchers_cost_their_own_rows_from_the_run_to_the_board(task, un
         predictions=[*folders.values()], root=task.parents[2], board=tmp_path / "boards" / "b", draws=100
     )
     board = make_board(request, tell=lambda _: None)
-    hashes = {prediction_files.read_run(folder)["hash"]: name for name, folder in folders.items()}
+    hashes = {RunManifest.open(folder).hash: name for name, folder in folders.items()}
     assert {entry.hash for entry in board.entries} == set(hashes)
     assert board.failures.found == {}
     answered = {hashes[entry.hash]: board.scores[entry.name]["status"].value_counts() for entry in board.entries}

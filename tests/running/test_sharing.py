@@ -15,6 +15,7 @@ from sasgeo_bench.files.folders import locked
 from sasgeo_bench.progress import Lines
 from sasgeo_bench.running import answers, prediction_files, runner, sandbox
 from sasgeo_bench.running.plan import RunRequest, by_map, plan_run
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks import task_files
@@ -71,11 +72,11 @@ def test_tasks_on_one_map_share_a_process_and_no_process_has_two_maps(pair, else
         assert set(rows(part)) == set(task_files.read_ids(part.task)[:2])
         assert told(part, "maps") == {1.0}
         assert told(part, "readable maps") == {1.0} or not HAS_LANDLOCK
-        about = prediction_files.read_run(part.folder)
-        assert (about["suite"], about["region"]) == (part.task.parent.name, part.task.name)
-        assert about["prepare_s"] > 0
-        assert about["peak_bytes"] > 0
-        assert about["isolation"]["truth"]
+        about = RunManifest.open(part.folder)
+        assert (about.suite, about.region) == (part.task.parent.name, part.task.name)
+        assert about.prepare_s > 0
+        assert about.peak_bytes > 0
+        assert about.isolation["truth"]
     first, other, second = (told(part, "process") for part in plan.parts)
     assert len(first) == 1
     assert first == second != other
@@ -85,10 +86,10 @@ def test_processor_seconds_are_those_of_a_tasks_own_queries(pair, tmp_path):
     plan = plan_of(pair, tmp_path, name="Works", limit=1)
     run(plan, tell=quiet)
     for part in plan.parts:  # each query takes 0.2 s of a processor; one was asked twice, and counts once
-        assert 0.2 <= prediction_files.read_run(part.folder)["cpu_s"] < 0.39
-    before = prediction_files.read_run(plan.parts[0].folder)["cpu_s"]
+        assert 0.2 <= RunManifest.open(part.folder).cpu_s < 0.39
+    before = RunManifest.open(plan.parts[0].folder).cpu_s
     run(plan_of(pair[:1], tmp_path, name="Works", limit=2), tell=quiet)
-    assert prediction_files.read_run(plan.parts[0].folder)["cpu_s"] >= before + 0.2
+    assert RunManifest.open(plan.parts[0].folder).cpu_s >= before + 0.2
 
 
 def test_a_crash_costs_one_row_of_one_task(pair, tmp_path):
@@ -118,7 +119,7 @@ def test_a_run_that_breaks_off_in_its_second_task_goes_on_there(pair, tmp_path):
     with pytest.raises(KeyboardInterrupt):
         run(plan, tell=quiet, progress=Breaks(quiet))
     assert [len(rows(part)) for part in plan.parts] == [2, 1]
-    assert all(prediction_files.read_run(part.folder)["prepare_s"] is not None for part in plan.parts)
+    assert all(RunManifest.open(part.folder).prepare_s is not None for part in plan.parts)
     again = plan_of(pair, tmp_path, name="Plain")
     assert [len(part.left) for part in again.parts] == [0, 1]
     run(again, tell=quiet)

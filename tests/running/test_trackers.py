@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching import follower
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks import flight_choice, task_files
@@ -215,16 +215,16 @@ def test_a_matcher_of_single_views_follows_flights_and_its_run_says_how(task, tm
     assert {item.covariance[0] for item in rows} == {25.0}
     assert flights == run_of(task, tmp_path, "prior_centre", limit=4)
     plan = plan_run(RunRequest(spec="prior_centre", tasks=(task,), out=tmp_path, limits=PATIENT, limit=4))
-    about = prediction_files.read_run(plan.parts[0].folder)
-    assert about["follower"]["gate"] == 3.5
-    assert "on flights, of sasgeo-bench" in about["matcher"]["ours"]
+    about = RunManifest.open(plan.parts[0].folder)
+    assert about.follower.gate == 3.5
+    assert "on flights, of sasgeo-bench" in about.matcher.ours
     assert not plan.parts[0].left
     monkeypatch.setattr(follower, "_VERSION", 0)
     again = plan_run(plan.request)
     assert again.hash == plan.hash
     assert (len(again.parts[0].left), again.parts[0].aside) == (4, 4)
-    with pytest.raises(MatchError, match="follower is 7, expected settings with a hash"):
-        prediction_files.key_of({"follower": 7})
+    with pytest.raises(ValueError, match="follower is 7, expected settings with a hash"):
+        RunManifest.model_validate({"follower": 7})
 
 
 @pytest.mark.usefixtures("in_threads")

@@ -7,15 +7,16 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring.cost import Costs, latency_quantile, map_kb_per_km2, per_fix, run_cost
+from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.scoring.cost import Costs, latency_quantile, map_kb_per_km2, per_fix
 from sasgeo_bench.scoring.tables import cost_figures
 from tests.scoring.test_tables import scores
 
 RUNS = (
-    {"region": "vaduz", "map_bytes": 2_000_000, "index_bytes": 1_000_000, "cpu_s": 6.0},
-    {"region": "vaduz", "map_bytes": 2_000_000, "index_bytes": 1_000_000, "cpu_s": 2.0},  # another suite
-    {"region": "monaco", "map_bytes": 1_000_000, "index_bytes": None, "cpu_s": 0.0},
-    {"region": "elsewhere", "map_bytes": 9_000_000, "cpu_s": 0.0},  # of an area that is not known
+    RunManifest(region="vaduz", map_bytes=2_000_000, index_bytes=1_000_000, cpu_s=6.0),
+    RunManifest(region="vaduz", map_bytes=2_000_000, index_bytes=1_000_000, cpu_s=2.0),  # another suite
+    RunManifest(region="monaco", map_bytes=1_000_000, index_bytes=None, cpu_s=0.0),
+    RunManifest(region="elsewhere", map_bytes=9_000_000, cpu_s=0.0),  # of an area that is not known
 )
 
 
@@ -42,13 +43,12 @@ def test_a_timeout_is_slower_than_every_answer_and_a_crash_was_not_timed():
 
 
 def test_a_run_without_a_figure_has_no_cost():
-    cost = run_cost({"prepare_s": 1.5, "peak_bytes": 250_000_000, "index_bytes": None, "map_bytes": 4_000_000})
-    assert (cost.prepare_s, cost.peak_rss_mb, cost.map_mb) == (1.5, 250.0, 4.0)
-    assert math.isnan(cost.index_mb)
-    assert math.isnan(cost.cpu_s)
+    cost = costs([RunManifest(prepare_s=1.5, peak_bytes=250_000_000, index_bytes=None, map_bytes=4_000_000)])
+    assert cost[["prepare", "peak_memory", "map"]].tolist() == [1.5, 250.0, 4.0]
+    assert cost[["index", "cpu_per_fix"]].isna().all()
     for wrong in ("fast", True, -1.0, math.nan):
-        with pytest.raises(MetricError, match="prepare_s"):
-            run_cost({"prepare_s": wrong})
+        with pytest.raises(ValueError, match="prepare_s of a run is"):
+            RunManifest(prepare_s=wrong)
 
 
 def test_a_fix_pays_for_the_queries_without_one():

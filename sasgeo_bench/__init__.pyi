@@ -75,8 +75,8 @@ from .regions.region import MapGraph as MapGraph
 from .regions.region import Region as Region
 from .regions.region_files import read_imagery as read_imagery
 from .regions.region_files import read_region as read_region
+from .running.prediction_files import PREDICTION_SCHEMA as PREDICTION_SCHEMA
 from .running.prediction_files import read_predictions as read_predictions
-from .running.prediction_rows import PREDICTION_SCHEMA as PREDICTION_SCHEMA
 from .running.segmenter_testing import check_segmenter as check_segmenter
 from .running.suite_testing import check_suite as check_suite
 from .running.testing import TinyPlace as TinyPlace

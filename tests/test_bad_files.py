@@ -51,7 +51,7 @@ from sasgeo_bench.publishing.site_files import read_board_files
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA, prediction_row
+from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.testing import TinyPlace
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel as Learnt
@@ -232,7 +232,7 @@ def read_all_of_run(folder: Path) -> object:
     asked = dict.fromkeys(("a", "b"), "ff")
     find_entries([folder])
     return (
-        prediction_files.read_answers(folder, asked),
+        prediction_files.Answers.open(folder, asked),
         list(prediction_files.read_predictions(folder)),
         prediction_files.read_ties(folder),
     )

@@ -40,7 +40,7 @@ from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.regions.graph import EDGE_DTYPES, NODE_DTYPES
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
-from sasgeo_bench.running.prediction_rows import PART_SCHEMA
+from sasgeo_bench.running.prediction_files import PART_SCHEMA
 from sasgeo_bench.scoring.metric import CostMetric, MeanMetric, Metric, QuantileMetric, RejectionMetric, ThresholdMetric
 from sasgeo_bench.scoring.metrics import METRICS, TRACKS
 from sasgeo_bench.scoring.rows import is_unranked

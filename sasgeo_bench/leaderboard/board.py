@@ -23,8 +23,8 @@ from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import Failures
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.running.sandbox import joined
-from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA, Falsifier, Verdict, failed_controls
 from sasgeo_bench.scoring.draws import DRAWS

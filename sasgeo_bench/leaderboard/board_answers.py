@@ -8,7 +8,7 @@ import pandas as pd
 
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import ANSWER_SCHEMA
-from sasgeo_bench.running.stored_answers import StoredAnswers
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.pose import columns_of
 from sasgeo_bench.scoring.score import single_views

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.leaderboard.plot_tables import JudgedKey, calibrated_parts
-from sasgeo_bench.running.stored_answers import StoredAnswers
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
 from sasgeo_bench.scoring.decisions import COST_RATIOS, cost_values, decision_cost

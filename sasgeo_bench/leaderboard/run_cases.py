@@ -23,7 +23,7 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.layers import read_layers
 from sasgeo_bench.regions.region import Manifest
-from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.prediction_files import Answers, read_ties
 from sasgeo_bench.running.run_manifest import RUN, RunManifest
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.contestants import AskedTask, ScoredTask, read_scored_task
@@ -329,7 +329,7 @@ def _answers(source: Path, run: RunManifest, folder: Path) -> dict[str, Predicti
     """Return the answers of a run to the queries as they are now."""
     task = AskedTask.of(folder)
     is_same = run.queries_sha256 == task.about["files"][task_files.QUERIES]["sha256"]
-    found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
+    found = Answers.open(source, task.asked, is_tied=is_same)
     if not (found.found or is_same):
         raise StoreError(
             f"{source} holds answers to other queries than {folder} does now: run again, or make the old ones again"
@@ -406,7 +406,7 @@ def _find(cases: RunCases, query: str) -> str:
     """Return the one id that begins so."""
     known = sorted(cases.scores["query_id"])
     found = _beginning(cases, known, query)
-    answered = {tie.query_id for source in cases.entry.sources for tie in prediction_files.read_ties(source)}
+    answered = {tie.query_id for source in cases.entry.sources for tie in read_ties(source)}
     is_old = found and found[0] in answered and found[0] not in cases.predictions
     if is_old or (not found and any(name.startswith(query) for name in answered)):
         raise StoreError(

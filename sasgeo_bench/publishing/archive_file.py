@@ -48,7 +48,7 @@ from sasgeo_bench.publishing.archive_folder import (
 )
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.regions.region_files import MANIFEST
-from sasgeo_bench.running.prediction_rows import prediction_row, predictions_of, schema_of
+from sasgeo_bench.running.prediction_files import prediction_row, predictions_of, schema_of
 from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.task_rows import (

@@ -193,7 +193,7 @@ def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Predict
     """Return answers to the board's queries by id; answers of runs to other queries are left out."""
     asked = {name: one for task in tasks for name, one in task.asked.items()}
     if predictions.is_dir():
-        return prediction_files.read_answers(predictions, asked, is_tied=False).found
+        return prediction_files.Answers.open(predictions, asked, is_tied=False).found
     return {item.query_id: item for item in prediction_files.read_predictions(predictions)}
 
 

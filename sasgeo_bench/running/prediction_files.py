@@ -1,43 +1,339 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Predictions on disk: parts of a run, which are only added; a file of the same shape is a submission."""
+"""Answers of a run or a submission: their one schema, rows and tables, parts on disk, and checks of untrusted rows."""
 
 import os
 import re
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Self
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import fresh_file
+from sasgeo_bench.files.garbage import uncollected
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import read_batches, read_schema, read_table, write_table
 from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.running.prediction_rows import (
-    FAR,
-    FLOWN_SCHEMA,
-    PART_SCHEMA,
-    PREDICTION_SCHEMA,
-    differing_columns,
-    far_fault,
-    prediction_row,
-    predictions_of,
-    row_faults,
-    schema_of,
-)
+from sasgeo_bench.geometry.pose import Pose
+from sasgeo_bench.matching.results import STATUSES, Prediction
+from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running.run_manifest import RUN, RunManifest
-from sasgeo_bench.tasks.task_rows import ASKED, asked_under
-from sasgeo_bench.texts import MOST_MESSAGE, json_text, one_line
+from sasgeo_bench.tasks.task_rows import ASKED, POSE_FIELDS, asked_under, is_like, poses_of
+from sasgeo_bench.texts import (
+    BOUNDS,
+    MOST_CANDIDATES,
+    MOST_DIAGNOSTICS,
+    MOST_MESSAGE,
+    MOST_NAME,
+    bounds_text,
+    is_line,
+    json_text,
+    one_line,
+)
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 ROUND: Final = "round.json"  # beside the tasks of a run, while all of it is asked again
 _MEND: Final = "write it again, or remove it where it is a part of a run"
 _MEND_ROUND: Final = "remove it and enter with --again"
 _ROWS_AT_ONCE: Final = 64
 _PART: Final = re.compile(r"part-(\d{20})-\d+\.parquet")
+
+SCHEMA_VERSION: Final = 1
+_CANDIDATE: Final = pa.struct([(name, pa.float64()) for name in (*POSE_FIELDS, "score")])
+PREDICTION_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("candidates", pa.list_(_CANDIDATE)),
+        ("confidence", pa.float64()),
+        ("diagnostics", pa.map_(pa.string(), pa.float64())),
+        ("status", pa.string()),
+        ("message", pa.string()),
+        ("latency_s", pa.float64()),
+    ],
+    metadata={"schema_version": str(SCHEMA_VERSION), "attribution": ATTRIBUTION, "licence": LICENCE},
+)
+RUN_SCHEMA: Final = PREDICTION_SCHEMA.append(pa.field(ASKED, pa.string()))  # of a submission
+MATCHER_S: Final = "matcher_s"
+# Of trackers, and not in files of others unless they follow flights.
+FIX_FIELDS: Final = (pa.field("is_accepted", pa.bool_()), pa.field("covariance", pa.list_(pa.float64())))
+FLOWN_SCHEMA: Final = pa.schema([*PREDICTION_SCHEMA, *FIX_FIELDS], metadata=PREDICTION_SCHEMA.metadata)
+_OPTIONAL: Final = (pa.field(MATCHER_S, pa.float64()), *FIX_FIELDS)
+PART_SCHEMA: Final = pa.schema([*RUN_SCHEMA, *_OPTIONAL], metadata=RUN_SCHEMA.metadata)  # of a run's own parts
+
+
+def schema_of(predictions: Iterable[Prediction]) -> pa.Schema:
+    """Return the schema of a file of predictions: with the columns of fixes where a tracker answered."""
+    return FLOWN_SCHEMA if any(item.is_accepted is not None for item in predictions) else PREDICTION_SCHEMA
+
+
+def prediction_row(prediction: Prediction) -> dict[str, Any]:
+    """Return a prediction as a row of `PREDICTION_SCHEMA`."""
+    return {
+        "query_id": prediction.query_id,
+        "candidates": [
+            {**{name: getattr(pose, name) for name in POSE_FIELDS}, "score": score}
+            for pose, score in prediction.candidates
+        ],
+        "confidence": prediction.confidence,
+        "diagnostics": list(prediction.diagnostics.items()),
+        "status": prediction.status,
+        "message": prediction.message,
+        "latency_s": prediction.latency_s,
+        MATCHER_S: prediction.matcher_s,
+        "is_accepted": prediction.is_accepted,
+        "covariance": None if prediction.covariance is None else list(prediction.covariance),
+    }
+
+
+def prediction_of(row: Mapping[str, Any]) -> Prediction:
+    """Invert `prediction_row`; ignore further fields of a candidate."""
+    poses = tuple(
+        (Pose(**{name: item[name] for name in POSE_FIELDS}), item["score"]) for item in row["candidates"] or ()
+    )
+    return _with_candidates(row, poses)
+
+
+def predictions_of(table: pa.Table) -> list[Prediction]:
+    """Return the predictions of a table without `row_faults`, last first; by columns, which is faster."""
+    column = table["candidates"].combine_chunks()
+    if not len(table):
+        return []
+    with uncollected():
+        poses, scores, ends = poses_of(column), column.values.field("score").to_pylist(), column.offsets.to_pylist()
+        rows = table.drop_columns(["candidates"]).to_pylist()
+        return [
+            _with_candidates(rows[at], tuple(zip(poses[at], scores[ends[at] : ends[at + 1]], strict=True)))
+            for at in reversed(range(len(rows)))
+        ]
+
+
+def _with_candidates(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float], ...]) -> Prediction:
+    """Make a prediction of a row whose candidates were read by columns."""
+    return Prediction(
+        query_id=row["query_id"],
+        candidates=candidates,
+        confidence=row["confidence"],
+        diagnostics=dict(row["diagnostics"] or ()),
+        status=row["status"],
+        message=row["message"] or "",
+        latency_s=row["latency_s"],
+        matcher_s=row.get(MATCHER_S),
+        is_accepted=row.get("is_accepted"),
+        covariance=None if row.get("covariance") is None else tuple(row["covariance"]),
+    )
+
+
+def differing_columns(table: pa.Table) -> list[tuple[str, str, str]]:
+    """Return the columns that a table of predictions lacks or has of another type: name, found and expected type.
+
+    Further columns, in any order, are no difference.
+
+    >>> differing_columns(PREDICTION_SCHEMA.empty_table().drop_columns(["message"]))
+    [('message', 'nothing', 'string')]
+    """
+    found = {field.name: field.type for field in table.schema}
+    # Rows of a run state the matcher's own time as well; a file of somebody else need not.
+    known = [*PREDICTION_SCHEMA, *(field for field in _OPTIONAL if field.name in found)]
+    counts = {field: table.schema.names.count(field.name) for field in known}
+    twice = [(field.name, f"{count} columns", str(field.type)) for field, count in counts.items() if count > 1]
+    return twice or [
+        (field.name, str(found.get(field.name, "nothing")), str(field.type))
+        for field in known
+        if field.name not in found or not is_like(found[field.name], field.type)
+    ]
+
+
+@dataclass(frozen=True, slots=True)
+class Answers:
+    """Answers to queries, a row for each with the columns of `PART_SCHEMA`; `aside` counts rows that answer others."""
+
+    table: pa.Table
+    aside: int = 0
+
+    @classmethod
+    def open(cls, folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Self:
+        """Read answers to some queries from a run's folder; of two for one query, the one that was written last.
+
+        `asked` gives the hash of each query, by id (`task_files.read_asked`); a row must carry it, tied to what
+        `run.json` says. `is_tied` states whether rows without a hash are known to answer these queries. A run that was
+        killed before its first row has no answers. Raise `StoreError` if a part cannot be read.
+        """
+        tables: list[pa.Table] = []
+        seen: set[str] = set()
+        aside: set[Tie] = set()
+        parts = parts_of(folder)
+        under = {parent: asked_in(parent, asked) for parent in {part.parent for part in parts}}
+        for part in reversed(parts):
+            table = _checked(part, is_own=part != folder)
+            ties = _ties_of(table)
+            is_own = [tie.answers(under[part.parent], is_tied=is_tied) for tie in ties]
+            aside |= {replace(tie, status="") for tie, own in zip(ties, is_own, strict=True) if not own}
+            ids = [tie.query_id if own else None for tie, own in zip(ties, is_own, strict=True)]
+            tables.append(_newest(table, ids, seen))
+        return cls(_joined(tables), len(aside))
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read all rows of a run's folder or a file, one for each id. Raise as `read_predictions` does."""
+        return cls(_joined(list(_tables_of(path))))
+
+    @classmethod
+    def of(cls, predictions: Iterable[Prediction]) -> Self:
+        """Return answers that are in memory."""
+        schema = PART_SCHEMA.remove(PART_SCHEMA.get_field_index(ASKED))
+        return cls(pa.Table.from_pylist([prediction_row(item) for item in predictions], schema=schema))
+
+    @classmethod
+    def merged(cls, parts: Sequence[Self]) -> Self:
+        """Return several answers as one; of two for one query, that of the last."""
+        seen: set[str] = set()
+        tables = [part.table for part in reversed(parts)]
+        return cls(_joined([_newest(table, table["query_id"].to_pylist(), seen) for table in tables]))
+
+    @property
+    def found(self) -> dict[str, Prediction]:
+        """Return the answers by query id."""
+        return {item.query_id: item for item in predictions_of(self.table)}
+
+    def columns(self) -> "AnswerColumns":
+        """Return the answers as columns, without an object for each."""
+        return AnswerColumns.of(self.table)
+
+    def some(self, rows: Sequence[int]) -> Self:
+        """Return some rows."""
+        return replace(self, table=self.table.take(pa.array(rows, pa.int64())))
+
+    def lean(self) -> Self:
+        """Return the answers without their candidates, which take far longer to read than all the rest."""
+        nothing = pa.array([[]] * len(self.table), PREDICTION_SCHEMA.field("candidates").type)
+        at = self.table.column_names.index("candidates")
+        return replace(self, table=self.table.set_column(at, "candidates", nothing))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AnswerColumns:
+    """R rows of predictions as columns, without an object for each, and their C candidates one after the other.
+
+    `confidence` and `latency_s` have shape (R,), NaN for null. `poses`, shape (C, 4), are easting, northing, yaw and
+    scale; `scores` and `row`, shape (C,), the score and the row of each candidate; `first`, shape (R,), the first
+    candidate of each row, -1 without one.
+    """
+
+    query_id: list[str]
+    status: list[str]
+    confidence: Floats
+    latency_s: Floats
+    poses: Floats
+    scores: Floats
+    row: Ints
+    first: Ints
+
+    @property
+    def is_ok(self) -> NDArray[np.bool_]:
+        """Return which rows have the status "ok", shape (R,)."""
+        return np.array([status == "ok" for status in self.status], dtype=bool)
+
+    @property
+    def fix(self) -> Ints:
+        """Return the candidate that is the fix of each row, its first, shape (R,); -1 where the status is not ok."""
+        return np.where(self.is_ok, self.first, -1)
+
+    @classmethod
+    def of(cls, table: pa.Table) -> Self:
+        """Return the columns of a table without `row_faults`.
+
+        >>> pose = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0)
+        >>> answers = [Prediction(query_id="a"), Prediction(query_id="b", candidates=((pose, 9.0),))]
+        >>> found = Answers.of(answers).columns()
+        >>> found.poses.tolist(), found.row.tolist(), found.first.tolist()
+        ([[1.0, 2.0, 3.0, 1.0]], [1], [-1, 0])
+        """
+        lists = table["candidates"].combine_chunks()
+        row, items = pc.list_parent_indices(lists).to_numpy(), pc.list_flatten(lists)
+        counts = np.bincount(row, minlength=len(table))
+        poses = [_numbers(items.field(name)) for name in POSE_FIELDS]
+        return cls(
+            query_id=table["query_id"].to_pylist(),
+            status=table["status"].to_pylist(),
+            confidence=_numbers(table["confidence"]),
+            latency_s=_numbers(table["latency_s"]),
+            poses=np.column_stack(poses),
+            scores=_numbers(items.field("score")),
+            row=np.asarray(row, dtype=np.int64),
+            first=np.where(counts > 0, np.cumsum(counts) - counts, -1),
+        )
+
+
+class StoredAnswers(Mapping[str, Prediction]):
+    """Answers to the queries of some tasks, read from their files when they are asked for, a task at a time.
+
+    `read` returns the answers to each task, by its folder; `task_of` is the folder of each query. A caller that asks in
+    the order of the tasks reads each of them once.
+    """
+
+    def __init__(self, read: Mapping[Path, Callable[[], Answers]], task_of: Mapping[str, Path]) -> None:
+        self._read, self._task_of = dict(read), task_of
+        self._last: tuple[Path | None, dict[str, Prediction]] = (None, {})
+
+    @classmethod
+    def of(cls, answers: Iterable[Prediction]) -> Self:
+        """Return answers that are in memory, as those of one task."""
+        listed = list(answers)
+        return cls({Path(): partial(Answers.of, listed)}, dict.fromkeys((item.query_id for item in listed), Path()))
+
+    def columns(self, query_ids: Iterable[str]) -> Iterator[AnswerColumns]:
+        """Yield the answers to all queries of the tasks that some queries belong to, a task at a time."""
+        asked = {self._task_of[name] for name in query_ids if name in self._task_of}
+        for task, read in self._read.items():
+            if task in asked:
+                yield read().columns()
+
+    def of_task(self, task: Path) -> Answers:
+        """Return the answers to one task. Raise `StoreError` if they cannot be read."""
+        return self._read[task]()
+
+    def __getitem__(self, query_id: str) -> Prediction:
+        """Return one answer; raise KeyError without one."""
+        task = self._task_of[query_id]
+        if task not in self._read:
+            raise KeyError(query_id)
+        return self._of(task)[query_id]
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the ids of all queries that are answered."""
+        for task in self._read:
+            yield from self._of(task)
+
+    def __len__(self) -> int:
+        """Return the number of answers."""
+        return sum(len(self._of(task)) for task in self._read)
+
+    def _of(self, task: Path) -> dict[str, Prediction]:
+        if self._last[0] != task:
+            self._last = (task, self.of_task(task).found)
+        return self._last[1]
+
+    def lean(self) -> "StoredAnswers":
+        """Return the same answers without their candidates, which take far longer to read than all the rest."""
+        return StoredAnswers({task: partial(_lean, read) for task, read in self._read.items()}, self._task_of)
+
+
+def _lean(read: Callable[[], Answers]) -> Answers:
+    return read().lean()
+
+
+# --- parts on disk ---------------------------------------------------------------------------------------------------
 
 
 def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mapping[str, str] | None = None) -> Path:
@@ -127,41 +423,6 @@ class Tie:
         return now is not None and (self.asked == now if self.asked else is_tied)
 
 
-@dataclass(frozen=True, slots=True)
-class Answers:
-    """Answers of a run to some queries, a row for each, and the number of rows that answer others."""
-
-    table: pa.Table
-    aside: int
-
-    @property
-    def found(self) -> dict[str, Prediction]:
-        """Return the answers by query id."""
-        return {item.query_id: item for item in predictions_of(self.table)}
-
-
-def read_answers(folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Answers:
-    """Read answers to some queries from a run's folder; of two for one query, the one that was written last.
-
-    `asked` gives the hash of each query, by id (`task_files.read_asked`); a row must carry it, tied to what `run.json`
-    says. `is_tied` states whether rows without a hash are known to answer these queries. A run that was
-    killed before its first row has no answers. Raise `StoreError` if a part cannot be read.
-    """
-    tables: list[pa.Table] = []
-    seen: set[str] = set()
-    aside: set[Tie] = set()
-    under = {parent: asked_in(parent, asked) for parent in {part.parent for part in parts_of(folder)}}
-    for part in reversed(parts_of(folder)):
-        table = _checked(part, is_own=part != folder)
-        ties, asked = _ties_of(table), under[part.parent]
-        is_own = [tie.answers(asked, is_tied=is_tied) for tie in ties]
-        aside |= {replace(tie, status="") for tie, own in zip(ties, is_own, strict=True) if not own}
-        tables.append(
-            _newest(table, [tie.query_id if own else None for tie, own in zip(ties, is_own, strict=True)], seen)
-        )
-    return Answers(_joined(tables), len(aside))
-
-
 def _newest(table: pa.Table, ids: Sequence[str | None], seen: set[str]) -> pa.Table:
     """Return the last row of each id that is not `seen`, and note these as seen; rows without an id are left out."""
     rows = []
@@ -171,12 +432,6 @@ def _newest(table: pa.Table, ids: Sequence[str | None], seen: set[str]) -> pa.Ta
             seen.add(name)
             rows.append(at)
     return table if len(rows) == len(table) else table.take(pa.array(rows, pa.int64()))
-
-
-def merged_rows(tables: Sequence[pa.Table]) -> pa.Table:
-    """Return the rows of several tables; of two for one query that of the table that comes last."""
-    seen: set[str] = set()
-    return _joined([_newest(table, table["query_id"].to_pylist(), seen) for table in reversed(tables)])
 
 
 def _joined(tables: Sequence[pa.Table]) -> pa.Table:
@@ -206,7 +461,7 @@ def read_key(folder: Path) -> str | None:
 def read_predictions(path: str | Path) -> Iterator[Prediction]:
     """Read predictions of a run's folder or a file, newest first; of two for one query, the one written last.
 
-    A folder holds two where a query was asked again, or was drawn anew and asked: `read_answers` separates them.
+    A folder holds two where a query was asked again, or was drawn anew and asked: `Answers.open` separates them.
 
     Raises
     ------
@@ -215,11 +470,6 @@ def read_predictions(path: str | Path) -> Iterator[Prediction]:
     """
     for table in _tables_of(given_path(path)):
         yield from predictions_of(table)
-
-
-def read_rows(path: Path) -> pa.Table:
-    """Read the rows of a run's folder or a file, one for each query. Raise as `read_predictions` does."""
-    return _joined(list(_tables_of(path)))
 
 
 def _tables_of(path: Path) -> Iterator[pa.Table]:
@@ -315,7 +565,7 @@ def _to_merge(path: Path, asked: Mapping[str, str] | None) -> Iterable[Predictio
     """Read all rows of a file, or the answers of a folder to the requested queries."""
     if asked is None or not path.is_dir() or not parts_of(path):
         return read_predictions(path)
-    return read_answers(path, asked).found.values()
+    return Answers.open(path, asked).found.values()
 
 
 def check_one_matcher(runs: Sequence[Path]) -> None:
@@ -389,3 +639,174 @@ def ids_done(folder: Path, asked: Mapping[str, str], *, again: Iterable[str] = (
     """
     ties = read_ties(folder, since_ns=since_ns) if folder.is_dir() else []
     return {tie.query_id for tie in ties if tie.status not in set(again) and tie.answers(asked)}
+
+
+# --- untrusted rows ---------------------------------------------------------------------------------------------------
+
+FAR: Final = 4  # times a bound, at least the bytes of a character; a file that goes beyond it is refused unread
+_TEXTS: Final = ("query_id", "status", "message", ASKED)
+_MOST_ITEMS: Final = {"candidates": MOST_CANDIDATES, "diagnostics": MOST_DIAGNOSTICS, "covariance": SIDE**2}
+_PAIRS: Final = pa.list_(pa.struct([("key", pa.string()), ("value", pa.float64())]))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowFault:
+    """A fault in one row: row number, column, value found, and value expected."""
+
+    row: int
+    column: str
+    found: str
+    expected: str
+
+
+def far_fault(batch: pa.RecordBatch) -> RowFault | None:
+    """Return the first list or text of some rows that is more than `FAR` times its bound, or None.
+
+    Texts must be dictionaries. Nothing becomes an object of Python; `row_faults` finds what is shorter.
+    """
+    columns = zip(batch.schema.names, batch.columns, strict=True)
+    return next((fault for name, column in columns for fault in _far_faults(name, column)), None)
+
+
+def _far_faults(name: str, column: pa.Array) -> Iterator[RowFault]:
+    kind = column.type
+    if name in _TEXTS and pa.types.is_dictionary(kind):
+        yield from _longest(name, _text_lengths(column), "bytes", MOST_MESSAGE)
+    if name in _MOST_ITEMS and (pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_map(kind)):
+        ends = column.offsets.to_numpy()
+        yield from _longest(name, np.diff(ends), "items", _MOST_ITEMS[name])
+        if pa.types.is_map(kind) and pa.types.is_dictionary(kind.key_type):
+            for fault in _longest(name, _text_lengths(column.keys), "bytes in a name", MOST_NAME):
+                yield replace(fault, row=int(np.searchsorted(ends, fault.row, side="right")) - 1)
+
+
+def _text_lengths(texts: pa.DictionaryArray) -> NDArray[np.int64]:
+    """Return the bytes of each text, 0 of a null."""
+    lengths = pc.binary_length(texts.dictionary).take(texts.indices)
+    return np.asarray(lengths.fill_null(0).cast(pa.int64()))
+
+
+def _longest(column: str, lengths: NDArray[np.int64], unit: str, most: int) -> Iterator[RowFault]:
+    if len(lengths) and lengths.max() > FAR * most:
+        row = int(np.argmax(lengths))
+        yield RowFault(row=row, column=column, found=f"{lengths[row]} {unit}", expected=f"at most {most}")
+
+
+def row_faults(table: pa.Table) -> Iterator[RowFault]:
+    """Check every number, name and text of rows against the bounds of an answer (`texts.BOUNDS`).
+
+    The table must have all columns of predictions. Faults come by column, then by row.
+    """
+    if not len(table):
+        return
+    yield from _of_texts(table)
+    for name in (name for name in ("confidence", "latency_s", MATCHER_S) if name in table.column_names):
+        values, is_null = _numbers(table[name]), np.asarray(table[name].is_null())
+        is_wrong = ~is_null & ~_is_within(name, values)
+        yield from _faults(name, is_wrong, f"{bounds_text(name)} or null", f"{name} is {{:g}}", values)
+    if "covariance" in table.column_names:
+        yield from _of_covariances(table["covariance"])
+    yield from _of_candidates(table["candidates"])
+    yield from _of_diagnostics(table["diagnostics"])
+
+
+def _faults(column: str, is_wrong: Mask, expected: str, found: str, *values: NDArray[Any]) -> Iterator[RowFault]:
+    """Yield a fault for each wrong row; `found` is formatted with the values of that row."""
+    yield from _firsts(column, np.flatnonzero(is_wrong), expected, found, *(one[is_wrong] for one in values))
+
+
+def _numbers(column: pa.ChunkedArray | pa.Array) -> NDArray[np.float64]:
+    """Return the values of a column; NaN for null."""
+    return np.asarray(column.cast(pa.float64(), safe=False), dtype=np.float64)
+
+
+def _is_within(name: str, values: NDArray[np.float64]) -> Mask:
+    least, most = BOUNDS[name]
+    return np.asarray((values >= least) & (values <= most))
+
+
+def _of_texts(table: pa.Table) -> Iterator[RowFault]:
+    """Check that names and statuses are known, and messages are lines."""
+    for name, is_sound, expected in (
+        ("query_id", bool, "the id of a query"),
+        ("status", STATUSES.__contains__, ", ".join(STATUSES)),
+        ("message", lambda text: is_line(text, MOST_MESSAGE), f"a line of at most {MOST_MESSAGE} printable characters"),
+    ):
+        texts, code = _texts(table[name])
+        is_odd = np.array([name != "message" if text is None else not is_sound(text) for text in texts])[code]
+        yield from _faults(name, is_odd, expected, "{!r}", texts[code])
+
+
+def _texts(column: pa.ChunkedArray | pa.Array) -> tuple[NDArray[np.object_], NDArray[np.int64]]:
+    """Return each text once, None last, and the index of the text of each row; -1 for null."""
+    whole = column.cast(pa.string())
+    coded = (whole.combine_chunks() if isinstance(whole, pa.ChunkedArray) else whole).dictionary_encode()
+    texts = np.array([*coded.dictionary.to_pylist(), None], dtype=object)
+    return texts, coded.indices.fill_null(-1).to_numpy(zero_copy_only=False).astype(np.int64)
+
+
+def _of_candidates(column: pa.ChunkedArray) -> Iterator[RowFault]:
+    """Check that every row has a list, not too long, of complete candidates."""
+    whole = column.combine_chunks()
+    is_null = np.asarray(whole.is_null())
+    yield from _faults("candidates", is_null, "a list, empty where there is no pose", "null")
+    if is_null.all():
+        return
+    rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
+    counts = np.bincount(rows, minlength=len(whole))
+    yield from _faults("candidates", counts > MOST_CANDIDATES, f"at most {MOST_CANDIDATES}", "{} poses", counts)
+    is_null = np.asarray(items.is_null())
+    yield from _firsts("candidates", rows[is_null], "poses with scores", "a null")
+    rows, items = rows[~is_null], items.filter(pa.array(~is_null))
+    for name in (*POSE_FIELDS, "score"):
+        values = _numbers(items.field(name))
+        is_wrong = ~_is_within(name, values)
+        yield from _firsts("candidates", rows[is_wrong], bounds_text(name), f"{name} is {{:g}}", values[is_wrong])
+
+
+def _of_covariances(column: pa.ChunkedArray) -> Iterator[RowFault]:
+    """Check that every covariance is null, or nine numbers that are one."""
+    whole = column.cast(pa.list_(pa.float64())).combine_chunks()
+    is_given = ~np.asarray(whole.is_null())
+    rows, values = pc.list_parent_indices(whole).to_numpy(), _numbers(pc.list_flatten(whole))
+    counts = np.bincount(rows, minlength=len(whole))
+    is_odd = is_given & (counts != SIDE**2)
+    yield from _faults("covariance", is_odd, f"{SIDE**2} numbers, or null", "{} numbers", counts)
+    bad = rows[~(np.abs(values) <= MOST_VARIANCE)]
+    is_far = is_given & ~is_odd & np.isin(np.arange(len(whole)), bad)
+    yield from _faults("covariance", is_far, f"numbers within {MOST_VARIANCE:g}", "a number beyond that")
+    whole_rows = np.flatnonzero(is_given & ~is_odd & ~is_far)
+    table = values[np.isin(rows, whole_rows)].reshape(-1, SIDE, SIDE)
+    is_none = np.zeros(len(whole), dtype=bool)
+    is_none[whole_rows] = ~are_covariances(table)
+    expected = "a symmetric and positive definite matrix, or null"
+    yield from _faults("covariance", is_none, expected, "a matrix that is none")
+
+
+def _of_diagnostics(column: pa.ChunkedArray) -> Iterator[RowFault]:
+    """Check the number of diagnostics of each row, their names, each a line that is there once, and their numbers."""
+    whole = column.cast(_PAIRS).combine_chunks()
+    rows, items = pc.list_parent_indices(whole).to_numpy(), pc.list_flatten(whole)
+    counts = np.bincount(rows, minlength=len(whole))
+    yield from _faults("diagnostics", counts > MOST_DIAGNOSTICS, f"at most {MOST_DIAGNOSTICS}", "{} numbers", counts)
+    names, code = _texts(items.field("key"))
+    is_odd = np.array([not name or not is_line(name, MOST_NAME) for name in names])[code]
+    expected = f"names of 1..{MOST_NAME} printable characters"
+    yield from _firsts("diagnostics", rows[is_odd], expected, "the name {!r}", names[code[is_odd]])
+    place = rows * len(names) + code
+    order = np.argsort(place, kind="stable")
+    again = order[1:][np.diff(place[order]) == 0]
+    yield from _firsts("diagnostics", rows[again], "each name once", "{!r} twice", names[code[again]])
+    values = _numbers(items.field("value"))
+    is_wrong = ~_is_within("diagnostics", values)
+    found, expected = "diagnostics[{!r}] is {:g}", bounds_text("diagnostics")
+    yield from _firsts("diagnostics", rows[is_wrong], expected, found, names[code[is_wrong]], values[is_wrong])
+
+
+def _firsts(
+    column: str, rows: NDArray[np.int64], expected: str, found: str, *values: NDArray[Any]
+) -> Iterator[RowFault]:
+    """Yield the first fault of each row among those of its items; `found` is formatted with the values of that item."""
+    for row, at in zip(*np.unique(rows, return_index=True), strict=True):
+        text = found.format(*(one[at] for one in values))[: 2 * MOST_NAME]
+        yield RowFault(row=int(row), column=column, found=text, expected=expected)

@@ -19,7 +19,7 @@ from sasgeo_bench.progress import Lines, Progress, Tell, connected, done_on
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.running import prediction_files, prediction_rows
+from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Watch, answer, pool_costs
 from sasgeo_bench.running.patience import Patience
 from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map, unit_of_task, whole_units
@@ -253,7 +253,7 @@ def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: the run, and its cost together with that of earlier runs."""
     about, total = part.about, pool_costs([before, cost])
     run = RunManifest(
-        schema_version=prediction_rows.SCHEMA_VERSION,
+        schema_version=prediction_files.SCHEMA_VERSION,
         matcher=CardRecord(**asdict(plan.card if part.follower is None else card_on_flights(plan.card))),
         spec=plan.request.spec,
         hash=plan.hash,

@@ -12,11 +12,9 @@ import pyarrow as pa
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.regions.region_files import read_manifest
-from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
-from sasgeo_bench.running.prediction_rows import predictions_of, table_of
+from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.running.run_manifest import RunManifest
-from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.scoring.controls import hold_controls
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.flights import score_flights
@@ -133,11 +131,11 @@ def read_entry_answers(
     whose answers cannot be read. Raise StoreError if a run that the user named answers none of the queries. Raise
     ConfigError if no entry answers any task.
     """
-    files: dict[str, pa.Table] = {}
+    files: dict[str, Answers] = {}
     for entry in entries:
         with failures.of(entry.name):
             if not entry.runs:
-                files[entry.name] = prediction_files.read_rows(entry.sources[0])  # without runs there is one file
+                files[entry.name] = Answers.read(entry.sources[0])  # without runs there is one file
     found = folders or _answered_folders(entries, files.values(), root)
     tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
     task_of = {name: task.folder for task in tasks for name in task.asked}
@@ -170,19 +168,19 @@ def read_entry_answers(
     return answers
 
 
-def _answered_folders(entries: Sequence[Entry], files: Collection[pa.Table], root: Path) -> Iterator[Path]:
+def _answered_folders(entries: Sequence[Entry], files: Collection[Answers], root: Path) -> Iterator[Path]:
     """Yield the task folders that runs were made on, then those for which files hold an answer."""
     for suite, region in sorted({(run.suite, run.region) for entry in entries for run in entry.runs}):
         if (root / "tasks" / suite / region / task_files.TASK).is_file():
             yield root / "tasks" / suite / region
-    held = {name for rows in files for name in rows["query_id"].to_pylist()}
+    held = {name for rows in files for name in rows.table["query_id"].to_pylist()}
     for path in sorted((root / "tasks").glob(f"*/*/{task_files.TASK}")) if held else ():
         if not held.isdisjoint(task_files.read_ids(path.parent)):
             yield path.parent
 
 
 def _answers_of_file(
-    entry: Entry, tasks: Sequence[AskedTask], rows: pa.Table, task_of: Mapping[str, Path]
+    entry: Entry, tasks: Sequence[AskedTask], answers: Answers, task_of: Mapping[str, Path]
 ) -> EntryAnswers:
     """Return a file or a submission with its answers; a submission is asked the tasks it names."""
     asked = tasks
@@ -190,12 +188,12 @@ def _answers_of_file(
         named = {(item.suite, item.region) for item in entry.submission.tasks}
         asked = [task for task in tasks if (task.about["suite"], task.about["region"]) in named]
     places: dict[Path | None, list[int]] = {}
-    for at, name in enumerate(rows["query_id"].to_pylist()):
+    for at, name in enumerate(answers.table["query_id"].to_pylist()):
         places.setdefault(task_of.get(name), []).append(at)
-    read = {task.folder: partial(rows.take, pa.array(places.get(task.folder, []), pa.int64())) for task in tasks}
+    read = {task.folder: partial(answers.some, places.get(task.folder, [])) for task in tasks}
     held = frozenset(task.folder for task in tasks if task.folder in places)
-    answers = StoredAnswers(read, task_of)
-    return EntryAnswers(entry=entry, predictions=answers, held=held, asked=frozenset(task.folder for task in asked))
+    stored = StoredAnswers(read, task_of)
+    return EntryAnswers(entry=entry, predictions=stored, held=held, asked=frozenset(task.folder for task in asked))
 
 
 class _Room:
@@ -204,16 +202,12 @@ class _Room:
     def __init__(self, most_bytes: int) -> None:
         self._left = most_bytes
 
-    def keep(self, rows: pa.Table, read: Callable[[], pa.Table]) -> Callable[[], pa.Table]:
-        """Return what returns these rows: from memory, or as `read` does."""
-        if rows.nbytes > self._left:
+    def keep(self, answers: Answers, read: Callable[[], Answers]) -> Callable[[], Answers]:
+        """Return what returns these answers: from memory, or as `read` does."""
+        if answers.table.nbytes > self._left:
             return read
-        self._left -= rows.nbytes
-        return partial(_same, rows)
-
-
-def _same(rows: pa.Table) -> pa.Table:
-    return rows
+        self._left -= answers.table.nbytes
+        return lambda: answers
 
 
 def _read_runs(
@@ -224,7 +218,7 @@ def _read_runs(
     Every answer is checked here; those that find no room are read again where they are used.
     """
     by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
-    read: dict[Path, Callable[[], pa.Table]] = {}
+    read: dict[Path, Callable[[], Answers]] = {}
     runs: list[tuple[Path, RunManifest]] = []
     asked: set[Path] = set()
     stale: list[Path] = []
@@ -234,11 +228,12 @@ def _read_runs(
             stale.append(source)
             continue
         is_same = run.queries_sha256 == task.about["files"][task_files.QUERIES]["sha256"]
-        found = prediction_files.read_answers(source, task.asked, is_tied=is_same)
+        open_answers = partial(Answers.open, source, task.asked, is_tied=is_same)
+        found = open_answers()
         if not (len(found.table) or is_same):
             stale.append(source)
             continue
-        mine = room.keep(found.table, partial(_rows_of_run, source, task.asked, is_tied=is_same))
+        mine = room.keep(found, open_answers)
         read[task.folder] = partial(_both, read[task.folder], mine) if task.folder in read else mine  # as of shards
         asked.add(task.folder)
         runs.append((source, _share_of(run, found)))
@@ -247,15 +242,11 @@ def _read_runs(
     return EntryAnswers(entry=left, predictions=answers, held=frozenset(asked), asked=frozenset(asked)), stale
 
 
-def _both(first: Callable[[], pa.Table], second: Callable[[], pa.Table]) -> pa.Table:
-    return prediction_files.merged_rows([first(), second()])
+def _both(first: Callable[[], Answers], second: Callable[[], Answers]) -> Answers:
+    return Answers.merged([first(), second()])
 
 
-def _rows_of_run(source: Path, asked: Mapping[str, str], *, is_tied: bool) -> pa.Table:
-    return prediction_files.read_answers(source, asked, is_tied=is_tied).table
-
-
-def _share_of(run: RunManifest, answers: prediction_files.Answers) -> RunManifest:
+def _share_of(run: RunManifest, answers: Answers) -> RunManifest:
     """Return the run record with CPU time scaled to the fraction of answers that count."""
     if not answers.aside or run.cpu_s is None:
         return run
@@ -393,11 +384,11 @@ def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) 
 
 def design_rows(task: ScoredTask, split: Split | None) -> pd.DataFrame:
     """Return a row for each query or flight of one task, scored without an answer; raise as `score_task` does."""
-    return _scorer(task, split)(table_of([])).whole
+    return _scorer(task, split)(Answers.of([])).whole
 
 
 def _scored(item: EntryAnswers, task: ScoredTask, score: Callable[[pa.Table], "_Part"]) -> "_Part":
-    return score(item.predictions.rows(task.folder))
+    return score(item.predictions.of_task(task.folder))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -430,7 +421,7 @@ def _joined(parts: Sequence[_Part], shared: dict[tuple[int, ...], pd.DataFrame])
 
 def _scorer(
     task: ScoredTask, split: Split | None, by_region: Collection[str] = (), by_block: Collection[str] = ()
-) -> Callable[[pa.Table], _Part]:
+) -> Callable[[Answers], _Part]:
     """Return what scores the rows of one entry's answers to a task, whose queries are read once for all entries."""
     of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
     questions = Questions.of(task.heads, task.truths, **of_split)
@@ -443,12 +434,11 @@ def _scorer(
 
     asked = resampled(questions.frame)
 
-    def score(rows: pa.Table) -> _Part:
+    def score(answers: Answers) -> _Part:
         """Score the answers of one entry."""
         if not task.is_of_flights:
-            return _Part(questions=asked, answers=questions.answered(rows))
-        answers = {item.query_id: item for item in predictions_of(rows)}
-        found = score_flights(questions.heads, questions.truths, answers, **of_split)
+            return _Part(questions=asked, answers=questions.answered(answers))
+        found = score_flights(questions.heads, questions.truths, answers.found, **of_split)
         return _Part(questions=None, answers=resampled(found.flights), views=found.views)
 
     return score

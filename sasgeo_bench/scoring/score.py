@@ -7,12 +7,11 @@ from typing import Annotated, Final, Self
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.running.prediction_rows import AnswerColumns, predictions_of, table_of
+from sasgeo_bench.running.prediction_files import AnswerColumns, Answers
 from sasgeo_bench.scoring.base import Bools, Floats, Ints
 from sasgeo_bench.scoring.frames import PRIOR_GROUP, TRACK, Shown, row_columns
 from sasgeo_bench.scoring.pose import check_candidate, columns_of, pose_errors, rank_candidate, ranks_of_lists
@@ -107,7 +106,7 @@ def score_task(
     belongs to no query.
     """
     questions = Questions.of(heads, truths, place_of=place_of, country_of=country_of)
-    return with_answers(questions.frame, questions.answered(table_of(predictions.values())))
+    return with_answers(questions.frame, questions.answered(Answers.of(predictions.values())))
 
 
 def with_answers(questions: pd.DataFrame, answers: pd.DataFrame) -> pd.DataFrame:
@@ -172,20 +171,20 @@ class Questions:
             twins=frozenset(twins),
         )
 
-    def answered(self, table: pa.Table) -> pd.DataFrame:
-        """Return the other columns of `Score`, a row for each query in order, from rows of answers, at most one each.
+    def answered(self, given: Answers) -> pd.DataFrame:
+        """Return the other columns of `Score`, a row for each query in order, from answers, at most one each.
 
         Raise MetricError if a row belongs to no query.
         """
-        answers, places = AnswerColumns.of(table), {head.query_id: at for at, head in enumerate(self.heads)}
+        answers, places = given.columns(), {head.query_id: at for at, head in enumerate(self.heads)}
         _check_known(answers.query_id, places)
         row_of = np.full(len(self.heads), -1)
-        row_of[[places[name] for name in answers.query_id]] = np.arange(len(table))
+        row_of[[places[name] for name in answers.query_id]] = np.arange(len(given.table))
         # A row more for queries without an answer, which the index -1 finds.
         first = np.append(answers.fix, -1)[row_of]
         fixes = np.vstack((answers.poses, np.full(4, np.nan)))[first]
         errors = self._errors(fixes)
-        above, tied, right = self._ranks(table, answers, row_of)
+        above, tied, right = self._ranks(given, answers, row_of)
         is_miss = (self.frame["track"] == RETRIEVAL).to_numpy(bool)  # a given heading and a random offset: no errors
         found = {
             "status": [[*answers.status, MISSING][row] for row in row_of],
@@ -211,20 +210,20 @@ class Questions:
         }
         return {name: np.where(is_known, column, np.nan) for name, column in columns.items()}
 
-    def _ranks(self, table: pa.Table, answers: AnswerColumns, row_of: Ints) -> Ints:
+    def _ranks(self, given: Answers, answers: AnswerColumns, row_of: Ints) -> Ints:
         """Return above, tied and right of the ranks of the right candidates, shape (3, N); see `pose.Rank`.
 
         A pose of the answer is the candidate at its position. Where another candidate shares the position of the right
         one, each pose is compared with all of them.
         """
-        query = np.full(len(table), -1)
+        query = np.full(len(answers.query_id), -1)
         query[row_of[row_of >= 0]] = np.flatnonzero(row_of >= 0)
         spots_m = self.right_m[query[answers.row]]
         is_right = answers.is_ok[answers.row] & (distances_m(answers.poses[:, :2], spots_m) <= SAME_PLACE_M)
-        found = ranks_of_lists(answers.row, answers.scores, is_right, len(table))
+        found = ranks_of_lists(answers.row, answers.scores, is_right, len(answers.query_id))
         ranks = np.array([np.append(column, 0)[row_of] for column in (found.above, found.tied, found.right)])
         for at in self.twins:
-            one = None if row_of[at] < 0 else predictions_of(table.slice(row_of[at], 1))[0]
+            one = None if row_of[at] < 0 else next(iter(given.some([row_of[at]]).found.values()))
             rank = rank_candidate(one, self.truths[at], self.heads[at].candidates)
             ranks[:, at] = rank.above, rank.tied, rank.right
         return np.asarray(ranks)

@@ -18,11 +18,11 @@ from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, write_table
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, Submission, SubmittedFile
-from sasgeo_bench.running.prediction_files import check_lengths
-from sasgeo_bench.running.prediction_rows import (
+from sasgeo_bench.running.prediction_files import (
     FLOWN_SCHEMA,
     PREDICTION_SCHEMA,
     RUN_SCHEMA,
+    check_lengths,
     prediction_row,
     schema_of,
 )

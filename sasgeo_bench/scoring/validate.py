@@ -16,7 +16,7 @@ from sasgeo_bench.matching.matcher import Match, check_match
 from sasgeo_bench.matching.submission import Submission, TaskManifest
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_rows import differing_columns, prediction_of, row_faults
+from sasgeo_bench.running.prediction_files import differing_columns, prediction_of, row_faults
 from sasgeo_bench.scoring.submission_files import SUBMISSION, predictions_name
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup

@@ -13,7 +13,7 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files import parquet
 from sasgeo_bench.files.parquet import read_frame, read_schema, read_table, write_frame, write_table
-from sasgeo_bench.running.prediction_rows import PREDICTION_SCHEMA
+from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA
 
 PACKAGE = Path(parquet.__file__).parents[1]
 MEND = "write it again"

@@ -26,7 +26,7 @@ from sasgeo_bench.leaderboard.plot_tables import (
 from sasgeo_bench.leaderboard.plots import draw_steps
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running.failures import Failures
-from sasgeo_bench.running.stored_answers import StoredAnswers
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.sasgeo.conformal import level_name
 from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
 from sasgeo_bench.scoring.decisions import calibration_error

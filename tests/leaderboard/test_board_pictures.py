@@ -313,7 +313,7 @@ def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_p
     mine = out / "runs" / "mine" / HASH / "alias" / "town-grid+alias"
     query = task_files.read_ids(out / "tasks" / "alias" / "town-grid+alias")[0]
     rows = dict.fromkeys(task_files.read_ids(out / "tasks" / "alias" / "town-grid+alias"), "f" * 64)
-    old = prediction_files.read_answers(
+    old = prediction_files.Answers.open(
         mine, task_files.read_asked(out / "tasks" / "alias" / "town-grid+alias")
     ).found.values()
     for part in prediction_files.parts_of(mine):

@@ -18,7 +18,7 @@ from sasgeo_bench.leaderboard.pooled_tables import (
     recall_frame,
 )
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.running.stored_answers import StoredAnswers
+from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.decisions import COST_RATIOS
 from sasgeo_bench.scoring.rejection import own_confidence

@@ -32,8 +32,7 @@ from sasgeo_bench.publishing.submissions import (
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA
-from sasgeo_bench.running.prediction_rows import prediction_row
+from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.scoring.contestants import check_submitted
 from sasgeo_bench.scoring.entries import find_entries

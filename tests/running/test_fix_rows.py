@@ -11,7 +11,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import Card, Submission, TaskManifest, example_card
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_rows import FLOWN_SCHEMA, prediction_row, row_faults
+from sasgeo_bench.running.prediction_files import FLOWN_SCHEMA, prediction_row, row_faults
 from sasgeo_bench.scoring.submission_files import predictions_name, read_submission, write_submission
 
 SURE = tuple(np.diag([4.0, 4.0, 1.0]).ravel().tolist())

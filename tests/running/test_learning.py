@@ -64,7 +64,7 @@ def carry_out(request):
 
 def answers(request, folder):
     (task,) = request.tasks
-    return prediction_files.read_answers(folder, task_files.read_asked(task)).found
+    return prediction_files.Answers.open(folder, task_files.read_asked(task)).found
 
 
 def told(request, folder):

@@ -12,9 +12,9 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.running import prediction_files, prediction_rows
+from sasgeo_bench.running import prediction_files
+from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.running.run_manifest import RUN, CardRecord, RunManifest
-from sasgeo_bench.running.stored_answers import StoredAnswers
 from sasgeo_bench.tasks.task_rows import POSE_FIELDS
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
@@ -74,10 +74,10 @@ def test_more_columns_other_orders_and_like_types_are_read_too(rows, write):
     assert {item.latency_s for item in everything(write(nothing))} == {None}
 
 
-@pytest.mark.parametrize("name", prediction_rows.PREDICTION_SCHEMA.names)
+@pytest.mark.parametrize("name", prediction_files.PREDICTION_SCHEMA.names)
 def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_are_read(tmp_path, rows, write, name):
     for table in (rows.drop_columns([name]), with_column(rows, name, pa.array([[True], [False]]))):
-        (column, _, _) = prediction_rows.differing_columns(table)[0]
+        (column, _, _) = prediction_files.differing_columns(table)[0]
         assert column == name
         path = write(table, "part-1.parquet")
         assert f"part-1.parquet holds no predictions ({name}: found " in refusal(everything, path)
@@ -143,7 +143,7 @@ def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words
     row = rows.to_pylist()[0]
     if name == "candidates":
         value = value and [None if item is None else row["candidates"][0] | item for item in value]
-    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=prediction_rows.PREDICTION_SCHEMA)
+    table = pa.Table.from_pylist([rows.to_pylist()[1], row | {name: value}], schema=prediction_files.PREDICTION_SCHEMA)
     pq.write_table(table, tmp_path / "mine.parquet")
     told = refusal(everything, tmp_path / "mine.parquet")
     assert "mine.parquet, row 1, is no prediction (" in told
@@ -171,7 +171,7 @@ def test_lists_and_texts_far_beyond_their_bounds_are_refused_before_the_file_is_
 ):
     one = rows.to_pylist()[0] | {"covariance": None, "is_accepted": None}
     value = one["candidates"][:1] * value if name == "candidates" else value
-    table = pa.Table.from_pylist([one] * 70 + [one | {name: value}], schema=prediction_rows.FLOWN_SCHEMA)
+    table = pa.Table.from_pylist([one] * 70 + [one | {name: value}], schema=prediction_files.FLOWN_SCHEMA)
     pq.write_table(table, tmp_path / "mine.parquet", row_group_size=50)
     monkeypatch.setattr(prediction_files, "read_table", None)
     assert words in refusal(everything, tmp_path / "mine.parquet")
@@ -247,10 +247,10 @@ def test_the_last_row_of_a_query_counts_in_a_table_too_whatever_like_types_its_p
     timed = rows.append_column("matcher_s", pa.array([0.1, None]))
     for at, table in enumerate((rows, texts, ranked, single, timed)):
         pq.write_table(table, folder / f"part-{at:020d}-1.parquet")
-    found = prediction_files.read_answers(folder, {"a": "", "b": ""})
+    found = Answers.open(folder, {"a": "", "b": ""})
     assert found.found == {item.query_id: item for item in everything(folder)}
-    assert sorted(prediction_files.read_rows(folder)["query_id"].to_pylist()) == ["a", "b"]
-    assert prediction_files.read_answers(folder, {"a": ""}).table["query_id"].to_pylist() == ["a"]
+    assert sorted(Answers.read(folder).table["query_id"].to_pylist()) == ["a", "b"]
+    assert Answers.open(folder, {"a": ""}).table["query_id"].to_pylist() == ["a"]
 
 
 def test_stored_answers_are_those_of_their_tasks_a_task_at_a_time(rows):
@@ -260,7 +260,7 @@ def test_stored_answers_are_those_of_their_tasks_a_task_at_a_time(rows):
     def reading(task):
         def rows_of():
             read.append(task)
-            return tasks[task]
+            return Answers(tasks[task])
 
         return rows_of
 

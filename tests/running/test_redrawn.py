@@ -97,7 +97,7 @@ def test_a_query_whose_content_changed_is_asked_again_and_both_answers_stay(draw
         prediction_files.merge_runs([folder], tmp_path / "both.parquet")
     assert prediction_files.merge_runs([folder], tmp_path / "mine.parquet", asked=after) == len(after)
     assert list(validate(tmp_path / "mine.parquet", [task])) == []
-    found = prediction_files.read_answers(folder, before)
+    found = prediction_files.Answers.open(folder, before)
     assert (found.found.keys(), found.aside) == (before.keys(), len(after))
     draw(prior="r500-weak-s3")
     assert ask(task)[1] == 0

@@ -11,7 +11,7 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.running import prediction_files, prediction_rows
+from sasgeo_bench.running import prediction_files
 from sasgeo_bench.scoring.validate import validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
@@ -34,8 +34,8 @@ def answers(task):
 
 def faults(tmp_path, task, predictions):
     path = tmp_path / "mine.parquet"
-    rows = [prediction_rows.prediction_row(item) for item in predictions]
-    pq.write_table(pa.Table.from_pylist(rows, schema=prediction_rows.PREDICTION_SCHEMA), path)
+    rows = [prediction_files.prediction_row(item) for item in predictions]
+    pq.write_table(pa.Table.from_pylist(rows, schema=prediction_files.PREDICTION_SCHEMA), path)
     return [(item.row, item.column, item.found, item.expected) for item in validate(path, [task])]
 
 
@@ -107,10 +107,10 @@ def test_without_a_map_beside_the_tasks_nobody_says_what_is_outside(tmp_path, ta
 
 def test_a_pose_without_a_place_is_named(tmp_path, task, answers):
     path = tmp_path / "mine.parquet"
-    rows = [prediction_rows.prediction_row(item) for item in answers]
+    rows = [prediction_files.prediction_row(item) for item in answers]
     rows[1]["candidates"][0]["easting_m"] = float("nan")
     rows[2]["candidates"][0]["score"] = None
-    pq.write_table(pa.Table.from_pylist(rows, schema=prediction_rows.PREDICTION_SCHEMA), path)
+    pq.write_table(pa.Table.from_pylist(rows, schema=prediction_files.PREDICTION_SCHEMA), path)
     listed = [(item.row, item.column) for item in validate(path, [task])]
     assert listed == [(1, "candidates"), (2, "candidates")]
     (fault, _) = validate(path, [task])
@@ -126,7 +126,7 @@ def test_missing_and_double_rows_are_named(tmp_path, task, answers):
 def test_columns_that_are_missing_or_of_another_kind_are_named(tmp_path, task, answers):
     path = tmp_path / "mine.parquet"
     full = pa.Table.from_pylist(
-        [prediction_rows.prediction_row(item) for item in answers], schema=prediction_rows.PREDICTION_SCHEMA
+        [prediction_files.prediction_row(item) for item in answers], schema=prediction_files.PREDICTION_SCHEMA
     )
     pq.write_table(full.drop_columns(["confidence"]), path)
     assert ("confidence", "nothing") in [(item.column, item.found) for item in validate(path, [task])]
@@ -142,8 +142,8 @@ def test_a_null_where_something_must_stand_is_named(tmp_path, task, answers, cha
 
 def test_more_columns_in_any_order_do_no_harm(tmp_path, task, answers):
     path = tmp_path / "mine.parquet"
-    rows = [prediction_rows.prediction_row(item) for item in answers]
-    full = pa.Table.from_pylist(rows, schema=prediction_rows.PREDICTION_SCHEMA)
+    rows = [prediction_files.prediction_row(item) for item in answers]
+    full = pa.Table.from_pylist(rows, schema=prediction_files.PREDICTION_SCHEMA)
     pq.write_table(full.select(full.column_names[::-1]).append_column("rank", pa.array(range(len(rows)))), path)
     assert list(validate(path, [task])) == []
     candidates = pa.array([[item | {"rank": 1} for item in row["candidates"]] for row in rows])

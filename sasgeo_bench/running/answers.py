@@ -347,12 +347,30 @@ class _Map:
         return lacks(self._plan.card, query, is_taught=is_taught, is_pictured=self._is_pictured)
 
     def _row(self, query: Query, reply: Reply) -> Prediction:
-        """Make a row of a reply, checked again in this process."""
+        """Make a row of a reply, checked against the query again in this process."""
+        row = partial(Prediction, query_id=query.query_id)
+        if reply.status != "ok":
+            return row(status=reply.status, message=reply.message)
+        if reply.match is None:
+            return row(status="invalid", message="no answer in an answer")
         try:
-            return _prediction(query, reply, self._plan.request.top_k)
+            match = check_match(reply.match, query, top_k=self._plan.request.top_k)
+            if reply.covariance is not None:
+                check_covariance(reply.covariance)
+            return row(
+                candidates=tuple(zip(match.poses, match.scores, strict=True)),
+                confidence=match.confidence,
+                diagnostics=match.diagnostics,
+                latency_s=reply.seconds,
+                matcher_s=reply.own_s,
+                is_accepted=reply.is_accepted,
+                covariance=reply.covariance,
+            )
+        except MatchError as error:
+            return row(status="invalid", message=one_line(str(error)))
         except Exception as error:  # noqa: BLE001 - any failure costs only its own row
             failed = failed_by_us(self._plan, error)
-            return Prediction(query_id=query.query_id, status=failed.status, message=failed.message)
+            return row(status=failed.status, message=failed.message)
 
     def _failed_training(self) -> Reply | None:
         """Return the reply to every query after a failed training; starts no process."""
@@ -380,30 +398,6 @@ class _Map:
 def flight_of(query: Query) -> str:
     """Return the flight of a view, or the id of a view alone."""
     return query.query_id if query.step is None else query.step.sequence_id
-
-
-def _prediction(query: Query, reply: Reply, top_k: int) -> Prediction:
-    """Make a row of a reply, checked against the query."""
-    if reply.status != "ok":
-        return Prediction(query_id=query.query_id, status=reply.status, message=reply.message)
-    if reply.match is None:
-        return Prediction(query_id=query.query_id, status="invalid", message="no answer in an answer")
-    try:
-        match = check_match(reply.match, query, top_k=top_k)
-        if reply.covariance is not None:
-            check_covariance(reply.covariance)
-    except MatchError as error:
-        return Prediction(query_id=query.query_id, status="invalid", message=one_line(str(error)))
-    return Prediction(
-        query_id=query.query_id,
-        candidates=tuple(zip(match.poses, match.scores, strict=True)),
-        confidence=match.confidence,
-        diagnostics=match.diagnostics,
-        latency_s=reply.seconds,
-        matcher_s=reply.own_s,
-        is_accepted=reply.is_accepted,
-        covariance=reply.covariance,
-    )
 
 
 class _Writer:

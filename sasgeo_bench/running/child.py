@@ -5,7 +5,6 @@ import gc
 import os
 import socket
 import sys
-from typing import Any
 
 from sasgeo_bench.running import wire
 
@@ -15,23 +14,25 @@ def main() -> None:
     gc.disable()  # until our own is imported, of which nothing is garbage: an eighth of what a process takes to start
     channel = socket.socket(fileno=int(sys.argv[1]))
     start, luggage = wire.receive(channel)
-    os.chdir(start["scratch"])
-    sys.path[:] = dict.fromkeys((*start["paths"], *sys.path))
-    _serve(channel, start, luggage if start["has_luggage"] else None)
+    serve(channel, luggage, **start)
 
 
-def _serve(channel: socket.socket, start: dict[str, Any], luggage: bytes | None) -> None:
+def serve(
+    channel: socket.socket, luggage: bytes, *, door: str, spec: str, scratch: str, paths: list[str], has_luggage: bool
+) -> None:
     """Load the plugin and answer; what is imported from here on comes from the runner's import path."""
-    if start["door"] == "segmenter":
+    os.chdir(scratch)
+    sys.path[:] = dict.fromkeys((*paths, *sys.path))
+    if door == "segmenter":
         from sasgeo_bench.running.serve_segmenter import SegmenterServer  # noqa: PLC0415
 
         gc.enable()
-        SegmenterServer(channel, spec=start["spec"], luggage=luggage).run()
+        SegmenterServer(channel, spec=spec, luggage=luggage if has_luggage else None).run()
         return
     from sasgeo_bench.running.serve import Server  # noqa: PLC0415
 
     gc.enable()
-    Server(channel, spec=start["spec"]).run()
+    Server(channel, spec=spec).run()
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import MOST_SAID, Match, MatcherCard, Need, check_learned
 from sasgeo_bench.matching.results import Status
 from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE
+from sasgeo_bench.running.wire import Message
 from sasgeo_bench.tasks.query import Track
 from sasgeo_bench.texts import (
     BOUNDS,
@@ -113,17 +114,26 @@ class Failed(Strictly):
     message: Annotated[Line, Field(max_length=MOST_MESSAGE)]
 
 
-class _Card(Strictly):
+class SentCard(Strictly):
+    """Fields of every plugin's card."""
+
     name: Line
     version: Line
     title: Line
     source: Line
     ours: Line
     licence: Line
-    tracks: list[Track]
-    needs: list[Need]
     limits: Line
     trained_on: Annotated[list[Line], Field(max_length=_MOST_PLACES)]
+
+    def fields(self) -> dict[str, Any]:
+        """Return the arguments of a card, which has tuples for lists."""
+        return {name: tuple(value) if isinstance(value, list) else value for name, value in self}
+
+
+class _Card(SentCard):
+    tracks: list[Track]
+    needs: list[Need]
     uses: list[Line]
     authors: list[Line]
     contact: Line
@@ -137,8 +147,7 @@ class _Loaded(Strictly):
 
     def reply(self) -> Reply:
         """Return the reply for the runner."""
-        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
-        return Reply(status="ok", card=MatcherCard(**fields), learns=self.learns)
+        return Reply(status="ok", card=MatcherCard(**self.card.fields()), learns=self.learns)
 
 
 class _Trained(Strictly):
@@ -202,7 +211,7 @@ _KINDS: Final[Mapping[str, type[_Loaded | _Trained | _Prepared | _Matched]]] = {
 }
 
 
-def read_reply(kind: str, given: Mapping[str, Any], *, nonce: str) -> Reply:
+def read_reply(kind: str, given: Message, *, nonce: str) -> Reply:
     """Read a JSON message as the reply to a question of a kind: "load", "learn", "prepare" or "match".
 
     `nonce` is that of the question, so that no answer can be made before it. Raise `MatchError`, in one line, if the
@@ -217,7 +226,7 @@ def read_reply(kind: str, given: Mapping[str, Any], *, nonce: str) -> Reply:
         return Reply(status=answer.status, message=answer.message) if isinstance(answer, Failed) else answer.reply()
 
 
-def read_answer(model: type[Model], given: Mapping[str, Any], *, nonce: str) -> Model | Failed:
+def read_answer(model: type[Model], given: Message, *, nonce: str) -> Model | Failed:
     """Read a JSON message as an answer of a model, or as a failure.
 
     Raise `MatchError` if it was made for another question, pydantic's `ValidationError` if it is neither.

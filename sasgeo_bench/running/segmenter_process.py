@@ -4,7 +4,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal
+from typing import Annotated, ClassVar, Final, Literal
 
 from pydantic import Field
 
@@ -18,13 +18,21 @@ from sasgeo_bench.matching.segmenter import (
     check_text,
 )
 from sasgeo_bench.running import wire
-from sasgeo_bench.running.replies import Failed, Line, PluginReply, Seconds, Strictly, in_one_line, read_answer
+from sasgeo_bench.running.replies import (
+    Failed,
+    Line,
+    PluginReply,
+    Seconds,
+    SentCard,
+    Strictly,
+    in_one_line,
+    read_answer,
+)
 from sasgeo_bench.running.worker import PluginProcess
 from sasgeo_bench.sensing.image import AerialImage
 from sasgeo_bench.sensing.image_bytes import image_bytes
 from sasgeo_bench.sensing.segmentation import MOST_CLASSES, Segmentation
 
-_MOST_PLACES: Final = 1000
 _MOST_GROWTH: Final = 1.01  # of bytes that do not become fewer by compression
 
 
@@ -36,17 +44,9 @@ class SegmenterReply(PluginReply):
     segmentation: Segmentation | None = None
 
 
-class _Card(Strictly):
-    name: Line
-    version: Line
-    title: Line
-    source: Line
-    ours: Line
-    licence: Line
+class _Card(SentCard):
     classes: Annotated[list[Line], Field(max_length=MOST_CLASSES)]
     needs: list[SegmenterNeed]
-    limits: Line
-    trained_on: Annotated[list[Line], Field(max_length=_MOST_PLACES)]
 
 
 class _Loaded(Strictly):
@@ -57,8 +57,7 @@ class _Loaded(Strictly):
     def reply(self, data: bytes) -> SegmenterReply:
         """Return the reply for the runner."""
         del data
-        fields: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in self.card}
-        return SegmenterReply(status="ok", card=SegmenterCard(**fields), learns=self.learns)
+        return SegmenterReply(status="ok", card=SegmenterCard(**self.card.fields()), learns=self.learns)
 
 
 class _Trained(Strictly):
@@ -98,16 +97,16 @@ class SegmenterProcess(PluginProcess[SegmenterReply]):
 
     def learn(self, images: Sequence[Path]) -> SegmenterReply:
         """Train on the labelled images of some files, which the process must be able to read."""
-        message = {"kind": "learn", "images": [str(path.resolve()) for path in images]}
+        files = [str(path.resolve()) for path in images]
         most_bytes = MOST_TEXT_BYTES + wire.MOST_BYTES
-        return self._ask(message, timeout_s=self.limits.learn_s, most_bytes=most_bytes)
+        return self._ask("learn", timeout_s=self.limits.learn_s, most_bytes=most_bytes, images=files)
 
     def segment(self, image: AerialImage, *, classes: Sequence[str] = ()) -> SegmenterReply:
         """Ask about one image; `classes` are those of the card, against which the answer is checked once more."""
         self._asked = (image, tuple(classes))
         rows, cols = image.shape
         most_bytes = int(MOST_CLASSES * rows * cols * _MOST_GROWTH) + wire.MOST_BYTES
-        return self._ask({"kind": "segment"}, image_bytes(image), timeout_s=self.limits.match_s, most_bytes=most_bytes)
+        return self._ask("segment", image_bytes(image), timeout_s=self.limits.match_s, most_bytes=most_bytes)
 
     def _luggage(self) -> bytes | None:
         return None if self.learned is None else self.learned.encode()
@@ -115,7 +114,7 @@ class SegmenterProcess(PluginProcess[SegmenterReply]):
     def _failure(self, status: Status, message: str) -> SegmenterReply:
         return SegmenterReply(status=status, message=message)
 
-    def _read(self, kind: str, answer: dict[str, Any], data: bytes, *, nonce: str) -> SegmenterReply:
+    def _read(self, kind: str, answer: wire.Message, data: bytes, *, nonce: str) -> SegmenterReply:
         with in_one_line():
             found = read_answer(_KINDS[kind], answer, nonce=nonce)
         if isinstance(found, Failed):

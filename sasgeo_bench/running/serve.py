@@ -8,10 +8,10 @@ import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Final, Self
 
 import numpy as np
 import psutil
@@ -39,6 +39,8 @@ from sasgeo_bench.texts import message_of, one_line
 if TYPE_CHECKING:
     from sasgeo_bench.geometry.grid import Grid
 
+Answer = tuple[wire.Message, bytes]  # to a question that was answered, and the bytes that follow it
+
 MOST_MAPS: Final = 2  # cached while a matcher trains
 _REFUSED: Final = frozenset({errno.EACCES, errno.EPERM, errno.EROFS, errno.ENETUNREACH, errno.EHOSTUNREACH})
 
@@ -58,19 +60,20 @@ class PluginServer(ABC):
             except wire.Closed:
                 return
             head = {"nonce": message["nonce"]}
+            fields = {name: value for name, value in message.items() if name not in {"kind", "nonce"}}
             try:
-                content, data = self._answer(message, blob)
-                answer = wire.packed(head | content, data)
+                content, data = self._answers()[message["kind"]](blob, **fields)
+                answer = wire.packed({**head, "status": "ok", **content}, data)
             except Exception as error:  # noqa: BLE001 - an error of a plugin costs only its own row
-                answer = wire.packed(head | _failure(error, package=self._package()))
+                answer = wire.packed({**head, **_failure(error, package=self._package())})
             try:
                 wire.put(self.channel, answer)
             except wire.Closed:  # the runner waited no longer
                 return
 
     @abstractmethod
-    def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
-        """Return the answer to a message, and the bytes that follow it."""
+    def _answers(self) -> Mapping[str, Callable[..., Answer]]:
+        """Return what answers each kind of question, given the bytes after it and its fields."""
 
     def _package(self) -> str:
         """Return the package of the plugin; empty while it is not known."""
@@ -82,42 +85,56 @@ class Server(PluginServer):
 
     def __init__(self, channel: socket.socket, *, spec: str) -> None:
         super().__init__(channel, spec=spec)
-        self.matcher: Matcher | Tracker | None = None
+        self._loaded: Matcher | Tracker | None = None
         self._grid: Grid | None = None
         self._follower: Tracker | None = None
 
     def _package(self) -> str:
-        return package_of(self.matcher)
+        return package_of(self._loaded)
 
-    def _answer(self, message: dict[str, Any], blob: bytes) -> tuple[dict[str, Any], bytes]:
-        if message["kind"] == "load":
-            self.matcher = load_method(self.spec)
-            card, learns = asdict(self.matcher.card), isinstance(self.matcher, Learner)
-            return {"status": "ok", "card": card, "learns": learns}, b""
-        if self.matcher is None:
-            self.matcher = load_method(self.spec)
-        if message["kind"] == "learn":
-            return _learn(self.matcher, message, blob), b""
-        if message["kind"] == "prepare":
-            return self._prepare(self.matcher, message), b""
-        query = query_from(blob)
-        if isinstance(self.matcher, Tracker):
-            return _step(self.matcher, message, query), b""
-        if query.step is not None and is_followed(self.matcher.card):
-            return _step(self._following(self.matcher), message, query), b""
-        return _match(self.matcher, message, query), b""
+    def _answers(self) -> Mapping[str, Callable[..., Answer]]:
+        return {"load": self._load, "learn": self._learn, "prepare": self._prepare, "match": self._match}
 
-    def _prepare(self, matcher: Matcher | Tracker, message: dict[str, Any]) -> dict[str, Any]:
-        reading, looking = _Cost(), _Cost()
-        folder = Path(message["region"])
-        region = read_region(folder, around=lambda: reading, around_layer=lambda: looking, with_layers=False)
-        self._grid = region.grid
+    @property
+    def matcher(self) -> Matcher | Tracker:
+        """Return the plugin, loaded at the first question."""
+        if self._loaded is None:
+            self._loaded = load_method(self.spec)
+        return self._loaded
+
+    def _load(self, _: bytes) -> Answer:
+        self._loaded = load_method(self.spec)
+        return {"card": asdict(self.matcher.card), "learns": isinstance(self.matcher, Learner)}, b""
+
+    def _learn(self, blob: bytes, *, regions: Mapping[str, str], query_bytes: Sequence[int]) -> Answer:
+        if not isinstance(self.matcher, Learner):
+            raise MatchError(f"{self.matcher.card.name} has no learn()")
+        pairs = tuple(pairs_from(query_bytes, blob))
+        maps = Maps({name: Path(folder) for name, folder in regions.items()})
+        start = time.perf_counter()
+        learned = check_learned(self.matcher.learn(Training(regions=maps, pairs=pairs)))
+        return {"seconds": time.perf_counter() - start, "learned": learned}, b""
+
+    def _prepare(self, _: bytes, *, region: str, learned: str | None) -> Answer:
+        reading, looking, matcher = _Cost(), _Cost(), self.matcher
+        place = read_region(Path(region), around=lambda: reading, around_layer=lambda: looking, with_layers=False)
+        self._grid = place.grid
         with (preparing := _Cost()):
-            matcher.prepare(region, message["learned"])
+            matcher.prepare(place, learned)
         # The region keeps what it read for good; a layer that was read alone is the matcher's, if it is kept.
         grown_bytes = max(0, preparing.grown_bytes - reading.grown_bytes)
-        seconds = preparing.seconds - reading.seconds - looking.seconds
-        return {"status": "ok", "seconds": seconds, "grown_bytes": grown_bytes}
+        return {"seconds": preparing.seconds - reading.seconds - looking.seconds, "grown_bytes": grown_bytes}, b""
+
+    def _match(self, blob: bytes, *, top_k: int) -> Answer:
+        query, matcher = query_from(blob), self.matcher
+        if isinstance(matcher, Tracker):
+            return _step(matcher, query, top_k), b""
+        if query.step is not None and is_followed(matcher.card):
+            return _step(self._following(matcher), query, top_k), b""
+        start, start_cpu = time.perf_counter(), time.process_time()
+        found = matcher.match(query, top_k=top_k)
+        seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
+        return {"seconds": seconds, "cpu_s": cpu_s, "match": match_row(check_match(found, query, top_k=top_k))}, b""
 
     def _following(self, matcher: Matcher) -> Tracker:
         """Return the tracker that asks a matcher of single views about flights."""
@@ -126,31 +143,22 @@ class Server(PluginServer):
         return self._follower
 
 
-def _match(matcher: Matcher, message: dict[str, Any], query: Query) -> dict[str, Any]:
-    start, start_cpu = time.perf_counter(), time.process_time()
-    found = matcher.match(query, top_k=message["top_k"])
-    seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
-    row = match_row(check_match(found, query, top_k=message["top_k"]))
-    return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
-
-
-def _step(tracker: Tracker, message: dict[str, Any], query: Query) -> dict[str, Any]:
+def _step(tracker: Tracker, query: Query, top_k: int) -> wire.Message:
     """Answer the next view of a flight; its first one begins it."""
     if query.step is None:
-        fault = f"{tracker.card.name} follows flights, and this query is a view alone"
-        raise MatchError(fault)
+        raise MatchError(f"{tracker.card.name} follows flights, and this query is a view alone")
     start, start_cpu = time.perf_counter(), time.process_time()
     if query.step.frame == 0:
         tracker.start(query.prior)
     found = tracker.step(query)
     seconds, cpu_s = time.perf_counter() - start, time.process_time() - start_cpu
-    fix = check_fix(found, top_k=message["top_k"])
+    fix = check_fix(found, top_k=top_k)
     covariance = None if fix.covariance is None else np.asarray(fix.covariance).ravel().tolist()
-    row = match_row(match_of(fix)) | {"is_accepted": fix.is_accepted, "covariance": covariance}
-    return {"status": "ok", "seconds": seconds, "cpu_s": cpu_s, "match": row}
+    row = {**match_row(match_of(fix)), "is_accepted": fix.is_accepted, "covariance": covariance}
+    return {"seconds": seconds, "cpu_s": cpu_s, "match": row}
 
 
-def _failure(error: Exception, *, package: str) -> dict[str, Any]:
+def _failure(error: Exception, *, package: str) -> wire.Message:
     """Describe an error as an answer; one that nobody foresaw with the last line of the plugin's package on its way."""
     if isinstance(error, MatchError):
         return {"status": "invalid", "message": one_line(str(error))}
@@ -197,17 +205,6 @@ class _Cost:
         self.grown_bytes += _resident_bytes() - self._before
 
 
-def _learn(matcher: Matcher | Tracker, message: dict[str, Any], blob: bytes) -> dict[str, Any]:
-    if not isinstance(matcher, Learner):
-        fault = f"{matcher.card.name} has no learn()"
-        raise MatchError(fault)
-    pairs = tuple(pairs_from(message["query_bytes"], blob))
-    regions = Maps({name: Path(folder) for name, folder in message["regions"].items()})
-    start = time.perf_counter()
-    learned = check_learned(matcher.learn(Training(regions=regions, pairs=pairs)))
-    return {"status": "ok", "seconds": time.perf_counter() - start, "learned": learned}
-
-
 class Maps(Mapping[str, Region]):
     """Regions read on demand: all of a split at once would not fit into memory."""
 
@@ -247,7 +244,7 @@ def _resident_bytes() -> int:
     return int(psutil.Process(number).memory_info().rss)
 
 
-def match_row(match: Match) -> dict[str, Any]:
+def match_row(match: Match) -> wire.Message:
     """Return a checked answer as plain numbers."""
     return {
         "candidates": [

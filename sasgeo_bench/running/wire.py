@@ -6,6 +6,7 @@ import select
 import socket
 import struct
 import time
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 MOST_BYTES: Final = 2**20  # of a message from a matcher's process, which is not trusted
@@ -30,14 +31,18 @@ class Garbled(Exception):  # noqa: N818
     """The data is complete, but not a message."""
 
 
-def send(channel: socket.socket, message: dict[str, Any], blob: bytes = b"", *, deadline: float | None = None) -> None:
+Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
+Message = Mapping[str, Json]
+
+
+def send(channel: socket.socket, message: Message, blob: bytes = b"", *, deadline: float | None = None) -> None:
     """Send a message; `Closed` if the other side has gone, `Late` if it does not read until a deadline."""
     put(channel, packed(message, blob), deadline=deadline)
 
 
-def packed(message: dict[str, Any], blob: bytes = b"") -> bytes:
+def packed(message: Message, blob: bytes = b"") -> bytes:
     """Return a message as it is sent."""
-    text = json.dumps(message).encode()
+    text = json.dumps(dict(message)).encode()
     return _HEAD.pack(len(text), len(blob)) + text + blob
 
 

@@ -13,11 +13,11 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, ClassVar, Final, Generic, Self, TypeVar
+from typing import IO, ClassVar, Final, Generic, Self, TypeVar
 
 import psutil
 
@@ -27,7 +27,7 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.plugin_files import import_paths
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.results import Status
-from sasgeo_bench.running import wire
+from sasgeo_bench.running import sandbox, wire
 from sasgeo_bench.running.launch import PROGRAM
 from sasgeo_bench.running.leak_scan import PACKED, walk_code
 from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
@@ -116,7 +116,7 @@ class PluginProcess(ABC, Generic[AnyReply]):
         """Return the reply of a process that gave none."""
 
     @abstractmethod
-    def _read(self, kind: str, answer: dict[str, Any], data: bytes, *, nonce: str) -> AnyReply:
+    def _read(self, kind: str, answer: wire.Message, data: bytes, *, nonce: str) -> AnyReply:
         """Read an answer, and the bytes after it, to a question of a kind; raise `MatchError` if it is none."""
 
     def _luggage(self) -> bytes | None:
@@ -125,23 +125,30 @@ class PluginProcess(ABC, Generic[AnyReply]):
 
     def load(self) -> AnyReply:
         """Import the plugin."""
-        return self._ask({"kind": "load"}, timeout_s=self.limits.prepare_s)
+        return self._ask("load", timeout_s=self.limits.prepare_s)
 
     def _is_gone(self) -> bool:
         return self._process is None or self._process.poll() is not None
 
     def _ask(
-        self, message: dict[str, Any], blob: bytes = b"", *, timeout_s: float, most_bytes: int = wire.MOST_BYTES
+        self,
+        kind: str,
+        blob: bytes = b"",
+        *,
+        timeout_s: float,
+        most_bytes: int = wire.MOST_BYTES,
+        **asked_for: wire.Json,
     ) -> AnyReply:
+        """Ask a question of a kind, with its fields and the bytes after it; the methods of a server answer it."""
         nonce = secrets.token_hex(16)  # so that no answer can be made in advance
         try:
             channel = self._started()
             asked = time.perf_counter()
             deadline = time.monotonic() + timeout_s
-            wire.send(channel, {**message, "nonce": nonce}, blob, deadline=deadline)
+            wire.send(channel, {"kind": kind, **asked_for, "nonce": nonce}, blob, deadline=deadline)
             answer, data = wire.receive(channel, deadline=deadline, most_bytes=most_bytes)
             came = time.perf_counter()
-            reply = self._read(message["kind"], answer, data, nonce=nonce)
+            reply = self._read(kind, answer, data, nonce=nonce)
         except wire.Late as late:
             self.end()
             return self._failure("timeout", str(late) or f"no answer within {timeout_s:g} s")
@@ -185,9 +192,8 @@ class PluginProcess(ABC, Generic[AnyReply]):
         self._channel = ours
         self.starts += 1
         if self.reach.is_shut_in:
-            wire.send(ours, self._policy(str(self._scratch)))
-            started = self._heard_of_start(ours)
-            self.isolation = {str(name): one_line(str(text)) for name, text in dict(started["isolation"]).items()}
+            wire.send(ours, asdict(self._policy(str(self._scratch))))
+            self.isolation = self._started_isolation(ours)
         self.isolation["memory"] = _memory_words(self.limits, self._group)
         luggage = self._luggage()
         start = {"door": self.door, "spec": self.spec, "scratch": str(self._scratch), "paths": import_paths(self.spec)}
@@ -195,14 +201,15 @@ class PluginProcess(ABC, Generic[AnyReply]):
         return ours
 
     @staticmethod
-    def _heard_of_start(channel: socket.socket) -> dict[str, Any]:
-        """Wait until the sandbox stands; a late one is no fault of the matcher, and its message says so."""
+    def _started_isolation(channel: socket.socket) -> dict[str, str]:
+        """Return how the sandbox isolates; a late one is no fault of the matcher, and its message says so."""
         try:
-            return wire.receive(channel, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)[0]
+            started, _ = wire.receive(channel, deadline=time.monotonic() + _START_S, most_bytes=wire.MOST_BYTES)
         except wire.Late:
             raise wire.Late(
                 f"the sandbox did not stand within {_START_S:g} s: is a folder of sys.path very large?"
             ) from None
+        return {str(name): one_line(str(text)) for name, text in dict(started["isolation"]).items()}
 
     def _begin_watch(self, process: subprocess.Popen[bytes], scratch: Path) -> None:
         """Put the process into a control group if possible, and measure its memory in any case."""
@@ -236,22 +243,21 @@ class PluginProcess(ABC, Generic[AnyReply]):
         """Return the peak memory of this matcher's process and all its descendants."""
         return max(self._peak_bytes, self._memory.peak_bytes if self._memory else 0)
 
-    def _policy(self, scratch: str) -> dict[str, Any]:
-        """Return the arguments of `sandbox.Policy`."""
+    def _policy(self, scratch: str) -> sandbox.Policy:
         code = _code()
         scan = walk_code(code)
         found = scan.hidden([*code, *self.reach.readable])
         packed = sorted(shipped_dir("pipelines").glob(f"*{PACKED}"))  # answers; nobody walks what is installed
         hidden = [*map(str, (*self.reach.hidden, *packed)), *(path for path in found if not self._is_lesson(path))]
-        return {
-            "readable": [str(path) for path in (*code, *self.reach.readable)],
-            "scratch": scratch,
-            "hidden": list(dict.fromkeys(hidden)),
-            "unsearched": scan.unsearched,
-            "memory_bytes": self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
-            "file_bytes": self.limits.file_bytes,
-            "scratch_bytes": self.limits.scratch_bytes,
-        }
+        return sandbox.Policy(
+            readable=[str(path) for path in (*code, *self.reach.readable)],
+            scratch=scratch,
+            hidden=list(dict.fromkeys(hidden)),
+            unsearched=scan.unsearched,
+            memory_bytes=self.limits.memory_bytes + 2 * 2**30,  # libraries reserve what they never touch
+            file_bytes=self.limits.file_bytes,
+            scratch_bytes=self.limits.scratch_bytes,
+        )
 
     def _is_lesson(self, path: str) -> bool:
         """Return whether a file is a labelled image in a folder that the plugin may read, to learn from it."""
@@ -298,14 +304,20 @@ class Worker(PluginProcess[Reply]):
         """Train on queries, each a row in Arrow's stream format, and their truths, with maps by name."""
         sizes, blob = pairs_bytes(pairs)
         maps = {name: str(path.resolve()) for name, path in regions.items()}
-        message = {"kind": "learn", "regions": maps, "query_bytes": sizes}
-        return self._ask(message, blob, timeout_s=self.limits.learn_s, most_bytes=wire.MOST_LEARN_BYTES)
+        return self._ask(
+            "learn",
+            blob,
+            timeout_s=self.limits.learn_s,
+            most_bytes=wire.MOST_LEARN_BYTES,
+            regions=maps,
+            query_bytes=sizes,
+        )
 
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Index a map, given the learned text."""
         self._region, self._learned = region, learned
-        message = {"kind": "prepare", "region": str(region.resolve()), "learned": learned}
-        reply = self._ask(message, timeout_s=self.limits.prepare_s)
+        place = str(region.resolve())
+        reply = self._ask("prepare", timeout_s=self.limits.prepare_s, region=place, learned=learned)
         if reply.status != "ok":
             self.end()
         return reply
@@ -324,7 +336,7 @@ class Worker(PluginProcess[Reply]):
             again = self.prepare(self._region, self._learned)
             if again.status != "ok":
                 return again
-        reply = self._ask({"kind": "match", "top_k": top_k}, query, timeout_s=self.limits.match_s)
+        reply = self._ask("match", query, timeout_s=self.limits.match_s, top_k=top_k)
         if reply.status in {"timeout", "crash"} and self._is_gone():
             self.end()
         return reply
@@ -332,7 +344,7 @@ class Worker(PluginProcess[Reply]):
     def _failure(self, status: Status, message: str) -> Reply:
         return Reply(status=status, message=message)
 
-    def _read(self, kind: str, answer: dict[str, Any], data: bytes, *, nonce: str) -> Reply:
+    def _read(self, kind: str, answer: wire.Message, data: bytes, *, nonce: str) -> Reply:
         del data  # no answer of a matcher has any
         return read_reply(kind, answer, nonce=nonce)
 

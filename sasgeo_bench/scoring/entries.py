@@ -13,6 +13,7 @@ import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, named
 from sasgeo_bench.files.plugins import ORACLE, shipped_names
+from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
 from sasgeo_bench.running.failures import Failures
@@ -70,7 +71,8 @@ class Entry:
         found: dict[str, dict[str, Any]] = {}
         for run in self.runs:
             if run.learned is not None:
-                one = found.setdefault(run.learned.key, run.learned.model_dump() | {"asked": []})
+                fields = run.learned.model_dump(include=set(TrainingRecord.model_fields))
+                one = found.setdefault(run.learned.key, fields | {"asked": []})
                 one["asked"].append(f"{run.suite}/{run.region}")
         return [one | {"asked": sorted(one["asked"])} for _, one in sorted(found.items())]
 

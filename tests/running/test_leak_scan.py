@@ -143,4 +143,4 @@ def test_the_archives_that_ship_are_hidden_from_every_plugin_although_nobody_wal
     monkeypatch.setattr(worker, "shipped_dir", lambda kind: tmp_path / kind)
     reach = Reach(readable=[], hidden=[])
     policy = process(spec="random", reach=reach, limits=Limits())._policy(str(tmp_path))
-    assert str(tmp_path / "pipelines/demo.tar.xz") in policy["hidden"]
+    assert str(tmp_path / "pipelines/demo.tar.xz") in policy.hidden

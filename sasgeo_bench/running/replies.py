@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Parse the answers of a plugin's process against one schema: the process is not trusted."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, TypeVar
 
@@ -221,27 +220,20 @@ def read_reply(kind: str, given: Message, *, nonce: str) -> Reply:
     >>> read_reply("match", given, nonce="7").message
     'ValueError: no index today'
     """
-    with in_one_line():
-        answer = read_answer(_KINDS[kind], given, nonce=nonce)
-        return Reply(status=answer.status, message=answer.message) if isinstance(answer, Failed) else answer.reply()
+    answer = read_answer(_KINDS[kind], given, nonce=nonce)
+    return Reply(status=answer.status, message=answer.message) if isinstance(answer, Failed) else answer.reply()
 
 
 def read_answer(model: type[Model], given: Message, *, nonce: str) -> Model | Failed:
     """Read a JSON message as an answer of a model, or as a failure.
 
-    Raise `MatchError` if it was made for another question, pydantic's `ValidationError` if it is neither.
+    Raise `MatchError`, in one line, if it was made for another question or is neither.
     """
     content = dict(given)
     if content.pop("nonce", None) != nonce:
         raise MatchError("it was not made for this question")
-    return Failed.model_validate(content) if content.get("status") != "ok" else model.model_validate(content)
-
-
-@contextmanager
-def in_one_line() -> Iterator[None]:
-    """Turn a `ValidationError` of the block into a `MatchError` of one line."""
     try:
-        yield
+        return Failed.model_validate(content) if content.get("status") != "ok" else model.model_validate(content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
         where = ".".join(map(str, first["loc"]))[:_SHOWN]

@@ -25,7 +25,6 @@ from sasgeo_bench.running.replies import (
     Seconds,
     SentCard,
     Strictly,
-    in_one_line,
     read_answer,
 )
 from sasgeo_bench.running.worker import PluginProcess
@@ -115,8 +114,7 @@ class SegmenterProcess(PluginProcess[SegmenterReply]):
         return SegmenterReply(status=status, message=message)
 
     def _read(self, kind: str, answer: wire.Message, data: bytes, *, nonce: str) -> SegmenterReply:
-        with in_one_line():
-            found = read_answer(_KINDS[kind], answer, nonce=nonce)
+        found = read_answer(_KINDS[kind], answer, nonce=nonce)
         if isinstance(found, Failed):
             return self._failure(found.status, found.message)
         return self._segmented(found, data) if isinstance(found, _Segmented) else found.reply(data)

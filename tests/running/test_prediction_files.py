@@ -16,6 +16,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.running.run_manifest import RUN, CardRecord, RunManifest
 from sasgeo_bench.tasks.task_rows import POSE_FIELDS
+from sasgeo_bench.texts import json_text
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)
 FULL = Prediction(
@@ -208,6 +209,13 @@ def test_what_a_run_says_of_itself_is_read_back_and_replaced_whole(tmp_path):
         about.save(tmp_path / "run")
         assert RunManifest.open(tmp_path / "run") == about
     assert [path.name for path in (tmp_path / "run").iterdir()] == [RUN]
+
+
+def test_what_a_run_does_not_state_is_not_written_and_what_nobody_knows_is_kept(tmp_path):
+    text = json_text({"matcher": {"name": "mine"}, "hash": "aa", "learned": None, "cpu_s": 3, "new": [1]})
+    (tmp_path / RUN).write_text(text)
+    RunManifest.open(tmp_path).save(tmp_path)
+    assert (tmp_path / RUN).read_text() == text
 
 
 def test_a_folder_that_cannot_be_written_is_told_in_one_line(tmp_path):

@@ -84,13 +84,13 @@ def test_a_good_matcher_passes_every_row_and_may_write_to_its_scratch_folder(own
         (
             "RaisesWithVectors",
             "shapes, order and finite scores",
-            "crash: TypeError: what are these? (faulty.py:88) (2 of 6 queries)",
+            "crash: TypeError: what are these? (faulty.py:86) (2 of 6 queries)",
         ),
         ("Fickle", "the same answer twice", "has another answer the second time"),
         (
             "FailsAgain",
             "the same answer twice",
-            "has none (crash: RuntimeError: again? (faulty.py:111)) the second time",
+            "has none (crash: RuntimeError: again? (faulty.py:108)) the second time",
         ),
         ("TwoAtLeast", "no more than top_k", "returned 2 poses, expected at most top_k = 1"),
         ("WantsADisc", "needs no more than its card says", "without a disc: crash: TypeError"),

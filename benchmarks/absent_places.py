@@ -35,7 +35,7 @@ from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive_file import read_stored_predictions
 from sasgeo_bench.scoring.base import Floats
-from sasgeo_bench.scoring.decisions import Answers, accept, presence_weights
+from sasgeo_bench.scoring.decisions import Fixes, accept, presence_weights
 from sasgeo_bench.scoring.draws import seed_of_text
 from sasgeo_bench.scoring.integrity_metric import risk_coverage
 from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval
@@ -77,18 +77,18 @@ def held_back(rejector: str, known: pd.DataFrame, said: Said) -> Floats:
     return found
 
 
-def risk_threshold(here: Answers, mass: Floats, risk: float) -> float:
+def risk_threshold(here: Fixes, mass: Floats, risk: float) -> float:
     """Return the threshold of largest coverage whose risk among the accepted is small enough; inf if none is."""
     curve = risk_coverage(here, mass)
     kept = np.flatnonzero(curve.risk <= risk)
     return float(curve.threshold[kept[-1]]) if len(kept) else np.inf
 
 
-def conformal_threshold(here: Answers, mass: Floats, place: Sequence[str], risk: float) -> float:
+def conformal_threshold(here: Fixes, mass: Floats, place: Sequence[str], risk: float) -> float:
     """Return the threshold of largest coverage that conformal risk control by places allows; inf if none.
 
     >>> facts = {"is_answered": [1] * 20, "is_right": [1] * 19 + [0], "is_present": [1] * 20}
-    >>> here = Answers(confidence=np.linspace(1, 0, 20), **facts)
+    >>> here = Fixes(confidence=np.linspace(1, 0, 20), **facts)
     >>> conformal_threshold(here, np.ones(20), [str(at) for at in range(20)], 0.05) > 0
     True
     >>> conformal_threshold(here, np.ones(20), ["one"] * 20, 0.05)
@@ -105,10 +105,10 @@ def conformal_threshold(here: Answers, mass: Floats, place: Sequence[str], risk:
     return best
 
 
-def answers(rows: pd.DataFrame, chance: Floats) -> Answers:
+def answers(rows: pd.DataFrame, chance: Floats) -> Fixes:
     """Return views as answers with chances."""
     facts = {name: rows[name].to_numpy(bool) for name in ("is_answered", "is_right", "is_present")}
-    return Answers(confidence=chance, **facts)
+    return Fixes(confidence=chance, **facts)
 
 
 def accepted(

@@ -9,7 +9,7 @@ import pandas as pd
 
 from sasgeo_bench.scoring.base import Floats, Ints, codes_of
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.decisions import Answers, equal_mass_bins, stanford
+from sasgeo_bench.scoring.decisions import Fixes, equal_mass_bins, stanford
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import effective_count, wilson_share
 from sasgeo_bench.scoring.metrics import TRACKS, primary_of
@@ -130,7 +130,7 @@ def risk_frame(judged: Mapping[tuple[str, str], pd.DataFrame], shown: Sequence[s
     return pd.DataFrame(rows, columns=columns)
 
 
-def _curves(suite: str, key: JudgedKey, some: Answers, *, is_pooled: bool) -> Iterator[tuple[str | float, ...]]:
+def _curves(suite: str, key: JudgedKey, some: Fixes, *, is_pooled: bool) -> Iterator[tuple[str | float, ...]]:
     """Yield rows of `risk_frame`."""
     for mixture, mass in mixtures_of(some, is_pooled=is_pooled):
         curve = risk_coverage(some, mass)

@@ -15,7 +15,7 @@ import pandas as pd
 
 from sasgeo_bench.scoring.base import Bools, Floats, codes_of
 from sasgeo_bench.scoring.controls import EVERY
-from sasgeo_bench.scoring.decisions import COST_RATIOS, Answers, accept_by_cost
+from sasgeo_bench.scoring.decisions import COST_RATIOS, Fixes, accept_by_cost
 from sasgeo_bench.scoring.draws import seed_of_text
 from sasgeo_bench.scoring.frames import MATCHER, PRIOR_GROUP, REJECTOR, TRACK, Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval
@@ -124,13 +124,13 @@ def _rows(pool: _Pool, *, matcher: str, rejector: str, track: str, prior_group: 
         )
 
 
-def _is_complete(plain: Answers, shifted: Answers) -> bool:
+def _is_complete(plain: Fixes, shifted: Fixes) -> bool:
     """Return whether no answer lost its chance to the correction, as where one calibration place lacks absent ones."""
     lost = np.isnan(shifted.confidence) & ~np.isnan(plain.confidence)
     return not lost.any() and not np.isnan(plain.confidence[plain.is_answered]).all()
 
 
-def _shares(answers: Answers, mass: Floats, cost_ratio: float) -> list[Share]:
+def _shares(answers: Fixes, mass: Floats, cost_ratio: float) -> list[Share]:
     """Return coverage, risk, and what is accepted of present and of absent places."""
     accepted = accept_by_cost(answers, cost_ratio).astype(float)
     right, present = answers.is_right.astype(float), answers.is_present.astype(float)

@@ -15,7 +15,7 @@ from statsmodels.stats.multitest import multipletests
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, block_codes, check_column
-from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.decisions import Fixes
 from sasgeo_bench.scoring.integrity_metric import Curve
 from sasgeo_bench.scoring.intervals import LEVEL
 
@@ -123,7 +123,7 @@ def sign_flip(sums: Floats) -> float:
     return min(float(found.pvalue), 1.0)
 
 
-def swap_places(first: Answers, second: Answers, place: Ints, name: str) -> float:
+def swap_places(first: Fixes, second: Fixes, place: Ints, name: str) -> float:
     """Return the p-value of swapping two sides at random places, for an area, which is no sum over places.
 
     `first` and `second` are answers to the same N queries, `place` the number of the place of each, shape (N,), `name`
@@ -154,14 +154,14 @@ def _gaps(curve: Curve, masses: Floats, swapped: Bools, name: str) -> Floats:
     return np.asarray(ours - theirs)
 
 
-def _stacked(first: Answers, second: Answers) -> Answers:
+def _stacked(first: Fixes, second: Fixes) -> Fixes:
     """Return the answers of both sides one after the other, with ranks for confidences."""
     ranks = []
     for answers in (first, second):
         sizes = np.bincount(answers.tie, minlength=len(answers.steps) + 1)
         middle = np.cumsum(sizes) - sizes / 2
         ranks.append(np.where(np.isnan(answers.confidence), np.nan, -middle[answers.tie]))
-    return Answers(
+    return Fixes(
         confidence=np.concatenate(ranks),
         is_answered=np.concatenate((first.is_answered, second.is_answered)),
         is_right=np.concatenate((first.is_right, second.is_right)),

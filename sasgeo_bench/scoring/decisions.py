@@ -20,15 +20,15 @@ PRESENT_SHARES: Final = (0.9, 0.7, 0.5)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Answers:
-    """Answers to N queries of the integrity track, present and absent places mixed; each column has shape (N,).
+class Fixes:
+    """Fixes of N queries of the integrity track, judged; present and absent places mixed; each column has shape (N,).
 
     `confidence` is the probability that the fix is right, or any other number that increases with trust; NaN if
     missing. It is ignored where `is_answered` is False: there is no fix that could be accepted. `is_right`: the fix is
     within tolerance of a present place. `is_present`: the place is on the searched map. Raise MetricError if shapes
     differ, a confidence is infinite, or a fix is right without an answer or without a place.
 
-    >>> some = Answers(confidence=[0.9, 0.9, np.nan], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 0, 0])
+    >>> some = Fixes(confidence=[0.9, 0.9, np.nan], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 0, 0])
     >>> some.tie.tolist()
     [0, 0, 1]
     """
@@ -84,19 +84,19 @@ def presence_weights(is_present: ArrayLike, share: float) -> Floats:
     return np.asarray(np.divide(target, there, out=np.zeros(len(present)), where=there > 0))
 
 
-def accept(answers: Answers, threshold: float) -> Bools:
+def accept(answers: Fixes, threshold: float) -> Bools:
     """Return which fixes are accepted, shape (N,): those with `confidence >= threshold`.
 
     A threshold of `-inf` accepts every answer, even without a confidence; queries without an answer are never accepted.
 
-    >>> some = Answers(confidence=[0.9, 0.5, 0.4], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 1, 1])
+    >>> some = Fixes(confidence=[0.9, 0.5, 0.4], is_answered=[1, 1, 0], is_right=[1, 0, 0], is_present=[1, 1, 1])
     >>> accept(some, 0.5).tolist(), accept(some, -np.inf).tolist()
     ([True, True, False], [True, True, False])
     """
     return np.append(answers.steps >= threshold, False)[answers.tie]  # the last group has no answer
 
 
-def accept_by_cost(answers: Answers, cost_ratio: float) -> Bools:
+def accept_by_cost(answers: Fixes, cost_ratio: float) -> Bools:
     """Return which fixes Eq. (14) accepts, shape (N,): chance of a false fix below 1 / (1 + cost ratio).
 
     The cost ratio is the cost of a false fix over that of withholding a right one: 5, 20 or 100. False without an
@@ -104,7 +104,7 @@ def accept_by_cost(answers: Answers, cost_ratio: float) -> Bools:
 
     The SASGeo paper, Eqs. (12)-(14), with P(F=1|E) = 1 - confidence; strict, as printed there.
 
-    >>> some = Answers(confidence=[0.9, 0.8, np.nan], is_answered=[1, 1, 1], is_right=[1, 0, 0], is_present=[1, 1, 1])
+    >>> some = Fixes(confidence=[0.9, 0.8, np.nan], is_answered=[1, 1, 1], is_right=[1, 0, 0], is_present=[1, 1, 1])
     >>> accept_by_cost(some, 5.0).tolist()
     [True, False, False]
     """
@@ -118,7 +118,7 @@ def _check_ratio(cost_ratio: float) -> None:
         raise MetricError(f"cost_ratio must be positive and finite, got {cost_ratio!r}")
 
 
-def check_probabilities(answers: Answers) -> None:
+def check_probabilities(answers: Fixes) -> None:
     """Check that all confidences lie in [0, 1].
 
     Raise MetricError with the range found.
@@ -131,7 +131,11 @@ def check_probabilities(answers: Answers) -> None:
 
 
 def cost_values(
-    answers: Answers, accepted: ArrayLike, cost_ratio: float, *, charged: Literal["right fix", "place"] = "right fix"
+    answers: Fixes,
+    accepted: ArrayLike,
+    cost_ratio: float,
+    *,
+    charged: Literal["right fix", "place"] = "right fix",
 ) -> Floats:
     """Return the cost of each query's decision, shape (N,), in units of a wrongly withheld fix: 0, 1 or `cost_ratio`.
 
@@ -140,7 +144,7 @@ def cost_values(
     present place without a fix and evaluates the whole method. Raise MetricError if the ratio is not positive, or a
     query without an answer is accepted.
 
-    >>> some = Answers(confidence=[0.9, 0.2], is_answered=[1, 1], is_right=[0, 0], is_present=[1, 1])
+    >>> some = Fixes(confidence=[0.9, 0.2], is_answered=[1, 1], is_right=[0, 0], is_present=[1, 1])
     >>> cost_values(some, [True, False], 20.0).tolist()
     [20.0, 0.0]
     >>> cost_values(some, [True, False], 20.0, charged="place").tolist()
@@ -155,7 +159,7 @@ def cost_values(
 
 
 def decision_cost(
-    answers: Answers,
+    answers: Fixes,
     cost_ratio: float,
     weights: ArrayLike | None = None,
     *,
@@ -163,7 +167,7 @@ def decision_cost(
 ) -> float:
     """Return the mean of `cost_values` when fixes are accepted by Eq. (14); NaN for no queries.
 
-    >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1])
+    >>> some = Fixes(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1])
     >>> decision_cost(some, 5.0)
     0.5
     """
@@ -174,11 +178,11 @@ def decision_cost(
 BINS: Final = 10
 
 
-def _have_confidence(answers: Answers) -> bool:
+def _have_confidence(answers: Fixes) -> bool:
     return not np.isnan(answers.confidence[answers.is_answered]).any()
 
 
-def brier(answers: Answers, weights: ArrayLike | None = None) -> float:
+def brier(answers: Fixes, weights: ArrayLike | None = None) -> float:
     """Return the Brier score of the confidences: the mean of (confidence - right)^2 over answered queries, in [0, 1].
 
     NaN without answers, and where any answer has no confidence: otherwise a method could omit unsure confidences to
@@ -186,7 +190,7 @@ def brier(answers: Answers, weights: ArrayLike | None = None) -> float:
 
     Brier, Monthly Weather Review 1950, for two outcomes: half of his sum.
 
-    >>> brier(Answers(confidence=[0.5, 1.0], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1]))
+    >>> brier(Fixes(confidence=[0.5, 1.0], is_answered=[1, 1], is_right=[1, 1], is_present=[1, 1]))
     0.125
     """
     mass = check_weights(weights, len(answers))
@@ -197,7 +201,7 @@ def brier(answers: Answers, weights: ArrayLike | None = None) -> float:
     return weighted_mean(gap**2, mass * answers.is_answered)
 
 
-def calibration_error(answers: Answers, weights: ArrayLike | None = None, *, bins: int = BINS) -> float:
+def calibration_error(answers: Fixes, weights: ArrayLike | None = None, *, bins: int = BINS) -> float:
     """Return the expected calibration error over at most `bins` bins of equal mass, in [0, 1].
 
     This is the mean over answers of |mean confidence - fraction right| of their bin. NaN as for `brier`. It is biased
@@ -205,7 +209,7 @@ def calibration_error(answers: Answers, weights: ArrayLike | None = None, *, bin
 
     Nguyen and O'Connor, EMNLP 2015; for the bias see Roelofs et al., AISTATS 2022.
 
-    >>> some = Answers(confidence=[0.9, 0.9, 0.1], is_answered=[1] * 3, is_right=[1, 0, 0], is_present=[1] * 3)
+    >>> some = Fixes(confidence=[0.9, 0.9, 0.1], is_answered=[1] * 3, is_right=[1, 0, 0], is_present=[1] * 3)
     >>> round(calibration_error(some, bins=2), 3)  # (2 |0.9 - 0.5| + |0.1 - 0|) / 3
     0.3
     """

@@ -15,7 +15,7 @@ from scipy.special import digamma
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import Bools, Floats, check_weights
-from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.decisions import Fixes
 
 _CACHED: Final = 2**16  # numbers that fit a core's cache: larger tables take twice the time
 _FIRST: Final = 512  # groups of one answer each, where groups are merged: an area weighs its first answers most
@@ -31,7 +31,7 @@ class RiskCoverage:
     risk: Floats
 
 
-def _masses(answers: Answers, weights: ArrayLike | None) -> tuple[Floats, Floats]:
+def _masses(answers: Fixes, weights: ArrayLike | None) -> tuple[Floats, Floats]:
     """Return the mass of each group of equal confidence and its false part, shape (G + 1,); no answers come last."""
     mass = check_weights(weights, len(answers))
     count = len(answers.steps) + 1
@@ -41,13 +41,13 @@ def _masses(answers: Answers, weights: ArrayLike | None) -> tuple[Floats, Floats
     )
 
 
-def risk_coverage(answers: Answers, weights: ArrayLike | None = None) -> RiskCoverage:
+def risk_coverage(answers: Fixes, weights: ArrayLike | None = None) -> RiskCoverage:
     """Return risk (false / accepted) at each coverage (accepted / all) that a threshold can reach.
 
     There is one point per distinct confidence; the last coverage is the share of answered queries.
 
     >>> facts = {"is_answered": [1, 1, 1, 0], "is_right": [1, 0, 1, 0], "is_present": [1] * 4}
-    >>> curve = risk_coverage(Answers(confidence=[0.9, 0.8, 0.8, np.nan], **facts))
+    >>> curve = risk_coverage(Fixes(confidence=[0.9, 0.8, 0.8, np.nan], **facts))
     >>> curve.coverage.tolist(), curve.risk.round(3).tolist()
     ([0.25, 0.75], [0.0, 0.333])
     """
@@ -61,7 +61,7 @@ def risk_coverage(answers: Answers, weights: ArrayLike | None = None) -> RiskCov
     )
 
 
-def aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
+def aurc(answers: Fixes, weights: ArrayLike | None = None) -> float:
     """Return the area under the risk-coverage curve: the mean risk of the 1, 2, ..., N most confident queries.
 
     In [0, 1]; NaN for no queries. `weights`, shape (N,), are counts: they may be fractions, but should sum to about N.
@@ -75,9 +75,9 @@ def aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
     The third of three is false, (0 + 0 + 1/3) / 3; all three tied, 1/3 at each coverage:
 
     >>> facts = {"is_answered": [1, 1, 1], "is_right": [1, 1, 0], "is_present": [1, 1, 1]}
-    >>> round(aurc(Answers(confidence=[0.9, 0.8, 0.1], **facts)), 4)
+    >>> round(aurc(Fixes(confidence=[0.9, 0.8, 0.1], **facts)), 4)
     0.1111
-    >>> round(aurc(Answers(confidence=[0.5, 0.5, 0.5], **facts)), 4)
+    >>> round(aurc(Fixes(confidence=[0.5, 0.5, 0.5], **facts)), 4)
     0.3333
     """
     group, false = _masses(answers, weights)
@@ -119,14 +119,14 @@ class Curve:
     is_given: Bools
 
     @classmethod
-    def of(cls, answers: Answers, *, is_merged: bool) -> Self:
+    def of(cls, answers: Fixes, *, is_merged: bool) -> Self:
         """Return the groups of some answers; with `is_merged`, of more than 1,536 answers neighbours tie.
 
         The first 512 keep their order, the others lie in 1,024 groups of nearly as many answers. Areas of draws change
         by less than 3e-5, a small part of their spread, and take no longer for a million answers.
 
         >>> facts = {"is_answered": [1] * 4, "is_right": [1, 0, 0, 1], "is_present": [1] * 4}
-        >>> Curve.of(Answers(confidence=[0.9, 0.8, 0.7, 0.7], **facts), is_merged=True).sides.toarray().argmax(axis=1)
+        >>> Curve.of(Fixes(confidence=[0.9, 0.8, 0.7, 0.7], **facts), is_merged=True).sides.toarray().argmax(axis=1)
         array([0, 4, 5, 2])
         """
         tie, last = answers.tie, len(answers.steps)  # the last group has no answer
@@ -178,10 +178,10 @@ class Curve:
         }
 
 
-def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
+def drawn_areas(answers: Fixes, weights: Floats) -> DrawnAreas:
     """Return all areas for each row of weights, shape (D, N); several times faster than one by one.
 
-    >>> some = Answers(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 0], is_present=[1, 1])
+    >>> some = Fixes(confidence=[0.9, 0.8], is_answered=[1, 1], is_right=[1, 0], is_present=[1, 1])
     >>> found = drawn_areas(some, np.array([[1.0, 1.0], [2.0, 0.0]]))
     >>> found.aurc.tolist(), found.augrc.tolist(), found.auroc.tolist()
     ([0.25, 0.0], [0.125, 0.0], [1.0, nan])
@@ -190,7 +190,7 @@ def drawn_areas(answers: Answers, weights: Floats) -> DrawnAreas:
     return curve.areas(weights @ curve.sides)
 
 
-def auroc(answers: Answers, weights: ArrayLike | None = None) -> float:
+def auroc(answers: Fixes, weights: ArrayLike | None = None) -> float:
     """Return the chance that a right answer is more confident than a false one; ties count half.
 
     In [0, 1]; NaN without answers of both kinds. Queries without an answer do not count. It does not depend on the
@@ -199,21 +199,21 @@ def auroc(answers: Answers, weights: ArrayLike | None = None) -> float:
     Hanley and McNeil, Radiology 1982.
 
     >>> facts = {"is_answered": [1] * 4, "is_right": [1, 0, 1, 0], "is_present": [1] * 4}
-    >>> auroc(Answers(confidence=[0.9, 0.8, 0.8, 0.1], **facts))
+    >>> auroc(Fixes(confidence=[0.9, 0.8, 0.8, 0.1], **facts))
     0.875
     """
     mass = check_weights(weights, len(answers))
     return float(drawn_areas(answers, mass[None]).auroc[0])
 
 
-def excess_aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
+def excess_aurc(answers: Fixes, weights: ArrayLike | None = None) -> float:
     """Return the E-AURC: the AURC less that of the best order of the same answers, in [0, 1]; NaN for no queries.
 
     Geifman, Uziel and El-Yaniv, ICLR 2019. They subtract r + (1 - r) ln(1 - r), the limit for many queries. This
     function subtracts the exact area of the best order of N, so a perfect order has 0 for every N.
 
     >>> facts = {"is_answered": [1, 1], "is_right": [1, 0], "is_present": [1, 1]}
-    >>> excess_aurc(Answers(confidence=[0.9, 0.1], **facts)), excess_aurc(Answers(confidence=[0.1, 0.9], **facts))
+    >>> excess_aurc(Fixes(confidence=[0.9, 0.1], **facts)), excess_aurc(Fixes(confidence=[0.1, 0.9], **facts))
     (0.0, 0.5)
     """
     group, false = _masses(answers, weights)
@@ -224,7 +224,7 @@ def excess_aurc(answers: Answers, weights: ArrayLike | None = None) -> float:
     return float(max(_area(group[group > 0], false[group > 0]) - least, 0.0)) if len(answers) else float("nan")
 
 
-def augrc(answers: Answers, weights: ArrayLike | None = None) -> float:
+def augrc(answers: Fixes, weights: ArrayLike | None = None) -> float:
     """Return the area under the generalized risk-coverage curve, in [0, 1/2]; NaN for no queries.
 
     It is the chance of an undetected false fix, averaged over coverages.
@@ -235,7 +235,7 @@ def augrc(answers: Answers, weights: ArrayLike | None = None) -> float:
     One false fix of two, taken last or first: (0 + 1/2) / 2 / 2 and (1/2 + 1/2 + 1/2) / 2 / 2.
 
     >>> facts = {"is_answered": [1, 1], "is_right": [1, 0], "is_present": [1, 1]}
-    >>> augrc(Answers(confidence=[0.9, 0.1], **facts)), augrc(Answers(confidence=[0.1, 0.9], **facts))
+    >>> augrc(Fixes(confidence=[0.9, 0.1], **facts)), augrc(Fixes(confidence=[0.1, 0.9], **facts))
     (0.125, 0.375)
     """
     group, false = _masses(answers, weights)
@@ -246,14 +246,14 @@ def augrc(answers: Answers, weights: ArrayLike | None = None) -> float:
     return float((group * (after - false / 2)).sum() / total**2)
 
 
-def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None = None) -> float:
+def false_fix_rate(answers: Fixes, coverage: float, weights: ArrayLike | None = None) -> float:
     """Return the risk among the most confident share `coverage` in (0, 1] of the queries; NaN for no queries.
 
     Where the coverage falls among tied confidences or within a query, false ones count in proportion. Queries without
     an answer come last and count as false. Raise MetricError if the coverage is out of range.
 
     >>> facts = {"is_answered": [1] * 4, "is_right": [1, 1, 0, 0], "is_present": [1] * 4}
-    >>> false_fix_rate(Answers(confidence=[0.9, 0.8, 0.8, 0.1], **facts), 0.5)
+    >>> false_fix_rate(Fixes(confidence=[0.9, 0.8, 0.8, 0.1], **facts), 0.5)
     0.25
     """
     if not 0 < coverage <= 1:
@@ -267,14 +267,14 @@ def false_fix_rate(answers: Answers, coverage: float, weights: ArrayLike | None 
     return float(np.interp(coverage * total, accepted, wrong) / (coverage * total))
 
 
-def choose_absent_threshold(calibration: Answers, rate: float) -> float:
+def choose_absent_threshold(calibration: Fixes, rate: float) -> float:
     """Return the threshold of largest coverage that accepts at most a share `rate` of the absent calibration places.
 
     The result is as that of `choose_threshold`; NaN without an absent place. Raise MetricError if the rate is not in
     [0, 1].
 
     >>> facts = {"is_answered": [1] * 3, "is_right": [1, 0, 1], "is_present": [1, 0, 1]}
-    >>> choose_absent_threshold(Answers(confidence=[0.9, 0.8, 0.1], **facts), 0.05)
+    >>> choose_absent_threshold(Fixes(confidence=[0.9, 0.8, 0.1], **facts), 0.05)
     0.9
     """
     _check_share(rate, "rate")
@@ -291,7 +291,7 @@ def _check_share(value: float, name: str) -> None:
         raise MetricError(f"{name} must lie in [0, 1], got {value!r}")
 
 
-def choose_threshold(calibration: Answers, risk: float) -> float:
+def choose_threshold(calibration: Fixes, risk: float) -> float:
     """Return the threshold of largest coverage whose risk on calibration blocks is at most `risk`.
 
     The result is one of the confidences; `-inf` accepts all answers, some without a confidence; `inf` means that no
@@ -299,7 +299,7 @@ def choose_threshold(calibration: Answers, risk: float) -> float:
     Raise MetricError if the risk is not in [0, 1].
 
     >>> facts = {"is_answered": [1] * 3, "is_right": [1, 1, 0], "is_present": [1] * 3}
-    >>> choose_threshold(Answers(confidence=[0.9, 0.8, 0.1], **facts), 0.05)
+    >>> choose_threshold(Fixes(confidence=[0.9, 0.8, 0.1], **facts), 0.05)
     0.8
     """
     _check_share(risk, "risk")

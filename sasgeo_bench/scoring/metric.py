@@ -60,7 +60,7 @@ class QuantileMetric(Metric):
 class RejectionMetric(Metric):
     """A metric of matcher x rejector; `needs_chances` if the confidence must be a probability.
 
-    `compute(answers, weights=...)` takes `decisions.Answers` of N queries and weights of shape (N,).
+    `compute(answers, weights=...)` takes `decisions.Fixes` of N queries and weights of shape (N,).
     """
 
     compute: Callable[..., float]

@@ -12,13 +12,13 @@ import numpy as np
 from scipy import special
 
 from sasgeo_bench.scoring.base import Floats
-from sasgeo_bench.scoring.decisions import Answers, presence_weights
+from sasgeo_bench.scoring.decisions import Fixes, presence_weights
 
 _EDGE: Final = 1e-6  # least distance of a chance from 0 and 1
 _WEAK: Final = 100.0  # inverse strength of the prior on the slope: it matters for a handful of answers alone
 
 
-def at_share(calibration: Answers, present_share: float, p_right: Floats) -> Floats:
+def at_share(calibration: Fixes, present_share: float, p_right: Floats) -> Floats:
     """Return chances of a right fix at a declared share of present places, shape (N,); NaN stays NaN.
 
     `calibration` are answers with the chances that a rejector gave them without having seen them, `p_right` its chances
@@ -37,7 +37,7 @@ def at_share(calibration: Answers, present_share: float, p_right: Floats) -> Flo
     >>> rng = np.random.default_rng(1)
     >>> is_present = np.arange(400) % 2 == 0
     >>> chance = special.expit(np.where(is_present, 1.5, -1.5) + rng.normal(size=400))
-    >>> known = Answers(confidence=chance, is_answered=np.ones(400), is_right=is_present, is_present=is_present)
+    >>> known = Fixes(confidence=chance, is_answered=np.ones(400), is_right=is_present, is_present=is_present)
     >>> at_share(known, 0.9, np.array([0.5])).round(1).tolist()
     [0.9]
     """

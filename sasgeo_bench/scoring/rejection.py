@@ -21,7 +21,7 @@ from sasgeo_bench.progress import Progress, Tell, spread
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA, acceptance_frame
 from sasgeo_bench.scoring.base import Bools, Floats
-from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, accept
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Fixes, accept
 from sasgeo_bench.scoring.integrity_metric import choose_absent_threshold, choose_threshold
 from sasgeo_bench.scoring.metrics import THRESHOLDS
 from sasgeo_bench.scoring.prior_shift import at_share
@@ -242,7 +242,7 @@ def _decided(known: pd.DataFrame, asked: pd.DataFrame) -> dict[str, Floats]:
     return found
 
 
-def _are_chances(answers: Answers) -> bool:
+def _are_chances(answers: Fixes) -> bool:
     """Return whether all confidences lie in [0, 1]; a margin is only an order."""
     given = answers.confidence[~np.isnan(answers.confidence)]
     return bool(((given >= 0) & (given <= 1)).all())

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.scoring.base import Floats, Ints, codes_of, weighted_mean
-from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Answers, presence_weights
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Fixes, presence_weights
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.integrity_metric import Curve
 from sasgeo_bench.scoring.intervals import (
@@ -29,10 +29,10 @@ AS_DRAWN: Final = "as drawn"
 SLOW_DRAWS: Final = 1000  # for metrics that are no means: each draw sorts again
 
 
-def answers_of(judged: pd.DataFrame, mixture: str = AS_DRAWN) -> Answers:
-    """Return rows of `judge` as `decisions.Answers`, with the chances that hold in a mixture of `mixtures_of`."""
+def answers_of(judged: pd.DataFrame, mixture: str = AS_DRAWN) -> Fixes:
+    """Return rows of `judge` as `decisions.Fixes`, with the chances that hold in a mixture of `mixtures_of`."""
     column = "p_right" if mixture == AS_DRAWN else f"p_right_{mixture}"
-    return Answers(
+    return Fixes(
         confidence=judged[column].to_numpy(float),
         is_answered=judged["is_answered"].to_numpy(bool),
         is_right=judged["is_right"].to_numpy(bool),
@@ -91,7 +91,7 @@ def _rows(key: RowKey, part: pd.DataFrame, metrics: Sequence[RejectionMetric]) -
 
 
 def _drawn_areas(
-    answers: Answers, mixtures: Mapping[str, Floats], drawn: ClusterDraws
+    answers: Fixes, mixtures: Mapping[str, Floats], drawn: ClusterDraws
 ) -> Mapping[tuple[str, str], Floats]:
     """Return every draw of the areas that have intervals, by mixture and name; nothing for a single cluster."""
     found: dict[tuple[str, str], list[Floats]] = {}
@@ -114,7 +114,7 @@ def mixture_name(present_share: float) -> str:
     return f"present {present_share:g}"
 
 
-def mixtures_of(some: Answers, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
+def mixtures_of(some: Fixes, *, is_pooled: bool) -> Iterator[tuple[str, Floats]]:
     """Yield names and weights: as drawn, and for pooled suites the declared mixtures of present and absent places."""
     yield AS_DRAWN, np.ones(len(some))
     if is_pooled and some.is_present.any() and not some.is_present.all():

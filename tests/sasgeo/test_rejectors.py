@@ -16,7 +16,7 @@ from sasgeo_bench.matching.plugins import load_rejector
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
 from sasgeo_bench.sasgeo.rejectors import FEW, Counted, SasgeoBoosted, SasgeoLogistic, features, lead, upper_rate
-from sasgeo_bench.scoring.decisions import COST_RATIOS, Answers, accept_by_cost, calibration_error
+from sasgeo_bench.scoring.decisions import COST_RATIOS, Fixes, accept_by_cost, calibration_error
 from sasgeo_bench.scoring.integrity_metric import aurc
 from tests.sasgeo.simulated import simulate
 
@@ -45,7 +45,7 @@ def fitted(request, calibration):
 
 def answers_of(p_false, is_false):
     everywhere = np.ones(len(p_false))
-    return Answers(confidence=1 - p_false, is_answered=everywhere, is_right=~is_false, is_present=everywhere)
+    return Fixes(confidence=1 - p_false, is_answered=everywhere, is_right=~is_false, is_present=everywhere)
 
 
 @pytest.mark.parametrize("name", REGISTERED)

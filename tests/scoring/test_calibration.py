@@ -13,7 +13,7 @@ from sklearn.metrics import brier_score_loss
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.decisions import (
-    Answers,
+    Fixes,
     brier,
     calibration_error,
     stanford,
@@ -23,9 +23,9 @@ ROWS = st.lists(st.tuples(st.integers(0, 8).map(lambda n: n / 8), st.booleans())
 METRES = st.one_of(st.integers(0, 4).map(float), st.just(math.inf))
 
 
-def simple(confidence, right) -> Answers:
+def simple(confidence, right) -> Fixes:
     count = len(right)
-    return Answers(
+    return Fixes(
         confidence=np.asarray(confidence, dtype=float),
         is_answered=np.ones(count),
         is_right=np.asarray(right),
@@ -82,10 +82,10 @@ def test_equal_confidences_share_a_bin() -> None:
 
 def test_queries_without_an_answer_do_not_count_and_a_missing_confidence_gives_nan() -> None:
     facts = {"is_right": np.array([1, 0]), "is_present": np.ones(2)}
-    silent = Answers(confidence=np.array([0.5, np.nan]), is_answered=np.array([1, 0]), **facts)
+    silent = Fixes(confidence=np.array([0.5, np.nan]), is_answered=np.array([1, 0]), **facts)
     assert brier(silent) == 0.25
     assert calibration_error(silent) == 0.5
-    unsaid = Answers(confidence=np.array([0.5, np.nan]), is_answered=np.ones(2), **facts)
+    unsaid = Fixes(confidence=np.array([0.5, np.nan]), is_answered=np.ones(2), **facts)
     assert math.isnan(brier(unsaid))
     assert math.isnan(calibration_error(unsaid))
 

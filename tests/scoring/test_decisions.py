@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.decisions import (
     COST_RATIOS,
-    Answers,
+    Fixes,
     accept,
     accept_by_cost,
     cost_values,
@@ -24,10 +24,10 @@ ROW = st.tuples(st.one_of(st.none(), st.integers(0, 4).map(lambda n: n / 4)), *(
 ROWS = st.lists(ROW, min_size=1, max_size=12)
 
 
-def answers_of(rows) -> Answers:
+def answers_of(rows) -> Fixes:
     table = [(math.nan if row[0] is None else row[0], *row[1:]) for row in rows]
     confidence, answered, right, present = np.array(table, dtype=float).reshape(-1, 4).T
-    return Answers(confidence=confidence, is_answered=answered, is_right=right * answered * present, is_present=present)
+    return Fixes(confidence=confidence, is_answered=answered, is_right=right * answered * present, is_present=present)
 
 
 @given(rows=ROWS, threshold=st.sampled_from([-math.inf, 0.0, 0.4, 0.5, math.inf]))
@@ -90,7 +90,7 @@ def test_with_true_probabilities_no_threshold_costs_less(rows, ratio) -> None:
     both = np.tile(confidence, 2)
     right = np.repeat([1, 0], len(rows))
     ones = np.ones(2 * len(rows))
-    answers = Answers(confidence=both, is_answered=ones, is_right=right, is_present=ones)
+    answers = Fixes(confidence=both, is_answered=ones, is_right=right, is_present=ones)
     weights = np.where(right == 1, both, 1 - both)
     least = decision_cost(answers, ratio, weights)
     for threshold in (-math.inf, *both, math.inf):
@@ -144,15 +144,15 @@ def test_nothing_to_decide_has_no_shares() -> None:
 def test_what_cannot_be_is_refused() -> None:
     one = np.ones(1)
     with pytest.raises(MetricError, match="is right only where"):
-        Answers(confidence=one, is_answered=one, is_right=one, is_present=0 * one)
+        Fixes(confidence=one, is_answered=one, is_right=one, is_present=0 * one)
     with pytest.raises(MetricError, match="is right only where"):
-        Answers(confidence=one, is_answered=0 * one, is_right=one, is_present=one)
+        Fixes(confidence=one, is_answered=0 * one, is_right=one, is_present=one)
     with pytest.raises(MetricError, match="finite"):
-        Answers(confidence=one * math.inf, is_answered=one, is_right=one, is_present=one)
+        Fixes(confidence=one * math.inf, is_answered=one, is_right=one, is_present=one)
     with pytest.raises(MetricError, match="shape"):
-        Answers(confidence=np.ones(2), is_answered=one, is_right=one, is_present=one)
+        Fixes(confidence=np.ones(2), is_answered=one, is_right=one, is_present=one)
     with pytest.raises(MetricError, match="probabilities"):
-        accept_by_cost(Answers(confidence=2 * one, is_answered=one, is_right=one, is_present=one), 5.0)
+        accept_by_cost(Fixes(confidence=2 * one, is_answered=one, is_right=one, is_present=one), 5.0)
     silent = answers_of([(None, False, False, True)])
     with pytest.raises(MetricError, match="without an answer is accepted"):
         cost_values(silent, [True], 20.0)

@@ -13,7 +13,7 @@ from sklearn.metrics import roc_auc_score
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import check_weights, weighted_mean
-from sasgeo_bench.scoring.decisions import Answers, accept, presence_weights
+from sasgeo_bench.scoring.decisions import Fixes, accept, presence_weights
 from sasgeo_bench.scoring.integrity_metric import (
     Curve,
     augrc,
@@ -46,15 +46,13 @@ def coverage_at_risk(calibration, test, risk):
     return operate(test, choose_threshold(calibration, risk))
 
 
-def answers_of(rows) -> Answers:
+def answers_of(rows) -> Fixes:
     table = [(math.nan if row[0] is None else row[0], *row[1:]) for row in rows]
     confidence, answered, right = np.array(table, dtype=float).reshape(-1, 3).T
-    return Answers(
-        confidence=confidence, is_answered=answered, is_right=right * answered, is_present=np.ones(len(rows))
-    )
+    return Fixes(confidence=confidence, is_answered=answered, is_right=right * answered, is_present=np.ones(len(rows)))
 
 
-def simple(confidence, right) -> Answers:
+def simple(confidence, right) -> Fixes:
     return answers_of([(one, True, other) for one, other in zip(confidence, right, strict=True)])
 
 
@@ -99,7 +97,7 @@ def test_areas_of_merged_answers_are_nearly_those_of_each(count) -> None:
     confidence = rng.random(count)
     is_present, is_answered = rng.random(count) < 0.8, rng.random(count) < 0.9
     is_right = is_present & is_answered & (rng.random(count) < confidence)
-    answers = Answers(confidence=confidence, is_answered=is_answered, is_right=is_right, is_present=is_present)
+    answers = Fixes(confidence=confidence, is_answered=is_answered, is_right=is_right, is_present=is_present)
     weights = rng.integers(0, 3, (4, count)).astype(float)
     exact, curve = drawn_areas(answers, weights), Curve.of(answers, is_merged=True)
     assert curve.sides.shape[1] <= 3 * 1_537
@@ -289,7 +287,7 @@ def test_equal_confidences_are_accepted_together() -> None:
 def test_reweighting_changes_the_risk_as_it_must() -> None:
     # Half present and right, half absent: at 0.9 present, a tenth of what is accepted is false.
     present = np.array([1, 1, 0, 0])
-    answers = Answers(confidence=np.full(4, 0.5), is_answered=np.ones(4), is_right=present, is_present=present)
+    answers = Fixes(confidence=np.full(4, 0.5), is_answered=np.ones(4), is_right=present, is_present=present)
     for share in (0.9, 0.7, 0.5):
         weights = presence_weights(present, share)
         assert operate(answers, 0.5, weights).risk == pytest.approx(1 - share)

@@ -6,13 +6,13 @@ import math
 import numpy as np
 import pytest
 
-from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.decisions import Fixes
 from sasgeo_bench.scoring.integrity_metric import augrc, aurc, excess_aurc
 from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of
 from tests.scoring.test_tables import scores
 
-SOME = Answers(confidence=[0.9, 0.8, 0.1, 0.0], is_answered=[1] * 4, is_right=[1, 0, 1, 1], is_present=[1] * 4)
+SOME = Fixes(confidence=[0.9, 0.8, 0.1, 0.0], is_answered=[1] * 4, is_right=[1, 0, 1, 1], is_present=[1] * 4)
 
 
 def test_every_metric_has_a_name_of_its_own_a_meaning_and_a_source():

@@ -12,7 +12,7 @@ import pandas as pd
 
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.base import Bools
-from sasgeo_bench.scoring.decisions import Answers
+from sasgeo_bench.scoring.decisions import Fixes
 from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import Interval, wilson_mean
 from sasgeo_bench.scoring.metrics import ranks_of
@@ -215,7 +215,7 @@ def risk_frame(trials: pd.DataFrame) -> pd.DataFrame:
     """
     frames = []
     for matcher, own in _contestants(trials):
-        some = Answers(
+        some = Fixes(
             confidence=own["margin"].to_numpy(float),
             is_answered=own["is_answered"].to_numpy(bool),
             is_right=own["is_right"].to_numpy(bool),

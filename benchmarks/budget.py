@@ -24,7 +24,7 @@ from benchmarks.open_numbers import drawn, systems
 from sasgeo_bench.errors import MatchError, SasgeoError
 from sasgeo_bench.files.plugins import MATCHERS, check_names, list_entry_points
 from sasgeo_bench.running.worker import Limits, Reach, Worker
-from sasgeo_bench.tasks.task_rows import query_bytes
+from sasgeo_bench.tasks.task_files import query_bytes
 
 PLACE = "vaduz"
 ASKED = 12

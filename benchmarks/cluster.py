@@ -67,7 +67,7 @@ def unit_of(out: Path, count: int) -> Unit:
     sgb.make_tasks(suite=SUITES, regions=[TOWN], split="crossfit", n=count, up_to=True, out=out)
     drawing_s = time.perf_counter() - begun
     tasks = [out / "tasks" / suite / TOWN for suite in SUITES]
-    queries = sum(len(task_files.read_ids(task)) for task in tasks)
+    queries = sum(len(task_files.Task.open(task).ids()) for task in tasks)
     plan = plan_run(RunRequest(spec="random", tasks=tasks, out=out))
     run(plan, tell=lambda _: None)
     return Unit(

@@ -21,11 +21,11 @@ import pandas as pd
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.leaderboard.board_files import read_scores
 from sasgeo_bench.publishing.archive_file import read_stored_predictions, unpack_tasks
-from sasgeo_bench.scoring.contestants import read_scored_task
 from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.flights import view_frame
 from sasgeo_bench.scoring.intervals import percentile_interval
 from sasgeo_bench.tasks.query import SEQUENCE
+from sasgeo_bench.tasks.task_files import Task
 
 RIGHT_M, LOST_M, LOST_FOR_M = 25.0, 100.0, 500.0
 RULE_OF_THREE = 3.0  # upper end of 95 % for a rate of which nothing was seen
@@ -82,7 +82,7 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
         raise StoreError(f"{folder} has no flights of suite {suite!r}: it has {there}")
     with tempfile.TemporaryDirectory() as scratch:
         folders = [path for path in unpack_tasks(folder, Path(scratch)) if path.parent.name == suite]
-        tasks = [read_scored_task(path, Path(scratch) / "truth") for path in folders]
+        tasks = [Task.open(path, Path(scratch) / "truth") for path in folders]
         truths = {truth.query_id: truth for task in tasks for truth in task.truths}
         heads = sorted((head for task in tasks for head in task.heads), key=lambda head: head.query_id)
         for matcher in matchers:

@@ -16,7 +16,7 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits, Reach, Worker
-from sasgeo_bench.tasks import task_files, task_rows
+from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
@@ -49,7 +49,7 @@ def measure(spec: str, task: Path, out: Path, cells: int) -> Row:
     """Ask some queries of one size, one after the other; medians."""
     region = out / "regions" / TOWN
     chosen = [query for query in task_files.read_queries(task) if query.evidence.shape[0] == cells]
-    blobs = [task_rows.query_bytes(query) for query in chosen if query.track == "localization"][:ASKED]
+    blobs = [task_files.query_bytes(query) for query in chosen if query.track == "localization"][:ASKED]
     reach = Reach(readable=[region.resolve()], hidden=[(out / "truth").resolve()])
     with Worker(spec=spec, reach=reach, limits=Limits(match_s=120.0)) as worker:
         begun = time.perf_counter()
@@ -97,7 +97,7 @@ def main() -> None:
                 row = measure(spec, task, out, cells)
                 numbers = f"{row.start_s:8.2f} {row.prepare_s:10.2f} {row.inside_ms:10.1f} {row.overhead_ms:12.2f}"
                 print(f"{spec:>18} {cells:6d} {numbers}", flush=True)
-        print(f"\nwhole runs of {len(task_files.read_ids(task))} queries, start included\n")
+        print(f"\nwhole runs of {len(task_files.Task.open(task).ids())} queries, start included\n")
         for spec in arguments.matchers[:3]:
             for jobs in (1, 2):
                 print(f"{spec:>18} jobs {jobs}: {whole_run(spec, task, jobs):.1f} queries/s", flush=True)

@@ -155,6 +155,7 @@ from .tasks.suites.base import SuiteCard as SuiteCard
 from .tasks.suites.base import Variant as Variant
 from .tasks.suites.base import controls as controls
 from .tasks.suites.base import ladder as ladder
+from .tasks.task_files import Task as Task
 from .tasks.task_files import read_queries as read_queries
 from .tasks.task_files import read_task as read_task
 from .tasks.task_files import read_truths as read_truths

@@ -13,7 +13,7 @@ import resource
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -41,11 +41,11 @@ from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.learned_file import read_learned
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.matching.submission import Card, Submission, TaskManifest, example_card
+from sasgeo_bench.matching.submission import AnsweredTask, Card, Submission, example_card
 from sasgeo_bench.osm.history import DatedExtract, read_history
 from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.publishing.archive_file import StoredRun, TaskFolders, unpack, write_pack
+from sasgeo_bench.publishing.archive_file import StoredRun, unpack, write_pack
 from sasgeo_bench.publishing.release_files import check_target
 from sasgeo_bench.publishing.site_files import read_board_files
 from sasgeo_bench.regions.region_files import read_region
@@ -135,7 +135,7 @@ def answers_of(task: Path) -> list[Prediction]:
     pose = Pose(easting_m=500_000.0, northing_m=5_200_000.0, yaw_deg=10.0)
     return [
         Prediction(query_id=name, candidates=((pose, 0.5),) * (at % 2), confidence=0.5, diagnostics={"margin": 1.0})
-        for at, name in enumerate(task_files.read_ids(task))
+        for at, name in enumerate(task_files.Task.open(task).ids())
     ]
 
 
@@ -157,7 +157,7 @@ def about_of(task: Path) -> RunManifest:
 def make_run(folder: Path, tiny: TinyPlace) -> None:
     task = task_of(tiny)
     about_of(task).save(folder)
-    prediction_files.write_part(folder, answers_of(task), asked=task_files.read_asked(task)).rename(folder / PART)
+    prediction_files.write_part(folder, answers_of(task), asked=task_files.Task.open(task).asked).rename(folder / PART)
 
 
 def make_predictions(folder: Path, tiny: TinyPlace) -> None:
@@ -169,7 +169,7 @@ def make_predictions(folder: Path, tiny: TinyPlace) -> None:
 def make_submission(folder: Path, tiny: TinyPlace) -> None:
     task = task_of(tiny)
     card = parse_toml(example_card("mine"), Card, source="card")
-    asked = TaskManifest(suite="clean", region="here", queries_sha256="0" * 64, queries=1, answered=1)
+    asked = AnsweredTask(suite="clean", region="here", queries_sha256="0" * 64, queries=1, answered=1)
     said = Submission(
         schema_version=1,
         card=card,
@@ -184,7 +184,7 @@ def make_submission(folder: Path, tiny: TinyPlace) -> None:
         licence="ODbL-1.0",
         attribution="OpenStreetMap",
     )
-    write_submission(folder / "mine", said, answers_of(task), task_files.read_asked(task))
+    write_submission(folder / "mine", said, answers_of(task), task_files.Task.open(task).asked)
 
 
 def make_pack(folder: Path, tiny: TinyPlace) -> None:
@@ -194,7 +194,7 @@ def make_pack(folder: Path, tiny: TinyPlace) -> None:
     write_pack(
         folder / "pack",
         board=board,
-        tasks=[TaskFolders(task=task, truth=truth_of(task, tiny), region=tiny.map_folder)],
+        tasks=[task_files.Task.open(task)],
         runs={"mine": [StoredRun(manifest=about_of(task), predictions=answers_of(task))]},
         settings={"split": None, "rejectors": [], "contrasts": [], "draws": 10, "by_region": [], "pipeline": {}},
     )
@@ -222,10 +222,10 @@ def make_ranking(folder: Path, _: TinyPlace) -> None:
 
 def read_all_of_task(folder: Path) -> object:
     task_files.read_task(folder)
-    task_files.check_truths(folder, folder)
-    rows = (task_files.read_queries(folder), task_files.read_heads(folder), task_files.read_truths(folder))
-    asked = task_files.read_asked(folder)
-    return [*map(list, rows), task_files.read_view_bytes(folder), list(task_files.read_some(folder, asked))]
+    replace(task_files.Task.open(folder), truth=folder).check_truths()
+    rows = (task_files.read_queries(folder), task_files.Task.open(folder).heads(), task_files.read_truths(folder))
+    asked = task_files.Task.open(folder).asked
+    return [*map(list, rows), task_files.Task.open(folder).view_bytes(), list(task_files.Task.open(folder).some(asked))]
 
 
 def read_all_of_run(folder: Path) -> object:

@@ -420,7 +420,7 @@ def root(tasks, tmp_path_factory):
             )
             for at, query in enumerate(task_files.read_queries(task))
         ]
-        prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
+        prediction_files.write_part(folder, answers, asked=task_files.Task.open(task).asked)
         about = {"matcher": card, "hash": HASH, "suite": suite, "region": region, "isolation": {"network": WORDS}}
         sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
         RunManifest(**about, queries_sha256=sha256).save(folder)
@@ -456,7 +456,7 @@ def test_a_hostile_board_is_scored_looked_at_published_and_released(root, printe
             assert not [cell for cell in cells if cell[:1] in ("=", "+", "@")]
     run = root / "runs" / "mine" / HASH
     printed("inspect", run, "--out", root)
-    query = task_files.read_ids(root / "tasks" / "clean" / "town-riverside")[0]
+    query = task_files.Task.open(root / "tasks" / "clean" / "town-riverside").ids()[0]
     out, _ = printed("inspect", run, "--query", query, "--out", root)
     assert cv2.imread(out.removeprefix("picture: ").strip()).shape[2] == 3
     assert plain(WORDS) in printed("inspect", root / "regions" / "town-grid", "--out", root)[0]

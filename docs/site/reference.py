@@ -47,8 +47,7 @@ from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.split import Place, SplitFile
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
-from sasgeo_bench.tasks.task_files import TaskManifest
-from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, TRUTH_SCHEMA
+from sasgeo_bench.tasks.task_files import FILE_SCHEMA, TRUTH_SCHEMA, TaskManifest
 
 RESULTS: Final = Path(__file__).parents[1] / "results"  # stored boards
 # Headings of the API pages, by the folder that a public name comes from.

@@ -276,7 +276,7 @@ def check_controls(board: Board) -> None:
     """End with a status that a script sees where a control or a contestant failed; the board is written though."""
     for name, why in board.failures.found.items():
         complain(f"failed, and so not on the board: {name}: {why}")
-    unseen = segmenter_lines({"tasks": board.tasks})
+    unseen = segmenter_lines({"tasks": [task.to_json() for task in board.tasks]})
     for line in unseen:
         complain(line)
     if board.failures.found and board.failures.log.is_file():

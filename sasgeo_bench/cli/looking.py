@@ -28,15 +28,15 @@ from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_features, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.strata import STRESS
-from sasgeo_bench.tasks.build import check_task, has_truths
+from sasgeo_bench.tasks.build import check_task
 from sasgeo_bench.tasks.duplicates import constellations, search_split
-from sasgeo_bench.tasks.flight_sheet import flight_panels, is_of_flights, write_flight_sheet
+from sasgeo_bench.tasks.flight_sheet import flight_panels, write_flight_sheet
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
 from sasgeo_bench.tasks.sheet import write_sheet
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.split_map import write_split_map
-from sasgeo_bench.tasks.task_files import read_task
+from sasgeo_bench.tasks.task_files import Task
 
 TOP_DROPS: Final = 12
 SOME_CASES: Final = 3
@@ -78,7 +78,7 @@ def inspect_command(
     task_folder, region_folder = find_task(target, out), find_built(target, out)
     if task_folder is not None:
         _refuse_strip(target, options.strip)
-        _inspect_task(task_folder, out, query=query, rows=options.rows)
+        _inspect_task(Task.open(task_folder, out / "truth"), out, query=query, rows=options.rows)
         return
     if options.strip is not None and (Path(target) / BOARD).is_file():
         target = str(_best_run(Path(target), out))
@@ -124,25 +124,22 @@ def _refuse_strip(target: str, strip: int | None) -> None:
         raise ConfigError(f"--strip draws queries with their answers, and {target} holds none: name a run or a board")
 
 
-def _inspect_task(folder: Path, out: Path, *, query: str | None, rows: int) -> None:
+def _inspect_task(task: Task, out: Path, *, query: str | None, rows: int) -> None:
     """Print what a task is and draw its contact sheet; of flights, maps of their paths, unless a view is named."""
-    about = read_task(folder)
-    truth_folder = out / "truth" / about["suite"] / about["region"]
-    path = _sheet(out, about["suite"], about["region"], *([query] if query else []))
+    about = task.manifest
+    path = _sheet(out, *about.name, *([query] if query else []))
     is_of_view = query is not None and len(query) > SEQUENCE_DIGITS
-    maps = (
-        flight_panels(folder, truth_folder, count=rows, flight=query) if is_of_flights(about) and not is_of_view else ()
-    )
-    chosen = () if maps else panels(folder, truth_folder, out=out, count=rows, query_id=query)
+    maps = flight_panels(task, count=rows, flight=query) if about.is_of_flights and not is_of_view else ()
+    chosen = () if maps else panels(task, out=out, count=rows, query_id=query)
     table = Table(box=None, show_header=False, pad_edge=False)
-    for name, value in about.items():
+    for name, value in about.to_json().items():
         table.add_row(name, _text_of(value))
     print_table(table)
     path.parent.mkdir(parents=True, exist_ok=True)
     if maps:
-        write_flight_sheet(path, about=about, shown=maps, region_folder=out / "regions" / about["region"])
+        write_flight_sheet(path, about=about, shown=maps, region_folder=out / "regions" / about.region)
     else:
-        write_sheet(path, title=f"{about['title']}: {about['region']}", panels=chosen)
+        write_sheet(path, title=f"{about.title}: {about.region}", panels=chosen)
     say(f"contact sheet: {path}")
 
 
@@ -227,10 +224,10 @@ def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
             return False
         row = flights[flights["query_id"] == flight].iloc[0]
     key = (str(row["suite"]), str(row["region"]))
-    about = read_task(cases.root / "tasks" / key[0] / key[1])
+    task = Task.open(cases.root / "tasks" / key[0] / key[1])
     views = {cases.entry.name: cases.flights[key].views}
     path = _sheet(out, cases.entry.name, str(row["query_id"]))
-    write_png(path, flight_map_pixels(about, str(row["query_id"]), views, root=cases.root))
+    write_png(path, flight_map_pixels(task, str(row["query_id"]), views))
     say(f"map of {'the worst flight' if query is None else 'the flight'}: {path}")
     return query is not None
 
@@ -309,8 +306,9 @@ def verify_command(
     """Check a region or a task against its hashes; search the parts of a split for ground they share."""
     task_folder, region_folder = find_task(target, out), find_built(target, out)
     if task_folder is not None:
-        with_truths = "every query has its truth" if has_truths(task_folder, out=out) else "its truths are not here"
-        faults, good = check_task(task_folder, out=out), f"all files are as task.json says, and {with_truths}"
+        task = Task.open(task_folder, out / "truth")
+        with_truths = "every query has its truth" if task.has_truths else "its truths are not here"
+        faults, good = check_task(task, out=out), f"all files are as task.json says, and {with_truths}"
     elif region_folder is not None:
         faults, good = differing_files(region_folder), "all files are as the manifest says"
     elif is_split(target):

@@ -19,7 +19,7 @@ from sasgeo_bench.running.prediction_files import merge_runs
 from sasgeo_bench.running.runner import RunReport
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks.split import Split, find_split, list_split_files
-from sasgeo_bench.tasks.task_files import read_asked, read_task
+from sasgeo_bench.tasks.task_files import Task
 
 SHARD: Final = re.compile(r"[0-9]{1,9}/[0-9]{1,9}")
 
@@ -149,7 +149,7 @@ def _shard(text: str) -> tuple[int, int]:
 def _split(name: str | None, tasks: Sequence[Path], folders: Sequence[Path] | None) -> Split | None:
     """The split that is named, or else that of the tasks, with all known regions; None where nobody knows it."""
     if name is None:
-        name = str(read_task(tasks[0]).get("split"))
+        name = str(Task.open(tasks[0]).manifest.split)
         if name not in list_split_files():
             return None
     return find_split(name, folders=tuple(folders or ()))
@@ -165,6 +165,6 @@ def merge_command(
     ] = None,
 ) -> None:
     """Put the parts of a run, shards of several machines included, into one predictions file, sorted by query."""
-    asked = {name: asked for task in tasks or () for name, asked in read_asked(task).items()}
+    asked = {name: asked for task in tasks or () for name, asked in Task.open(task).asked.items()}
     count = merge_runs(runs, into, asked=asked if tasks else None)
     say(f"{into}: {counted(count, 'prediction')}")

@@ -12,7 +12,7 @@ from sasgeo_bench.cli.options import Options, Out, RegionFolders, takes
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks.split import find_split
-from sasgeo_bench.tasks.task_files import FAILED_PICTURES, read_task
+from sasgeo_bench.tasks.task_files import Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,7 +63,7 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
             spec=options.segmenter,
             tasks=options.tasks,
             split=find_split(
-                options.split or str(read_task(options.tasks[0]).get("split")),
+                options.split or str(Task.open(options.tasks[0]).manifest.split),
                 folders=tuple(options.region_files or ()),
             ),
             out=options.out,
@@ -84,7 +84,7 @@ def segment_command(options: SegmentOptions) -> None:
         folders = segment(**vars(options) | {"tell": tell, "progress": progress})
     for folder in folders:
         say(folder)
-    if any(FAILED_PICTURES in read_task(folder) for folder in folders):
+    if any(Task.open(folder).manifest.failed_pictures for folder in folders):
         complain(
             f"pictures failed, so the command ends with status {CONTESTANT_FAILED}; it tries them again when repeated"
         )

@@ -15,6 +15,7 @@ from sasgeo_bench.publishing.submissions import SubmitRequest, hold_submission, 
 from sasgeo_bench.running.prediction_files import parts_of
 from sasgeo_bench.scoring.submission_files import SUBMISSION, is_submission
 from sasgeo_bench.scoring.validate import Violation, set_aside, validate
+from sasgeo_bench.tasks.task_files import Task
 
 MOST_MISSING: Final = 5  # queries without a row that are named; the others are counted
 
@@ -76,8 +77,9 @@ def validate_command(
     if not tasks:
         raise ConfigError("validate needs --tasks: name task folders, or the stored results of a board")
     with laid_tasks(tasks) as folders:
-        _show(validate(predictions, folders), predictions)
-        aside = set_aside(predictions, folders)
+        asked = [Task.open(folder) for folder in folders]
+        _show(validate(predictions, asked), predictions)
+        aside = set_aside(predictions, asked)
     rest = f"{counted(aside, 'answer')} to other queries set aside" if aside else "and nothing else"
     say(f"{predictions}: answers every query of {counted(len(folders), 'task')}, {rest}")
 

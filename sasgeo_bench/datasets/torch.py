@@ -8,7 +8,7 @@ turns texts into lists.
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final, Self, overload
 
@@ -17,16 +17,14 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, ImageError
-from sasgeo_bench.files.paths import given_path
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits, observe
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.sensing.image import LabelledImage
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, read_labels
 from sasgeo_bench.tasks.query import Query, Track, Truth, base_of
-from sasgeo_bench.tasks.task_rows import QUERY_SCHEMA, query_of
+from sasgeo_bench.tasks.task_files import QUERIES, QUERY_SCHEMA, Task, query_of, read_batches
 
 try:
     import torch
@@ -106,15 +104,18 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
         seed: int = 0,
     ) -> None:
         _check_torch()
-        folder = given_path(task)
-        about = task_files.read_task(folder)
-        if region is not None and base_of(about["region"]) != base_of(region.manifest.id):
+        opened = _opened(task, truths)
+        if region is not None and base_of(opened.manifest.region) != base_of(region.manifest.id):
             raise ConfigError(
-                f"{folder} is about {about['region']!r}, the region is {region.manifest.id!r}: read the other one"
+                f"{opened.folder} is about {opened.manifest.region!r}, the region is {region.manifest.id!r}: "
+                "read the other one"
             )
         self.view_cells, self.map_cells = sides_cells
-        self._truths = None if truths is None else _read_truths(folder, Path(truths))
-        self._rows = _rows_of(folder, track, seed)
+        self._truths = None
+        if truths is not None:
+            opened.check_truths()
+            self._truths = {truth.query_id: truth for truth in opened.truths}
+        self._rows = _rows_of(opened, track, seed)
         self.classes = self.query(0).evidence.classes
         self._map = None if region is None else _Map.of(region, self.classes)
 
@@ -243,14 +244,19 @@ def task_pictures(task: str | Path, truths: str | Path) -> Sequence[LabelledImag
     >>> pictures = task_pictures("out/tasks/aerial/town-grid", "out/truth/aerial/town-grid")  # doctest: +SKIP
     >>> crops = PictureDataset(pictures, crop_px=128)  # doctest: +SKIP
     """
-    folder = given_path(task)
-    about = task_files.read_task(folder)
-    if not about.get("frames"):
-        raise ConfigError(f"{folder} has no pictures: name a task of a suite such as aerial")
-    task_files.check_truths(folder, Path(truths))
-    frames = {query.query_id: query.frames for query in task_files.read_queries(folder)}
-    pairs = [(frames[name][number], labels) for name, number, labels in read_labels(Path(truths))]
-    return _Pictures(pairs, base_of(about["region"]))
+    opened = _opened(task, truths)
+    if not opened.manifest.frames:
+        raise ConfigError(f"{opened.folder} has no pictures: name a task of a suite such as aerial")
+    opened.check_truths()
+    frames = {query.query_id: query.frames for query in opened.queries()}
+    pairs = [(frames[name][number], labels) for name, number, labels in read_labels(opened.truth)]
+    return _Pictures(pairs, base_of(opened.manifest.region))
+
+
+def _opened(task: str | Path, truths: str | Path | None) -> Task:
+    """Open a task whose truths lie where the user says."""
+    opened = Task.open(task)
+    return opened if truths is None else replace(opened, truth=Path(truths))
 
 
 class _Pictures(Sequence[LabelledImage]):
@@ -297,22 +303,16 @@ def _hash_of(text: str) -> int:
     return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
 
 
-def _rows_of(folder: Path, track: Track, seed: int) -> pa.Table:
+def _rows_of(task: Task, track: Track, seed: int) -> pa.Table:
     """Read the queries of a track, packed as they are stored, in the order of hashes of the seed and their ids."""
-    task_files.check_queries(folder)
-    batches = list(task_files.read_batches(folder / task_files.QUERIES, QUERY_SCHEMA.names))
-    rows = pa.Table.from_batches(batches)
+    task.check_queries()
+    rows = pa.Table.from_batches(list(read_batches(task.folder / QUERIES, QUERY_SCHEMA.names)))
     kept = [at for at, name in enumerate(rows["track"].to_pylist()) if name == track]
     if not kept:
         known = ", ".join(sorted(set(rows["track"].to_pylist()))) or "none"
-        raise ConfigError(f"{folder} has no queries of the track {track!r}: it has {known}")
+        raise ConfigError(f"{task.folder} has no queries of the track {track!r}: it has {known}")
     ids = rows["query_id"].to_pylist()
     return rows.take(sorted(kept, key=lambda at: _hash_of(f"{seed}/{ids[at]}"))).combine_chunks()
-
-
-def _read_truths(task: Path, folder: Path) -> dict[str, Truth]:
-    task_files.check_truths(task, folder)
-    return {truth.query_id: truth for truth in task_files.read_truths(folder)}
 
 
 def _fitted(cells: Cells, side: int) -> Cells:

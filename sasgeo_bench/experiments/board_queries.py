@@ -19,9 +19,9 @@ from sasgeo_bench.publishing.archive_folder import is_pack
 from sasgeo_bench.publishing.release_files import BoardTasks
 from sasgeo_bench.regions.build import package_version
 from sasgeo_bench.regions.region import DATA_VERSION
-from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.query import TASK_VERSION
+from sasgeo_bench.tasks.task_files import Task
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -108,7 +108,7 @@ def draw_board(request: BoardRequest, *, tell: Tell, progress: Progress | None =
     fetch_extracts(plan)
     tasks, controls = draw_all(plan, tell=tell, progress=progress)
     board = asked_tasks(request.stored)
-    names = {(task.about["suite"], task.about["region"]) for task in board}
+    names = {task.manifest.name for task in board}
     folders = tuple(task for task in [*tasks, *controls] if (task.parent.name, task.name) in names)
     same = same_queries(request.stored, folders, tell=tell)
     return BoardTasks(
@@ -157,10 +157,11 @@ def _asking(spec: PipelineFile, matchers: Sequence[str]) -> PipelineFile:
     return spec.model_copy(update={"matchers": list(matchers), "task": tasks, "contrast": [], "rejectors": []})
 
 
-def asked_tasks(stored: Path) -> list[AskedTask]:
-    """Return the tasks of a board with the hashes of their queries."""
+def asked_tasks(stored: Path) -> list[Task]:
+    """Return the tasks of a board with the hashes of their queries; nothing else of them can be read later."""
     with laid_tasks([stored]) as folders:
-        return [AskedTask.of(folder) for folder in folders]
+        tasks = [Task.open(folder) for folder in folders]
+        return [task for task in tasks if task.asked is not None]
 
 
 def same_queries(stored: Path, tasks: Sequence[Path], *, tell: Tell) -> dict[str, str]:
@@ -168,7 +169,7 @@ def same_queries(stored: Path, tasks: Sequence[Path], *, tell: Tell) -> dict[str
 
     Raise `ConfigError` if there is none.
     """
-    drawn = {name: asked for task in tasks for name, asked in AskedTask.of(task).asked.items()}
+    drawn = {name: asked for task in tasks for name, asked in Task.open(task).asked.items()}
     board = {name: asked for task in asked_tasks(stored) for name, asked in task.asked.items()}
     same = {name: asked for name, asked in board.items() if drawn.get(name) == asked}
     if not same:

@@ -20,9 +20,9 @@ from sasgeo_bench.progress import duration_text
 from sasgeo_bench.publishing.archive_folder import RUNS
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunPlan
-from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.tasks.query import SEQUENCE, TASK_VERSION, base_of
+from sasgeo_bench.tasks.task_files import Task
 
 # Seconds of a free processor, measured by entering the board `systems-objects`: a guide, no promise.
 _TASK_S: Final = 0.8  # of a task that is drawn
@@ -71,9 +71,7 @@ class OpenTask:
     left: Mapping[str, float]
 
 
-def open_tasks(
-    plan: PipelinePlan, tasks: Sequence[AskedTask], run: RunPlan | None, *, is_again: bool
-) -> list[OpenTask]:
+def open_tasks(plan: PipelinePlan, tasks: Sequence[Task], run: RunPlan | None, *, is_again: bool) -> list[OpenTask]:
     """Return the tasks of a board that can be asked here, with what is left of them.
 
     `run` is the plan of the matcher's runs, of which each row counts, or with `is_again` those of an open round alone;
@@ -84,7 +82,7 @@ def open_tasks(
     since_ns = since_ns or (sys.maxsize if is_again else 0)
     found = []
     for task in tasks:
-        suite, region = str(task.about["suite"]), str(task.about["region"])
+        suite, region = task.manifest.name
         if plan.requests and base_of(region) not in places:
             continue
         drawn = _drawn(plan.out / "tasks" / suite / region)
@@ -93,7 +91,7 @@ def open_tasks(
             folder = run.run_folder / suite / region
             left -= prediction_files.ids_done(folder, prediction_files.asked_in(folder, task.asked), since_ns=since_ns)
         share = len(left) / max(1, len(task.asked))
-        counts = {track: count * share for track, count in task.about["counts"].items()}
+        counts = {track: count * share for track, count in task.manifest.counts.items()}
         found.append(OpenTask(region=region, is_drawn=drawn is not None, left=counts))
     return found
 
@@ -101,12 +99,12 @@ def open_tasks(
 def _drawn(folder: Path) -> Mapping[str, str] | None:
     """Return the hashes of the queries of a task, None where there is no sound one: it is drawn anew."""
     with suppress(StoreError):
-        return AskedTask.of(folder).asked
+        return Task.open(folder).asked
     return None
 
 
 def cost_lines(
-    plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask], run: RunPlan | None, *, is_again: bool
+    plan: PipelinePlan, stored: Path, tasks: Sequence[Task], run: RunPlan | None, *, is_again: bool
 ) -> Iterator[str]:
     """Yield what it costs to enter a board: how long, as a span, and what on disk; `tasks` are those of the board.
 
@@ -214,7 +212,7 @@ def _prepare_s(stored: Path) -> dict[str, float]:
     return {name: sum(seconds) / len(seconds) for name, seconds in found.items()}
 
 
-def lost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask]) -> Iterator[str]:
+def lost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[Task]) -> Iterator[str]:
     """Yield which queries of a board will have no answer: of older versions, sealed, or of regions left out."""
     about, seal = read_board(stored)[0], plan.seal
     if about.get("task_version") != TASK_VERSION:
@@ -224,9 +222,9 @@ def lost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[AskedTask]) -> 
         )
     closed = set(about.get("sealed", {})) if seal is None or seal.seed is None else set()
     drawn = {item.region.id for item in (*plan.requests, *plan.controls)}
-    places = {base_of(str(task.about["region"])): 0 for task in tasks}
+    places = {base_of(task.manifest.region): 0 for task in tasks}
     for task in tasks:
-        places[base_of(str(task.about["region"]))] += len(task.asked)
+        places[base_of(task.manifest.region)] += len(task.asked)
     sealed = sum(count for place, count in places.items() if place in closed)
     if sealed:
         yield f"  {sealed} of the queries are of sealed places, and count as misses without --sealed-seed-file"

@@ -35,7 +35,7 @@ from sasgeo_bench.publishing.archive_folder import check_results
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
-from sasgeo_bench.scoring.contestants import design_rows, read_scored_task, rows_to_rank
+from sasgeo_bench.scoring.contestants import design_rows, rows_to_rank
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import REFERENCE
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts
@@ -44,6 +44,7 @@ from sasgeo_bench.sensing.reference_imagery import render_place
 from sasgeo_bench.tasks.build import carry_out
 from sasgeo_bench.tasks.query import BY, RECALIBRATED, base_of
 from sasgeo_bench.tasks.suites.all_suites import is_pictured
+from sasgeo_bench.tasks.task_files import Task
 from sasgeo_bench.tasks.task_plan import Request
 
 # Every board has controls: of small towns that everybody can build, asked of all matchers and of a plain search.
@@ -129,8 +130,10 @@ def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: S
     """Report what the registered contrasts could show on the drawn queries; refuse one that cannot be reached."""
     if not contrasts:
         return
-    read = [read_scored_task(folder, plan.out / "truth") for folder in tasks]
-    frames = [design_rows(task, plan.split) for task in read]
+    opened = [Task.open(folder, plan.out / "truth") for folder in tasks]
+    for task in opened:
+        task.check_truths()
+    frames = [design_rows(task, plan.split) for task in opened]
     design = rows_to_rank({plan.spec.id: pd.concat(frames, ignore_index=True)}, plan.split)[plan.spec.id]
     pilots = {item.name: Pilot(**item.pilot.model_dump()) for item in plan.spec.contrast if item.pilot is not None}
     check_contrasts(contrasts, pilots, design, tell=tell)

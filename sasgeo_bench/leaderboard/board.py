@@ -32,9 +32,9 @@ from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
 from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, Truth
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.tasks.task_files import PRIVATE, TaskManifest
 
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
 _CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
@@ -111,7 +111,7 @@ class Board:
     findings: tuple[Finding, ...] = ()
     falsifiers: tuple[Falsifier, ...] = ()
     verdicts: tuple[Verdict, ...] = ()
-    tasks: tuple[dict[str, Any], ...] = field(default=())
+    tasks: tuple[TaskManifest, ...] = ()
     remarks: tuple[str, ...] = ()
     protection: pd.DataFrame = field(default_factory=pd.DataFrame)
     acceptance: pd.DataFrame = field(default_factory=pd.DataFrame)
@@ -187,12 +187,12 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
     seed, sealed = seed_of(board.tasks), request.sealed or request.kept.get("sealed")
     return {
         "scorer_version": SCORER_VERSION,
-        "task_version": max((item["task_version"] for item in board.tasks), default=TASK_VERSION),
+        "task_version": max((item.task_version for item in board.tasks), default=TASK_VERSION),
         "data_version": board.data_version,
         "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
         "libraries": _libraries(),
         "pipeline": dict(request.pipeline) or None,
-        **{name: seed for name, seed in ((task_files.PRIVATE, seed), ("private", board.on_private.seed)) if seed},
+        **{name: seed for name, seed in ((PRIVATE, seed), ("private", board.on_private.seed)) if seed},
         **({"sealed": dict(sealed)} if sealed else {}),
         "split": None if request.split is None else request.split.spec.id,
         "draws": request.draws,
@@ -223,13 +223,13 @@ def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]
         ],
         "tasks": [
             {
-                "suite": item["suite"],
-                "suite_version": item.get("suite_version"),
-                "region": item["region"],
-                "map_date": item.get("map_date"),
-                "queries_sha256": item["files"][task_files.QUERIES]["sha256"],
-                "map_fingerprint": item["map_fingerprint"],
-                **{name: item[name] for name in (task_files.FAILED_PICTURES,) if name in item},
+                "suite": item.suite,
+                "suite_version": item.suite_version,
+                "region": item.region,
+                "map_date": item.map_date,
+                "queries_sha256": item.queries_sha256,
+                "map_fingerprint": item.map_fingerprint,
+                **({} if item.failed_pictures is None else {"failed_pictures": item.failed_pictures}),
             }
             for item in board.tasks
         ],

@@ -37,11 +37,11 @@ from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
 from sasgeo_bench.running.failures import Failures, stops_all
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.score import single_views
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import CONTROLS, Truth, base_of
 from sasgeo_bench.tasks.sheet import sheet_figure
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.tasks.task_files import Task, TaskManifest
 from sasgeo_bench.texts import json_text, one_line
 
 REGION_BYTES: Final = 120_000
@@ -106,21 +106,21 @@ def pictures_extra(
     place of every query.
     """
     found = _Found(failures=board.failures)
-    tasks = [about for about in board.tasks if about["suite"] != CONTROLS]
-    asked = [about for about in tasks if _is_there(about, root)]
+    tasks = [about for about in board.tasks if about.suite != CONTROLS]
+    asked = {about.name: task for about in tasks if (task := _there(about, root)) is not None}
     if len(asked) < len(tasks):
         tell(f"pictures of {len(asked)} of {counted(len(tasks), 'task')}: {root / 'tasks'} lacks the views of the rest")
-    _add_regions(found, asked, root, split)
+    _add_regions(found, list(asked), root, split)
     _add_suites(found, asked, board, root)
     answers = {}
     if has_cases:
         failures = _failures(board, contrasts)
         placed = answers_frame(board, failures, ranked_matchers(board.table))
         answers = {ANSWERS: placed} if len(placed) else {}
-        _add_strips(found, board, asked, root)
-        _add_flights(found, board, asked, root)
+        _add_strips(found, board, asked)
+        _add_flights(found, board, asked)
         shown = failures[failures["matcher"].isin(shown_matchers(board.table, contrasts))]
-        _add_cases(found, board, shown, asked, root, jobs=jobs)
+        _add_cases(found, board, shown, asked, jobs=jobs)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
     listed = ", ".join(
@@ -135,23 +135,23 @@ def _with_list(files: Mapping[str, bytes], listed: Mapping[str, Any]) -> dict[st
     return {**files, PICTURES_FILE: json_text(content).encode()}
 
 
-def _is_there(about: Mapping[str, Any], root: Path) -> bool:
-    """Return whether a folder holds the queries of a task, to the byte: stored results hold no views of their own."""
+def _there(about: TaskManifest, root: Path) -> Task | None:
+    """Return the task with these queries, to the byte, if it is there: stored results hold no views of their own."""
     try:
-        there = task_files.read_task(root / "tasks" / str(about["suite"]) / str(about["region"]))
+        task = Task.open(root / "tasks" / about.suite / about.region, root / "truth")
     except StoreError:
-        return False
-    return bool(there["files"] == about["files"])
+        return None
+    return task if task.manifest.files == about.files else None
 
 
 # --- regions and suites -----------------------------------------------------------------------------------------------
 
 
-def _add_regions(found: _Found, asked: Sequence[Mapping[str, Any]], root: Path, split: Split | None) -> None:
+def _add_regions(found: _Found, asked: Sequence[tuple[str, str]], root: Path, split: Split | None) -> None:
     """Add each region once: itself, or the first of its maps if it is missing."""
     maps: dict[str, list[str]] = {}
-    for about in asked:
-        maps.setdefault(base_of(str(about["region"])), []).append(str(about["region"]))
+    for _, region in asked:
+        maps.setdefault(base_of(region), []).append(region)
     for base, variants in sorted(maps.items()):
         there = (name for name in (base, *sorted(variants)) if (root / "regions" / name).is_dir())
         folder = root / "regions" / next(there, base)
@@ -176,27 +176,25 @@ def _map(folder: Path, manifest: Manifest) -> bytes:
     return fitted(np.ascontiguousarray((255 * colours[..., ::-1]).round().astype(np.uint8)), REGION_BYTES)
 
 
-def _add_suites(found: _Found, asked: Sequence[Mapping[str, Any]], board: Board, root: Path) -> None:
+def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], board: Board, root: Path) -> None:
     """Add for each suite a control and its strongest stress at one site."""
     drawn: dict[tuple[str, str], set[str]] = {}
     for frame in board.scores.values():
         for suite, region, role in zip(frame["suite"], frame["region"], frame["role"], strict=True):
             drawn.setdefault((suite, region), set()).add(role)
-    best: dict[str, tuple[int, str, Mapping[str, Any]]] = {}
-    for about in asked:
-        suite, region = str(about["suite"]), str(about["region"])
+    best: dict[str, tuple[int, str]] = {}
+    for suite, region in asked:
         roles = drawn.get((suite, region), set())
         rank = -sum(weight for role, weight in (("stress", 2), ("control", 1)) if role in roles)
-        best[suite] = min(best.get(suite, (1, "", about)), (rank, region, about), key=lambda item: item[:2])
-    for suite, (_, region, about) in sorted(best.items()):
+        best[suite] = min(best.get(suite, (1, "")), (rank, region))
+    for suite, (_, region) in sorted(best.items()):
         alt = f"Example of {suite} on {region}: view, map at the true place, difference, twin or hardest decoy"
-        found.add("suites", suite, partial(_example, about, root), {"suite": suite, "alt": alt})
+        found.add("suites", suite, partial(_example, asked[suite, region], root), {"suite": suite, "alt": alt})
 
 
-def _example(about: Mapping[str, Any], root: Path) -> bytes:
-    folder, hidden = (root / kind / str(about["suite"]) / str(about["region"]) for kind in ("tasks", "truth"))
-    shown = panels(folder, hidden, out=root, choose=control_and_stress)
-    title = f"{about['title']}: {about['region']}"
+def _example(task: Task, root: Path) -> bytes:
+    shown = panels(task, out=root, choose=control_and_stress)
+    title = f"{task.manifest.title}: {task.manifest.region}"
     return fitted(pixels_of(sheet_figure(title, shown, dpi=_SHEET_DPI)), SUITE_BYTES)
 
 
@@ -218,11 +216,11 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
 # --- strips and cases -------------------------------------------------------------------------------------------------
 
 
-def _add_strips(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
+def _add_strips(found: _Found, board: Board, asked: Mapping[tuple[str, str], Task]) -> None:
     """Add for each suite of pictures some queries of the matcher that finds most of them, from picture to pose."""
-    about = {(str(item["suite"]), str(item["region"])): item for item in asked if item.get("frames")}
-    for suite in sorted({suite for suite, _ in about}):
-        own = {key: item for key, item in about.items() if key[0] == suite}
+    pictured = {name: task for name, task in asked.items() if task.manifest.frames}
+    for suite in sorted({suite for suite, _ in pictured}):
+        own = {name: task for name, task in pictured.items() if name[0] == suite}
         name = best_on_pictures(board.scores, own)
         if name is None:
             continue
@@ -232,12 +230,12 @@ def _add_strips(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]],
             (row["query_id"], name): row | {"matcher": name, "failure": ""}
             for row in chosen.reset_index().to_dict("records")
         }
-        cases = {case.query.query_id: case for case in _cases(drawn, board, {}, root, found)}
+        cases = {case.query.query_id: case for case in _cases(drawn, board, {}, asked, found)}
         alt = f"From the picture to the pose: {name} on {suite}. {strip.facts}"
         found.add(
             "strips",
             suite,
-            partial(_strip, strip, cases, own, root, title=f"{name} on {suite}"),
+            partial(_strip, strip, cases, own, title=f"{name} on {suite}"),
             {"suite": suite, "matcher": name, "alt": alt},
         )
 
@@ -245,22 +243,21 @@ def _add_strips(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]],
 def _strip(
     strip: Strip,
     cases: Mapping[str, Case],
-    about: Mapping[tuple[str, str], Mapping[str, Any]],
-    root: Path,
+    tasks: Mapping[tuple[str, str], Task],
     *,
     title: str,
 ) -> bytes:
     own = [cases[query_id] for query_id in strip.query_ids if query_id in cases]
-    rows = [read_picture(case, root, about[case.query.suite, case.query.region]) for case in own]
+    rows = [read_picture(case, tasks[case.query.suite, case.query.region]) for case in own]
     return fitted(strip_pixels(strip, rows, title=title), STRIP_BYTES)
 
 
-def _add_flights(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]], root: Path) -> None:
+def _add_flights(found: _Found, board: Board, asked: Mapping[tuple[str, str], Task]) -> None:
     """Add for each suite of flights the flight on which trackers differ most, a map for each of them."""
-    about = {(str(item["suite"]), str(item["region"])): item for item in asked if "sequence" in item["counts"]}
+    flown = [name for name, task in asked.items() if task.manifest.is_of_flights]
     names = [name for name in shown_matchers(board.table, ()) if name in board.views]
-    for suite in sorted({suite for suite, _ in about}):
-        regions = [region for one, region in about if one == suite]
+    for suite in sorted({suite for suite, _ in flown}):
+        regions = [region for one, region in flown if one == suite]
         chosen = shown_flight({name: board.scores[name] for name in names}, suite, regions)
         if chosen is None:
             continue
@@ -270,27 +267,26 @@ def _add_flights(found: _Found, board: Board, asked: Sequence[Mapping[str, Any]]
         found.add(
             "flights",
             suite,
-            partial(_flight_map, about[suite, region], flight, views, root),
+            partial(_flight_map, asked[suite, region], flight, views),
             {"suite": suite, "alt": f"A flight of {suite} on {region}, with the estimates of {', '.join(shown)}"},
         )
 
 
-def _flight_map(about: Mapping[str, Any], flight: str, views: Mapping[str, pd.DataFrame], root: Path) -> bytes:
-    return fitted(flight_map_pixels(about, flight, views, root=root), FLIGHT_BYTES)
+def _flight_map(task: Task, flight: str, views: Mapping[str, pd.DataFrame]) -> bytes:
+    return fitted(flight_map_pixels(task, flight, views), FLIGHT_BYTES)
 
 
 def _add_cases(
-    found: _Found, board: Board, failures: pd.DataFrame, asked: Sequence[Mapping[str, Any]], root: Path, *, jobs: int
+    found: _Found, board: Board, failures: pd.DataFrame, asked: Mapping[tuple[str, str], Task], *, jobs: int
 ) -> None:
-    about = {(str(item["suite"]), str(item["region"])): item for item in asked}
-    failures = failures[[key in about for key in zip(failures["suite"], failures["region"], strict=True)]]
+    failures = failures[[key in asked for key in zip(failures["suite"], failures["region"], strict=True)]]
     if not len(failures):
         return
     chosen = sample_cases(failures, each=_EACH, most=MOST_CASES)
     words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in {*chosen["matcher"]}}
     drawn = {(row["query_id"], row["matcher"]): row for row in chosen.to_dict("records")}
-    cases = list(_cases(drawn, board, words, root, found))
-    draws = [partial(_drawn, case, root, about[case.query.suite, case.query.region]) for case in cases]
+    cases = list(_cases(drawn, board, words, asked, found))
+    draws = [partial(_drawn, case, asked[case.query.suite, case.query.region]) for case in cases]
     for case, outcome in zip(cases, spread(_outcome, draws, jobs=jobs), strict=True):
         row = drawn[case.query.query_id, case.matcher]
         facts = facts_of(case)
@@ -332,25 +328,24 @@ def _picture(outcome: bytes | Exception) -> bytes:
     return outcome
 
 
-def _drawn(case: Case, root: Path, about: Mapping[str, Any]) -> bytes:
-    return fitted(case_pixels(read_picture(case, root, about)), CASE_BYTES)
+def _drawn(case: Case, task: Task) -> bytes:
+    return fitted(case_pixels(read_picture(case, task)), CASE_BYTES)
 
 
 def _cases(
     drawn: Mapping[tuple[Any, Any], Mapping[Any, Any]],
     board: Board,
     words: Mapping[tuple[str, str], pd.DataFrame],
-    root: Path,
+    tasks: Mapping[tuple[str, str], Task],
     found: _Found,
 ) -> Iterator[Case]:
     """Yield each chosen case with its view, task by task."""
     by_task: dict[tuple[str, str], list[Mapping[Any, Any]]] = {}
     for row in drawn.values():
         by_task.setdefault((row["suite"], row["region"]), []).append(row)
-    for (suite, region), rows in sorted(by_task.items()):
-        folder = root / "tasks" / suite / region
+    for name, rows in sorted(by_task.items()):
         try:
-            some = list(task_files.read_some(folder, {row["query_id"] for row in rows}))
+            some = list(tasks[name].some({row["query_id"] for row in rows}))
         except SasgeoError as error:
             found.lacking[one_line(str(error))] += len(rows)
             continue

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 import pandas as pd
 
@@ -15,10 +16,10 @@ from sasgeo_bench.leaderboard.board_files import check_board, read_board
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
 from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.regions.region import DATA_VERSION
+from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
 from sasgeo_bench.scoring.contestants import (
     Contest,
-    ScoredTask,
     read_entry_answers,
     read_tasks,
     rows_to_rank,
@@ -37,6 +38,9 @@ from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
 from sasgeo_bench.scoring.verdicts import with_causes
 from sasgeo_bench.tasks.query import SEQUENCE, base_of
+from sasgeo_bench.tasks.task_files import Task
+
+_M2_PER_KM2: Final = 1e6
 
 
 def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
@@ -113,7 +117,7 @@ def _contest(request: ScoreRequest, failures: Failures, tell: Tell) -> Contest:
         entries, folders, root=request.root, named=request.predictions, tell=tell, failures=failures
     )
     tasks = read_tasks(answers, folders, request.truth or request.root / "truth")
-    seed_of([task.about for task in tasks])  # refuse a mixture of seeds before it is scored
+    seed_of([task.manifest for task in tasks])  # refuse a mixture of seeds before it is scored
     return score_entries(
         answers, tasks, split=request.split, by_region=request.by_region, by_block=request.by_block, failures=failures
     )
@@ -128,7 +132,7 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
     apart = set_apart(entries, scores, request.split, verdicts)
     for name, why in apart.items():
         tell(f"{name}: set apart, {why}")
-    tasks = tuple(task.about for task in contest.tasks)
+    tasks = tuple(task.manifest for task in contest.tasks)
     if request.private is not None:
         on_private = hold_private(
             request.private,
@@ -163,10 +167,10 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
     )
 
 
-def _of_flights(tasks: Sequence[ScoredTask]) -> dict[str, Mapping[str, float]]:
+def _of_flights(tasks: Sequence[Task]) -> dict[str, Mapping[str, float]]:
     """Return what was measured at the first view of each flight by the flight's id."""
-    flown = [task for task in tasks if task.is_of_flights]
-    firsts = {head.query_id: head.sequence_id for task in flown for head in task.heads if head.frame == 0}
+    flown = [task for task in tasks if task.manifest.is_of_flights]
+    firsts = {head.query_id: head.sequence_id for task in flown for head in task.heads() if head.frame == 0}
     truths = (truth for task in flown for truth in task.truths)
     return {str(firsts[truth.query_id]): truth.measured for truth in truths if truth.query_id in firsts}
 
@@ -192,10 +196,10 @@ def _ranks(board: Board, draws: int, tell: Tell, progress: Progress) -> list[pd.
     return None
 
 
-def _costs(board: Board, tasks: Sequence[ScoredTask], tell: Tell) -> list[pd.DataFrame]:
+def _costs(board: Board, tasks: Sequence[Task], tell: Tell) -> list[pd.DataFrame]:
     """Return the costs of each entry, and report how many queries it answered, and the status of the others."""
-    views = {name: size for task in tasks for name, size in task.view_bytes.items()}
-    areas = {task.about["region"]: task.area_km2 for task in tasks if task.area_km2 is not None}
+    views = {name: size for task in tasks for name, size in task.view_bytes().items()}
+    areas = {task.manifest.region: area for task in tasks if (area := _area_km2(task.region)) is not None}
     found = []
     for entry in board.entries:
         scores = board.scores[entry.name]
@@ -209,6 +213,16 @@ def _costs(board: Board, tasks: Sequence[ScoredTask], tell: Tell) -> list[pd.Dat
             found.append(cost_figures(entry.name, costs))
         tell(f"{entry.name}: {_answered_text(scores)}")
     return found
+
+
+def _area_km2(region: Path) -> float | None:
+    """Return the mapped area of a region; None if its map is missing, since scores need no map."""
+    try:
+        manifest = read_manifest(region)
+    except StoreError:
+        return None
+    west, south, east, north = manifest.bounds_m
+    return manifest.coverage.share * (east - west) * (north - south) / _M2_PER_KM2
 
 
 def _answered_text(scores: pd.DataFrame) -> str:

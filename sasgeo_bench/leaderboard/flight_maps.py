@@ -2,7 +2,6 @@
 """Maps of a flight, one for each tracker: the true path, the estimates, and which of them were accepted."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, Final
 
 import cv2
@@ -19,6 +18,7 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.scoring.score import FIX_M
 from sasgeo_bench.tasks.flight_sheet import Ground, bounds_of_m, draw_flight, flight_keys, flight_panels
+from sasgeo_bench.tasks.task_files import Task
 
 MOST_TRACKERS: Final = 6
 _ACROSS: Final = 3
@@ -48,33 +48,28 @@ def shown_flight(scores: Mapping[str, pd.DataFrame], suite: str, regions: Sequen
     return str(region), str(flight)
 
 
-def flight_map_pixels(
-    about: Mapping[str, Any], flight: str, views: Mapping[str, pd.DataFrame], *, root: Path
-) -> NDArray[np.uint8]:
+def flight_map_pixels(task: Task, flight: str, views: Mapping[str, pd.DataFrame]) -> NDArray[np.uint8]:
     """Draw a flight with the estimates of some trackers, a map for each; pixels have blue first.
 
     Parameters
     ----------
-    about : mapping
-        Content of `task.json`.
+    task : Task
+        Its map and truths lie below the root that holds it.
     flight : str
         Id of the flight.
     views : mapping of str to DataFrame
         Rows of `scoring.flights.view_frame` by tracker, in the order in which they are drawn.
-    root : Path
-        Holds tasks/, truth/ and regions/.
     """
-    suite, region = str(about["suite"]), str(about["region"])
-    (panel,) = flight_panels(root / "tasks" / suite / region, root / "truth" / suite / region, flight=flight)
-    folder = root / "regions" / region
+    about, folder = task.manifest, task.region
+    (panel,) = flight_panels(task, flight=flight)
     ground = Ground.of(folder, region_files.read_manifest(folder), bounds_of_m([panel]))
     mine = {name: frame[frame["sequence_id"] == flight] for name, frame in views.items()}
     names = list(mine)
     truth = panel.truth
     across = min(_ACROSS, len(names))
     sheet = Page(
-        title=f"{about['title']}: {region}",
-        facts=f"One flight, {truth.role}: {truth.kind}. {about['what']}",
+        title=f"{about.title}: {about.region}",
+        facts=f"One flight, {truth.role}: {truth.kind}. {about.what}",
         note="North is up." + (" Trackers differ most on this flight of the suite." if len(names) > 1 else ""),
         data=ATTRIBUTION,
         rows=-(-len(names) // across),

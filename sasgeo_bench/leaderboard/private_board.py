@@ -32,9 +32,9 @@ from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, PACKED, REPROD
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP
 from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS
 from sasgeo_bench.tasks.query import TASK_VERSION
+from sasgeo_bench.tasks.task_files import PRIVATE, TaskManifest
 
 _ALL_PRIORS: Final = "all"
 SEEDS_NOTE: Final = (
@@ -257,12 +257,12 @@ class OnPrivate:
         return str(self.rows[entry.name]["verdict"]) if entry.name in self.rows else entry.how
 
 
-def seed_of(tasks: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+def seed_of(tasks: Sequence[TaskManifest]) -> dict[str, str | int] | None:
     """Return the commitment and bits of the private seed that tasks were drawn by; None for public tasks.
 
     Raise ConfigError if they are of several seeds, or some are public.
     """
-    seeds = [about.get(task_files.PRIVATE) for about in tasks]
+    seeds = [task.private_seed for task in tasks]
     if any(seed != seeds[0] for seed in seeds):
         raise ConfigError(
             "these tasks are drawn by several seeds, and one is private: draw them by one, and score those alone"
@@ -287,14 +287,14 @@ def hold_private(
     *,
     entries: Sequence[Entry],
     scores: Mapping[str, pd.DataFrame],
-    tasks: Sequence[Mapping[str, Any]],
+    tasks: Sequence[TaskManifest],
     pipeline: Mapping[str, str],
     draws: int,
     tell: Callable[[str], None],
 ) -> OnPrivate:
     """Compare the rows of a public board with a board of a private seed in `folder`.
 
-    `entries`, `scores`, `tasks` (contents of each `task.json`) and `pipeline` (its id and hash) are those of the public
+    `entries`, `scores`, `tasks` and `pipeline` (its id and hash) are those of the public
     board. Report by `tell` which tasks the two boards do not share. Raise ConfigError if the folder holds no board of a
     private seed, or one of another pipeline or version, or the public one is itself of a private seed. Raise StoreError
     if it holds no sound board.
@@ -304,7 +304,8 @@ def hold_private(
         raise ConfigError(
             "the rows to be held against a private seed are of a private seed themselves: name a public board"
         )
-    both = {_task(item) for item in tasks} & {_task(item) for item in about["tasks"]}
+    asked = {(task.suite, task.region, str(task.map_date)) for task in tasks}
+    both = asked & {tuple(str(item.get(name)) for name in _TASK) for item in about["tasks"]}
     alone = len(tasks) - len(both)
     if alone:
         tell(f"{folder}: {counted(alone, 'task')} of this board {'is' if alone == 1 else 'are'} not on the private one")
@@ -317,20 +318,20 @@ def hold_private(
         if not entry.runs or entry.how == PACKED:
             continue
         other = known.get(_whose(entry.name, {"version": entry.version, "hash": entry.hash}))
-        why = _lack(other, about[task_files.PRIVATE])
+        why = _lack(other, about[PRIVATE])
         if other is None or why:
             rows[entry.name] = record_of(RUN_HERE, why)
             continue
         mine, frame = scores[entry.name], theirs[theirs["matcher"] == other["name"]]
         figures = compare_seeds(mine[_is_of(mine, named)], frame, draws=draws)
         rows[entry.name] = record_of(*verdict_of(figures), figures)
-    return OnPrivate(seed=about[task_files.PRIVATE], rows=rows)
+    return OnPrivate(seed=about[PRIVATE], rows=rows)
 
 
 def read_private(folder: Path, pipeline: Mapping[str, str]) -> dict[str, Any]:
     """Read the `board.json` of a private board that rows of a pipeline are compared with."""
     about, _ = read_board(folder)
-    if not about.get(task_files.PRIVATE):
+    if not about.get(PRIVATE):
         raise ConfigError(f"{folder} is a board of a public seed: name one that 'leaderboard --seed-file' has made")
     if not pipeline or about.get("pipeline") != dict(pipeline):
         raise ConfigError(
@@ -342,10 +343,6 @@ def read_private(folder: Path, pipeline: Mapping[str, str]) -> dict[str, Any]:
             f"{folder} has {stale} {about.get(stale)}, this program {_VERSIONS[stale]}: run the seed again"
         )
     return about
-
-
-def _task(about: Mapping[str, Any]) -> tuple[str, ...]:
-    return tuple(str(about.get(name)) for name in _TASK)
 
 
 def _is_of(scores: pd.DataFrame, named: set[tuple[str, ...]]) -> "pd.Series[bool]":

@@ -26,19 +26,18 @@ from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.running.prediction_files import Answers, read_ties
 from sasgeo_bench.running.run_manifest import RUN, RunManifest
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
-from sasgeo_bench.scoring.contestants import AskedTask, ScoredTask, read_scored_task
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries
 from sasgeo_bench.scoring.flights import ScoredFlights, score_flights
 from sasgeo_bench.scoring.pose import first_pose
 from sasgeo_bench.scoring.rejection import OWN, judge, own_confidence, rules_of
 from sasgeo_bench.scoring.score import COLUMNS, MISSING, score_task, settle_not_applicable
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
 from sasgeo_bench.tasks.query import REAL, Query, Truth
 from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.sheet import strength_text
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.tasks.task_files import Task
 
 _ROOM: Final = 1.25  # around both places
 _LEAST_SIDES: Final = 2.4  # of a view, a piece of a map is at least
@@ -119,16 +118,16 @@ def _plain(value: float | str) -> float | str:
     return value if isinstance(value, str) else float(f"{float(value):.6g}")
 
 
-def read_picture(case: Case, root: Path, about: Mapping[str, Any]) -> CasePicture:
+def read_picture(case: Case, task: Task) -> CasePicture:
     """Read the map, evidence and poses that the picture of a case shows.
 
-    `root` holds regions/ and segmenters/, `about` is the content of `task.json`: the map must be that very build.
-    Raise StoreError if the map is missing, damaged, or was built anew since the queries were drawn.
+    The map must be the very build that the task was drawn on. Raise StoreError if it is missing, damaged, or was built
+    anew since.
     """
-    region = root / "regions" / str(about["region"])
+    region = task.region
     manifest = region_files.read_manifest(region)
-    if not task_files.is_of_map(about, manifest):
-        raise StoreError(built_anew(str(about["region"])))
+    if not task.manifest.is_of_map(manifest):
+        raise StoreError(built_anew(task.manifest.region))
     query, truth = case.query, case.truth
     modes = case.prediction.candidates if case.prediction is not None and case.fix is not None else ()
     row, col, rows, cols = window = _window(case, manifest.grid)
@@ -149,9 +148,7 @@ def read_picture(case: Case, root: Path, about: Mapping[str, Any]) -> CasePictur
         what=_what(case),
         region=query.region,
         picture=query.frames[-1].image().rgb if query.frames else None,
-        segmented=read_segmented(
-            segmented_file(root, str(about["files"][task_files.QUERIES]["sha256"])), query.query_id
-        ),
+        segmented=read_segmented(segmented_file(task.root, task.manifest.queries_sha256), query.query_id),
     )
 
 
@@ -256,7 +253,7 @@ class RunCases:
     run: Path
     entry: Entry
     root: Path
-    tasks: Mapping[tuple[str, str], ScoredTask]
+    tasks: Mapping[tuple[str, str], Task]
     predictions: Mapping[str, Prediction]
     flights: Mapping[tuple[str, str], ScoredFlights]
     scores: pd.DataFrame = field(default_factory=lambda: pd.DataFrame(columns=list(COLUMNS)))
@@ -295,7 +292,7 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
         raise ConfigError(f"{run} holds runs of {len(entries)} matchers or versions: name the folder of one ({names})")
     (entry,), root = entries, root_of(run, out)
     predictions: dict[str, Prediction] = {}
-    tasks: dict[tuple[str, str], ScoredTask] = {}
+    tasks: dict[tuple[str, str], Task] = {}
     lost: list[SasgeoError] = []
     flights: dict[tuple[str, str], ScoredFlights] = {}
     frames = []
@@ -303,15 +300,17 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     for source, manifest in zip(entry.sources, entry.runs, strict=True):
         name = (manifest.suite, manifest.region)
         try:
-            mine = _answers(source, manifest, root.joinpath("tasks", *name))
-            task = read_scored_task(root.joinpath("tasks", *name), root / "truth")
+            task = Task.open(root.joinpath("tasks", *name), root / "truth")
+            mine = _answers(source, manifest, task)
+            task.check_truths()
+            asked = (tuple(task.heads()), task.truths)
         except SasgeoError as error:
             lost.append(error)
             continue
-        if task.is_of_flights:
-            flights[name] = score_flights(task.heads, task.truths, mine, place_of=place_of)
+        if task.manifest.is_of_flights:
+            flights[name] = score_flights(*asked, mine, place_of=place_of)
             continue
-        frames.append(score_task(task.heads, task.truths, mine, place_of=place_of))
+        frames.append(score_task(*asked, mine, place_of=place_of))
         tasks[name] = task
         predictions |= mine
     if not (frames or flights):
@@ -325,14 +324,14 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     return replace(found, scores=scores, judged=_judged(entry, scores, predictions, split, rejectors))
 
 
-def _answers(source: Path, run: RunManifest, folder: Path) -> dict[str, Prediction]:
+def _answers(source: Path, run: RunManifest, task: Task) -> dict[str, Prediction]:
     """Return the answers of a run to the queries as they are now."""
-    task = AskedTask.of(folder)
-    is_same = run.queries_sha256 == task.about["files"][task_files.QUERIES]["sha256"]
+    is_same = run.queries_sha256 == task.manifest.queries_sha256
     found = Answers.open(source, task.asked, is_tied=is_same)
     if not (found.found or is_same):
         raise StoreError(
-            f"{source} holds answers to other queries than {folder} does now: run again, or make the old ones again"
+            f"{source} holds answers to other queries than {task.folder} does now: "
+            "run again, or make the old ones again"
         )
     return found.found
 
@@ -362,22 +361,18 @@ def picture_of(cases: RunCases, query: str) -> tuple[str, CasePicture]:
     query_id = _find(cases, query)
     row = cases.scores[cases.scores["query_id"] == query_id].iloc[0]
     task = cases.tasks[row["suite"], row["region"]]
-    (found,) = list(task_files.read_some(task.folder, {query_id}))
+    (found,) = list(task.some({query_id}))
     failures = cases.failures().set_index("query_id")["failure"]
     words = {key: frame.set_index("query_id") for key, frame in cases.judged.items()}
     case = Case(
         matcher=cases.entry.name,
         failure=str(failures.get(query_id, "")),
         query=found[0],
-        truth=_truth(task, query_id),
+        truth=next(truth for truth in task.truths if truth.query_id == query_id),
         prediction=cases.predictions.get(query_id),
         **words_of(words, cases.entry.name, query_id),
     )
-    return query_id, read_picture(case, cases.root, task.about)
-
-
-def _truth(task: ScoredTask, query_id: str) -> Truth:
-    return next(truth for truth in task.truths if truth.query_id == query_id)
+    return query_id, read_picture(case, task)
 
 
 def find_flight(cases: RunCases, query: str) -> str | None:

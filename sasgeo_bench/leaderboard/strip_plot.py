@@ -112,7 +112,7 @@ def pictured_tasks(cases: RunCases) -> tuple[tuple[str, str], ...]:
 
     Tasks of a control such as `oracle_segmenter` are returned if there are no others.
     """
-    found = tuple(name for name, task in cases.tasks.items() if task.about.get("frames"))
+    found = tuple(name for name, task in cases.tasks.items() if task.manifest.frames)
     return tuple(name for name in found if not is_unranked(name[0].partition(BY)[2])) or found
 
 

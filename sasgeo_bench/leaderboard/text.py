@@ -21,7 +21,6 @@ from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.strata import ALL
 from sasgeo_bench.scoring.verdicts import Finding
 from sasgeo_bench.tasks.query import SEQUENCE
-from sasgeo_bench.tasks.task_files import FAILED_PICTURES
 from sasgeo_bench.texts import markdown, markdown_item, tex
 
 _FLIGHT: Final = primary_of(SEQUENCE).name
@@ -146,7 +145,7 @@ def segmenter_lines(about: Mapping[str, Any]) -> list[str]:
     regions: dict[str, list[str]] = {}
     counts: Counter[str] = Counter()
     for task in about.get("tasks", ()):
-        if failed := task.get(FAILED_PICTURES):
+        if failed := task.get("failed_pictures"):
             regions.setdefault(task["suite"], []).append(task["region"])
             counts[task["suite"]] += failed
     return [

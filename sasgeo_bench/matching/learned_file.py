@@ -28,7 +28,7 @@ class Record(BaseModel):
 class TrainingRecord(Record):
     """Record of a training in `run.json`.
 
-    `key` ties all rows to it (`task_rows.asked_under`); `file` is that of the learned text, relative to the folder of
+    `key` ties all rows to it (`task_files.asked_under`); `file` is that of the learned text, relative to the folder of
     the run, None where training failed; `trained_on` names places, and `pairs` counts queries with their truths.
     """
 

@@ -95,7 +95,7 @@ class SubmittedFile(Document):
     bytes: Count
 
 
-class TaskManifest(Document):
+class AnsweredTask(Document):
     """A task that was answered: its queries, by the hash of their file, and how many of them have a row."""
 
     suite: Folder
@@ -116,7 +116,7 @@ class Submission(Document):
     data_version: int
     scorer_version: int
     made_by: Short
-    tasks: Annotated[list[TaskManifest], Field(min_length=1, max_length=100_000)]
+    tasks: Annotated[list[AnsweredTask], Field(min_length=1, max_length=100_000)]
     files: Annotated[dict[str, SubmittedFile], Field(max_length=100)]
     licence: Short
     attribution: Line

@@ -22,7 +22,6 @@ from sasgeo_bench.publishing.archive_file import (
     MOST_BYTES,
     Packed,
     StoredRun,
-    TaskFolders,
     unpack,
     unpack_tasks,
     write_pack,
@@ -33,7 +32,7 @@ from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.tasks.split import find_split
-from sasgeo_bench.tasks.task_files import read_ids
+from sasgeo_bench.tasks.task_files import Task
 from sasgeo_bench.texts import one_line
 
 
@@ -70,16 +69,11 @@ def pack_board(
         raise ConfigError(f"{submitted} is a file of predictions: only boards of runs are stored")
     check_public(seed_of(board.tasks), str(request.board))
     truth = request.truth or request.root / "truth"
-    names = [(str(about["suite"]), str(about["region"])) for about in board.tasks]
     tasks = [
-        TaskFolders(
-            task=request.root / "tasks" / suite / region,
-            truth=truth / suite / region,
-            region=request.root / "regions" / region,
-        )
-        for suite, region in names
+        Task(request.root / "tasks" / about.suite / about.region, about, truth / about.suite / about.region)
+        for about in board.tasks
     ]
-    ids = {name: read_ids(item.task) for name, item in zip(names, tasks, strict=True)}
+    ids = {task.manifest.name: task.ids() for task in tasks}
     runs = {entry.name: list(_runs_of(entry, board, ids)) for entry in board.everyone}
     packed = write_pack(
         folder,

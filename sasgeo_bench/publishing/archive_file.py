@@ -51,12 +51,16 @@ from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.running.prediction_files import prediction_row, predictions_of, schema_of
 from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.task_rows import (
+from sasgeo_bench.tasks.task_files import (
     ASKED,
     HEAD_SCHEMA,
+    QUERIES,
     STEP_COLUMNS,
+    TRUTH,
+    TRUTH_OF,
     TRUTH_SCHEMA,
     VIEW_BYTES,
+    Task,
     asked_under,
     with_added,
 )
@@ -76,15 +80,6 @@ _MEND: Final = "fetch the results again"
 _AGAIN: Final = "make the queries again"
 _AND: Final = "; "
 _NO_HEADINGS: Final = "heading and scale of all poses of an answer but the first: no figure reads them"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskFolders:
-    """Folders of a task, its truths and its map; the map need not exist."""
-
-    task: Path
-    truth: Path
-    region: Path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,7 +105,7 @@ def write_pack(
     folder: Path,
     *,
     board: Path,
-    tasks: Sequence[TaskFolders],
+    tasks: Sequence[Task],
     runs: Mapping[str, Sequence[StoredRun]],
     settings: Mapping[str, Any],
     lacks: str = "",
@@ -201,25 +196,25 @@ def _write_table(table: pa.Table, path: Path, *, dictionary: Sequence[str] = _TE
     )
 
 
-def _write_tasks(folder: Path, tasks: Sequence[TaskFolders]) -> None:
+def _write_tasks(folder: Path, tasks: Sequence[Task]) -> None:
     """Write tasks without their views, and their truths."""
     rows, queries, truths = [], [], []
     for number, item in enumerate(tasks):
         region = item.region / MANIFEST
         rows.append(
             {
-                "task_json": plain_file(item.task / task_files.TASK).read_text(encoding="utf-8"),
-                "truth_json": plain_file(item.truth / task_files.TRUTH_OF).read_text(encoding="utf-8"),
+                "task_json": plain_file(item.folder / task_files.TASK).read_text(encoding="utf-8"),
+                "truth_json": plain_file(item.truth / TRUTH_OF).read_text(encoding="utf-8"),
                 "region_json": plain_file(region).read_text(encoding="utf-8") if region.is_file() else None,
             }
         )
-        heads = _heads_of(item.task / task_files.QUERIES)
-        asked, view_bytes = task_files.read_asked(item.task), task_files.read_view_bytes(item.task)
+        heads = _heads_of(item.folder / QUERIES)
+        view_bytes = item.view_bytes()
         names = heads["query_id"].to_pylist()
-        heads = heads.append_column(ASKED, pa.array([asked[name] for name in names], pa.string()))
+        heads = heads.append_column(ASKED, pa.array([item.asked[name] for name in names], pa.string()))
         heads = heads.append_column(VIEW_BYTES, pa.array([view_bytes[name] for name in names], pa.int64()))
         queries.append(_numbered(heads, number))
-        truth = read_table(item.truth / task_files.TRUTH, mend=_AGAIN, columns=TRUTH_SCHEMA.names)
+        truth = read_table(item.truth / TRUTH, mend=_AGAIN, columns=TRUTH_SCHEMA.names)
         truths.append(_numbered(with_added(truth), number))
     _write_table(pa.Table.from_pylist(rows, schema=TASK_SCHEMA), folder / "tasks.parquet")
     _write_table(pa.concat_tables(queries), folder / "queries.parquet")
@@ -349,9 +344,9 @@ def _lay_tasks(tables: Mapping[str, pa.Table], into: Path) -> Iterator[Path]:
         for place in (task, truth):
             place.mkdir(parents=True)
         (task / task_files.TASK).write_text(row["task_json"], encoding="utf-8")
-        (truth / task_files.TRUTH_OF).write_text(row["truth_json"], encoding="utf-8")
-        write_table(parts["queries"][number], task / task_files.QUERIES)
-        write_table(parts["truths"][number], truth / task_files.TRUTH)
+        (truth / TRUTH_OF).write_text(row["truth_json"], encoding="utf-8")
+        write_table(parts["queries"][number], task / QUERIES)
+        write_table(parts["truths"][number], truth / TRUTH)
         if row["region_json"] is not None:
             place = into / "regions" / region
             place.mkdir(parents=True, exist_ok=True)

@@ -30,7 +30,7 @@ from sasgeo_bench.leaderboard.archive_record import ArchiveRecord, VersionRecord
 from sasgeo_bench.leaderboard.board_files import BOARD, BOARD_FILES, LEADERBOARD
 from sasgeo_bench.running.prediction_files import differing_columns, row_faults
 from sasgeo_bench.tasks.query import Detector, PriorGroup
-from sasgeo_bench.tasks.task_rows import ASKED, HEAD_SCHEMA, POSE_FIELDS, STEP_COLUMNS, TRUTH_SCHEMA, VIEW_BYTES
+from sasgeo_bench.tasks.task_files import ASKED, HEAD_SCHEMA, POSE_FIELDS, STEP_COLUMNS, TRUTH_SCHEMA, VIEW_BYTES
 from sasgeo_bench.texts import one_line
 
 PACK: Final = "pack.json"

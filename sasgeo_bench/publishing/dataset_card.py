@@ -118,7 +118,7 @@ def _suites(release: Release) -> str:
             own = [task for task in tasks if part in task.parts]
             released = f"`{suite}-{TRUTHS}`" if any(part in task.released for task in own) else "kept back"
             count = sum(task.parts[part] for task in own)
-            title = markdown(tasks[0].about["title"])
+            title = markdown(tasks[0].source.manifest.title)
             rows.append(f"| `{suite}` | {title} | `{part}` | {count} | {len(own)} | {released} |")
     return "## Suites\n\n" + _table("| Configuration | What is asked | Split | Queries | Maps | Truths |", rows)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.private_board import check_public
@@ -36,12 +36,12 @@ from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import cog_faults
 from sasgeo_bench.regions.region import LICENCE, Manifest
 from sasgeo_bench.regions.region_spec import find_region_file
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew, is_of_region
 from sasgeo_bench.tasks.private_seed import LEAST_BITS
 from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, read_split_file
 from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
+from sasgeo_bench.tasks.task_files import TASK, Task, TruthManifest
 from sasgeo_bench.texts import FOLDER, one_line
 
 HIDDEN_PARTS: Final = ("test", "crossfit")  # whose truths are left out unless asked for
@@ -111,7 +111,9 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     maps = tuple(_map(request.out / "regions" / name) for name in names)
     manifests = {item.name: item.manifest for item in maps}
     for task in tasks:
-        _check_task(task, manifests[task.map_name], split)
+        _check_task(task.source, manifests[task.map_name], split)
+        if task.released:
+            task.source.check_truths()
     if request.board is None:
         _warn_of_seeds(tasks, tell)
     return Release(
@@ -170,7 +172,7 @@ def _tasks(regions: Sequence[str], request: ReleaseRequest, tell: Tell) -> tuple
     suites = [find_suite(name).card.name for name in dict.fromkeys(request.suites)] or list(SUITES)
     found = []
     for suite in sorted(suites):
-        folders = sorted(path.parent for path in (request.out / "tasks" / suite).glob(f"*/{task_files.TASK}"))
+        folders = sorted(path.parent for path in (request.out / "tasks" / suite).glob(f"*/{TASK}"))
         own = {name: [one for one in folders if is_of_region(one.name, name)] for name in regions}
         lacking = [name for name in regions if not own[name]]
         if request.suites and len(lacking) == len(regions):
@@ -189,12 +191,11 @@ def _tasks_of_board(board: BoardTasks) -> tuple[ReleaseTask, ...]:
     """Return the tasks of a board with its queries alone; those that are not drawn as they were are left out."""
     found = []
     for folder in board.folders:
-        names = task_files.read_asked(folder)
-        own = frozenset(name for name, asked in names.items() if board.asked.get(name) == asked)
-        only = None if len(own) == len(names) else own
+        task = Task.open(folder)
+        own = frozenset(name for name, asked in task.asked.items() if board.asked.get(name) == asked)
+        only = None if len(own) == len(task.asked) else own
         if own:
-            about, parts = task_files.read_task(folder), count_parts(folder, only)
-            found.append(ReleaseTask(folder=folder, truth=folder, about=about, parts=parts, only=only))
+            found.append(ReleaseTask(source=task, parts=count_parts(task, only), only=only))
     return tuple(sorted(found, key=lambda task: (task.suite, task.map_name)))
 
 
@@ -204,15 +205,15 @@ def _no_queries(suite: str, regions: Sequence[str], out: Path) -> StoreError:
 
 
 def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
-    about, parts = task_files.read_task(folder), count_parts(folder)
+    task = Task.open(folder, request.out / "truth")
+    parts = count_parts(task)
     odd = next((name for name in (folder.name, *parts) if not re.fullmatch(FOLDER, name)), None)
     if odd is not None:
         raise StoreError(
             f"{folder} speaks of {odd[:80]!r}, which cannot be part of a file's name: make the queries again"
         )
     released = frozenset(part for part in parts if request.with_truth or part not in HIDDEN_PARTS)
-    truth = request.out / "truth" / str(about["suite"]) / str(about["region"])
-    return ReleaseTask(folder=folder, truth=truth, about=about, parts=parts, released=released)
+    return ReleaseTask(source=task, parts=parts, released=released)
 
 
 def _map(folder: Path) -> ReleaseMap:
@@ -236,29 +237,28 @@ def _map(folder: Path) -> ReleaseMap:
     return ReleaseMap(folder=folder, manifest=manifest)
 
 
-def _check_task(task: ReleaseTask, manifest: Manifest, split: SplitFile) -> None:
-    check_public(task.about.get(task_files.PRIVATE), str(task.folder))
-    if not task_files.is_of_map(task.about, manifest):
-        raise StoreError(built_anew(task.map_name))
-    if task.about.get("split") != split.id and task.suite != CONTROLS:  # controls of every board have a split of theirs
+def _check_task(task: Task, manifest: Manifest, split: SplitFile) -> None:
+    about = task.manifest
+    check_public(about.private_seed, str(task.folder))
+    if not about.is_of_map(manifest):
+        raise StoreError(built_anew(about.region))
+    if about.split != split.id and about.suite != CONTROLS:  # controls of every board have a split of theirs
         raise StoreError(
-            f"{task.folder} was drawn by split {task.about.get('split')!r}, not by {split.id!r}: name it with --split, "
+            f"{task.folder} was drawn by split {about.split!r}, not by {split.id!r}: name it with --split, "
             "or make the queries again"
         )
-    if has_images(task.folder):
+    if has_images(task):
         raise StoreError(
             f"{task.folder} holds pictures, and a release holds none so far: name the other suites with --suites, and "
             "pass this folder on by itself if the licence of its pictures allows it (rendered ones have the map's)"
         )
-    if task.released:
-        task_files.check_truths(task.folder, task.truth)
 
 
 def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
     """Report withheld truths that could be drawn again by trying a few seeds."""
     hiding = [task for task in tasks if set(task.parts) - task.released]
-    seeds: list[Any] = [task_files.read_hidden(task.truth).get("seed") for task in hiding]
-    guessable = sum(isinstance(seed, int) and abs(seed) < 2**LEAST_BITS for seed in seeds)
+    seeds = [TruthManifest.read(task.source.truth).seed for task in hiding]
+    guessable = sum(seed is not None and abs(seed) < 2**LEAST_BITS for seed in seeds)
     if guessable:
         tell(
             f"warning: truths of {counted(guessable, 'task')} are kept back, but their seed is so small that anyone "

@@ -31,7 +31,7 @@ from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Place, SplitFile
-from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA, TRUTH_SCHEMA
+from sasgeo_bench.tasks.task_files import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA, TRUTH_SCHEMA, Task
 from sasgeo_bench.texts import json_text
 
 INDEX: Final = "release.json"
@@ -114,15 +114,13 @@ class BoardTasks:
 
 @dataclass(frozen=True, kw_only=True)
 class ReleaseTask:
-    """One task of a release: folders of the task and of its truths, and the content of `task.json` (`about`).
+    """One task of a release.
 
     `parts` counts the queries of each part; `released` are the parts whose truths are released. `only` are the queries
     to release, all without it.
     """
 
-    folder: Path
-    truth: Path
-    about: Mapping[str, Any]
+    source: Task
     parts: Mapping[str, int]
     released: frozenset[str] = frozenset()
     only: frozenset[str] | None = None
@@ -130,12 +128,12 @@ class ReleaseTask:
     @property
     def suite(self) -> str:
         """Return the name of the suite."""
-        return str(self.about["suite"])
+        return self.source.manifest.suite
 
     @property
     def map_name(self) -> str:
         """Return the map that is searched."""
-        return str(self.about["region"])
+        return self.source.manifest.region
 
     @property
     def is_whole(self) -> bool:
@@ -210,9 +208,9 @@ class Release:
         return {part: found[part] for part in sorted(found)}
 
 
-def count_parts(task_folder: Path, only: Collection[str] | None = None) -> dict[str, int]:
+def count_parts(task: Task, only: Collection[str] | None = None) -> dict[str, int]:
     """Count the queries of each part of a task, or some of them; raise `StoreError` if a column is missing."""
-    path, found = task_folder / task_files.QUERIES, Counter[str]()
+    path, found = task.folder / task_files.QUERIES, Counter[str]()
     task_files.check_columns(path, FILE_SCHEMA.names)
     for batch in task_files.read_batches(path, ["query_id", "part"]):
         found.update(_of(batch, only)["part"].to_pylist())
@@ -224,9 +222,9 @@ def _of(batch: pa.RecordBatch, only: Collection[str] | None) -> pa.RecordBatch:
     return batch if only is None else batch.filter(pc.is_in(batch["query_id"], pa.array(sorted(only))))
 
 
-def has_images(task_folder: Path) -> bool:
+def has_images(task: Task) -> bool:
     """Return whether any query of a task holds an image, by the counts of its file."""
-    with open_table(task_folder / task_files.QUERIES, mend="make the queries again", is_whole=False) as source:
+    with open_table(task.folder / task_files.QUERIES, mend="make the queries again", is_whole=False) as source:
         metadata = source.metadata
     columns = [
         metadata.row_group(group).column(at)
@@ -313,10 +311,10 @@ def _copy_queries(folder: Path, task: ReleaseTask) -> None:
     target.mkdir(parents=True)
     if task.is_whole:
         for name in (task_files.QUERIES, task_files.TASK):
-            _copy(task.folder / name, target / name)
+            _copy(task.source.folder / name, target / name)
         return
     for part in task.parts:
-        rows = task_files.read_batches(task.folder / task_files.QUERIES, FILE_SCHEMA.names)
+        rows = task_files.read_batches(task.source.folder / task_files.QUERIES, FILE_SCHEMA.names)
         chosen = (_of(batch.filter(pc.equal(batch["part"], part)), task.only) for batch in rows)
         _write_batches(folder / task.file_of(part), FILE_SCHEMA, chosen)
 
@@ -324,14 +322,16 @@ def _copy_queries(folder: Path, task: ReleaseTask) -> None:
 def _copy_truths(folder: Path, task: ReleaseTask) -> None:
     target = folder / "truth" / task.suite / task.map_name
     target.mkdir(parents=True)
-    heads = read_table(task.folder / task_files.QUERIES, mend="make the queries again", columns=["query_id", "part"])
+    heads = read_table(
+        task.source.folder / task_files.QUERIES, mend="make the queries again", columns=["query_id", "part"]
+    )
     for part in sorted(task.released):
         ids = heads.filter(pc.equal(heads["part"], part))["query_id"].combine_chunks()
-        rows = task_files.read_batches(task.truth / task_files.TRUTH, TRUTH_SCHEMA.names)
+        rows = task_files.read_batches(task.source.truth / task_files.TRUTH, TRUTH_SCHEMA.names)
         plain = (_plain(batch.filter(pc.is_in(batch["query_id"], ids))) for batch in rows)
         _write_batches(folder / task.file_of(part, kind="truth"), PLAIN_TRUTH_SCHEMA, plain)
     if task.is_whole:  # neither the seed nor the hash of the request, which would tell it
-        _write_json(target / task_files.TRUTH_OF, {"queries_sha256": task.about["files"][task_files.QUERIES]["sha256"]})
+        _write_json(target / task_files.TRUTH_OF, {"queries_sha256": task.source.manifest.queries_sha256})
 
 
 def _plain(batch: pa.RecordBatch) -> pa.RecordBatch:
@@ -362,9 +362,9 @@ def read_records(folder: Path, release: Release) -> dict[str, FileRecord]:
                 raise StoreError(f"{item.folder / name} is not what {MANIFEST} says: build the region again")
     for task in (one for one in release.tasks if one.is_whole):
         part = next(iter(task.parts))
-        if found[task.file_of(part)].sha256 != task.about["files"][task_files.QUERIES]["sha256"]:
+        if found[task.file_of(part)].sha256 != task.source.manifest.queries_sha256:
             raise StoreError(
-                f"{task.folder / task_files.QUERIES} is not what {task_files.TASK} says: make the queries again"
+                f"{task.source.folder / task_files.QUERIES} is not what {task_files.TASK} says: make the queries again"
             )
     return found
 
@@ -438,9 +438,9 @@ def _map_record(item: ReleaseMap) -> dict[str, Any]:
 def _task_record(task: ReleaseTask) -> dict[str, Any]:
     return {
         "suite": task.suite,
-        "suite_version": task.about["suite_version"],
+        "suite_version": task.source.manifest.suite_version,
         "map": task.map_name,
-        "split": task.about.get("split"),
+        "split": task.source.manifest.split,
         "queries": dict(task.parts),
         "truths": sorted(task.released),
         "files": {part: task.file_of(part) for part in task.parts},

@@ -19,7 +19,7 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.tasks.task_rows import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA
+from sasgeo_bench.tasks.task_files import FILE_SCHEMA, PLAIN_TRUTH_SCHEMA
 from sasgeo_bench.texts import json_text
 
 QUERY_TEXTS: Final = {
@@ -215,7 +215,7 @@ class _Table:
 
 def _query_tables(release: Release) -> Iterator[_Table]:
     for suite in release.suites:
-        title = release.tasks_of(suite)[0].about["title"]
+        title = release.tasks_of(suite)[0].source.manifest.title
         yield _Table(
             name=suite,
             pattern=f"tasks/{suite}/*/*.parquet",

@@ -15,23 +15,22 @@ from sasgeo_bench.leaderboard.board_files import read_board
 from sasgeo_bench.leaderboard.stored_figures import read_stored_figures, why_anew
 from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.matching.submission import SCHEMA_VERSION, Card, Submission, TaskManifest
+from sasgeo_bench.matching.submission import SCHEMA_VERSION, AnsweredTask, Card, Submission
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_among, stored_settings
 from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.run_manifest import RUN, RunManifest
-from sasgeo_bench.scoring.contestants import AskedTask
 from sasgeo_bench.scoring.entries import check_name
 from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.submission_files import is_submission, list_submissions, read_submission, write_submission
 from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Split, find_split
+from sasgeo_bench.tasks.task_files import Task
 
 FOLDER: Final = Path("submissions")  # the default folder of submissions
 
@@ -63,9 +62,9 @@ def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
         )
     split = check_card(card, request.board, source="the card" if isinstance(request.card, Card) else str(request.card))
     with laid_tasks([request.board]) as folders:
-        tasks = [AskedTask.of(folder) for folder in folders]
+        tasks = [Task.open(folder) for folder in folders]
         _check_runs(card, request.predictions, split, tasks)
-        _check_rows(request.predictions, folders)
+        _check_rows(request.predictions, tasks)
         rows = _rows_of(request.predictions, tasks)
     submission = Submission(
         schema_version=SCHEMA_VERSION,
@@ -144,9 +143,9 @@ def _hint(unknown: str, split: Split | None) -> str:
     return f"did you mean {near[0]!r}?" if near else f"there are {', '.join(split.blocks)}"
 
 
-def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Sequence[AskedTask]) -> None:
+def _check_runs(card: Card, predictions: Path, split: Split | None, tasks: Sequence[Task]) -> None:
     """Refuse a card that disagrees with the runs on the matcher or its training places."""
-    named = {(task.about["suite"], task.about["region"]) for task in tasks}
+    named = {task.manifest.name for task in tasks}
     for run in _runs_in(predictions):
         name, version = run.matcher.name, run.matcher.version
         if (name, version) != (card.name, card.version):
@@ -180,8 +179,8 @@ def _check_taught(card: Card, run: RunManifest, split: Split | None) -> None:
         )
 
 
-def _check_rows(predictions: Path, folders: Sequence[Path]) -> None:
-    faults = [fault for fault in validate(predictions, folders) if not fault.is_missing_row]
+def _check_rows(predictions: Path, tasks: Sequence[Task]) -> None:
+    faults = [fault for fault in validate(predictions, tasks) if not fault.is_missing_row]
     if faults:
         raise ConfigError(
             f"{predictions} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all); "
@@ -189,7 +188,7 @@ def _check_rows(predictions: Path, folders: Sequence[Path]) -> None:
         )
 
 
-def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Prediction]:
+def _rows_of(predictions: Path, tasks: Sequence[Task]) -> dict[str, Prediction]:
     """Return answers to the board's queries by id; answers of runs to other queries are left out."""
     asked = {name: one for task in tasks for name, one in task.asked.items()}
     if predictions.is_dir():
@@ -197,24 +196,24 @@ def _rows_of(predictions: Path, tasks: Sequence[AskedTask]) -> dict[str, Predict
     return {item.query_id: item for item in prediction_files.read_predictions(predictions)}
 
 
-def _answered(tasks: Sequence[AskedTask], rows: Mapping[str, Prediction], predictions: Path) -> list[TaskManifest]:
+def _answered(tasks: Sequence[Task], rows: Mapping[str, Prediction], predictions: Path) -> list[AnsweredTask]:
     """Return all tasks of every suite with an answer: an author may choose suites, but not tasks within them."""
     counts = [(task, sum(name in rows for name in task.asked)) for task in tasks]
-    suites = {task.about["suite"] for task, count in counts if count}
+    suites = {task.manifest.suite for task, count in counts if count}
     if not suites:
         raise ConfigError(
             f"{predictions} holds no answer to the queries of this board: ask its tasks (docs/howto/matcher.md)"
         )
     return [
-        TaskManifest(
-            suite=task.about["suite"],
-            region=task.about["region"],
-            queries_sha256=task.about["files"][task_files.QUERIES]["sha256"],
+        AnsweredTask(
+            suite=task.manifest.suite,
+            region=task.manifest.region,
+            queries_sha256=task.manifest.queries_sha256,
             queries=len(task.asked),
             answered=count,
         )
         for task, count in counts
-        if task.about["suite"] in suites
+        if task.manifest.suite in suites
     ]
 
 
@@ -250,7 +249,7 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
             f"results of {submission.board!r} by --for"
         )
     with laid_tasks(tasks) as folders:
-        return submission, tuple(submission_faults(folder, submission, folders, split))
+        return submission, tuple(submission_faults(folder, submission, [*map(Task.open, folders)], split))
 
 
 def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:

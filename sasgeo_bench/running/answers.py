@@ -25,9 +25,8 @@ from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.sandbox import PROMISES, joined
 from sasgeo_bench.running.training import failed_by_us, guarded
 from sasgeo_bench.running.worker import Worker
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.tasks.task_rows import asked_under
+from sasgeo_bench.tasks.task_files import asked_under
 from sasgeo_bench.texts import one_line
 
 Item = TypeVar("Item")
@@ -272,10 +271,10 @@ class _Map:
         """Yield the queries of all tasks, each with the writer of its row; hold one row group in memory."""
         for writer in self._writers:
             writer.begin()
-            for query, blob, asked in task_files.read_some(writer.part.task, frozenset(writer.part.left)):
+            for query, blob, asked in writer.part.task.some(frozenset(writer.part.left)):
                 if writer.part.asked[query.query_id] != asked_under(asked, writer.part.key):
                     raise StoreError(
-                        f"{writer.part.task} was made anew while it was asked: run again, answers are kept"
+                        f"{writer.part.task.folder} was made anew while it was asked: run again, answers are kept"
                     )
                 yield writer, query, blob
 
@@ -382,7 +381,7 @@ class _Map:
     def _check_map(self, ready: Reply) -> None:
         """Refuse a map that was replaced meanwhile, or is damaged: the matcher is not at fault."""
         part = self._writers[0].part
-        if not task_files.is_of_map(part.about, read_manifest(part.region)):
+        if not part.task.manifest.is_of_map(read_manifest(part.region)):
             raise StoreError(f"{part.region} was built anew while it was searched: run again, answers are kept")
         if ready.status != "ok":
             check_files(part.region)
@@ -391,7 +390,7 @@ class _Map:
         """Return the process that answers: a plugin's own, or the control that is given the truth."""
         request, part = self._plan.request, self._writers[0].part
         if request.spec == ORACLE:
-            return Oracle(part.truth)
+            return Oracle(part.task.truth)
         return Worker(spec=request.spec, reach=reach_of(request, (part.region,)), limits=request.limits)
 
 

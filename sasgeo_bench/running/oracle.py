@@ -11,8 +11,8 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.plugins import ORACLE
 from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.running.replies import Reply
-from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth
+from sasgeo_bench.tasks.task_files import TRUTH, query_from, read_truths
 
 CARD: Final = MatcherCard(
     name=ORACLE,
@@ -52,10 +52,10 @@ class Oracle:
     def prepare(self, region: Path, learned: str | None = None) -> Reply:
         """Read the truths; raise `StoreError` if they are missing."""
         del region, learned
-        if not (self._folder / task_files.TRUTH).is_file():
+        if not (self._folder / TRUTH).is_file():
             raise StoreError(f"{self._folder} holds no truths, and {ORACLE} answers with them: run it where they are")
         start = time.perf_counter()
-        self._truths = {truth.query_id: truth for truth in task_files.read_truths(self._folder)}
+        self._truths = {truth.query_id: truth for truth in read_truths(self._folder)}
         seconds = time.perf_counter() - start
         return Reply(status="ok", seconds=seconds, own_s=seconds, grown_bytes=0)
 
@@ -63,7 +63,7 @@ class Oracle:
         """Answer one query."""
         del top_k
         start = time.perf_counter()
-        asked = task_rows.query_from(query)
+        asked = query_from(query)
         truth = self._truths.get(asked.query_id)
         if truth is None:
             raise StoreError(f"{self._folder} holds no truth of query {asked.query_id}: make the queries again")

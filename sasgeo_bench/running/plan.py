@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.files.plugins import ORACLE, check_card_name, list_entry_points
@@ -23,12 +23,11 @@ from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.code_hash import matcher_code
 from sasgeo_bench.running.oracle import CARD
 from sasgeo_bench.running.run_manifest import FollowerRecord, RunManifest
-from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, map_of, plan_training, root_of, truth_of
+from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.task_rows import asked_under, tie_key
+from sasgeo_bench.tasks.task_files import Task, TaskManifest, asked_under, tie_key
 from sasgeo_bench.texts import MOST_CANDIDATES
 
 MOST_LINES: Final = 12  # tasks that are named; the others are counted
@@ -86,20 +85,18 @@ class RunRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunPart:
-    """One task of a run: its folder of rows, its map, its truths, and its pending queries.
+    """One task of a run: its folder of rows, its map, and its pending queries.
 
-    `about` is the content of `task.json`; `asked` gives the hash that the row of each pending query carries
-    (`task_rows.asked_under`); `failed` counts rows by status of queries that were asked in vain and are not pending;
-    `aside` counts rows of earlier queries, of other training, or of other imagery. `imagery` is the hash of rendered
-    imagery that the matcher looks at, `follower` says how a matcher of single views is asked about flights
-    (`follower.follower_record`), and `key` what its rows are tied to.
+    `asked` gives the hash that the row of each pending query carries (`task_files.asked_under`); `failed` counts rows
+    by status of queries that were asked in vain and are not pending; `aside` counts rows of earlier queries, of other
+    training, or of other imagery. `imagery` is the hash of rendered imagery that the matcher looks at, `follower` says
+    how a matcher of single views is asked about flights (`follower.follower_record`), and `key` what its rows are tied
+    to.
     """
 
-    task: Path
-    about: Mapping[str, Any]
+    task: Task
     folder: Path
     region: Path
-    truth: Path
     left: tuple[str, ...]
     asked: Mapping[str, str]
     done: int
@@ -201,22 +198,21 @@ def plan_run(request: RunRequest) -> RunPlan:
     """
     _check(request)
     if request.dask is not None:  # other processes work in other folders
-        tasks, train = ([task.resolve() for task in folders] for folders in (request.tasks, request.train))
-        request = replace(request, out=request.out.resolve(), tasks=tasks, train=train)
+        asked, train = ([task.resolve() for task in folders] for folders in (request.tasks, request.train))
+        request = replace(request, out=request.out.resolve(), tasks=asked, train=train)
     if ":" not in request.spec:
         list_entry_points()  # warns of a clash of names: what the plugin's own process prints is not shown
-    abouts = {folder: task_files.read_task(folder) for folder in request.tasks}
+    tasks = [Task.open(folder) for folder in dict.fromkeys(request.tasks)]
     card, code, learns = _card(request)
-    _check_seen(abouts, card)
+    _check_seen(tasks, card)
     limits = _hashed(request.limits, learns=learns)
     settings = json.dumps({"top_k": request.top_k, "limits": limits, "is_shut_in": request.is_shut_in}, sort_keys=True)
     found = matcher_hash(request.spec, card.version, code.encode(), settings)
     training_set = result = None
     if learns and request.train:
-        asked = () if request.is_oracle else request.tasks
         training_set = plan_training(
             request.train,
-            asked=asked,
+            asked=() if request.is_oracle else request.tasks,
             split=request.split,
             most=request.most_trained,
             lessons=request.lessons,
@@ -224,7 +220,7 @@ def plan_run(request: RunRequest) -> RunPlan:
         text = read_learned(learned_path(_run_folder(request, card, found), training_set.sha256))
         result = None if text is None else TrainingResult(text=text)
     key = None if training_set is None else _key(training_set, result)
-    parts = tuple(_part(request, card, found, key, *item) for item in abouts.items())
+    parts = tuple(_part(request, card, found, key, task) for task in tasks)
     return RunPlan(
         request=request,
         card=card,
@@ -236,9 +232,9 @@ def plan_run(request: RunRequest) -> RunPlan:
     )
 
 
-def _check_seen(abouts: Mapping[Path, Mapping[str, Any]], card: MatcherCard) -> None:
+def _check_seen(tasks: Sequence[Task], card: MatcherCard) -> None:
     """Refuse tasks of pictures that nothing has made evidence of, unless the matcher looks at pictures itself."""
-    unseen = next((task for task, about in abouts.items() if about.get("frames") and not about.get("segmenter")), None)
+    unseen = next((task.folder for task in tasks if task.manifest.frames and not task.manifest.segmenter), None)
     if unseen is not None and "image" not in card.needs:
         raise StoreError(
             f"{unseen} holds pictures and no evidence, and {card.name!r} reads evidence: run sasgeo-bench segment "
@@ -256,7 +252,7 @@ def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
 def with_training_result(plan: RunPlan, result: TrainingResult) -> RunPlan:
     """Return the plan with a training result: only answers given under it count as done. Raise as `plan_run` does."""
     plan = replace(plan, training_result=result)
-    parts = tuple(_part(plan.request, plan.card, plan.hash, plan.key, part.task, part.about) for part in plan.parts)
+    parts = tuple(_part(plan.request, plan.card, plan.hash, plan.key, part.task) for part in plan.parts)
     return replace(plan, parts=parts)
 
 
@@ -343,35 +339,34 @@ def by_map(spec: str, parts: Sequence[RunPart]) -> list[list[RunPart]]:
     """
     groups: dict[Path, list[RunPart]] = {}
     for part in parts:
-        groups.setdefault(part.truth if spec == ORACLE else part.region.resolve(), []).append(part)
+        groups.setdefault(part.task.truth if spec == ORACLE else part.region.resolve(), []).append(part)
     return list(groups.values())
 
 
-def _part(
-    request: RunRequest, card: MatcherCard, found: str, key: str | None, task: Path, about: Mapping[str, Any]
-) -> RunPart:
+def _part(request: RunRequest, card: MatcherCard, found: str, key: str | None, task: Task) -> RunPart:
     """Find the pending queries of a task; refuse folders that hold other answers, and a map built anew since."""
-    folder = _run_folder(request, card, found) / about["suite"] / about["region"]
+    about = task.manifest
+    folder = _run_folder(request, card, found) / about.suite / about.region
     before = RunManifest.open(folder)
     if before is not None and before.hash != found:
         raise StoreError(f"{folder} holds answers of {before.hash or 'an unknown run'}, not of {found}: move it away")
-    task_files.check_queries(task)
-    if task_files.PRIVATE in about and request.out.resolve() != root_of(task):
+    task.check_queries()
+    if about.private_seed is not None and request.out.resolve() != task.root:
         raise ConfigError(
-            f"{task} is of a private seed, whose answers stay with it: say --out {task.parent.parent.parent}"
+            f"{task.folder} is of a private seed, whose answers stay with it: "
+            f"say --out {task.folder.parent.parent.parent}"
         )
-    region = map_of(task, about)
+    region = task.checked_region()
     imagery = _rendered_imagery(card, region)
-    settings = follower_record(card) if _is_of_flights(about) else None
+    settings = follower_record(card) if about.is_of_flights else None
     follower = None if settings is None else FollowerRecord(**settings)
     key = tie_key(key, imagery, None if follower is None else follower.hash)
-    drawn = task_files.read_asked(task)
-    asked = {name: asked_under(one, key) for name, one in drawn.items()}
+    asked = {name: asked_under(one, key) for name, one in task.asked.items()}
     ties = prediction_files.read_ties(folder, since_ns=request.since_ns) if folder.is_dir() else []
-    is_same_task = before is not None and before.queries_sha256 == about["files"][task_files.QUERIES]["sha256"]
+    is_same_task = before is not None and before.queries_sha256 == about.queries_sha256
     if not (is_same_task or all(tie.asked for tie in ties)):  # rows of older versions lack the hash of their query
         raise StoreError(
-            f"{folder} holds answers of an older version, and not to the queries that {task} holds now: "
+            f"{folder} holds answers of an older version, and not to the queries that {task.folder} holds now: "
             "move it away and run again"
         )
     index, count = request.shard
@@ -379,7 +374,7 @@ def _part(
     other = (
         set()
         if request.only is None
-        else {unit_of(name) for name, one in drawn.items() if request.only.get(name) != one}
+        else {unit_of(name) for name, one in task.asked.items() if request.only.get(name) != one}
     )
     own = [name for name in asked if _shard_of(unit_of(name), count) == index - 1 and unit_of(name) not in other]
     own = own[: request.limit]
@@ -388,10 +383,8 @@ def _part(
     failed = Counter(statuses[name] for name in set(own) - set(left) if statuses[name] not in SOUND)
     return RunPart(
         task=task,
-        about=about,
         folder=folder,
         region=region,
-        truth=truth_of(task, about),
         left=left,
         asked={name: asked[name] for name in left},
         done=len(own) - len(left),
@@ -403,13 +396,9 @@ def _part(
     )
 
 
-def unit_of_task(about: Mapping[str, Any]) -> Callable[[str], str]:
+def unit_of_task(about: TaskManifest) -> Callable[[str], str]:
     """Return a function from the id of a query to that of what is asked at once: a flight, or the query itself."""
-    return flight_id if _is_of_flights(about) else str
-
-
-def _is_of_flights(about: Mapping[str, Any]) -> bool:
-    return "sequence" in about.get("counts", {})
+    return flight_id if about.is_of_flights else str
 
 
 def whole_units(names: Sequence[str], done: AbstractSet[str], unit_of: Callable[[str], str]) -> tuple[str, ...]:

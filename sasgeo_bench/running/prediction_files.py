@@ -26,7 +26,7 @@ from sasgeo_bench.matching.results import STATUSES, Prediction
 from sasgeo_bench.matching.tracker import MOST_VARIANCE, SIDE, are_covariances
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running.run_manifest import RUN, RunManifest
-from sasgeo_bench.tasks.task_rows import ASKED, POSE_FIELDS, asked_under, is_like, poses_of
+from sasgeo_bench.tasks.task_files import ASKED, POSE_FIELDS, asked_under, is_like, poses_of
 from sasgeo_bench.texts import (
     BOUNDS,
     MOST_CANDIDATES,
@@ -339,7 +339,7 @@ def _lean(read: Callable[[], Answers]) -> Answers:
 def write_part(folder: Path, predictions: Sequence[Prediction], *, asked: Mapping[str, str] | None = None) -> Path:
     """Add rows to a run, in a file of their own that is written whole or not at all.
 
-    `asked` gives the hash that each row carries, by query id (`task_files.read_asked`); without it, the file is one as
+    `asked` gives the hash that each row carries, by query id (`Task.asked`); without it, the file is one as
     anyone may submit it. Raise `StoreError` if the disk is full or the folder cannot be written.
     """
     path = folder / f"part-{_stamp_ns(folder):020d}-{os.getpid()}.parquet"
@@ -537,7 +537,7 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
     """Write the predictions of folders and files into one file, sorted by query; return their number.
 
     Of two for one query the first counts, in the order of `runs`. The same predictions give the same file, whatever
-    parts they came in. With `asked`, only answers to these queries (`task_files.read_asked`) are taken from folders.
+    parts they came in. With `asked`, only answers to these queries (`Task.asked`) are taken from folders.
     Answers of trackers keep `is_accepted` and `covariance`.
 
     Raises

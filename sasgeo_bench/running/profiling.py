@@ -25,7 +25,6 @@ from sasgeo_bench.running.runner import map_bytes
 from sasgeo_bench.running.sensors import EnergyMeter, clock_mhz, hottest_celsius, processor_name
 from sasgeo_bench.running.training import trained
 from sasgeo_bench.running.worker import Limits, Worker
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import Query
 
 LEAST_FIXES: Final = 20  # whatever time they take: fewer have no percentiles
@@ -196,7 +195,7 @@ def profile(
                 version=plan.card.version,
                 region=region.name,
                 km2=math.prod(manifest.grid.shape) * manifest.cell_size_m**2 / 1e6,
-                suites=tuple(dict.fromkeys(part.about["suite"] for part in plan.parts)),
+                suites=tuple(dict.fromkeys(part.task.manifest.suite for part in plan.parts)),
                 queries=len(asked),
                 machine=_machine(cores, request),
                 start_s=start_s,
@@ -245,7 +244,7 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tupl
     reasons: Counter[str] = Counter()
     found: list[bytes] = []
     for part in plan.parts:
-        for query, blob, _ in task_files.read_some(part.task, frozenset(task_files.read_ids(part.task))):
+        for query, blob, _ in part.task.some(part.task.asked.keys()):
             reason = _far(query, request.radius_m) or lacks(
                 plan.card, query, is_taught=bool(request.train), is_pictured=is_pictured
             )

@@ -10,7 +10,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.matching.learned_file import Names, Record, TrainingRecord
-from sasgeo_bench.tasks.task_rows import tie_key
+from sasgeo_bench.tasks.task_files import tie_key
 from sasgeo_bench.texts import json_text, one_line
 
 RUN: Final = "run.json"

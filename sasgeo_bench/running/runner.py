@@ -25,7 +25,6 @@ from sasgeo_bench.running.patience import Patience
 from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map, unit_of_task, whole_units
 from sasgeo_bench.running.run_manifest import CardRecord, RunManifest
 from sasgeo_bench.running.training import trained
-from sasgeo_bench.tasks import task_files
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -46,7 +45,7 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
     bare = replace(plan, parts=(), request=replace(plan.request, split=None))
     numbers, chunks = [], []
     for number, part in enumerate(parts):
-        for ids in _chunks(part.left, threads, unit_of_task(part.about)):
+        for ids in _chunks(part.left, threads, unit_of_task(part.task.manifest)):
             numbers.append(number)
             chunks.append(replace(part, left=ids, asked={name: part.asked[name] for name in ids}))
     for at, cost in done_on(client, partial(_answer_chunk, bare, uuid4().hex), chunks):
@@ -179,7 +178,7 @@ def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
         done = prediction_files.ids_done(
             part.folder, part.asked, again=plan.request.again, since_ns=plan.request.since_ns
         )
-        left = whole_units(part.left, done, unit_of_task(part.about))
+        left = whole_units(part.left, done, unit_of_task(part.task.manifest))
         if left:
             found.append(replace(part, left=left))
     return found
@@ -251,17 +250,17 @@ def map_bytes(part: RunPart) -> int:
 
 def _write_run(plan: RunPlan, part: RunPart, cost: Cost, before: Cost) -> None:
     """Write `run.json`: the run, and its cost together with that of earlier runs."""
-    about, total = part.about, pool_costs([before, cost])
+    about, total = part.task.manifest, pool_costs([before, cost])
     run = RunManifest(
         schema_version=prediction_files.SCHEMA_VERSION,
         matcher=CardRecord(**asdict(plan.card if part.follower is None else card_on_flights(plan.card))),
         spec=plan.request.spec,
         hash=plan.hash,
-        suite=about["suite"],
-        region=about["region"],
-        task_version=about["task_version"],
-        queries_sha256=about["files"][task_files.QUERIES]["sha256"],
-        map_fingerprint=about["map_fingerprint"],
+        suite=about.suite,
+        region=about.region,
+        task_version=about.task_version,
+        queries_sha256=about.queries_sha256,
+        map_fingerprint=about.map_fingerprint,
         top_k=plan.request.top_k,
         limits=asdict(plan.request.limits),
         warm_up="one query of each process is asked twice and timed the second time",

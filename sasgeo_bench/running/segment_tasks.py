@@ -7,12 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
-from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.learned_file import write_learned
 from sasgeo_bench.matching.segmenter import check_text
@@ -21,23 +20,21 @@ from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.recalibration import Said, recalibrated
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
-from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of, truth_of
+from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import FrameLabels, read_labels
 from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of, view_id
 from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
 from sasgeo_bench.tasks.split import HALVES, Split
+from sasgeo_bench.tasks.task_files import Task, TruthManifest
 
 FOLDER: Final = "segmenters"  # below the root: what segmenters learned
 _TRAIN: Final = "train"
 _MOST_SHOWN: Final = 3  # failures that are told
-# What `write_task` writes anew.
-_OF_FILES: Final = ("schema_version", "task_version", "counts", "prior_groups", "candidates_sha256", "frames", "files")
 _DIGEST: Final = 16  # hexadecimal digits of the text in the name of its file
 
 
@@ -74,8 +71,8 @@ class _Group:
     """Tasks of places that one training serves, and the tasks that it learns from."""
 
     name: str
-    asked: tuple[Path, ...]
-    train: tuple[Path, ...]
+    asked: tuple[Task, ...]
+    train: tuple[Task, ...]
 
     @property
     def is_taught_from(self) -> bool:
@@ -97,14 +94,14 @@ class _Sight:
         """Return what the evidence is named by: the segmenter, and whether it is recalibrated."""
         return segmenter_name(self.loaded.card.name, is_recalibrated=self.is_recalibrated)
 
-    def record(self, about: Mapping[str, Any]) -> dict[str, str]:
+    def record(self, task: Task) -> dict[str, str]:
         """Return what the evidence of a task follows from, for its `task.json`."""
         return {
             "name": self.loaded.card.name,
             "version": self.loaded.card.version,
             "code_sha256": self.loaded.code,
             "learned_sha256": "" if self.learned is None else hashlib.sha256(self.learned.encode()).hexdigest(),
-            "pictures_sha256": str(about["files"][task_files.QUERIES]["sha256"]),
+            "pictures_sha256": task.manifest.queries_sha256,
             **({"recalibrated_by": "shares of the map"} if self.is_recalibrated else {}),
         }
 
@@ -140,14 +137,13 @@ def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None
     StoreError
         If a task, its truths or labels, or what was learned, are missing or damaged, or training fails.
     """
-    abouts = {folder: _pictured(folder) for folder in dict.fromkeys((*wanted.tasks, *wanted.taught))}
-    groups = _groups(wanted, abouts)
+    groups = _groups(wanted)
     request = wanted.request
     loaded = load_card(request)
     made: list[Path] = []
     for group in groups:
         if group.is_taught_from and loaded.learns:
-            left = named(sorted(task.name for task in group.asked), "train place")
+            left = named(sorted(task.folder.name for task in group.asked), "train place")
             tell(f"left out: {left}, which {loaded.card.name} learns from")
             continue
         sight = _Sight(
@@ -164,20 +160,22 @@ def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None
     return tuple(made)
 
 
-def _pictured(folder: Path) -> dict[str, Any]:
-    """Read a task's description; refuse a task without pictures, or with evidence already."""
-    about = task_files.read_task(folder)
-    if not about.get("frames"):
+def _pictured(folder: Path) -> Task:
+    """Open a task; refuse one without pictures, or with evidence already."""
+    task = Task.open(folder)
+    if not task.manifest.frames:
         raise ConfigError(f"{folder} holds no pictures: draw a suite that has some, as in make-queries --suite aerial")
-    if about.get("segmenter"):
+    if task.manifest.segmenter:
         raise ConfigError(f"{folder} has its evidence from a segmenter: name the task of the pictures, without '+'")
-    return about
+    return task
 
 
-def _groups(wanted: SegmentTasks, abouts: Mapping[Path, Mapping[str, Any]]) -> list[_Group]:
+def _groups(wanted: SegmentTasks) -> list[_Group]:
     """Return the groups of tasks that learn from the same places."""
     split = wanted.split
-    group = {task: _group_of(_region(about), split) for task, about in abouts.items()}
+    tasks = {folder: _pictured(folder) for folder in dict.fromkeys((*wanted.tasks, *wanted.taught))}
+    region = {folder: base_of(task.manifest.region) for folder, task in tasks.items()}
+    group = {folder: _group_of(region[folder], split) for folder in tasks}
     strange = next((task for task, name in group.items() if name is None), None)
     if strange is not None:
         raise ConfigError(
@@ -186,15 +184,11 @@ def _groups(wanted: SegmentTasks, abouts: Mapping[Path, Mapping[str, Any]]) -> l
     names: tuple[str, ...] = HALVES if split.half_of else ("held out", _TRAIN)
     found = []
     for name in names:
-        asked = tuple(task for task in dict.fromkeys(wanted.tasks) if group[task] == name)
-        others = [task for task in group if group[task] != name and not split.sealed_place(_region(abouts[task]))]
-        train = () if name == _TRAIN else tuple(others)
+        asked = tuple(tasks[folder] for folder in dict.fromkeys(wanted.tasks) if group[folder] == name)
+        others = [folder for folder in group if group[folder] != name and not split.sealed_place(region[folder])]
+        train = () if name == _TRAIN else tuple(tasks[folder] for folder in others)
         found.append(_Group(name=name, asked=asked, train=train))
     return [one for one in found if one.asked]
-
-
-def _region(about: Mapping[str, Any]) -> str:
-    return base_of(str(about["region"]))
 
 
 def _group_of(region: str, split: Split) -> str | None:
@@ -216,7 +210,11 @@ def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell:
             )
         return None
     chosen = plan_training(
-        group.train, asked=group.asked, split=wanted.split, most=wanted.most, lessons=Lessons(detector=RENDERED)
+        [task.folder for task in group.train],
+        asked=[task.folder for task in group.asked],
+        split=wanted.split,
+        most=wanted.most,
+        lessons=Lessons(detector=RENDERED),
     )
     code = json.dumps([wanted.spec, loaded.card.version, loaded.code])
     own = f"{loaded.card.name}-{hashlib.sha256(code.encode()).hexdigest()[:12]}"
@@ -255,8 +253,8 @@ def _lessons_of(chosen: TrainingSet) -> Iterator[LabelledImage]:
     classes = tuple(dict.fromkeys(name for item in chosen.taken for name in read_manifest(item.region).classes))
     for item in chosen.taken:
         ids = frozenset(item.ids)
-        queries = {query.query_id: query for query in task_files.read_queries(item.task) if query.query_id in ids}
-        for query_id, number, found in read_labels(item.truth):
+        queries = {query.query_id: query for query in item.task.queries() if query.query_id in ids}
+        for query_id, number, found in read_labels(item.task.truth):
             query = queries.get(query_id)
             if query is not None and number == len(query.frames) - 1:
                 yield found.labelled(_image(query, number), item.region.name, classes)
@@ -266,27 +264,23 @@ def _image(query: Query, number: int) -> AerialImage:
     return query.frames[number].image(observed_on=query.observed_on, season=query.season)
 
 
-def _segmented(sight: _Sight, task: Path) -> tuple[Path, list[str]]:
+def _segmented(sight: _Sight, task: Task) -> tuple[Path, list[str]]:
     """Segment one task unless that is done already; return the folder of the task that results, and what to tell."""
-    about = task_files.read_task(task)
-    suite, record = name_of(str(about["suite"]), sight.name), sight.record(about)
-    root = root_of(task)
-    folder: Path = root / "tasks" / suite / str(about["region"])
+    about, root = task.manifest, task.root
+    suite, record = name_of(about.suite, sight.name), sight.record(task)
+    folder = root / "tasks" / suite / about.region
     if _is_made(folder, record, root):
         return folder, []
-    truth = truth_of(task, about)
-    task_files.check_queries(task)
-    task_files.check_truths(task, truth)
+    task.check_queries()
+    task.check_truths()
     faults: list[str] = []
     lines: list[str] = []
-    done = _seen_by(sight, task, truth, suite, faults)
-    own = {name: value for name, value in about.items() if name not in _OF_FILES}
-    hidden = {name: value for name, value in task_files.read_hidden(truth).items() if name != "queries_sha256"}
-    own |= {"suite": suite, "segmenter": record, **({task_files.FAILED_PICTURES: len(faults)} if faults else {})}
-    made = put_task(done.pairs, own, hidden, out=root, tell=lines.append)
-    queries_sha256 = str(task_files.read_task(made.folder)["files"][task_files.QUERIES]["sha256"])
-    write_segmented(segmented_file(root, queries_sha256), done.pictures)
-    lines.append(f"{suite} on {about['region']}: {counted(made.queries, 'query', 'queries')} in {made.folder}")
+    done = _seen_by(sight, task, suite, faults)
+    new = {"suite": suite, "segmenter": record, **({"failed_pictures": len(faults)} if faults else {})}
+    origin = about.origin.model_copy(update=new)
+    made = put_task(done.pairs, origin, TruthManifest.read(task.truth), out=root, tell=lines.append)
+    write_segmented(segmented_file(root, made.manifest.queries_sha256), done.pictures)
+    lines.append(f"{suite} on {about.region}: {counted(made.manifest.queries, 'query', 'queries')} in {made.folder}")
     if faults:
         total = counted(sum(len(query.frames) for query, _ in done.pairs), "picture")
         failed = f"{sight.loaded.card.name} failed at {len(faults)} of {total}"
@@ -300,13 +294,13 @@ def _is_made(folder: Path, record: Mapping[str, str], root: Path) -> bool:
     Pictures that it failed at are tried again: it may have been late on a busy machine.
     """
     try:
-        about = task_files.read_task(folder)
+        task = Task.open(folder)
+        task.check_queries()
     except StoreError:
         return False
-    path = folder / task_files.QUERIES
-    sha256 = str(about["files"][task_files.QUERIES]["sha256"])
-    is_whole = path.is_file() and sha256_of(path) == sha256 and segmented_file(root, sha256).is_file()
-    return is_whole and about.get("segmenter") == dict(record) and task_files.FAILED_PICTURES not in about
+    about = task.manifest
+    is_whole = segmented_file(root, about.queries_sha256).is_file()
+    return is_whole and about.segmenter == record and about.failed_pictures is None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -317,15 +311,15 @@ class _Seen:
     pictures: dict[str, Segmented]
 
 
-def _seen_by(sight: _Sight, task: Path, truth: Path, suite: str, faults: list[str]) -> _Seen:
+def _seen_by(sight: _Sight, task: Task, suite: str, faults: list[str]) -> _Seen:
     """Segment the pictures of a task; `faults` gets a line for each picture that failed."""
-    truths = {item.query_id: item for item in task_files.read_truths(truth)}
+    truths = {item.query_id: item for item in task.truths}
     pairs: list[tuple[Query, Truth]] = []
     pictures: dict[str, Segmented] = {}
     with SegmenterRun(sight.request, sight.loaded, learned=sight.learned) as run:
-        said = _said(run, task, truth, faults)
+        said = _said(run, task, faults)
         if sight.is_recalibrated:
-            said = recalibrated(said, read_region(root_of(task) / "regions" / task.name))
+            said = recalibrated(said, read_region(task.root / "regions" / task.folder.name))
         for query, seen in said:
             pairs.append(_with_evidence(query, truths[query.query_id], suite, sight.name, seen))
             if seen and seen[-1] is not None:
@@ -333,14 +327,14 @@ def _seen_by(sight: _Sight, task: Path, truth: Path, suite: str, faults: list[st
     return _Seen(pairs=sorted(pairs, key=lambda pair: pair[0].query_id), pictures=pictures)
 
 
-def _said(run: SegmenterRun, task: Path, truth: Path, faults: list[str]) -> Iterator[Said]:
+def _said(run: SegmenterRun, task: Task, faults: list[str]) -> Iterator[Said]:
     """Yield queries with what the segmenter says of their pictures; `faults` gets a line for each that failed."""
-    rows = read_labels(truth)
-    for query in task_files.read_queries(task):
+    rows = read_labels(task.truth)
+    for query in task.queries():
         seen: list[Segmentation | None] = []
         for number in range(len(query.frames)):
             of_frame = _next_labels(rows, query.query_id, number)
-            reply = run.segment(of_frame.labelled(_image(query, number), task.name))
+            reply = run.segment(of_frame.labelled(_image(query, number), task.folder.name))
             faults += [] if reply.segmentation else [f"{query.query_id}: {reply.message} ({reply.status})"]
             seen.append(reply.segmentation)
         yield query, seen

@@ -33,7 +33,7 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import wire
 from sasgeo_bench.tasks.query import Query
-from sasgeo_bench.tasks.task_rows import pairs_from, query_from
+from sasgeo_bench.tasks.task_files import pairs_from, query_from
 from sasgeo_bench.texts import message_of, one_line
 
 if TYPE_CHECKING:

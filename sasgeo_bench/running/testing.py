@@ -22,9 +22,9 @@ from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.checks import Check, kept_check, listing_of, loaded_check, refusal_of, taught_check
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.worker import Limits, Reach, Worker
-from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.task_files import query_bytes
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWN: Final = "town-agricultural"  # the smallest that has room for candidates
@@ -79,8 +79,8 @@ def tiny_place(path: str | Path) -> TinyPlace:
     wanted = Wanted(suites=_SUITES, regions=(TOWN,), split="crossfit", count=1, seed=1, out=folder, may_be_fewer=True)
     for request in plan_requests(wanted, tell=_silent):
         for made in make_tasks(request, tell=_silent):
-            queries += task_files.read_queries(made.folder)
-            truths += task_files.read_truths(folder / "truth" / made.folder.relative_to(folder / "tasks"))
+            queries += made.queries()
+            truths += made.truths
     region = read_region(folder / "regions" / TOWN)
     return TinyPlace(folder=folder, region=region, queries=tuple(queries), truths=tuple(truths))
 
@@ -140,7 +140,7 @@ class _Taught:
 def _taught(worker: Worker, place: TinyPlace) -> _Taught:
     """Train a matcher twice, each time in a process of its own."""
     maps = {place.region.manifest.id: place.map_folder}
-    blobs = [task_rows.query_bytes(query) for query in place.queries]
+    blobs = [query_bytes(query) for query in place.queries]
     replies = []
     for _ in range(2):
         worker.end()
@@ -162,7 +162,7 @@ def _untaught(worker: Worker, card: MatcherCard, place: TinyPlace) -> Check:
         [query for query in place.queries if lacks(card, query, is_pictured=place.is_pictured) is None]
     )
     for query in queries if fault is None else ():
-        fault = fault or _fault(worker.match(task_rows.query_bytes(query), top_k=TOP_K), query)
+        fault = fault or _fault(worker.match(query_bytes(query), top_k=TOP_K), query)
     worker.end()
     found = f"learned = None: {fault}" if fault else f"{len(queries)} queries"
     return Check(name=name, outcome="fail" if fault else "pass", found=found)
@@ -224,7 +224,7 @@ class _Kit:
         return lacks(self.card, query, is_taught=self.is_taught, is_pictured=self.place.is_pictured)
 
     def _ask(self, query: Query, *, top_k: int = TOP_K) -> Reply:
-        reply = self.worker.match(task_rows.query_bytes(query), top_k=top_k)
+        reply = self.worker.match(query_bytes(query), top_k=top_k)
         self.refused = self.refused or refusal_of(reply)
         return reply
 

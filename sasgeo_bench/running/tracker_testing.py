@@ -23,10 +23,10 @@ from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.checks import Check, check_of, kept_check, listing_of, loaded_check, refusal_of
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.worker import Limits, Reach, Worker
-from sasgeo_bench.tasks import task_files, task_rows
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import Query, Step, Truth
 from sasgeo_bench.tasks.suites.base import Choice
+from sasgeo_bench.tasks.task_files import query_bytes
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWN: Final = "town-riverside"  # the smallest over which views tell where they are
@@ -87,9 +87,8 @@ def tiny_flights(path: str | Path) -> TinyFlights:
     truths: dict[str, Truth] = {}
     for request in plan_requests(wanted, tell=_silent):
         for made in make_tasks(request, tell=_silent):
-            queries += task_files.read_queries(made.folder)
-            found = task_files.read_truths(folder / "truth" / made.folder.relative_to(folder / "tasks"))
-            truths |= {truth.query_id: truth for truth in found}
+            queries += made.queries()
+            truths |= {truth.query_id: truth for truth in made.truths}
     flights = [tuple(views) for _, views in groupby(queries, key=lambda query: query.step and query.step.sequence_id)]
     flights.sort(key=lambda views: (truths[views[0].query_id].kind != _KIND, views[0].query_id))
     return TinyFlights(
@@ -164,7 +163,7 @@ class _Kit:
         """Ask the views of a flight in order; stop at the first without an answer."""
         replies = []
         for query in views:
-            replies.append(self.worker.match(task_rows.query_bytes(query), top_k=TOP_K))
+            replies.append(self.worker.match(query_bytes(query), top_k=TOP_K))
             self.refused = self.refused or refusal_of(replies[-1])
             if replies[-1].status != "ok":
                 break

@@ -7,22 +7,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
-from sasgeo_bench.regions.region_files import read_manifest
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import PUBLISHED, Detector, Truth, base_of
 from sasgeo_bench.tasks.split import Block, Split, nearest_blocks
-from sasgeo_bench.tasks.task_rows import truth_sha256
+from sasgeo_bench.tasks.task_files import Task, read_truths, truth_sha256
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Taken:
-    """A training task: its folder, its truths, its map, and the ids of the queries that are used."""
+    """A training task, its map, and the ids of the queries that are used."""
 
-    task: Path
-    truth: Path
+    task: Task
     region: Path
     ids: tuple[str, ...]
 
@@ -58,7 +54,7 @@ class _Pair:
     suite: str
     site: str
     query_id: str
-    task: Path
+    task: Task
     hashes: tuple[str, str]
 
 
@@ -105,30 +101,32 @@ def plan_training(
         If a task, its map or its truths are missing, damaged or do not belong together.
     """
     chosen_by = lessons or Lessons()
-    tasks = {folder.resolve(): folder for folder in train}
-    abouts = {folder: task_files.read_task(folder) for folder in tasks.values()}
-    regions = {base_of(about["region"]): folder for folder, about in abouts.items()}
-    others = {base_of(task_files.read_task(folder)["region"]): folder for folder in asked}
+    tasks = [Task.open(folder) for folder in {folder.resolve(): folder for folder in train}.values()]
+    regions = {base_of(task.manifest.region): task.folder for task in tasks}
+    others = {base_of(Task.open(folder).manifest.region): folder for folder in asked}
     check_apart(regions, others, split)
-    maps = {folder: map_of(folder, about) for folder, about in abouts.items()}
+    maps = {task.folder: task.checked_region() for task in tasks}
     _check_names(maps)
-    pairs = [pair for folder, about in abouts.items() for pair in _pairs_of(folder, about, split, chosen_by)]
+    pairs = [pair for task in tasks for pair in _pairs_of(task, split, chosen_by)]
     if not pairs:
-        first = next(iter(tasks.values()))
+        first = tasks[0].folder
         raise ConfigError(
             f"{first}, to learn from, holds no queries {chosen_by.to_text()}: there is nothing to learn from"
         )
     chosen = spread(pairs, (lambda pair: pair.place, lambda pair: pair.suite, lambda pair: pair.site))[:most]
-    order = sorted({pair.task for pair in chosen}, key=lambda task: (abouts[task]["region"], abouts[task]["suite"]))
-    ids = {folder: tuple(sorted(pair.query_id for pair in chosen if pair.task == folder)) for folder in order}
+    ids: dict[Path, list[str]] = {}
+    for pair in chosen:
+        ids.setdefault(pair.task.folder, []).append(pair.query_id)
+    taken = tuple(
+        Taken(task=task, region=maps[task.folder], ids=tuple(sorted(ids[task.folder])))
+        for task in sorted(tasks, key=lambda task: task.manifest.name[::-1])
+        if task.folder in ids
+    )
     hashes = {pair.query_id: pair.hashes for pair in chosen}
     return TrainingSet(
-        taken=tuple(
-            Taken(task=folder, truth=truth_of(folder, abouts[folder]), region=maps[folder], ids=ids[folder])
-            for folder in order
-        ),
+        taken=taken,
         places=tuple(sorted({pair.place for pair in chosen})),
-        sha256=_hash_of([hashes[name] for folder in order for name in ids[folder]]),
+        sha256=_hash_of([hashes[name] for item in taken for name in item.ids]),
     )
 
 
@@ -178,19 +176,6 @@ def root_of(task: Path) -> Path:
     return task.resolve().parent.parent.parent
 
 
-def truth_of(task: Path, about: Mapping[str, Any]) -> Path:
-    """Return the folder of a task's truths."""
-    return root_of(task) / "truth" / str(about["suite"]) / str(about["region"])
-
-
-def map_of(task: Path, about: Mapping[str, Any]) -> Path:
-    """Return the map of a task; refuse one that was built anew since."""
-    region: Path = root_of(task) / "regions" / str(about["region"])
-    if not task_files.is_of_map(about, read_manifest(region)):
-        raise StoreError(f"{region} was built anew since the queries of {task} were made: make them again")
-    return region
-
-
 def _check_names(maps: Mapping[Path, Path]) -> None:
     """Refuse two maps of one name: queries hold the name alone."""
     seen: dict[str, Path] = {}
@@ -201,26 +186,26 @@ def _check_names(maps: Mapping[Path, Path]) -> None:
             )
 
 
-def _pairs_of(task: Path, about: Mapping[str, Any], split: Split | None, lessons: Lessons) -> Iterator[_Pair]:
+def _pairs_of(task: Task, split: Split | None, lessons: Lessons) -> Iterator[_Pair]:
     """Yield every query of a task that may be learned from, with what decides whether it is used."""
-    truth = truth_of(task, about)
-    if not (truth / task_files.TRUTH).is_file():
+    if not task.has_truths:
         raise StoreError(
-            f"{truth} holds no truths of {task}, which training needs: make the queries here, or leave it out"
+            f"{task.truth} holds no truths of {task.folder}, which training needs: "
+            "make the queries here, or leave it out"
         )
-    task_files.check_queries(task)
-    task_files.check_truths(task, truth)
-    asked, place_of = task_files.read_asked(task), {} if split is None else split.place_of
-    for item in task_files.read_truths(truth):
+    task.check_queries()
+    task.check_truths()
+    place_of = {} if split is None else split.place_of
+    for item in read_truths(task.truth):
         if not lessons.hold(item):
             continue
         yield _Pair(
-            place=place_of.get(item.block, base_of(about["region"])),
-            suite=str(about["suite"]),
+            place=place_of.get(item.block, base_of(task.manifest.region)),
+            suite=task.manifest.suite,
             site=item.pair_id,
             query_id=item.query_id,
             task=task,
-            hashes=(asked[item.query_id], truth_sha256(item)),
+            hashes=(task.asked[item.query_id], truth_sha256(item)),
         )
 
 
@@ -247,13 +232,13 @@ def read_pairs(training_set: TrainingSet) -> list[tuple[bytes, Truth]]:
     found: list[tuple[bytes, Truth]] = []
     hashes: list[tuple[str, str]] = []
     for item in training_set.taken:
-        truths = {truth.query_id: truth for truth in task_files.read_truths(item.truth)}
-        for query, blob, asked in task_files.read_some(item.task, frozenset(item.ids)):
+        truths = {truth.query_id: truth for truth in read_truths(item.task.truth)}
+        for query, blob, asked in item.task.some(frozenset(item.ids)):
             if query.query_id in truths:
                 found.append((blob, truths[query.query_id]))
                 hashes.append((asked, truth_sha256(truths[query.query_id])))
     if _hash_of(hashes) != training_set.sha256:
         raise StoreError(
-            f"{training_set.taken[0].task} or another task to learn from was made anew meanwhile: run again"
+            f"{training_set.taken[0].task.folder} or another task to learn from was made anew meanwhile: run again"
         )
     return found

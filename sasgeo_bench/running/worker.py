@@ -34,7 +34,7 @@ from sasgeo_bench.running.memory import WATCH_S, Group, MemoryWatch
 from sasgeo_bench.running.replies import PluginReply, Reply, read_reply
 from sasgeo_bench.sensing.packing import LABELLED
 from sasgeo_bench.tasks.query import Truth
-from sasgeo_bench.tasks.task_rows import pairs_bytes
+from sasgeo_bench.tasks.task_files import pairs_bytes
 from sasgeo_bench.texts import one_line
 
 _KEEPER_S: Final = 5.0  # for the keeper of a matcher's process to end all its descendants

@@ -5,13 +5,12 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Final
 
 import pandas as pd
 import pyarrow as pa
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.running.run_manifest import RunManifest
@@ -21,79 +20,11 @@ from sasgeo_bench.scoring.flights import score_flights
 from sasgeo_bench.scoring.rows import AS_SUBMITTED
 from sasgeo_bench.scoring.score import Questions, settle_not_applicable, some_rows, with_answers
 from sasgeo_bench.scoring.validate import submission_faults, validate
-from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.query import CONTROLS, Head, Truth
+from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.split import Split
+from sasgeo_bench.tasks.task_files import TASK, Task
 
-M2_PER_KM2: Final = 1e6
 _MOST_KEPT_BYTES: Final = 128 * 1024**2  # of answers: some 120,000 of 25 poses
-
-
-@dataclass(frozen=True, kw_only=True)
-class AskedTask:
-    """A task to compare runs against: the hash of each query."""
-
-    folder: Path
-    about: Mapping[str, Any]
-    asked: Mapping[str, str]
-
-    @classmethod
-    def of(cls, folder: Path) -> Self:
-        """Read it from its folder.
-
-        Raise StoreError if the folder holds no valid task.
-        """
-        return cls(folder=folder, about=task_files.read_task(folder), asked=task_files.read_asked(folder))
-
-
-@dataclass(frozen=True, kw_only=True)
-class ScoredTask:
-    """A task with truths, read once for all entries; `parts` are those of the split that its queries belong to."""
-
-    folder: Path
-    about: dict[str, Any]
-    truths: tuple[Truth, ...]
-    parts: frozenset[str]
-    view_bytes: dict[str, int]
-    area_km2: float | None
-
-    @property
-    def is_of_flights(self) -> bool:
-        """Return whether its queries are views of flights."""
-        return "sequence" in self.about["counts"]
-
-    @property
-    def heads(self) -> tuple[Head, ...]:
-        """Read the queries, whose candidates are too many to keep those of all tasks in memory."""
-        return tuple(task_files.read_heads(self.folder))
-
-
-def read_scored_task(folder: Path, root: Path) -> ScoredTask:
-    """Read a task and its truths from their own root, and check that they match.
-
-    Raise StoreError if either is missing or damaged, or they do not belong together.
-    """
-    about = task_files.read_task(folder)
-    truth = root / str(about["suite"]) / str(about["region"])
-    task_files.check_truths(folder, truth)
-    return ScoredTask(
-        folder=folder,
-        about=about,
-        truths=tuple(task_files.read_truths(truth)),
-        parts=frozenset(task_files.read_parts(folder)),
-        view_bytes=task_files.read_view_bytes(folder),
-        area_km2=_area_km2(folder.resolve().parents[2] / "regions" / about["region"]),
-    )
-
-
-def _area_km2(region: Path) -> float | None:
-    """Return the mapped area of a region; None if its map is missing, since scores need no map."""
-    try:
-        manifest = read_manifest(region)
-    except StoreError:
-        return None
-    west, south, east, north = manifest.bounds_m
-    return manifest.coverage.share * (east - west) * (north - south) / M2_PER_KM2
 
 
 _HOW_TO_MEND: Final = "run again (existing answers are kept), or make the old queries again"
@@ -137,7 +68,7 @@ def read_entry_answers(
             if not entry.runs:
                 files[entry.name] = Answers.read(entry.sources[0])  # without runs there is one file
     found = folders or _answered_folders(entries, files.values(), root)
-    tasks = [AskedTask.of(folder) for folder in dict.fromkeys(found)]
+    tasks = [Task.open(folder) for folder in dict.fromkeys(found)]
     task_of = {name: task.folder for task in tasks for name in task.asked}
     room = _Room(_MOST_KEPT_BYTES)
     answers: list[EntryAnswers] = []
@@ -171,22 +102,22 @@ def read_entry_answers(
 def _answered_folders(entries: Sequence[Entry], files: Collection[Answers], root: Path) -> Iterator[Path]:
     """Yield the task folders that runs were made on, then those for which files hold an answer."""
     for suite, region in sorted({(run.suite, run.region) for entry in entries for run in entry.runs}):
-        if (root / "tasks" / suite / region / task_files.TASK).is_file():
+        if (root / "tasks" / suite / region / TASK).is_file():
             yield root / "tasks" / suite / region
     held = {name for rows in files for name in rows.table["query_id"].to_pylist()}
-    for path in sorted((root / "tasks").glob(f"*/*/{task_files.TASK}")) if held else ():
-        if not held.isdisjoint(task_files.read_ids(path.parent)):
+    for path in sorted((root / "tasks").glob(f"*/*/{TASK}")) if held else ():
+        if not held.isdisjoint(Task.open(path.parent).ids()):
             yield path.parent
 
 
 def _answers_of_file(
-    entry: Entry, tasks: Sequence[AskedTask], answers: Answers, task_of: Mapping[str, Path]
+    entry: Entry, tasks: Sequence[Task], answers: Answers, task_of: Mapping[str, Path]
 ) -> EntryAnswers:
     """Return a file or a submission with its answers; a submission is asked the tasks it names."""
     asked = tasks
     if entry.submission is not None:
         named = {(item.suite, item.region) for item in entry.submission.tasks}
-        asked = [task for task in tasks if (task.about["suite"], task.about["region"]) in named]
+        asked = [task for task in tasks if task.manifest.name in named]
     places: dict[Path | None, list[int]] = {}
     for at, name in enumerate(answers.table["query_id"].to_pylist()):
         places.setdefault(task_of.get(name), []).append(at)
@@ -211,13 +142,13 @@ class _Room:
 
 
 def _read_runs(
-    entry: Entry, tasks: Sequence[AskedTask], task_of: Mapping[str, Path], room: _Room
+    entry: Entry, tasks: Sequence[Task], task_of: Mapping[str, Path], room: _Room
 ) -> tuple[EntryAnswers, list[Path]]:
     """Return an entry with the answers of its runs, and the folders of runs that answer none of the tasks.
 
     Every answer is checked here; those that find no room are read again where they are used.
     """
-    by_name = {(task.about["suite"], task.about["region"]): task for task in tasks}
+    by_name = {task.manifest.name: task for task in tasks}
     read: dict[Path, Callable[[], Answers]] = {}
     runs: list[tuple[Path, RunManifest]] = []
     asked: set[Path] = set()
@@ -227,7 +158,7 @@ def _read_runs(
         if task is None:
             stale.append(source)
             continue
-        is_same = run.queries_sha256 == task.about["files"][task_files.QUERIES]["sha256"]
+        is_same = run.queries_sha256 == task.manifest.queries_sha256
         open_answers = partial(Answers.open, source, task.asked, is_tied=is_same)
         found = open_answers()
         if not (len(found.table) or is_same):
@@ -253,13 +184,16 @@ def _share_of(run: RunManifest, answers: Answers) -> RunManifest:
     return run.model_copy(update={"cpu_s": run.cpu_s * len(answers.table) / (len(answers.table) + answers.aside)})
 
 
-def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[ScoredTask]:
-    """Read the tasks of a board with their truths; without `folders`, those that the entries bring.
+def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[Task]:
+    """Open the tasks of a board, whose truths lie in `truth`; without `folders`, those that the entries bring.
 
-    Raise StoreError as `read_scored_task` does.
+    Raise StoreError if a task or its truths are missing or damaged, or do not belong together.
     """
     chosen = dict.fromkeys(folders) or sorted({folder for item in answers for folder in item.held})
-    return [read_scored_task(folder, truth) for folder in chosen]
+    tasks = [Task.open(folder, truth) for folder in chosen]
+    for task in tasks:
+        task.check_truths()
+    return tasks
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -270,14 +204,14 @@ class Contest:
     """
 
     answers: tuple[EntryAnswers, ...]
-    tasks: tuple[ScoredTask, ...]
+    tasks: tuple[Task, ...]
     scores: dict[str, pd.DataFrame]
     views: dict[str, pd.DataFrame]
 
 
 def score_entries(
     answers: Sequence[EntryAnswers],
-    tasks: Sequence[ScoredTask],
+    tasks: Sequence[Task],
     *,
     split: Split | None,
     by_region: Collection[str],
@@ -290,12 +224,11 @@ def score_entries(
     `by_block`, whose blocks are drawn independently, each is a place. Raise the first fault, a StoreError or
     ConfigError, if no entry is left.
     """
-    folders = [task.folder for task in tasks]
     parts: dict[str, list[_Part]] = {}
     for item in answers:
         with failures.of(item.entry.name):
             if item.entry.how == AS_SUBMITTED:
-                check_submitted(item.entry, folders, split)
+                check_submitted(item.entry, tasks, split)
             parts[item.entry.name] = []
     for task in tasks:  # the candidates of a task are in memory at once
         score = _scorer(task, split, by_region, by_block)
@@ -329,11 +262,11 @@ def scored_rows(contest: Contest, split: Split | None, *, tell: Callable[[str], 
     about the other suites of an entry. Raise ConfigError if no entry is left.
     """
     unused = {"train"} if split is not None and split.spec.kind == "holdout" else set()
-    tasks = [task for task in contest.tasks if not task.parts <= unused]
+    tasks = [task for task in contest.tasks if not task.parts() <= unused]
     found = {}
     for item in contest.answers:
-        asked = {task.about["suite"] for task in tasks if task.folder in item.asked}
-        lacking = {CONTROLS} | {task.about["suite"] for task in tasks if task.folder not in item.asked}
+        asked = {task.manifest.suite for task in tasks if task.folder in item.asked}
+        lacking = {CONTROLS} | {task.manifest.suite for task in tasks if task.folder not in item.asked}
         lost = sorted(asked & lacking - {CONTROLS})
         if lost:
             tell(f"{item.entry.name}: not on the board of {', '.join(lost)}, for it was not asked all tasks there")
@@ -366,28 +299,28 @@ def rows_to_rank(scored: Mapping[str, pd.DataFrame], split: Split | None) -> dic
     return found
 
 
-def check_submitted(entry: Entry, folders: Sequence[Path], split: Split | None) -> None:
+def check_submitted(entry: Entry, tasks: Sequence[Task], split: Split | None) -> None:
     """Check a file or submission against the tasks; a query without a row is a miss, not a fault.
 
     Raise ConfigError with the first fault, and the number of faults. Raise StoreError if it cannot be read.
     """
     path = entry.sources[0]
     if entry.submission is None:
-        found = validate(path, folders)
+        found = validate(path, tasks)
     else:
         path = path.parents[1]
-        found = submission_faults(path, entry.submission, folders, split)
+        found = submission_faults(path, entry.submission, tasks, split)
     faults = [fault for fault in found if not fault.is_missing_row]
     if faults:
         raise ConfigError(f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)")
 
 
-def design_rows(task: ScoredTask, split: Split | None) -> pd.DataFrame:
+def design_rows(task: Task, split: Split | None) -> pd.DataFrame:
     """Return a row for each query or flight of one task, scored without an answer; raise as `score_task` does."""
     return _scorer(task, split)(Answers.of([])).whole
 
 
-def _scored(item: EntryAnswers, task: ScoredTask, score: Callable[[pa.Table], "_Part"]) -> "_Part":
+def _scored(item: EntryAnswers, task: Task, score: Callable[[pa.Table], "_Part"]) -> "_Part":
     return score(item.predictions.of_task(task.folder))
 
 
@@ -420,15 +353,15 @@ def _joined(parts: Sequence[_Part], shared: dict[tuple[int, ...], pd.DataFrame])
 
 
 def _scorer(
-    task: ScoredTask, split: Split | None, by_region: Collection[str] = (), by_block: Collection[str] = ()
+    task: Task, split: Split | None, by_region: Collection[str] = (), by_block: Collection[str] = ()
 ) -> Callable[[Answers], _Part]:
     """Return what scores the rows of one entry's answers to a task, whose queries are read once for all entries."""
     of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
-    questions = Questions.of(task.heads, task.truths, **of_split)
+    questions = Questions.of(tuple(task.heads()), task.truths, **of_split)
 
     def resampled(frame: pd.DataFrame) -> pd.DataFrame:
         """Return rows with the blocks and places that they are drawn by."""
-        suite = task.about["suite"]
+        suite = task.manifest.suite
         frame = frame.assign(block=frame["region"]) if suite in by_region else frame
         return frame.assign(place=frame["block"], country=frame["block"]) if suite in by_block else frame
 
@@ -436,7 +369,7 @@ def _scorer(
 
     def score(answers: Answers) -> _Part:
         """Score the answers of one entry."""
-        if not task.is_of_flights:
+        if not task.manifest.is_of_flights:
             return _Part(questions=asked, answers=questions.answered(answers))
         found = score_flights(questions.heads, questions.truths, answers.found, **of_split)
         return _Part(questions=None, answers=resampled(found.flights), views=found.views)

@@ -26,7 +26,7 @@ from sasgeo_bench.running.prediction_files import (
     prediction_row,
     schema_of,
 )
-from sasgeo_bench.tasks.task_rows import ASKED
+from sasgeo_bench.tasks.task_files import ASKED
 from sasgeo_bench.texts import json_text
 
 SUBMISSION: Final = "submission.json"

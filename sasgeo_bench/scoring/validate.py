@@ -13,15 +13,14 @@ import pyarrow as pa
 from sasgeo_bench.errors import MatchError, StoreError, counted
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match, check_match
-from sasgeo_bench.matching.submission import Submission, TaskManifest
+from sasgeo_bench.matching.submission import AnsweredTask, Submission
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import differing_columns, prediction_of, row_faults
 from sasgeo_bench.scoring.submission_files import SUBMISSION, predictions_name
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, PriorGroup
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.task_rows import ASKED
+from sasgeo_bench.tasks.task_files import ASKED, Task
 from sasgeo_bench.texts import MOST_CANDIDATES
 
 TaskName = tuple[str, str]  # suite and region
@@ -56,13 +55,12 @@ class Violation:
         return f"{where}, {self.column}: found {self.found}, expected {self.expected}"
 
 
-def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
+def validate(path: Path, tasks: Sequence[Task]) -> Iterator[Violation]:
     """Yield the violations of predictions in the order of the rows, queries without a row last.
 
     `path` is a predictions file, or a run's folder of parts, where a newer row replaces an older one. It should answer
     the tasks and no others. Rows of a run's folder that state other queries are skipped (`set_aside` counts them).
-    Raise StoreError if a file cannot be read at all, a task is of another version, or the folder holds runs of two
-    matchers.
+    Raise StoreError if a file cannot be read at all, or the folder holds runs of two matchers.
     """
     prediction_files.check_one_matcher([path])
     queries = _asked_of(tasks)
@@ -93,21 +91,20 @@ def validate(path: Path, tasks: Sequence[Path]) -> Iterator[Violation]:
 
 
 def submission_faults(
-    folder: Path, submission: Submission, tasks: Sequence[Path] | None, split: Split | None
+    folder: Path, submission: Submission, tasks: Sequence[Task] | None, split: Split | None
 ) -> Iterator[Violation]:
     """Yield the violations of a submission against the tasks of a board: card, rows, then missing rows.
 
     Tasks that the submission does not name are skipped; without tasks, rows are not checked. `split` is that of the
-    board. Files and hashes are checked by `read_submission`. Raise StoreError if a file cannot be read, or a task is of
-    another version.
+    board. Files and hashes are checked by `read_submission`. Raise StoreError if a file cannot be read.
     """
     yield from _record_faults(submission, split)
     if tasks is None or submission.task_version not in TASK_VERSIONS:
         return
     named = {(item.suite, item.region) for item in submission.tasks}
-    mine = {name: task for task in tasks if (name := _name_of(task)) in named}
+    mine = {task.manifest.name: task for task in tasks if task.manifest.name in named}
     yield from _task_faults(submission, mine)
-    queries, by_task = _asked_of([*mine.values()]), {name: task_files.read_asked(task) for name, task in mine.items()}
+    queries, by_task = _asked_of([*mine.values()]), {name: task.asked for name, task in mine.items()}
     asked = {query: digest for one in by_task.values() for query, digest in one.items()}
     seen: dict[str, str] = {}
     file = folder / predictions_name(submission.card.name)
@@ -147,7 +144,7 @@ def _record_faults(submission: Submission, split: Split | None) -> Iterator[Viol
             yield Violation(SUBMISSION, -1, "trained_on", repr(place), f"places of the split{hint}")
 
 
-def _task_faults(submission: Submission, tasks: Mapping[TaskName, Path]) -> Iterator[Violation]:
+def _task_faults(submission: Submission, tasks: Mapping[TaskName, Task]) -> Iterator[Violation]:
     """Yield tasks of the record that the board lacks, that it lists twice, or of other queries."""
     counts = Counter((item.suite, item.region) for item in submission.tasks)
     for name in sorted(counts.keys() - tasks.keys()):
@@ -157,7 +154,7 @@ def _task_faults(submission: Submission, tasks: Mapping[TaskName, Path]) -> Iter
         count = counts.pop(name, 1)
         if count > 1:
             yield _task_fault(item, f"{count} times", "each task once")
-        digest = task_files.read_task(tasks[name])["files"][task_files.QUERIES]["sha256"] if name in tasks else None
+        digest = tasks[name].manifest.queries_sha256 if name in tasks else None
         if digest not in (None, item.queries_sha256):
             yield _task_fault(item, f"with queries_sha256 {item.queries_sha256}", f"{digest}, of the board's queries")
 
@@ -177,7 +174,7 @@ def _count_faults(
             yield _task_fault(item, f"with answered {item.answered}", f"{answered}, which have a row")
 
 
-def _task_fault(item: TaskManifest, found: str, expected: str) -> Violation:
+def _task_fault(item: AnsweredTask, found: str, expected: str) -> Violation:
     return Violation(SUBMISSION, -1, "tasks", f"{item.suite}/{item.region} {found}", f"{expected}: submit again")
 
 
@@ -187,7 +184,7 @@ def _missing(file: str, queries: Iterable[str], seen: Mapping[str, str]) -> Iter
             yield Violation(file, -1, "query_id", f"{_NO_ROW}{name}", "one for every query")
 
 
-def set_aside(path: Path, tasks: Sequence[Path]) -> int:
+def set_aside(path: Path, tasks: Sequence[Task]) -> int:
     """Return how many answers of a run's folder are to queries that the tasks do not hold in this form.
 
     Raise StoreError if a file cannot be read.
@@ -204,13 +201,8 @@ def set_aside(path: Path, tasks: Sequence[Path]) -> int:
     return len(found)
 
 
-def _asked(tasks: Sequence[Path]) -> dict[str, str]:
-    return {name: digest for task in tasks for name, digest in task_files.read_asked(task).items()}
-
-
-def _name_of(task: Path) -> TaskName:
-    about = task_files.read_task(task)
-    return str(about["suite"]), str(about["region"])
+def _asked(tasks: Sequence[Task]) -> dict[str, str]:
+    return {name: digest for task in tasks for name, digest in task.asked.items()}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,16 +213,15 @@ class _Asked:
     bounds_m: Bounds | None
 
 
-def _asked_of(tasks: Sequence[Path]) -> dict[str, _Asked]:
+def _asked_of(tasks: Sequence[Task]) -> dict[str, _Asked]:
     return {asked.head.query_id: asked for task in tasks for asked in _queries(task)}
 
 
-def _queries(task: Path) -> Iterator[_Asked]:
+def _queries(task: Task) -> Iterator[_Asked]:
     """Yield the queries of a task; views are not read, since stored results lack them."""
-    _, region = _name_of(task)
-    bounds_m = _bounds_m(task.resolve().parents[2] / "regions" / region)
+    bounds_m = _bounds_m(task.region)
     by_group: dict[str, Bounds] = {}
-    for head in task_files.read_heads(task):
+    for head in task.heads():
         group = head.prior_group
         if bounds_m is not None and head.track == "localization" and group not in by_group:
             by_group[group] = _reach_m(bounds_m, PriorGroup.parse(group))

@@ -5,7 +5,7 @@ import datetime as dt
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
@@ -40,21 +40,13 @@ from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.suites.synthetic_age import ageing_of
+from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
 from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
 
 _SKIP: Final = " (--skip passes on to the next suite)"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Made:
-    """One written task: its folder, and the numbers of its queries and sites."""
-
-    folder: Path
-    queries: int
-    sites: int
-
-
-def make_tasks(request: Request, *, tell: Tell) -> tuple[Made, ...]:
+def make_tasks(request: Request, *, tell: Tell) -> tuple[Task, ...]:
     """Draw a suite's queries on a region; write a task for each searched map, for real ageing each older one.
 
     Raises
@@ -80,7 +72,7 @@ def ensure_tasks(request: Request, *, tell: Tell) -> tuple[Path, ...]:
     made = made_tasks(request)
     if made is None:
         with _locked(request, tell):
-            made = made_tasks(request) or tuple(item.folder for item in _make_tasks(request, tell))
+            made = made_tasks(request) or tuple(task.folder for task in _make_tasks(request, tell))
     return made
 
 
@@ -90,12 +82,13 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
     They are unchanged, request and program version are the same, and a build would give the map they search.
     """
     sha256 = _request_sha256(request)
-    drawn = {name: record for name, record in _records(request).items() if record.get("request_sha256") == sha256}
-    if not drawn or any(record.get("maps") != len(drawn) for record in drawn.values()):
+    drawn = {name: record for name, record in _records(request).items() if record.request_sha256 == sha256}
+    if not drawn or any(record.maps != len(drawn) for record in drawn.values()):
         return None
     folders = tuple(request.out / "tasks" / request.suite / name for name in drawn)
     try:
-        if any(check_task(folder, out=request.out) or not has_truths(folder, out=request.out) for folder in folders):
+        tasks = [Task.open(folder, request.out / "truth") for folder in folders]
+        if any(check_task(task, out=request.out) or not task.has_truths for task in tasks):
             return None
     except StoreError:
         return None
@@ -105,23 +98,23 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
 
 def why_to_draw(request: Request) -> str:
     """Return in a few words why a request has to be drawn."""
-    records = [record for record in _records(request).values() if record]
+    records = [record for record in _records(request).values() if record.model_fields_set]
     if not records:
         return "not there yet"
-    if any(record.get("request_sha256") == _request_sha256(request) for record in records):
+    if any(record.request_sha256 == _request_sha256(request) for record in records):
         return "task, truths or map changed since"
-    if all(record | seed_record(request.seed) != record for record in records):
+    if all(record.model_copy(update=seed_record(request.seed)) != record for record in records):
         return "drawn with another seed"
-    counts = [record.get("count") for record in records]
+    counts = [record.count for record in records]
     if not {request.count, None} & set(counts):
         return f"drawn with sites = {counts[0]}, now {request.count}"
     return "drawn by other settings or an older version"
 
 
-def _records(request: Request) -> dict[str, dict[str, Any]]:
+def _records(request: Request) -> dict[str, TruthManifest]:
     """Return by map the contents of `truth.json` of a request's suite and region."""
     folders = sorted((request.out / "truth" / request.suite).glob(f"{request.region.id}*"))
-    return {path.name: task_files.read_hidden(path) for path in folders if is_of_region(path.name, request.region.id)}
+    return {path.name: TruthManifest.read(path) for path in folders if is_of_region(path.name, request.region.id)}
 
 
 def is_of_region(name: str, region: str) -> bool:
@@ -161,7 +154,7 @@ def _foreign_code(request: Request) -> tuple[str, ...]:
     return () if code is None else (code,)
 
 
-def _make_tasks(request: Request, tell: Tell) -> tuple[Made, ...]:
+def _make_tasks(request: Request, tell: Tell) -> tuple[Task, ...]:
     drawer, sites = plan_draw(request, tell)
     return tuple(_write(request, drawer, sites, tell))
 
@@ -267,7 +260,7 @@ def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell)
     return plan.folder
 
 
-def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site], tell: Tell) -> Iterator[Made]:
+def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site], tell: Tell) -> Iterator[Task]:
     jobs = drawer.jobs(sites)
     why = {job.query_id: drawer.why_not(job) for job in jobs}
     left = [job for job in jobs if why[job.query_id] is None]
@@ -288,20 +281,20 @@ def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site
     if request.choice.profile is not None:
         hidden["profile"] = request.choice.profile.model_dump(mode="json", exclude={"classes"})
     for region, own in sorted(by_map.items()):
-        about = _about(request, drawer, region, sites, own)
-        made = put_task(drawer.drawn(own), about, hidden, out=request.out, tell=tell)
-        drawn = f"{counted(made.queries, 'query', 'queries')} at {counted(len(sites), 'site')}"
+        origin = _origin(request, drawer, region, sites, own)
+        made = put_task(drawer.drawn(own), origin, TruthManifest(**hidden), out=request.out, tell=tell)
+        drawn = f"{counted(made.manifest.queries, 'query', 'queries')} at {counted(len(sites), 'site')}"
         tell(f"{name} on {region}: {drawn} in {made.folder}")
         yield made
 
 
 def put_task(
-    pairs: Iterable[tuple[Query, Truth]], about: dict[str, Any], hidden: dict[str, Any], *, out: Path, tell: Tell
-) -> Made:
+    pairs: Iterable[tuple[Query, Truth]], origin: TaskOrigin, hidden: TruthManifest, *, out: Path, tell: Tell
+) -> Task:
     """Write queries below `out/tasks` and their truths below `out/truth`, each folder whole or not at all.
 
-    `pairs` are in the order of the query ids. `about` becomes `task.json`; its `suite` and `region` name the folders.
-    `hidden` becomes `truth.json`; `task.json` repeats the commitment of a private or sealed seed.
+    `pairs` are in the order of the query ids. `origin` becomes `task.json`; its `suite` and `region` name the
+    folders. `hidden` becomes `truth.json`; `task.json` repeats the commitment of a private or sealed seed.
 
     Raises
     ------
@@ -309,14 +302,15 @@ def put_task(
         If a folder holds foreign files or cannot be written, or if only one of its queries and these has a private
         seed.
     """
-    task_folder = out / "tasks" / about["suite"] / about["region"]
-    truth_folder = out / "truth" / about["suite"] / about["region"]
+    task_folder = out / "tasks" / origin.suite / origin.region
+    truth_folder = out / "truth" / origin.suite / origin.region
     check_separate(out / "tasks", truth_folder)
     check_separate(task_folder, out / "truth")
     task_files.check_ours(task_folder, (task_files.QUERIES, task_files.TASK))
     task_files.check_ours(truth_folder, (task_files.TRUTH, task_files.TRUTH_OF, LABELS))
     _check_unmixed(truth_folder, hidden)
-    about |= {name: hidden[name] for name in (task_files.PRIVATE, task_files.SEALED) if name in hidden}
+    seeds = {"private_seed": hidden.private_seed, "sealed_seed": hidden.sealed_seed}
+    origin = origin.model_copy(update={name: seed for name, seed in seeds.items() if seed is not None})
     try:
         with (
             locked(task_folder, tell=tell),
@@ -324,67 +318,59 @@ def put_task(
             fresh_folder(task_folder) as task_scratch,
             fresh_folder(truth_folder) as truth_scratch,
         ):
-            total = task_files.write_task(task_scratch, truth_scratch, pairs, about, hidden)
+            manifest = task_files.write_task(task_scratch, truth_scratch, pairs, origin, hidden)
     except SasgeoError:
         raise
     except OSError as error:
         raise StoreError(
             f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
         ) from error
-    return Made(folder=task_folder, queries=total, sites=about["sites"])
+    return Task(task_folder, manifest, truth_folder)
 
 
-def _check_unmixed(truth_folder: Path, hidden: Mapping[str, Any]) -> None:
+def _check_unmixed(truth_folder: Path, hidden: TruthManifest) -> None:
     """Refuse to draw with a public seed over queries of a private one, and the other way round."""
-    before = task_files.read_hidden(truth_folder)
-    if before and (task_files.PRIVATE in before) != (task_files.PRIVATE in hidden):
-        kinds = ("public", "private") if task_files.PRIVATE in hidden else ("private", "public")
+    before = TruthManifest.read(truth_folder)
+    if before.model_fields_set and (before.private_seed is None) != (hidden.private_seed is None):
+        kinds = ("private", "public") if hidden.private_seed is None else ("public", "private")
         raise StoreError(
             f"{truth_folder} was drawn by a {kinds[0]} seed, and this one is {kinds[1]}: choose another --out"
         )
 
 
-def _about(
+def _origin(
     request: Request, drawer: Drawer | FlightDrawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]
-) -> dict[str, Any]:
-    """Return the contents of `task.json`: how the queries were drawn, but not where they lie."""
+) -> TaskOrigin:
+    """Say how the queries were drawn, but not where they lie."""
     card, code = drawer.suite.card, suite_code(request.suite_spec)
     state = drawer.scene.state(region)
     manifest = region_files.read_manifest(request.out / "regions" / region)
     spec = request.split.spec
     texts = ("title", "what", "separates", "falsifier", "strength_unit")
-    return {
-        "suite": card.name,
-        "suite_version": card.version,
+    return TaskOrigin(
+        suite=card.name,
+        suite_version=card.version,
         **({"suite_sha256": code} if code else {}),
         **{name: getattr(card, name) for name in texts},
-        "region": region,
-        "map_date": state.date.isoformat(),
-        **task_files.map_of(manifest),
-        "split": spec.id,
-        "split_sha256": hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),
-        "sites": len(sites),
-        "views_cells": sorted({job.variant.view_cells for job in jobs}),
-        "epsg": state.grid.epsg,
-        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
-    }
+        region=region,
+        map_date=state.date.isoformat(),
+        map_fingerprint=manifest.fingerprint,
+        map_inputs_sha256=manifest.inputs_sha256,
+        split=spec.id,
+        split_sha256=hashlib.sha256(spec.model_dump_json().encode()).hexdigest(),
+        sites=len(sites),
+        views_cells=sorted({job.variant.view_cells for job in jobs}),
+        epsg=state.grid.epsg,
+        made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+    )
 
 
-def check_task(task_folder: Path, *, out: Path) -> list[str]:
+def check_task(task: Task, *, out: Path) -> list[str]:
     """Check a task against its hashes, its truths and its map; return a line for each fault."""
-    about = task_files.read_task(task_folder)
-    faults = task_files.task_faults(task_folder, out / "truth" / about["suite"] / about["region"])
-    manifest = region_files.read_manifest(out / "regions" / about["region"])
-    if not task_files.is_of_map(about, manifest):
-        faults.append(built_anew(about["region"]))
+    faults, region = task.faults(), task.manifest.region
+    if not task.manifest.is_of_map(region_files.read_manifest(out / "regions" / region)):
+        faults.append(built_anew(region))
     return faults
-
-
-def has_truths(task_folder: Path, *, out: Path) -> bool:
-    """Return whether the truths of a task exist."""
-    about = task_files.read_task(task_folder)
-    path: Path = out / "truth" / about["suite"] / about["region"] / task_files.TRUTH
-    return path.is_file()
 
 
 def built_anew(region: str) -> str:

@@ -20,9 +20,9 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_layers, read_overview
 from sasgeo_bench.regions.preview import paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
 from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, Truth, flight_id
+from sasgeo_bench.tasks.task_files import QUERIES, Task, TaskManifest, read_batches
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -91,18 +91,7 @@ class FlightPanel:
         return int(np.argmax(np.hypot(*np.diff(self.place_m, axis=0).T))) + 1
 
 
-def is_of_flights(about: Mapping[str, Any]) -> bool:
-    """Return whether a task, by its `task.json`, has flights.
-
-    >>> is_of_flights({"counts": {"sequence": 80}}), is_of_flights({"counts": {"localization": 8}})
-    (True, False)
-    """
-    return "sequence" in about["counts"]
-
-
-def flight_panels(
-    task_folder: Path, truth_folder: Path, *, count: int = 12, flight: str | None = None
-) -> tuple[FlightPanel, ...]:
+def flight_panels(task: Task, *, count: int = 12, flight: str | None = None) -> tuple[FlightPanel, ...]:
     """Choose the flights of as many whole sites as `count` panels hold, one site at least; a site's control first.
 
     With `flight`, only the one whose id begins so.
@@ -115,7 +104,7 @@ def flight_panels(
         If there is no such flight.
     """
     truths: dict[str, list[Truth]] = {}
-    for truth in task_files.read_truths(truth_folder):
+    for truth in task.truths:
         truths.setdefault(flight_id(truth.query_id), []).append(truth)
     if flight is None:
         chosen = _of_sites(truths, count)
@@ -123,16 +112,16 @@ def flight_panels(
         chosen = [name for name in truths if name.startswith(flight)][:1]
         if not chosen:
             raise ConfigError(
-                f"{task_folder} holds no flight {flight!r}: it has {counted(len(truths), 'flight')}, as "
+                f"{task.folder} holds no flight {flight!r}: it has {counted(len(truths), 'flight')}, as "
                 f"{', '.join(list(truths)[:3])}"
             )
     rows: dict[str, list[dict[str, Any]]] = {name: [] for name in chosen}
-    for batch in task_files.read_batches(task_folder / task_files.QUERIES, _COLUMNS):
+    for batch in read_batches(task.folder / QUERIES, _COLUMNS):
         for row in batch.to_pylist():
             rows.get(flight_id(row["query_id"]), []).append(row)
     for name in chosen:
         if [row["query_id"] for row in rows[name]] != [truth.query_id for truth in truths[name]]:
-            raise StoreError(f"{truth_folder} does not hold the truths of {task_folder}: make the queries again")
+            raise StoreError(f"{task.truth} does not hold the truths of {task.folder}: make the queries again")
     return tuple(_panel(name, truths[name], rows[name]) for name in chosen)
 
 
@@ -169,23 +158,21 @@ def _panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str, Any]]
     )
 
 
-def write_flight_sheet(
-    path: Path, *, about: Mapping[str, Any], shown: Sequence[FlightPanel], region_folder: Path
-) -> None:
+def write_flight_sheet(path: Path, *, about: TaskManifest, shown: Sequence[FlightPanel], region_folder: Path) -> None:
     """Write the maps of flights as PNG, a row for each site; `about` is `task.json`, `region_folder` its map's.
 
     Raise `StoreError` if the map has been rebuilt since the queries were drawn.
     """
     manifest = region_files.read_manifest(region_folder)
-    if not task_files.is_of_map(about, manifest):
-        raise StoreError(built_anew(about["region"]))
+    if not about.is_of_map(manifest):
+        raise StoreError(built_anew(about.region))
     places = list(_places(shown))
     row_is_site = len({panel.truth.pair_id for panel in shown}) < len(shown)
     across = 1 + max((column for _, column in places), default=0)
     inches = _ONE_INCHES if len(shown) == 1 else _PANEL_INCHES
     sheet = Page(
-        title=f"{about['title']}: {about['region']}",
-        facts=f"{about['what']} {_IN_A_ROW if row_is_site else ''}Number of a stress: {about['strength_unit']}.",
+        title=f"{about.title}: {about.region}",
+        facts=f"{about.what} {_IN_A_ROW if row_is_site else ''}Number of a stress: {about.strength_unit}.",
         note="North is up. inspect --query ID draws one flight alone, or the sheet of one view by its whole id.",
         data=ATTRIBUTION,
         rows=1 + max((row for row, _ in places), default=0),

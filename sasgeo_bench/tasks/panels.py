@@ -13,20 +13,19 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import built_anew
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, Query, Truth
 from sasgeo_bench.tasks.sheet import TWIN, Panel
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import changed_share
 from sasgeo_bench.tasks.suites.mining import describe, mine
+from sasgeo_bench.tasks.task_files import QUERIES, Task
 
 SOME_IDS: Final = 3  # that the refusal of an unknown id names
 
 
 def panels(
-    task_folder: Path,
-    truth_folder: Path,
+    task: Task,
     *,
     out: Path,
     count: int = 12,
@@ -45,23 +44,23 @@ def panels(
     ConfigError
         If there is no such query.
     """
-    about = task_files.read_task(task_folder)
-    region = region_files.read_region(out / "regions" / about["region"])
-    if not task_files.is_of_map(about, region.manifest):
-        raise StoreError(built_anew(about["region"]))
-    state = State.of(region, name=about["region"])
-    truths = {truth.query_id: truth for truth in task_files.read_truths(truth_folder)}
-    strangers = StoreError(f"{truth_folder} does not hold the truths of {task_folder}: make the queries again")
+    name = task.manifest.region
+    region = region_files.read_region(out / "regions" / name)
+    if not task.manifest.is_of_map(region.manifest):
+        raise StoreError(built_anew(name))
+    state = State.of(region, name=name)
+    truths = {truth.query_id: truth for truth in task.truths}
+    strangers = StoreError(f"{task.truth} does not hold the truths of {task.folder}: make the queries again")
     chosen = _for_sheet(list(truths.values()), count) if choose is None else list(choose(list(truths.values())))
     if query_id is not None:
         chosen = [truth for truth in truths.values() if truth.query_id.startswith(query_id)][:1]
         if not chosen:
-            raise _no_query(task_folder, query_id, sorted(truths))
+            raise _no_query(task.folder, query_id, sorted(truths))
     ids = {truth.query_id for truth in chosen}
     queries = {}
     rivals: dict[Pose, tuple[Pose, ...]] = {}
     poses = {truth.pose for truth in chosen}
-    for query in task_files.read_queries(task_folder):
+    for query in task.queries():
         truth = truths.get(query.query_id)
         if truth is None:
             raise strangers
@@ -78,7 +77,7 @@ def _no_query(task_folder: Path, query_id: str, known: Sequence[str]) -> ConfigE
     """Return the error for an id that no query of a task has, with the first of those they have."""
     message = (
         f"{task_folder} holds no query {query_id!r}: it has {counted(len(known), 'query', 'queries')}, "
-        f"as {', '.join(known[:SOME_IDS])}; the column query_id of {task_files.QUERIES} lists all"
+        f"as {', '.join(known[:SOME_IDS])}; the column query_id of {QUERIES} lists all"
     )
     return ConfigError(message)
 

@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tasks on disk: `queries.parquet` and `task.json` for everyone, `truth.parquet` for the scorer alone."""
 
+import datetime as dt
 import hashlib
+import json
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from itertools import chain, islice
+from dataclasses import dataclass, field
+from functools import cached_property
+from itertools import accumulate, chain, islice, pairwise
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import shapely
-from pydantic import Field
+from pydantic import ConfigDict, Field, JsonValue
 
 from sasgeo_bench.config import Document, check_document
 from sasgeo_bench.errors import ConfigError, StoreError
@@ -21,31 +25,384 @@ from sasgeo_bench.files.folders import file_record, sha256_of
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import open_table, read_schema, read_table, table_writer
 from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.regions.evidence import CELLS_PER_BYTE
+from sasgeo_bench.geometry.pose import Pose, Prior
+from sasgeo_bench.regions.evidence import CELLS_PER_BYTE, Evidence, pack, unpack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE, Manifest
-from sasgeo_bench.tasks.frames import LABEL_SCHEMA, LABELS, label_row
-from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Head, Query, Truth
-from sasgeo_bench.tasks.task_rows import (
-    ADDED,
-    ASKED,
-    FILE_SCHEMA,
-    HEAD_SCHEMA,
-    MAY_BE_NULL,
-    PLAIN_TRUTH_SCHEMA,
-    QUERY_SCHEMA,
-    TRUTH_SCHEMA,
-    VIEW_BYTES,
-    asked_sha256,
-    is_like,
-    poses_of,
-    query_of,
-    query_row,
-    stream_of,
-    truth_of,
-    truth_row,
-    with_added,
-)
+from sasgeo_bench.regions.region_files import read_manifest
+from sasgeo_bench.tasks.frames import FRAME, LABEL_SCHEMA, LABELS, frame_of, frame_row, label_row
+from sasgeo_bench.tasks.query import PUBLISHED, TASK_VERSION, TASK_VERSIONS, Head, Query, Step, Truth
 from sasgeo_bench.texts import FOLDER, json_text
+
+if TYPE_CHECKING:
+    import geopandas as gpd
+
+Rows = TypeVar("Rows", pa.Table, pa.RecordBatch)
+
+POSE_FIELDS: Final = ("easting_m", "northing_m", "yaw_deg", "scale")
+# Columns that are fields of a query, and of its prior.
+_FIELDS: Final = (
+    *("query_id", "track", "suite", "suite_version", "part", "region"),
+    *("observed_on", "season", "prior_group"),
+)
+_PRIOR_FIELDS: Final = ("radius_m", "yaw_deg", "yaw_sigma_deg", "scale_sigma")
+_POSE: Final = pa.struct([(name, pa.float64()) for name in POSE_FIELDS])
+
+_VECTOR: Final = pa.struct(
+    [("class", pa.string()), ("level", pa.int16()), ("is_bridge", pa.bool_()), ("wkb", pa.binary())]
+)
+
+_ASKED_VERSION: Final = 1  # raised if the same row asks for another answer, not if other rows are drawn
+_META: Final = {"attribution": ATTRIBUTION, "licence": LICENCE, "task_version": str(TASK_VERSION)}
+
+QUERY_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("track", pa.string()),
+        ("suite", pa.string()),
+        ("suite_version", pa.int16()),
+        ("part", pa.string()),
+        ("region", pa.string()),
+        ("cell_size_m", pa.float64()),
+        ("rows", pa.int32()),
+        ("cols", pa.int32()),
+        ("classes", pa.list_(pa.string())),
+        ("evidence", pa.binary()),
+        ("confidence", pa.binary()),
+        ("observed_on", pa.date32()),
+        ("season", pa.string()),
+        ("prior_group", pa.string()),
+        ("prior_easting_m", pa.float64()),
+        ("prior_northing_m", pa.float64()),
+        ("prior_radius_m", pa.float64()),
+        ("prior_yaw_deg", pa.float64()),
+        ("prior_yaw_sigma_deg", pa.float64()),
+        ("prior_scale_sigma", pa.float64()),
+        ("candidates", pa.list_(_POSE)),
+        ("vectors", pa.list_(_VECTOR)),
+        ("sequence_id", pa.string()),
+        ("frame", pa.int32()),
+        ("increment", pa.list_(pa.float64())),
+        ("increment_covariance", pa.list_(pa.float64())),
+        ("frames", pa.list_(FRAME)),
+    ],
+    metadata=_META,
+)
+
+ASKED: Final = "asked_sha256"  # hash of a query and its map; an answer carries it, so that it counts for no other
+VIEW_BYTES: Final = "view_bytes"  # column of stored results, which hold no views: bytes of each view
+FILE_SCHEMA: Final = QUERY_SCHEMA.append(pa.field(ASKED, pa.string()))
+
+STEP_COLUMNS: Final = ("sequence_id", "frame", "increment")  # of views of flights; null for others
+HEAD_SCHEMA: Final = pa.schema(
+    [
+        QUERY_SCHEMA.field(name)
+        for name in (
+            *("query_id", "track", "suite", "suite_version", "part", "region"),
+            *("rows", "cell_size_m", "prior_group", "candidates", *STEP_COLUMNS),
+        )
+    ]
+)
+
+TRUTH_SCHEMA: Final = pa.schema(
+    [
+        ("query_id", pa.string()),
+        ("is_present", pa.bool_()),
+        ("easting_m", pa.float64()),
+        ("northing_m", pa.float64()),
+        ("yaw_deg", pa.float64()),
+        ("scale", pa.float64()),
+        ("candidate", pa.int32()),
+        ("pair_id", pa.string()),
+        ("role", pa.string()),
+        ("kind", pa.string()),
+        ("strength", pa.float64()),
+        ("strength_unit", pa.string()),
+        ("unknown_share", pa.float64()),
+        ("changed_share", pa.float64()),
+        ("feature_density", pa.float64()),
+        ("alias_index", pa.float64()),
+        ("block", pa.string()),
+        ("scene", pa.string()),
+        ("measured", pa.map_(pa.string(), pa.float64())),
+        ("detector", pa.string()),
+    ],
+    metadata=_META,
+)
+
+# Columns that older files lack, and the value that is meant by it.
+ADDED: Final = {
+    "detector": PUBLISHED,
+    **dict.fromkeys(("frames", *STEP_COLUMNS, "increment_covariance")),
+}
+
+# Columns of queries and truths that may be null.
+MAY_BE_NULL: Final = frozenset(
+    {
+        *("confidence", "observed_on", "season", "prior_easting_m", "prior_northing_m", "prior_radius_m"),
+        *("prior_yaw_deg", "prior_yaw_sigma_deg", "candidates", "vectors", "sequence_id", "frame", "increment"),
+        *("increment_covariance", "frames", ASKED, *POSE_FIELDS, "alias_index"),
+    }
+)
+
+# Truths in a release: lists of pairs, since not every reader of parquet knows maps.
+_PAIR: Final = pa.struct([("name", pa.string()), ("value", pa.float64())])
+PLAIN_TRUTH_SCHEMA: Final = TRUTH_SCHEMA.set(
+    TRUTH_SCHEMA.get_field_index("measured"), pa.field("measured", pa.list_(_PAIR))
+)
+
+
+def query_row(query: Query) -> dict[str, Any]:
+    """Return one query as a row of `QUERY_SCHEMA`."""
+    seen, prior = query.evidence, query.prior
+    center = prior.center_m or (None, None)
+    plain = {name: getattr(query, name) for name in _FIELDS}
+    known = {f"prior_{name}": getattr(prior, name) for name in _PRIOR_FIELDS}
+    return (
+        plain
+        | known
+        | {
+            "cell_size_m": seen.cell_size_m,
+            "rows": seen.shape[0],
+            "cols": seen.shape[1],
+            "classes": list(seen.classes),
+            "evidence": pack(seen.cells),
+            "confidence": None if seen.confidence is None else seen.confidence.tobytes(),
+            "prior_easting_m": center[0],
+            "prior_northing_m": center[1],
+            "candidates": [_pose_row(pose) for pose in query.candidates],
+            "vectors": None if query.vectors is None else _vector_rows(query.vectors),
+            "frames": [frame_row(frame) for frame in query.frames] or None,
+        }
+        | _step_row(query.step)
+    )
+
+
+def _step_row(step: Step | None) -> dict[str, Any]:
+    """Return the columns of a flight; no column for a view alone."""
+    if step is None:
+        return {}
+    numbers = {"increment": step.increment, "increment_covariance": step.covariance}
+    return {
+        "sequence_id": step.sequence_id,
+        "frame": step.frame,
+        **{name: None if values is None else list(values) for name, values in numbers.items()},
+    }
+
+
+def _pose_row(pose: Pose) -> dict[str, float]:
+    return {name: getattr(pose, name) for name in POSE_FIELDS}
+
+
+def _vector_rows(vectors: "gpd.GeoDataFrame") -> list[dict[str, Any]]:
+    columns = [vectors[name].to_list() for name in ("class", "level", "is_bridge")]
+    shapes = [bytes(shape) for shape in shapely.to_wkb(vectors.geometry.to_numpy())]
+    return [
+        {"class": name, "level": level, "is_bridge": is_bridge, "wkb": wkb}
+        for name, level, is_bridge, wkb in zip(*columns, shapes, strict=True)
+    ]
+
+
+def query_of(row: dict[str, Any]) -> Query:
+    """Return the query of a row of `QUERY_SCHEMA`."""
+    shape = (len(row["classes"]), row["rows"], row["cols"])
+    confidence = row["confidence"]
+    evidence = Evidence(
+        classes=tuple(row["classes"]),
+        cells=unpack(row["evidence"], shape),
+        cell_size_m=row["cell_size_m"],
+        confidence=None if confidence is None else np.frombuffer(confidence, dtype=np.uint8).reshape(shape).copy(),
+    )
+    has_place = row["prior_radius_m"] is not None
+    prior = Prior(
+        center_m=(row["prior_easting_m"], row["prior_northing_m"]) if has_place else None,
+        **{name: row[f"prior_{name}"] for name in _PRIOR_FIELDS},
+    )
+    return Query(
+        **{name: row[name] for name in _FIELDS},
+        evidence=evidence,
+        prior=prior,
+        candidates=tuple(Pose(**pose) for pose in row["candidates"] or ()),
+        vectors=None if row["vectors"] is None else _vectors_of(row["vectors"]),
+        frames=tuple(map(frame_of, row.get("frames") or ())),
+        step=_step_of(row),
+    )
+
+
+def _step_of(row: dict[str, Any]) -> Step | None:
+    """Return where the query of a row stands in a flight, None for a view alone."""
+    if row.get("sequence_id") is None:
+        return None
+    increment, covariance = row["increment"], row["increment_covariance"]
+    return Step(
+        sequence_id=row["sequence_id"],
+        frame=row["frame"],
+        increment=None if increment is None else tuple(increment),
+        covariance=None if covariance is None else tuple(covariance),
+    )
+
+
+def _vectors_of(rows: list[dict[str, Any]]) -> "gpd.GeoDataFrame":
+    import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
+
+    return gpd.GeoDataFrame(
+        {
+            "class": np.array([row["class"] for row in rows], dtype=object),
+            "level": np.array([row["level"] for row in rows], dtype=np.int16),
+            "is_bridge": np.array([row["is_bridge"] for row in rows], dtype=bool),
+        },
+        geometry=gpd.GeoSeries(shapely.from_wkb([row["wkb"] for row in rows]), dtype="geometry"),
+    )
+
+
+def asked_sha256(row: Mapping[str, Any], map_hashes: Mapping[str, str]) -> str:
+    """Return the hash of all that decides an answer: the row of a query, and what `task.json` holds of its map.
+
+    Fields that are null, or not in `QUERY_SCHEMA`, do not count.
+    """
+    fields = {name: row[name] for name in QUERY_SCHEMA.names if row.get(name) is not None}
+    text = json.dumps([_ASKED_VERSION, dict(map_hashes), fields], sort_keys=True, default=_plain)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def _plain(value: bytes | dt.date) -> str:
+    return value.isoformat() if isinstance(value, dt.date) else hashlib.sha256(value).hexdigest()
+
+
+def with_added(rows: Rows, added: Sequence[str] = ("detector",)) -> Rows:
+    """Return queries or truths with the columns that were added since they were written, last.
+
+    >>> with_added(pa.table({"query_id": ["a"]})).to_pylist()
+    [{'query_id': 'a', 'detector': 'published'}]
+    """
+    lost = [name for name in added if name not in rows.schema.names]
+    new: list[pa.Field] = [(TRUTH_SCHEMA if name in TRUTH_SCHEMA.names else QUERY_SCHEMA).field(name) for name in lost]
+    columns = [*rows.columns, *(pa.array([ADDED[field.name]] * rows.num_rows, field.type) for field in new)]
+    return type(rows).from_arrays(columns, schema=pa.schema([*rows.schema, *new], metadata=rows.schema.metadata))
+
+
+def truth_row(truth: Truth) -> dict[str, Any]:
+    """Return one truth as a row of `TRUTH_SCHEMA`."""
+    pose = _pose_row(truth.pose) if truth.pose else dict.fromkeys(POSE_FIELDS)
+    names = [name for name in TRUTH_SCHEMA.names if name not in pose and name != "measured"]
+    return {name: getattr(truth, name) for name in names} | pose | {"measured": list(truth.measured.items())}
+
+
+def truth_of(row: dict[str, Any]) -> Truth:
+    """Return the truth of a row of `TRUTH_SCHEMA`, or of a release (`PLAIN_TRUTH_SCHEMA`)."""
+    pose = None if row["easting_m"] is None else Pose(**{name: row[name] for name in POSE_FIELDS})
+    rest = {name: value for name, value in row.items() if name not in (*POSE_FIELDS, "measured")}
+    pairs = [(pair["name"], pair["value"]) if isinstance(pair, dict) else pair for pair in row["measured"]]
+    return Truth(**rest, pose=pose, measured=dict(pairs))
+
+
+def truth_sha256(truth: Truth) -> str:
+    """Return the hash of a truth; values that older files lack do not count."""
+    fields = {name: value for name, value in truth_row(truth).items() if ADDED.get(name) != value}
+    return hashlib.sha256(json.dumps(fields, sort_keys=True).encode()).hexdigest()
+
+
+def tie_key(learned: str | None, *others: str | None) -> str | None:
+    """Return the key of what decides an answer besides the question: what was learned, and hashes of other things.
+
+    Others are rendered imagery that was looked at, and how flights are followed.
+
+    >>> tie_key("ab", None), len(tie_key(None, "cd"))
+    ('ab', 64)
+    """
+    key = learned
+    for other in others:
+        key = key if other is None else hashlib.sha256(f"{key} {other}".encode()).hexdigest()
+    return key
+
+
+def asked_under(asked: str, key: str | None) -> str:
+    """Return the hash that an answer carries: that of the question and of what else decides it (`tie_key`).
+
+    Examples
+    --------
+    >>> asked_under("ab", None), len(asked_under("ab", "cd"))
+    ('ab', 64)
+    """
+    return asked if key is None else hashlib.sha256(f"{asked} {key}".encode()).hexdigest()
+
+
+def poses_of(lists: pa.ListArray) -> list[tuple[Pose, ...]]:
+    """Return the poses of each row of a column of lists, without the slow way over a dictionary for each."""
+    columns = [lists.values.field(name).to_numpy(zero_copy_only=False).tolist() for name in POSE_FIELDS]
+    poses = [
+        Pose(easting_m=easting_m, northing_m=northing_m, yaw_deg=yaw_deg, scale=scale)
+        for easting_m, northing_m, yaw_deg, scale in zip(*columns, strict=True)
+    ]
+    return [tuple(poses[begin:end]) for begin, end in pairwise(lists.offsets.to_pylist())]
+
+
+def query_bytes(query: Query) -> bytes:
+    """Return one query as it goes to a matcher's process: a row in Arrow's stream format."""
+    return stream_of(pa.RecordBatch.from_pylist([query_row(query)], schema=QUERY_SCHEMA))
+
+
+def query_from(data: bytes) -> Query:
+    """Return the query of `query_bytes`."""
+    with pa.ipc.open_stream(data) as stream:
+        return query_of(stream.read_all().to_pylist()[0])
+
+
+def pairs_bytes(pairs: Iterable[tuple[bytes, Truth]]) -> tuple[list[int], bytes]:
+    """Return queries (as bytes) and truths as they go to a process that learns, and the length of each query."""
+    queries, truths = zip(*pairs, strict=True)
+    rows = pa.RecordBatch.from_pylist([truth_row(truth) for truth in truths], schema=TRUTH_SCHEMA)
+    return [len(query) for query in queries], b"".join((*queries, stream_of(rows)))
+
+
+def pairs_from(sizes: Sequence[int], data: bytes) -> Iterator[tuple[Query, Truth]]:
+    """Yield the pairs of `pairs_bytes`."""
+    ends = list(accumulate(sizes, initial=0))
+    with pa.ipc.open_stream(data[ends[-1] :]) as stream:
+        truths = [truth_of(row) for row in stream.read_all().to_pylist()]
+    for (begin, end), truth in zip(pairwise(ends), truths, strict=True):
+        yield query_from(data[begin:end]), truth
+
+
+def stream_of(batch: pa.RecordBatch) -> bytes:
+    """Return a batch in Arrow's stream format."""
+    sink = pa.BufferOutputStream()
+    with pa.ipc.new_stream(sink, batch.schema) as stream:
+        stream.write_batch(batch)
+    return bytes(sink.getvalue())
+
+
+_LIKE: Final = (  # a kind of column, and the kinds that can be read as it
+    (pa.types.is_floating, (pa.types.is_floating, pa.types.is_integer)),
+    (pa.types.is_integer, (pa.types.is_integer,)),
+    (pa.types.is_string, (pa.types.is_string, pa.types.is_large_string)),
+    (pa.types.is_binary, (pa.types.is_large_binary,)),
+    (pa.types.is_map, (pa.types.is_map,)),
+)
+
+
+def is_like(found: pa.DataType, expected: pa.DataType) -> bool:
+    """Return whether a column can be read as another type: floats and strings of any size, null for anything.
+
+    Examples
+    --------
+    >>> is_like(pa.int16(), pa.float64()), is_like(pa.string(), pa.float64())
+    (True, False)
+    """
+    if pa.types.is_null(found) or found.equals(expected):
+        return True
+    if pa.types.is_list(expected):
+        is_list = pa.types.is_list(found) or pa.types.is_large_list(found)
+        return is_list and _is_like_inside(found.value_type, expected.value_type)
+    return any(kind(expected) and any(other(found) for other in others) for kind, others in _LIKE)
+
+
+def _is_like_inside(found: pa.DataType, expected: pa.DataType) -> bool:
+    """Return whether items of a list can be read as another type; structs may have more fields."""
+    if not pa.types.is_struct(expected):
+        return is_like(found, expected)
+    names = [field.name for field in found] if pa.types.is_struct(found) else []
+    return all(names.count(field.name) == 1 and is_like(found.field(field.name).type, field.type) for field in expected)
+
 
 Row = TypeVar("Row")
 Made = TypeVar("Made")
@@ -54,17 +411,13 @@ Folder = Annotated[str, Field(pattern=FOLDER)]  # never a path that leaves its r
 
 QUERIES: Final = "queries.parquet"
 TASK: Final = "task.json"
-FAILED_PICTURES: Final = "failed_pictures"  # of `task.json`: how many a segmenter failed at; absent if none
 TRUTH: Final = "truth.parquet"
 TRUTH_OF: Final = "truth.json"
 PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and bits, where the seed is private
-SEALED: Final = "sealed_seed"  # the same of queries of a sealed place
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # of a row group, which is in memory at once
 _ROWS_WITH_FRAMES: Final = 8  # the same where labels of pictures are in memory, too
-_MAP: Final = ("map_fingerprint", "map_inputs_sha256")  # hashes of the searched map in `task.json`
-_READ: Final = ", ".join(map(str, TASK_VERSIONS))  # readable versions of tasks
 
 
 class TaskFile(Document):
@@ -80,11 +433,12 @@ class TaskFiles(Document):
     queries: Annotated[TaskFile, Field(alias=QUERIES)]
 
 
-class TaskManifest(Document):
-    """Contents of `task.json`; an unknown key is an error, since a later schema has another version."""
+class TaskOrigin(Document):
+    """How the queries of a task were drawn: what `task.json` holds besides their counts and hashes.
 
-    schema_version: int
-    task_version: int
+    Keys that a file lacks stay unset, so that a copy of the task lacks them, too.
+    """
+
     suite: Folder
     suite_version: Count | None = None
     suite_sha256: str | None = None  # of the code of a suite of another package
@@ -96,37 +450,302 @@ class TaskManifest(Document):
     region: Folder
     map_date: str | None = None
     map_fingerprint: str
-    map_inputs_sha256: str | None = None
+    map_inputs_sha256: str | None = None  # older programs recorded less of the map
     split: str | None = None
     split_sha256: str | None = None
     sites: Count | None = None
     views_cells: list[Count] | None = None
     epsg: int | None = None
     made_by: str | None = None
+    private_seed: dict[str, str | int] | None = None  # its commitment and bits
+    sealed_seed: dict[str, str | int] | None = None  # the same
+    licence: str | None = None
+    attribution: str | None = None
+    segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
+    failed_pictures: Count | None = None  # that the segmenter failed at
+
+    @property
+    def name(self) -> tuple[str, str]:
+        """Suite and region, by which a task is known."""
+        return self.suite, self.region
+
+    @property
+    def map_hashes(self) -> dict[str, str]:
+        """Hashes of the contents and the inputs of the searched map, as far as they are recorded."""
+        found = {"map_fingerprint": self.map_fingerprint, "map_inputs_sha256": self.map_inputs_sha256}
+        return {name: value for name, value in found.items() if value is not None}
+
+    def is_of_map(self, manifest: Manifest) -> bool:
+        """Return whether a task belongs to this very build of a map."""
+        of_map = {"map_fingerprint": manifest.fingerprint, "map_inputs_sha256": manifest.inputs_sha256}
+        return self.map_hashes.items() <= of_map.items()
+
+
+class TaskManifest(TaskOrigin):
+    """Contents of `task.json`; an unknown key is an error, since a later schema has another version."""
+
+    schema_version: int
+    task_version: int
     counts: dict[str, Count]
     prior_groups: list[str] | None = None
     candidates_sha256: str | None = None
-    private_seed: dict[str, str | int] | None = None  # its commitment and bits
-    sealed_seed: dict[str, str | int] | None = None  # the same
     frames: Count | None = None  # pictures of all queries
-    segmenter: dict[str, str] | None = None  # what made the evidence of the pictures: name, version, hash
-    failed_pictures: Count | None = None  # that the segmenter failed at
     files: TaskFiles
-    licence: str | None = None
-    attribution: str | None = None
+
+    @property
+    def queries_sha256(self) -> str:
+        """Hash of `queries.parquet`."""
+        return self.files.queries.sha256
+
+    @property
+    def queries(self) -> int:
+        """Number of queries."""
+        return sum(self.counts.values())
+
+    @property
+    def is_of_flights(self) -> bool:
+        """Whether the queries are views of flights."""
+        return "sequence" in self.counts
+
+    @property
+    def origin(self) -> TaskOrigin:
+        """What is not of the queries' file, for a task made of this one."""
+        known = self.model_fields_set & TaskOrigin.model_fields.keys()
+        return TaskOrigin(**{name: value for name, value in self if name in known})
+
+    def to_json(self) -> dict[str, JsonValue]:
+        """Return the contents of `task.json`."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
+
+
+class TruthManifest(Document):
+    """Contents of `truth.json`: which queries the truths are of, and what they could be drawn by again."""
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True)
+
+    queries_sha256: str = "unknown"
+    seed: int | None = None
+    private_seed: dict[str, str | int] | None = None
+    sealed_seed: dict[str, str | int] | None = None
+    count: int | None = None
+    maps: int | None = None
+    request_sha256: str | None = None
+    profile: JsonValue = None
+
+    @classmethod
+    def read(cls, truth_folder: Path) -> Self:
+        """Read `truth.json`; of one that cannot be read nothing is known."""
+        try:
+            return check_document(read_json(truth_folder / TRUTH_OF, mend=_MEND), cls, source=TRUTH_OF)
+        except (StoreError, ConfigError):
+            return cls()
+
+
+@dataclass(frozen=True)
+class Task:
+    """A task on disk: its folder, what `task.json` says, and the folder where its truths are, if they are anywhere.
+
+    Queries and truths are read when they are asked for.
+
+    Examples
+    --------
+    >>> task = Task.open("out/tasks/clean/town-grid")  # doctest: +SKIP
+    >>> task.manifest.title, task.manifest.queries, len(list(task.queries()))  # doctest: +SKIP
+    ('Clean views', 24, 24)
+    """
+
+    folder: Path
+    manifest: TaskManifest = field(hash=False)
+    truth: Path
+
+    @classmethod
+    def open(cls, folder: str | Path, truth: Path | None = None) -> Self:
+        """Read `task.json`; `truth` is the root of truths, that of the task's own root unless given.
+
+        Raises
+        ------
+        StoreError
+            If `task.json` is missing, damaged or of another version.
+        """
+        path = given_path(folder)
+        manifest = _read_manifest(path, named=folder)
+        root = path.resolve().parent.parent.parent / "truth" if truth is None else truth
+        return cls(path, manifest, root / manifest.suite / manifest.region)
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Path, TaskManifest, Path]]:
+        """Leave behind what was read, where the task goes to another process."""
+        return type(self), (self.folder, self.manifest, self.truth)
+
+    @property
+    def root(self) -> Path:
+        """The folder of output that holds the task."""
+        return self.folder.resolve().parent.parent.parent
+
+    @property
+    def region(self) -> Path:
+        """The folder of the map, which may be missing or built anew since."""
+        return self.root / "regions" / self.manifest.region
+
+    def checked_region(self) -> Path:
+        """Return the folder of the map; raise a StoreError if it is missing or was built anew since."""
+        if not self.manifest.is_of_map(read_manifest(self.region)):
+            raise StoreError(
+                f"{self.region} was built anew since the queries of {self.folder} were made: make them again"
+            )
+        return self.region
+
+    @property
+    def has_truths(self) -> bool:
+        """Whether its truths are there."""
+        return (self.truth / TRUTH).is_file()
+
+    @cached_property
+    def asked(self) -> Mapping[str, str]:
+        """By query id the hash of the query and of its map, which its answer has to carry."""
+        path = self.folder / QUERIES
+        is_recorded = ASKED in read_schema(path, mend=_MEND).names
+        columns = ["query_id", ASKED] if is_recorded else QUERY_SCHEMA.names
+        rows = (row for batch in read_batches(path, columns) for row in batch.to_pylist())
+        return {row["query_id"]: self._asked_of(row) for row in rows}
+
+    def _asked_of(self, row: Mapping[str, Any]) -> str:
+        """Return the recorded hash, or compute it for files of versions that did not record it."""
+        recorded = row.get(ASKED)
+        return asked_sha256(row, self.manifest.map_hashes) if recorded is None else str(recorded)
+
+    def ids(self) -> list[str]:
+        """Read the ids of the queries, in their order."""
+        batches = read_batches(self.folder / QUERIES, ["query_id"])
+        return [str(name) for batch in batches for name in batch["query_id"].to_pylist()]
+
+    def queries(self) -> Iterator[Query]:
+        """Yield the queries in the order of their ids, a row group in memory at a time."""
+        return read_queries(self.folder)
+
+    def some(self, ids: Collection[str]) -> Iterator[tuple[Query, bytes, str]]:
+        """Yield queries of some ids, each with its bytes for a matcher's process and its hash, by row groups."""
+        path = self.folder / QUERIES
+        with open_table(path, mend=_MEND, is_whole=False) as source:
+            for batch in source.iter_batches(batch_size=_ROWS):
+                sent = batch.select([name for name in batch.schema.names if name != ASKED])
+                for at, name in enumerate(batch["query_id"].to_pylist()):
+                    if name in ids:
+                        row = batch.slice(at, 1).to_pylist()[0]
+                        yield _made(path, query_of, row), stream_of(sent.slice(at, 1)), self._asked_of(row)
+
+    def heads(self) -> Iterator[Head]:
+        """Yield the queries without their views, in the order of their ids."""
+        path = self.folder / QUERIES
+        for batch in read_batches(path, HEAD_SCHEMA.names):
+            rows = batch.drop_columns(["candidates"]).to_pylist()
+            for row, poses in zip(rows, _made(path, poses_of, batch["candidates"]), strict=True):
+                way = row.pop("increment")
+                yield Head(
+                    view_cells=row.pop("rows"), candidates=poses, increment=None if way is None else tuple(way), **row
+                )
+
+    def parts(self) -> set[str]:
+        """Read which parts of a split the queries belong to."""
+        batches = read_batches(self.folder / QUERIES, ["part"])
+        return {str(part) for batch in batches for part in pc.unique(batch["part"]).to_pylist()}
+
+    def view_bytes(self) -> dict[str, int]:
+        """Return the bytes of each query's view as it travels: packed cells, confidences and vectors, uncompressed.
+
+        The size of packed cells follows from their shape, so that no view is read. Stored results record the bytes.
+        """
+        path = self.folder / QUERIES
+        if VIEW_BYTES in read_schema(path, mend=_MEND).names:
+            table = read_table(path, mend=_MEND, columns=["query_id", VIEW_BYTES])
+            return dict(zip(*(column.to_pylist() for column in table.columns), strict=True))
+        found: dict[str, int] = {}
+        for batch in read_batches(path, ["query_id", "rows", "cols", "classes", "confidence", "vectors"]):
+            shape = (batch["rows"], batch["cols"], pc.list_value_length(batch["classes"]))
+            cells = np.prod([np.asarray(side, dtype=np.int64) for side in shape], axis=0)
+            confidence = np.asarray(pc.fill_null(pc.binary_length(batch["confidence"]), 0))
+            vectors = batch["vectors"]
+            ends = np.concatenate(([0], np.cumsum(np.asarray(pc.binary_length(vectors.values.field("wkb"))))))
+            offsets = np.asarray(vectors.offsets)
+            total = -(-cells // CELLS_PER_BYTE) + confidence + ends[offsets[1:]] - ends[offsets[:-1]]
+            found |= dict(zip(batch["query_id"].to_pylist(), total.tolist(), strict=True))
+        return found
+
+    @cached_property
+    def truths(self) -> tuple[Truth, ...]:
+        """The truths in the order of the query ids; `read_truths` yields them one at a time."""
+        return tuple(read_truths(self.truth))
+
+    def check_queries(self) -> None:
+        """Raise a StoreError if the queries are missing or not those of `task.json`."""
+        path = self.folder / QUERIES
+        if not path.is_file() or sha256_of(path) != self.manifest.queries_sha256:
+            raise StoreError(f"{path} is not what {TASK} says: make the queries again")
+
+    def check_truths(self) -> None:
+        """Raise a StoreError if truths are missing, belong to other queries, or have another task version."""
+        if not self.has_truths:
+            raise StoreError(
+                f"{self.truth} holds no truths of {self.folder}: "
+                "name their folder with --truth, or make the queries again"
+            )
+        if (self.truth / TRUTH_OF).is_file():
+            read_json(self.truth / TRUTH_OF, mend=_MEND)  # a damaged file raises here
+        if TruthManifest.read(self.truth).queries_sha256 != self.manifest.queries_sha256:
+            raise StoreError(
+                f"{self.truth} holds the truths of other queries than {self.folder}: make the queries again"
+            )
+        metadata = read_schema(self.truth / TRUTH, mend=_MEND).metadata or {}
+        version = metadata.get(b"task_version", b"none").decode(errors="replace")
+        if version not in map(str, TASK_VERSIONS):
+            raise StoreError(
+                f"{self.truth} holds truths of task version {version}, this version reads "
+                f"{', '.join(map(str, TASK_VERSIONS))}: make the queries again"
+            )
+
+    def faults(self) -> list[str]:
+        """Check the files against `task.json` and the truths, if there are any; return a line for each fault.
+
+        Each line begins with the path of the file and ends with what to do about it. Raise a StoreError if a file
+        cannot be read.
+        """
+        faults = []
+        path, recorded = self.folder / QUERIES, self.manifest.files.queries
+        if not path.is_file():
+            return [f"{path}: missing: {_MEND}"]
+        known = {self.folder / TASK, path}
+        others = [other for other in sorted(self.folder.rglob("*")) if other not in known]
+        faults += [f"{other}: not part of a task: move it away" for other in others]
+        found = file_record(path)
+        if (found.sha256, found.bytes) != (recorded.sha256, recorded.bytes):  # its contents need no check
+            was = f"{recorded.bytes} bytes, {recorded.sha256}"
+            return [f"{path}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}: {_MEND}", *faults]
+        asked = [(query.query_id, query.track) for query in self.queries()]
+        names, counts = [name for name, _ in asked], dict(Counter(track for _, track in asked))
+        if counts != self.manifest.counts:
+            was = _counts_text(self.manifest.counts)
+            faults.append(f"{path}: holds {_counts_text(counts)}, {TASK} says {was}: {_MEND}")
+        if self.has_truths:
+            belongs = TruthManifest.read(self.truth).queries_sha256
+            if belongs != found.sha256:
+                faults.append(f"{self.truth / TRUTH_OF}: the truths are of other queries, SHA-256 {belongs}: {_MEND}")
+            answered = [truth.query_id for truth in read_truths(self.truth)]
+            if answered != names:
+                not_those = f"{len(answered)} truths that are not those of the {len(names)} queries, in order"
+                faults.append(f"{self.truth / TRUTH}: {not_those}: {_MEND}")
+        return faults
 
 
 def write_task(
     task_folder: Path,
     truth_folder: Path,
     pairs: Iterable[tuple[Query, Truth]],
-    about: dict[str, Any],
-    hidden: dict[str, Any] | None = None,
-) -> int:
+    origin: TaskOrigin,
+    hidden: TruthManifest | None = None,
+) -> TaskManifest:
     """Write queries and truths into two empty folders, by row groups, then `task.json`, which completes the task.
 
-    `pairs` are in the order of the query ids, which reveals nothing about the answers. `about` and `hidden` are the
-    contents of `task.json` and `truth.json` besides counts and hashes. Return the number of queries.
+    `pairs` are in the order of the query ids, which reveals nothing about the answers. `origin` and `hidden` are the
+    contents of `task.json` and `truth.json` besides counts and hashes. Return what `task.json` says now.
     """
     counts: Counter[str] = Counter()
     groups: set[str] = set()
@@ -140,7 +759,7 @@ def write_task(
         )
         for part in _batches(pairs):
             rows = pa.Table.from_pylist([query_row(query) for query, _ in part], schema=QUERY_SCHEMA)
-            asked = [asked_sha256(row, _map_hashes(about)) for row in rows.to_pylist()]
+            asked = [asked_sha256(row, origin.map_hashes) for row in rows.to_pylist()]
             queries.write_table(rows.append_column(FILE_SCHEMA.field(ASKED), pa.array(asked)))
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
             of_frames = _label_rows(part)
@@ -156,7 +775,7 @@ def write_task(
     content = {
         "schema_version": SCHEMA_VERSION,
         "task_version": TASK_VERSION,
-        **about,
+        **origin.model_dump(mode="json", exclude_unset=True),
         "counts": dict(counts),
         "prior_groups": sorted(groups),
         "candidates_sha256": frozen.hexdigest(),
@@ -165,9 +784,10 @@ def write_task(
         "licence": LICENCE,
         "attribution": ATTRIBUTION,
     }
-    _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **(hidden or {})})
+    more = {} if hidden is None else hidden.model_dump(mode="json", exclude_unset=True, exclude={"queries_sha256"})
+    _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **more})
     _write_json(task_folder / TASK, content)
-    return counts.total()
+    return TaskManifest.model_validate(content)
 
 
 def _label_rows(part: Sequence[tuple[Query, Truth]]) -> list[dict[str, Any]]:
@@ -196,11 +816,15 @@ def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Qu
         yield batch
 
 
-def read_task(folder: str | Path) -> dict[str, Any]:
-    """Read `task.json`; raise a StoreError if it is missing, damaged or of another version."""
-    path = given_path(folder) / TASK
+def read_task(folder: str | Path) -> dict[str, JsonValue]:
+    """Read `task.json` as it stands there; raise as `Task.open` does, which gives more."""
+    return Task.open(folder).manifest.to_json()
+
+
+def _read_manifest(folder: Path, *, named: str | Path) -> TaskManifest:
+    path = folder / TASK
     if not path.is_file():
-        raise StoreError(f"{folder} holds no {TASK}: make the queries first")
+        raise StoreError(f"{named} holds no {TASK}: make the queries first")
     content = read_json(path, mend=_MEND)
     about = content if isinstance(content, dict) else {}
     for name, known in (("schema_version", (SCHEMA_VERSION,)), ("task_version", TASK_VERSIONS)):
@@ -208,22 +832,13 @@ def read_task(folder: str | Path) -> dict[str, Any]:
             noun, versions = name.replace("_", " "), ", ".join(map(str, known))
             raise StoreError(f"{path} has {noun} {about[name]!r}, this version reads {versions}: {_MEND}")
     try:
-        check_document(content, TaskManifest, source=TASK)
+        return check_document(content, TaskManifest, source=TASK)
     except ConfigError as error:
         raise _damaged(path, error) from error
-    return about
 
 
 def _damaged(path: Path, fault: object) -> StoreError:
     return StoreError(f"{path} is damaged ({str(fault)[:200]}): {_MEND}")
-
-
-def check_queries(folder: Path) -> None:
-    """Raise a StoreError if the queries are missing or not those of `task.json`."""
-    recorded = read_task(folder)["files"][QUERIES]["sha256"]
-    path = folder / QUERIES
-    if not path.is_file() or sha256_of(path) != recorded:
-        raise StoreError(f"{path} is not what {TASK} says: make the queries again")
 
 
 def check_ours(folder: Path, names: Sequence[str]) -> None:
@@ -235,154 +850,8 @@ def check_ours(folder: Path, names: Sequence[str]) -> None:
         raise StoreError(f"{other} is no part of a task and would be lost: move it away")
 
 
-def task_faults(task_folder: Path, truth_folder: Path) -> list[str]:
-    """Check a task against its `task.json` and its truths, if there are any; return a line for each fault.
-
-    Each line begins with the path of the file and ends with what to do about it.
-
-    Raises
-    ------
-    StoreError
-        If the folder holds no task, or a file cannot be read.
-    """
-    about = read_task(task_folder)
-    faults = []
-    path, recorded = task_folder / QUERIES, about["files"][QUERIES]
-    if not path.is_file():
-        return [f"{path}: missing: {_MEND}"]
-    known = {task_folder / TASK, path}
-    others = [other for other in sorted(task_folder.rglob("*")) if other not in known]
-    faults += [f"{other}: not part of a task: move it away" for other in others]
-    found = file_record(path)
-    if found.model_dump() != recorded:  # its contents need no check
-        was = f"{recorded['bytes']} bytes, {recorded['sha256']}"
-        return [f"{path}: {found.bytes} bytes, SHA-256 {found.sha256}; {TASK} says {was}: {_MEND}", *faults]
-    asked = [(query.query_id, query.track) for query in read_queries(task_folder)]
-    names, counts = [name for name, _ in asked], dict(Counter(track for _, track in asked))
-    if counts != about["counts"]:
-        faults.append(f"{path}: holds {_counts_text(counts)}, {TASK} says {_counts_text(about['counts'])}: {_MEND}")
-    if (truth_folder / TRUTH).is_file():
-        belongs = _belongs_to(truth_folder)
-        if belongs != found.sha256:
-            faults.append(f"{truth_folder / TRUTH_OF}: the truths are of other queries, SHA-256 {belongs}: {_MEND}")
-        answered = [truth.query_id for truth in read_truths(truth_folder)]
-        if answered != names:
-            not_those = f"{len(answered)} truths that are not those of the {len(names)} queries, in order"
-            faults.append(f"{truth_folder / TRUTH}: {not_those}: {_MEND}")
-    return faults
-
-
 def _counts_text(counts: Mapping[Any, int]) -> str:
     return ", ".join(f"{count} of {track}" for track, count in sorted(counts.items()))
-
-
-def _belongs_to(truth_folder: Path) -> str:
-    """Return the SHA-256 of the queries that the truths of a folder belong to; "unknown" if it is not recorded."""
-    return str(read_hidden(truth_folder).get("queries_sha256", "unknown"))
-
-
-def check_truths(task_folder: Path, truth_folder: Path) -> None:
-    """Raise a StoreError if truths are missing, belong to other queries, or have another task version."""
-    if not (truth_folder / TRUTH).is_file():
-        raise StoreError(
-            f"{truth_folder} holds no truths of {task_folder}: "
-            "name their folder with --truth, or make the queries again"
-        )
-    if (truth_folder / TRUTH_OF).is_file():
-        read_json(truth_folder / TRUTH_OF, mend=_MEND)  # a damaged file raises here
-    if _belongs_to(truth_folder) != read_task(task_folder)["files"][QUERIES]["sha256"]:
-        raise StoreError(f"{truth_folder} holds the truths of other queries than {task_folder}: make the queries again")
-    metadata = read_schema(truth_folder / TRUTH, mend=_MEND).metadata or {}
-    version = metadata.get(b"task_version", b"none").decode(errors="replace")
-    if version not in map(str, TASK_VERSIONS):
-        raise StoreError(
-            f"{truth_folder} holds truths of task version {version}, this version reads {_READ}: make the queries again"
-        )
-
-
-def read_hidden(truth_folder: Path) -> dict[str, Any]:
-    """Read `truth.json`; return an empty dictionary if it cannot be read."""
-    try:
-        hidden = read_json(truth_folder / TRUTH_OF, mend=_MEND)
-    except StoreError:
-        return {}
-    return hidden if isinstance(hidden, dict) else {}
-
-
-def map_of(manifest: Manifest) -> dict[str, str]:
-    """Return what `task.json` holds of a map: the hashes of its contents and of its inputs."""
-    return {"map_fingerprint": manifest.fingerprint, "map_inputs_sha256": manifest.inputs_sha256}
-
-
-def is_of_map(about: Mapping[str, Any], manifest: Manifest) -> bool:
-    """Return whether a task belongs to this very build of a map; older programs recorded less of it."""
-    return all(about.get(name, value) == value for name, value in map_of(manifest).items())
-
-
-def _map_hashes(about: Mapping[str, Any]) -> dict[str, str]:
-    return {name: str(about[name]) for name in _MAP if name in about}
-
-
-def read_asked(folder: Path) -> dict[str, str]:
-    """Read by query id the hash of the query and of its map, which its answer has to carry."""
-    about, path = _map_hashes(read_task(folder)), folder / QUERIES
-    is_recorded = ASKED in read_schema(path, mend=_MEND).names
-    columns = ["query_id", ASKED] if is_recorded else QUERY_SCHEMA.names
-    rows = (row for batch in read_batches(path, columns) for row in batch.to_pylist())
-    return {row["query_id"]: _asked_of(row, about) for row in rows}
-
-
-def _asked_of(row: Mapping[str, Any], about: Mapping[str, str]) -> str:
-    """Return the recorded hash, or compute it for files of versions that did not record it."""
-    recorded = row.get(ASKED)
-    return asked_sha256(row, about) if recorded is None else str(recorded)
-
-
-def read_some(folder: Path, ids: Collection[str]) -> Iterator[tuple[Query, bytes, str]]:
-    """Yield queries of some ids, each with its bytes for a matcher's process and its hash; a row group at a time."""
-    about = _map_hashes(read_task(folder))
-    with open_table(folder / QUERIES, mend=_MEND, is_whole=False) as source:
-        for batch in source.iter_batches(batch_size=_ROWS):
-            sent = batch.select([name for name in batch.schema.names if name != ASKED])
-            for at, name in enumerate(batch["query_id"].to_pylist()):
-                if name in ids:
-                    row = batch.slice(at, 1).to_pylist()[0]
-                    yield _made(folder / QUERIES, query_of, row), stream_of(sent.slice(at, 1)), _asked_of(row, about)
-
-
-def read_ids(folder: Path) -> list[str]:
-    """Read the ids of a task's queries, in their order."""
-    batches = read_batches(folder / QUERIES, ["query_id"])
-    return [str(name) for batch in batches for name in batch["query_id"].to_pylist()]
-
-
-def read_parts(folder: Path) -> set[str]:
-    """Read which parts of a split the queries of a task belong to."""
-    return {
-        str(part) for batch in read_batches(folder / QUERIES, ["part"]) for part in pc.unique(batch["part"]).to_pylist()
-    }
-
-
-def read_view_bytes(folder: Path) -> dict[str, int]:
-    """Return the bytes of each query's view as it travels: packed cells, confidences and vectors, without compression.
-
-    The size of packed cells follows from their shape, so that no view is read. Stored results record the bytes.
-    """
-    if VIEW_BYTES in read_schema(folder / QUERIES, mend=_MEND).names:
-        table = read_table(folder / QUERIES, mend=_MEND, columns=["query_id", VIEW_BYTES])
-        return dict(zip(*(column.to_pylist() for column in table.columns), strict=True))
-    found: dict[str, int] = {}
-    columns = ["query_id", "rows", "cols", "classes", "confidence", "vectors"]
-    for batch in read_batches(folder / QUERIES, columns):
-        shape = (batch["rows"], batch["cols"], pc.list_value_length(batch["classes"]))
-        cells = np.prod([np.asarray(side, dtype=np.int64) for side in shape], axis=0)
-        confidence = np.asarray(pc.fill_null(pc.binary_length(batch["confidence"]), 0))
-        vectors = batch["vectors"]
-        ends = np.concatenate(([0], np.cumsum(np.asarray(pc.binary_length(vectors.values.field("wkb"))))))
-        offsets = np.asarray(vectors.offsets)
-        total = -(-cells // CELLS_PER_BYTE) + confidence + ends[offsets[1:]] - ends[offsets[:-1]]
-        found |= dict(zip(batch["query_id"].to_pylist(), total.tolist(), strict=True))
-    return found
 
 
 def read_queries(folder: str | Path) -> Iterator[Query]:
@@ -390,17 +859,6 @@ def read_queries(folder: str | Path) -> Iterator[Query]:
     path = given_path(folder) / QUERIES
     for row in _rows(path, QUERY_SCHEMA):
         yield _made(path, query_of, row)
-
-
-def read_heads(folder: Path) -> Iterator[Head]:
-    """Yield the queries of a task without their views, in the order of their ids."""
-    for batch in read_batches(folder / QUERIES, HEAD_SCHEMA.names):
-        rows = batch.drop_columns(["candidates"]).to_pylist()
-        for row, poses in zip(rows, _made(folder / QUERIES, poses_of, batch["candidates"]), strict=True):
-            way = row.pop("increment")
-            yield Head(
-                view_cells=row.pop("rows"), candidates=poses, increment=None if way is None else tuple(way), **row
-            )
 
 
 def read_truths(folder: str | Path) -> Iterator[Truth]:
@@ -416,7 +874,7 @@ def read_batches(path: Path, columns: Sequence[str]) -> Iterator[pa.RecordBatch]
     Raises
     ------
     StoreError
-        If the file is missing or damaged, or lacks a column; older files may lack those of `task_rows.ADDED`.
+        If the file is missing or damaged, or lacks a column; older files may lack those of `ADDED`.
     """
     with open_table(path, mend=_MEND, is_whole=False) as source:
         schema = source.schema_arrow

@@ -38,7 +38,7 @@ def out(program, tiny, tmp_path, monkeypatch):
 
 @pytest.fixture
 def ids(out):
-    return task_files.read_ids(out / "tasks" / SUITE / TOWN)
+    return task_files.Task.open(out / "tasks" / SUITE / TOWN).ids()
 
 
 @pytest.fixture
@@ -278,7 +278,7 @@ def test_of_many_tasks_the_first_are_named_and_the_rest_counted(program, run_fol
     monkeypatch.setattr("sasgeo_bench.running.plan.MOST_LINES", 1)
     monkeypatch.setattr("sasgeo_bench.running.runner.MOST_LINES", 0)
     other = TASK.parent.parent / "clean" / TOWN
-    more = len(task_files.read_ids(other))
+    more = len(task_files.Task.open(other).ids())
     code, told, _ = program(*ORACLE, "--tasks", other, "--dry-run")
     assert (code, told.splitlines()[1:]) == (
         0,

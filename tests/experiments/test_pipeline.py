@@ -91,8 +91,8 @@ def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
 
 def test_a_pipeline_ends_with_a_board(made):
     plan, board, lines = made
-    count = len(task_files.read_ids(plan.out / "tasks" / "clean" / "town-suburb"))
-    controls = len(task_files.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls"))
+    count = len(task_files.Task.open(plan.out / "tasks" / "clean" / "town-suburb").ids())
+    controls = len(task_files.Task.open(plan.out / "tasks" / "controls" / "town-suburb+controls").ids())
     assert f"random: {count + controls} queries to ask, 0 answered before" in lines
     assert f"fft_vote: {controls} queries to ask, 0 answered before" in lines
     assert {entry.name for entry in board.entries} == {"random", "prior_centre", "oracle_pose"}
@@ -182,7 +182,7 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     told = plan.to_text()
     assert "  queries: 1 of 1 task up to date\n  controls: 1 of 1 task up to date\n" in told
     count = len(board.scores["random"]) + len(
-        task_files.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+        task_files.Task.open(plan.out / "tasks" / "controls" / "town-suburb+controls").ids()
     )
     assert f"    random: {count} answered, 0 to ask\n" in told
     assert "to be drawn" not in told
@@ -196,7 +196,7 @@ def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_comi
     told = other.to_text()
     assert "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with another seed), at most 56 queries\n" in told
     count = len(board.scores["random"]) + len(
-        task_files.read_ids(plan.out / "tasks" / "controls" / "town-suburb+controls")
+        task_files.Task.open(plan.out / "tasks" / "controls" / "town-suburb+controls").ids()
     )
     assert re.search(
         rf"^    random: 0 answered, 0 to ask, and at most \d+ queries to be drawn; {count} answered there before$",

@@ -124,7 +124,7 @@ def test_the_queries_of_a_sealed_place_depend_on_its_seed_alone(split, tmp_path,
         out = lay_towns(tmp_path / name, OPEN, SEALED)
         for request in plan_of(split, out, sealed=seed).requests:
             (folder,) = ensure_tasks(request, tell=lambda _: None)
-            found[name, request.region.id] = task_files.read_asked(folder)
+            found[name, request.region.id] = task_files.Task.open(folder).asked
     assert found["one", SEALED] == found["same", SEALED]
     assert not found["one", SEALED].keys() & found["other", SEALED].keys()
     assert found["one", OPEN] == found["other", OPEN]

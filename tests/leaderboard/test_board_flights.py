@@ -44,7 +44,7 @@ def run(out, name, *, off_m, accepts):
             )
         )
     folder = out / "runs" / name / HASH / SUITE / REGION
-    prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
+    prediction_files.write_part(folder, answers, asked=task_files.Task.open(task).asked)
     about = {"matcher": {"name": name, "version": "1"}, "hash": HASH, "suite": SUITE, "region": REGION}
     sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
     RunManifest(**about, queries_sha256=sha256, cpu_s=3.0).save(folder)

@@ -74,7 +74,7 @@ def root(tasks, tmp_path_factory):
         task = out / "tasks" / suite / region
         truths = {truth.query_id: truth for truth in task_files.read_truths(out / "truth" / suite / region)}
         answers = [answer(query, truths[query.query_id], at) for at, query in enumerate(task_files.read_queries(task))]
-        prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
+        prediction_files.write_part(folder, answers, asked=task_files.Task.open(task).asked)
         about = {"matcher": {"name": "mine", "version": "1"}, "hash": HASH, "suite": suite, "region": region}
         sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
         RunManifest(**about, queries_sha256=sha256).save(folder)
@@ -198,7 +198,7 @@ def case_at(root, suite, region, number=0, **changes):
     query = list(task_files.read_queries(task))[number]
     truth = truths[query.query_id]
     said = {"prediction": answer(query, truth, 0), "failure": "other", **changes}
-    return Case(matcher="mine", query=query, truth=truth, **said), task_files.read_task(task)
+    return Case(matcher="mine", query=query, truth=truth, **said), task_files.Task.open(task)
 
 
 @pytest.mark.parametrize(
@@ -212,9 +212,9 @@ def case_at(root, suite, region, number=0, **changes):
 def test_any_query_has_a_picture_answered_or_not_and_the_same_each_time(root, asked, prediction):
     changes = {} if prediction == "answer" else {"prediction": prediction}
     said = {"p_false": {"sure": 0.25}, "orders": {"margin": 0.5}, "accepted": {"sure": True}}
-    case, about = case_at(root, *asked, **said, **changes)
-    picture = read_picture(case, root, about)
-    first, again = case_pixels(picture), case_pixels(read_picture(case, root, about))
+    case, task = case_at(root, *asked, **said, **changes)
+    picture = read_picture(case, task)
+    first, again = case_pixels(picture), case_pixels(read_picture(case, task))
     assert first.dtype == np.uint8
     np.testing.assert_array_equal(first, again)
     assert fitted(first, CASE_BYTES) == fitted(again, CASE_BYTES)
@@ -236,8 +236,8 @@ def test_what_orders_answers_alone_is_told_apart_from_a_probability():
 
 
 def test_the_map_of_a_case_holds_both_places(root):
-    case, about = case_at(root, "absent", "town-riverside")
-    picture = read_picture(case, root, about)
+    case, task = case_at(root, "absent", "town-riverside")
+    picture = read_picture(case, task)
     for pose in (case.truth.pose, case.fix):
         if pose is not None:
             assert picture.part.west_m <= pose.easting_m <= picture.part.east_m
@@ -279,7 +279,7 @@ def test_inspect_counts_the_failures_of_a_run_and_draws_any_of_its_queries(root,
     assert "absent accepted" in text
     assert re.search(r"failures in \d+ queries, \d+ of them under stress", text)
     assert not (tmp_path / "out").exists()
-    query = task_files.read_ids(root / "tasks" / "alias" / "town-grid+alias")[2]
+    query = task_files.Task.open(root / "tasks" / "alias" / "town-grid+alias").ids()[2]
     code, text, err = program("inspect", run, "--query", query[:10], "--out", tmp_path / "mine")
     assert code == 0, err
     path = Path(text.removeprefix("picture: ").strip())
@@ -301,7 +301,7 @@ def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_p
 
     assert "was asked no query 'zz'; 'inspect " in fault(run, "--query", "zz")
     assert "lists some that went wrong" in fault(run, "--query", "zz")
-    known = task_files.read_ids(root / "tasks" / "alias" / "town-grid+alias")[0]
+    known = task_files.Task.open(root / "tasks" / "alias" / "town-grid+alias").ids()[0]
     assert f"did you mean {known}?" in fault(run, "--query", known[:-1] + "z")
     assert "--query is empty: name the beginning of an id" in fault(run, "--query", "")
     assert "draws a query of a task or a run" in fault("crossfit", "--query", known)
@@ -311,10 +311,10 @@ def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_p
         (out / kind).unlink()
         shutil.copytree(root / kind, out / kind)
     mine = out / "runs" / "mine" / HASH / "alias" / "town-grid+alias"
-    query = task_files.read_ids(out / "tasks" / "alias" / "town-grid+alias")[0]
-    rows = dict.fromkeys(task_files.read_ids(out / "tasks" / "alias" / "town-grid+alias"), "f" * 64)
+    query = task_files.Task.open(out / "tasks" / "alias" / "town-grid+alias").ids()[0]
+    rows = dict.fromkeys(task_files.Task.open(out / "tasks" / "alias" / "town-grid+alias").ids(), "f" * 64)
     old = prediction_files.Answers.open(
-        mine, task_files.read_asked(out / "tasks" / "alias" / "town-grid+alias")
+        mine, task_files.Task.open(out / "tasks" / "alias" / "town-grid+alias").asked
     ).found.values()
     for part in prediction_files.parts_of(mine):
         part.unlink()
@@ -325,11 +325,11 @@ def test_inspect_names_what_is_wrong_with_a_run_in_one_line(root, program, tmp_p
     shutil.rmtree(out / "tasks" / "alias")
     assert "holds no task.json: make the queries first" in fault(mine)
     (out / "regions").unlink()
-    there = task_files.read_ids(out / "tasks" / "absent" / "town-riverside")[0]
+    there = task_files.Task.open(out / "tasks" / "absent" / "town-riverside").ids()[0]
     assert "holds no region.json: build the region first" in fault(out / "runs" / "mine" / HASH, "--query", there)
 
 
 def _beginnings(root):
     """First letters that several ids share."""
-    names = [name for asked in ASKED for name in task_files.read_ids(root / "tasks" / asked[0] / asked[1])]
+    names = [name for asked in ASKED for name in task_files.Task.open(root / "tasks" / asked[0] / asked[1]).ids()]
     return (name[0] for name in names if sum(other[0] == name[0] for other in names) > 1)

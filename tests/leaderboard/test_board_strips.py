@@ -39,7 +39,8 @@ def put_pictures(out, tasks):
     ]
     about = task_files.read_task(folder)
     kept = {name: about[name] for name in ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites")}
-    made = put_task(pairs, kept | {"suite": SUITE, "region": REGION}, {"seed": 0}, out=out, tell=print)
+    origin = task_files.TaskOrigin(**kept, suite=SUITE, region=REGION)
+    made = put_task(pairs, origin, task_files.TruthManifest(seed=0), out=out, tell=print)
     planes = np.where(DRAWN.labels == 1, 254, 0).astype(np.uint8)
     seen = Segmented.of(Segmentation(classes=DRAWN.classes, probability_bytes=planes))
     sha256 = task_files.read_task(made.folder)["files"][task_files.QUERIES]["sha256"]
@@ -55,7 +56,7 @@ def run(out, task, pairs, name, rights):
         place = replace(truth.pose, easting_m=truth.pose.easting_m + off_m)
         answers.append(Prediction(query_id=query.query_id, candidates=((place, 1.0),), latency_s=0.1))
     folder = out / "runs" / name / HASH / SUITE / REGION
-    prediction_files.write_part(folder, answers, asked=task_files.read_asked(task))
+    prediction_files.write_part(folder, answers, asked=task_files.Task.open(task).asked)
     about = {"matcher": {"name": name, "version": "1"}, "hash": HASH, "suite": SUITE, "region": REGION}
     sha256 = task_files.read_task(task)["files"][task_files.QUERIES]["sha256"]
     RunManifest(**about, queries_sha256=sha256).save(folder)

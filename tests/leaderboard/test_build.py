@@ -39,7 +39,7 @@ from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.entries import find_entries
 from sasgeo_bench.scoring.rejection import JUDGED, why_not
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.tasks import task_files, task_rows
+from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.split import SplitFile, find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -85,8 +85,8 @@ def built(tmp_path_factory, lay_towns):
     for town in TOWNS:
         folder = out / "truth" / "clean" / town
         truths = [replace(truth, is_present=at % 4 > 0) for at, truth in enumerate(task_files.read_truths(folder))]
-        rows = [task_rows.truth_row(truth) for truth in truths]
-        pq.write_table(pa.Table.from_pylist(rows, schema=task_rows.TRUTH_SCHEMA), folder / task_files.TRUTH)
+        rows = [task_files.truth_row(truth) for truth in truths]
+        pq.write_table(pa.Table.from_pylist(rows, schema=task_files.TRUTH_SCHEMA), folder / task_files.TRUTH)
     run(plan_run(RunRequest(spec="oracle_pose", tasks=tasks, out=out)), tell=lambda _: None)
     return out
 
@@ -340,7 +340,9 @@ def test_what_was_sent_and_what_maps_take_is_told(out, tmp_path):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, out / "runs", tmp_path / "mine.parquet")
     told = board.table.set_index(["matcher", "metric"])["value"]
-    sizes = [size for town in TOWNS for size in task_files.read_view_bytes(out / "tasks" / "clean" / town).values()]
+    sizes = [
+        size for town in TOWNS for size in task_files.Task.open(out / "tasks" / "clean" / town).view_bytes().values()
+    ]
     fixes = int(board.scores["mine"]["is_answered"].sum())
     assert told["mine", "observation_per_fix"] == pytest.approx(sum(sizes) / 1e3 / fixes)
     assert told["oracle_pose", "map_per_km2"] > 0
@@ -524,7 +526,7 @@ def copy_run(out, name, towns, *, asked=None):
     for town in towns:
         (run,) = (path for path in (out / "runs" / "oracle_pose").glob(f"*/clean/{town}"))
         folder = out / "runs" / name / "0123456789ab" / "clean" / town
-        hashes = task_files.read_asked(out / "tasks" / "clean" / town) if asked is None else asked
+        hashes = task_files.Task.open(out / "tasks" / "clean" / town).asked if asked is None else asked
         rows = list(prediction_files.read_predictions(run))
         prediction_files.write_part(folder, rows, asked={row.query_id: hashes[row.query_id] for row in rows})
         about = RunManifest.open(run)
@@ -847,7 +849,7 @@ def test_shards_of_a_run_in_several_folders_are_one_run(out, tmp_path):
         for path in sorted((out / "runs").rglob("run.json")):
             shard = tmp_path / f"shard{number}" / path.parent.relative_to(out / "runs")
             rows = list(prediction_files.read_predictions(path.parent))
-            asked = task_files.read_asked(out / "tasks" / shard.parent.name / shard.name)
+            asked = task_files.Task.open(out / "tasks" / shard.parent.name / shard.name).asked
             prediction_files.write_part(shard, [row for at, row in enumerate(rows) if keep(at)], asked=asked)
             shutil.copyfile(path, shard / "run.json")
     board = board_of(out, tmp_path / "shard0", tmp_path / "shard1")

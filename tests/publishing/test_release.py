@@ -206,7 +206,7 @@ def test_public_libraries_alone_load_every_file(written: Path, source: Path, tmp
     found = json.loads(_python(LOAD_ALL, written, str(tmp_path)).splitlines()[-1])
     drawn = {"clean": (RIVERSIDE,), "alias": (f"{GRID}+alias",)}
     for suite, maps in drawn.items():
-        ids = [name for region in maps for name in task_files.read_ids(source / "tasks" / suite / region)]
+        ids = [name for region in maps for name in task_files.Task.open(source / "tasks" / suite / region).ids()]
         assert found["rows"][f"{suite}/crossfit"] == ids
         assert found["rows"][f"{suite}-truth/crossfit"] == ids
         assert sum(count for path, count in found["queries"].items() if suite in path) == len(ids)
@@ -249,8 +249,8 @@ def test_a_footprint_keeps_to_the_sides_of_its_grid_between_its_points_too() -> 
 
 def test_a_release_is_a_root_that_the_program_itself_runs_and_scores_on(written: Path, source: Path) -> None:
     folder, truth = written / "tasks/clean" / RIVERSIDE, written / "truth/clean" / RIVERSIDE
-    assert task_files.task_faults(folder, truth) == []
-    task_files.check_truths(folder, truth)
+    assert replace(task_files.Task.open(folder), truth=truth).faults() == []
+    replace(task_files.Task.open(folder), truth=truth).check_truths()
     assert list(task_files.read_truths(truth)) == list(task_files.read_truths(source / "truth/clean" / RIVERSIDE))
     request = RunRequest(spec="sasgeo_raster", tasks=(folder,), out=source)
     reach = reach_of(request, [written / "regions" / RIVERSIDE])
@@ -333,7 +333,7 @@ def test_mlcroissant_finds_no_issue_and_loads_records_of_every_set(written: Path
     for name in sets:
         assert list(islice(loaded.records(name), 2)), name
     ids = [row["alias/query_id"].decode() for row in loaded.records("alias")]
-    assert ids == task_files.read_ids(source / "tasks/alias" / f"{GRID}+alias")
+    assert ids == task_files.Task.open(source / "tasks/alias" / f"{GRID}+alias").ids()
     hashes = {item.content_url: item.sha256 for item in loaded.metadata.file_objects}
     data = {
         path.relative_to(written).as_posix()
@@ -416,13 +416,12 @@ def _rewritten(source: Path, out: Path, part_of: Callable[[int], str]) -> Path:
     """A root with the clean task of the town by the river in other parts of the split `holdout`."""
     shutil.copytree(source / "regions", out / "regions")
     folder = source / "tasks/clean" / RIVERSIDE
-    about = task_files.read_task(folder) | {"split": "holdout"}
     queries, truths = task_files.read_queries(folder), task_files.read_truths(source / "truth/clean" / RIVERSIDE)
     pairs = [
         (replace(query, part=part_of(at)), truth) for at, (query, truth) in enumerate(zip(queries, truths, strict=True))
     ]
-    kept = {name: value for name, value in about.items() if name not in {"counts", "files", "prior_groups"}}
-    put_task(iter(pairs), kept, {"seed": 10**30}, out=out, tell=lambda _: None)
+    kept = task_files.Task.open(folder).manifest.origin.model_copy(update={"split": "holdout"})
+    put_task(iter(pairs), kept, task_files.TruthManifest(seed=10**30), out=out, tell=lambda _: None)
     return out
 
 
@@ -430,7 +429,7 @@ def test_parts_of_a_task_are_splits_of_their_own_and_test_truths_stay_back(sourc
     out = _rewritten(source, tmp_path / "out", lambda at: ("train", "test")[at % 2])
     _release(out, tmp_path / FOLDER, regions=(RIVERSIDE,), suites=(), split="holdout")
     found = json.loads(_python(LOAD_ALL, tmp_path / FOLDER, str(tmp_path)).splitlines()[-1])
-    ids = task_files.read_ids(out / "tasks/clean" / RIVERSIDE)
+    ids = task_files.Task.open(out / "tasks/clean" / RIVERSIDE).ids()
     expected = {"clean/train": ids[::2], "clean/test": ids[1::2], "clean-truth/train": ids[::2]}
     assert found["rows"] == expected
     assert not list((tmp_path / FOLDER).rglob("truth-test*"))

@@ -185,7 +185,7 @@ def test_a_submission_says_versions_tasks_and_hashes_and_is_the_same_bytes_again
 
 
 def test_queries_without_a_row_are_misses_and_a_suite_without_any_is_not_asked(stored, files, rows, program):
-    clean = set(task_files.read_ids(stored.parent / "out" / "tasks" / "clean" / "town-riverside"))
+    clean = set(task_files.Task.open(stored.parent / "out" / "tasks" / "clean" / "town-riverside").ids())
     write_rows(files["predictions"], [row for row in rows if row["query_id"] in clean][:-3])
     code, _, err = program(*flags(files, stored))
     assert code == 0, err
@@ -490,7 +490,7 @@ def test_rows_and_versions_that_do_not_fit_the_board_are_listed_and_never_scored
     assert fault in out
     (entry,) = find_entries([], [copied])
     with laid_tasks([stored]) as folders, pytest.raises(ConfigError) as refused:
-        check_submitted(entry, folders, find_split(stored_settings([stored]).split))
+        check_submitted(entry, [*map(task_files.Task.open, folders)], find_split(stored_settings([stored]).split))
     assert fault in str(refused.value)
 
 

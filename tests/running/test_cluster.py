@@ -50,7 +50,7 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     run(alone, tell=lambda _: None)
     told = []
     report = run(spread, tell=told.append)
-    assert report.counts == {"ok": len(task_files.read_ids(task))}
+    assert report.counts == {"ok": len(task_files.Task.open(task).ids())}
     assert rows(spread.parts[0].folder) == rows(alone.parts[0].folder)
     about = RunManifest.open(spread.parts[0].folder)
     assert about.isolation == RunManifest.open(alone.parts[0].folder).isolation
@@ -91,7 +91,7 @@ def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
     first = plan_run(request_of(task, tmp_path, limit=3))
     run(first, tell=lambda _: None)
     plan = plan_run(request_of(task, tmp_path))
-    asked = task_files.read_asked(task)
+    asked = task_files.Task.open(task).asked
     chunk = replace(plan.parts[0], left=tuple(asked)[:5], asked=asked)
     assert runner._answer_chunk(plan, "one", chunk).counts == {"ok": 2}
 
@@ -99,7 +99,7 @@ def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
 def test_chunks_of_a_run_give_up_a_matcher_that_hangs_together_and_another_run_does_not(task, tmp_path, monkeypatch):
     monkeypatch.setattr(Patience.__init__, "__kwdefaults__", {"most_late": 3})
     plan = plan_run(request_of(task, tmp_path, name="Hangs", limits=Limits(match_s=0.01)))
-    asked = task_files.read_asked(task)
+    asked = task_files.Task.open(task).asked
     chunks = [replace(plan.parts[0], left=tuple(asked)[at : at + 2], asked=asked) for at in (0, 2, 4)]
     with threaded():
         costs = [runner._answer_chunk(plan, token, chunk) for token, chunk in zip(("a", "a", "b"), chunks, strict=True)]
@@ -190,7 +190,7 @@ def test_over_500_queries_two_processes_two_shards_and_a_cluster_give_the_same_r
     )
     requests = plan_requests(replace(wanted, may_be_fewer=True), tell=lambda _: None)
     tasks = [made.folder for request in requests for made in make_tasks(request, tell=lambda _: None)]
-    assert sum(len(task_files.read_ids(task)) for task in tasks) > 500
+    assert sum(len(task_files.Task.open(task).ids()) for task in tasks) > 500
     ways = {
         "two processes": [{"jobs": 2}],
         "two shards": [{"shard": (1, 2)}, {"shard": (2, 2)}],

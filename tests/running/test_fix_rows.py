@@ -9,7 +9,7 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.matching.submission import Card, Submission, TaskManifest, example_card
+from sasgeo_bench.matching.submission import AnsweredTask, Card, Submission, example_card
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import FLOWN_SCHEMA, prediction_row, row_faults
 from sasgeo_bench.scoring.submission_files import predictions_name, read_submission, write_submission
@@ -54,7 +54,7 @@ def test_a_covariance_and_none_at_all_are_sound(covariance) -> None:
 
 
 def test_a_submission_keeps_what_a_tracker_says_of_its_fixes(tmp_path) -> None:
-    asked = TaskManifest(suite="flight-clean", region="here", queries_sha256="0" * 64, queries=2, answered=2)
+    asked = AnsweredTask(suite="flight-clean", region="here", queries_sha256="0" * 64, queries=2, answered=2)
     submission = Submission(
         schema_version=1,
         card=parse_toml(example_card("mine"), Card, source="card"),

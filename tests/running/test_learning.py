@@ -20,7 +20,7 @@ from sasgeo_bench.running import prediction_files, sandbox, training
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.running.training_tasks import Lessons, _Pair, check_apart, plan_training, spread, truth_of
+from sasgeo_bench.running.training_tasks import Lessons, _Pair, check_apart, plan_training, spread
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.scoring.validate import set_aside, validate
 from sasgeo_bench.tasks import task_files
@@ -64,7 +64,7 @@ def carry_out(request):
 
 def answers(request, folder):
     (task,) = request.tasks
-    return prediction_files.Answers.open(folder, task_files.read_asked(task)).found
+    return prediction_files.Answers.open(folder, task_files.Task.open(task).asked).found
 
 
 def told(request, folder):
@@ -85,10 +85,12 @@ def test_what_was_learnt_reaches_every_answer_and_is_kept_where_people_can_read_
     text = (plan.run_folder / said.file).read_text(encoding="utf-8")
     assert json.loads(text)["suites"] == ["alias"]
     assert plan_run(request).to_text().splitlines()[1].startswith("  trained on ")
-    assert next(validate(folder, request.tasks)).is_missing_row  # the rest was not asked, and no row is strange
-    assert set_aside(folder, request.tasks) == 0
+    assert next(
+        validate(folder, [*map(task_files.Task.open, request.tasks)])
+    ).is_missing_row  # the rest was not asked, and no row is strange
+    assert set_aside(folder, [*map(task_files.Task.open, request.tasks)]) == 0
     merged = prediction_files.merge_runs(
-        [folder], folder / "merged.parquet", asked=task_files.read_asked(request.tasks[0])
+        [folder], folder / "merged.parquet", asked=task_files.Task.open(request.tasks[0]).asked
     )
     assert merged == 2
 
@@ -108,7 +110,7 @@ def test_what_was_learnt_is_used_again_and_learnt_anew_from_something_else(reque
     assert (same, report.counts, second.training_set.count) == (folder, {"ok": 3}, 3)
     assert first.training_set.sha256 != second.training_set.sha256
     assert told(request, folder) == {3.0}
-    assert set_aside(folder, request.tasks) == 3
+    assert set_aside(folder, [*map(task_files.Task.open, request.tasks)]) == 3
     # Back again, nothing is asked, and the answers under the first training are those that count.
     monkeypatch.setattr(training, "_learn", None)
     assert carry_out(replace(request, limit=3))[1].counts == {}
@@ -221,7 +223,7 @@ def test_a_training_set_is_the_same_whatever_order_its_tasks_are_named_in(tasks)
 
 def test_matchers_learn_under_stress_from_some_kinds_alone(tasks):
     (task,) = (tasks / "tasks" / "alias").glob("town-grid*")
-    truths = list(task_files.read_truths(truth_of(task, task_files.read_task(task))))
+    truths = task_files.Task.open(task).truths
     kind = next(truth.kind for truth in truths if truth.role == "stress")
     count = sum(truth.role != "stress" or truth.kind.startswith(kind) for truth in truths)
     found = plan_training([task], asked=[], split=None, most=2000, lessons=Lessons(kinds=(kind,)))

@@ -15,7 +15,7 @@ from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.running.run_manifest import RUN, CardRecord, RunManifest
-from sasgeo_bench.tasks.task_rows import POSE_FIELDS
+from sasgeo_bench.tasks.task_files import POSE_FIELDS
 from sasgeo_bench.texts import json_text
 
 POSE = Pose(easting_m=1.0, northing_m=2.0, yaw_deg=3.0, scale=1.1)

@@ -60,15 +60,15 @@ def ask(task):
 @pytest.mark.slow
 def test_more_sites_fewer_sites_and_another_seed_ask_nothing_twice(draw):
     task = draw()
-    few = set(task_files.read_ids(task))
+    few = set(task_files.Task.open(task).ids())
     assert ask(task)[1] == len(few)
     draw(count=2)
-    more = set(task_files.read_ids(task))
+    more = set(task_files.Task.open(task).ids())
     assert few < more
     part, asked = ask(task)
     assert (set(part.left), asked) == (more - few, len(more - few))
     draw(seed=1)
-    other = set(task_files.read_ids(task))
+    other = set(task_files.Task.open(task).ids())
     part, asked = ask(task)
     assert (asked, part.done, part.aside) == (len(other), 0, len(more))
     draw()
@@ -78,25 +78,25 @@ def test_more_sites_fewer_sites_and_another_seed_ask_nothing_twice(draw):
     assert ask(task)[1] == 0
     # All of it is there, and every task is answered by its own.
     assert {row.query_id for row in prediction_files.read_predictions(part.folder)} == more | other
-    assert list(validate(part.folder, [task])) == []
-    assert set_aside(part.folder, [task]) == len(other)
+    assert list(validate(part.folder, [task_files.Task.open(task)])) == []
+    assert set_aside(part.folder, [task_files.Task.open(task)]) == len(other)
 
 
 def test_a_query_whose_content_changed_is_asked_again_and_both_answers_stay(draw, tmp_path):
     task = draw(prior="r500-weak-s3")
-    before = task_files.read_asked(task)
+    before = task_files.Task.open(task).asked
     folder = ask(task)[0].folder
     draw(prior="r250-known-s3")
-    after = task_files.read_asked(task)
+    after = task_files.Task.open(task).asked
     assert before.keys() == after.keys()
     assert not set(before.values()) & set(after.values())
-    assert len(list(validate(folder, [task]))) == len(after)
+    assert len(list(validate(folder, [task_files.Task.open(task)]))) == len(after)
     part, asked = ask(task)
     assert (asked, part.aside) == (len(after), len(before))
     with pytest.raises(StoreError, match="and to an earlier version of it: name the tasks with --tasks"):
         prediction_files.merge_runs([folder], tmp_path / "both.parquet")
     assert prediction_files.merge_runs([folder], tmp_path / "mine.parquet", asked=after) == len(after)
-    assert list(validate(tmp_path / "mine.parquet", [task])) == []
+    assert list(validate(tmp_path / "mine.parquet", [task_files.Task.open(task)])) == []
     found = prediction_files.Answers.open(folder, before)
     assert (found.found.keys(), found.aside) == (before.keys(), len(after))
     draw(prior="r500-weak-s3")
@@ -109,7 +109,7 @@ def test_a_task_that_is_drawn_anew_while_it_is_asked_ends_the_run(draw):
     draw(prior="r250-known-s3")
     with pytest.raises(StoreError, match="was made anew while it was asked: run again, answers are kept"):
         run(plan, tell=quiet)
-    assert prediction_files.ids_done(plan.parts[0].folder, task_files.read_asked(task)) == set()
+    assert prediction_files.ids_done(plan.parts[0].folder, task_files.Task.open(task).asked) == set()
 
 
 @pytest.mark.usefixtures("in_threads")
@@ -132,14 +132,14 @@ def test_another_build_of_the_map_is_another_question(draw, own_out):
     with pytest.raises(StoreError, match="was built anew while it was searched: run again"):
         answers.answer(plan, plan.parts, jobs=1, watch=answers.Watch())
     about = task / "task.json"
-    before = task_files.read_asked(task)
-    (query, *_), said = task_files.read_some(task, set(before)), json.loads(about.read_text())
+    before = task_files.Task.open(task).asked
+    (query, *_), said = task_files.Task.open(task).some(set(before)), json.loads(about.read_text())
     assert query[2] == before[query[0].query_id]
     # Of a task of an older program the hashes are reckoned, and say as much of the map as it does.
     strip(task)
-    assert task_files.read_asked(task) == before
+    assert task_files.Task.open(task).asked == before
     about.write_text(json.dumps(said | {"map_fingerprint": "0" * 64}))
-    assert not set(task_files.read_asked(task).values()) & set(before.values())
+    assert not set(task_files.Task.open(task).asked.values()) & set(before.values())
 
 
 def strip(task):

@@ -13,6 +13,7 @@ from sasgeo_bench.scoring.validate import validate
 from sasgeo_bench.sensing.reference_imagery import Look, render_imagery
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.suites.base import Choice
+from sasgeo_bench.tasks.task_files import Task
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWN = "town-riverside"
@@ -71,7 +72,7 @@ def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(dra
     kept = shutil.copytree(folder, folder.parents[1] / "kept")
     assert first.map_bytes > bare + 50_000
     assert first.rendered_imagery == plan_of(seen, "orb_vlad").parts[0].imagery
-    assert not list(validate(plan_of(seen, "orb_vlad").parts[0].folder, [seen]))
+    assert not list(validate(plan_of(seen, "orb_vlad").parts[0].folder, [Task.open(seen)]))
 
     render_imagery(folder, folder, replace(LOOK, seed=1), tell=quiet)
     assert plan_of(seen, "orb_vlad").parts[0].aside == 2 * count

@@ -77,7 +77,7 @@ def undisturbed(made, tmp_path_factory):
 
 def test_every_query_has_a_row_and_run_json_says_how(task, undisturbed):
     report, folder = undisturbed
-    ids = task_files.read_ids(task)
+    ids = task_files.Task.open(task).ids()
     assert [item.query_id for item in table(folder)] == sorted(ids)
     assert report.counts == {"ok": len(ids)}
     about = RunManifest.open(folder)
@@ -98,7 +98,7 @@ def test_two_shards_merged_give_what_one_run_does(task, undisturbed, tmp_path):
     folders = [run_all(request_of(task, tmp_path / str(index), shard=(index, 2)))[1] for index in (1, 2)]
     assert all(len(table(folder)) < len(table(undisturbed[1])) for folder in folders)
     merged = (tmp_path / "both.parquet", tmp_path / "again.parquet")
-    assert prediction_files.merge_runs(folders, merged[0]) == len(task_files.read_ids(task))
+    assert prediction_files.merge_runs(folders, merged[0]) == len(task_files.Task.open(task).ids())
     prediction_files.merge_runs(folders[::-1], merged[1])
     assert merged[0].read_bytes() == merged[1].read_bytes()
     assert table(merged[0]) == table(undisturbed[1])
@@ -140,13 +140,13 @@ def test_rows_of_a_status_are_asked_again_on_demand(task, tmp_path):
     assert {item.status for item in table(folder)} == {"ok"}
     prediction_files.merge_runs([folder], tmp_path / "merged.parquet")
     assert {item.status for item in table(tmp_path / "merged.parquet")} == {"ok"}
-    assert not [fault for fault in validate(folder, [task]) if "again" in fault.found]
+    assert not [fault for fault in validate(folder, [task_files.Task.open(task)]) if "again" in fault.found]
 
 
 @pytest.mark.usefixtures("in_threads")
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_a_matcher_that_hangs_on_ten_queries_in_a_row_is_given_up(task, tmp_path, jobs):
-    count = len(task_files.read_ids(task))
+    count = len(task_files.Task.open(task).ids())
     hanging = Limits(match_s=0.01)  # it never answers, however long one waits
     report, folder = run_all(request_of(task, tmp_path, name="Hangs", limits=hanging, jobs=jobs))
     assert report.counts == {"timeout": count}
@@ -170,7 +170,7 @@ def test_killed_once_or_at_random_moments_a_run_ends_with_the_same_rows(place, t
     command = command_of(UNDISTURBED, task, tmp_path, "--jobs", "2")
     process = subprocess.run(killed, cwd=place, env=env_with(place), capture_output=True, text=True)  # noqa: S603, PLW1510
     assert process.returncode == -signal.SIGKILL, process.stderr
-    every, asked = len(task_files.read_ids(task)), task_files.read_asked(task)
+    every, asked = len(task_files.Task.open(task).ids()), task_files.Task.open(task).asked
     assert 0 < len(prediction_files.ids_done(folder, asked)) < every
     chance = random.Random(7)  # noqa: S311 - moments, no secrets
     for _ in range(kills - 1):
@@ -201,7 +201,11 @@ def test_an_interrupt_stops_a_run_in_the_middle_and_it_goes_on_there(place, task
     process = subprocess.run(command, cwd=place, env=env_with(place), capture_output=True, text=True)  # noqa: S603, PLW1510
     assert process.returncode == 130, process.stderr
     assert "interrupted; answers so far are kept" in process.stderr.splitlines()[-1]
-    assert 0 < len(prediction_files.ids_done(folder, task_files.read_asked(task))) < len(task_files.read_ids(task))
+    assert (
+        0
+        < len(prediction_files.ids_done(folder, task_files.Task.open(task).asked))
+        < len(task_files.Task.open(task).ids())
+    )
     run_all(request_of(task, tmp_path, name="Slow"))
     assert table(folder) == table(undisturbed[1])
 
@@ -317,7 +321,7 @@ def test_hostile_matchers_cost_their_own_rows_from_the_run_to_the_board(task, un
     assert {entry.hash for entry in board.entries} == set(hashes)
     assert board.failures.found == {}
     answered = {hashes[entry.hash]: board.scores[entry.name]["status"].value_counts() for entry in board.entries}
-    assert answered.pop("Plain").to_dict() == {"ok": len(task_files.read_ids(task))}
+    assert answered.pop("Plain").to_dict() == {"ok": len(task_files.Task.open(task).ids())}
     for name, (status, _) in HOSTILE.items():
         assert answered[name][status] == 2
 

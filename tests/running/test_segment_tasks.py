@@ -28,6 +28,7 @@ from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import Step, view_id
 from sasgeo_bench.tasks.segmented import read_segmented, segmented_file
 from sasgeo_bench.tasks.split import find_split
+from sasgeo_bench.tasks.task_files import TaskOrigin, TruthManifest
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWNS = ("town-grid", "town-riverside")  # of either half
@@ -36,6 +37,9 @@ PATIENT = Limits(match_s=600.0, learn_s=600.0, memory_bytes=2 * 10**9)
 
 def silent(line):
     del line
+
+
+KEPT = ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites")
 
 
 def with_pictures(query, truth, at):
@@ -59,13 +63,13 @@ def drawn_once(tmp_path_factory, lay_towns):
     folders = []
     for request in plan_requests(wanted, tell=silent):
         (made,) = make_tasks(request, tell=silent)
-        about = task_files.read_task(made.folder)
+        about = made.manifest
         truth = out / "truth" / "clean" / request.region.id
         plain = islice(zip(task_files.read_queries(made.folder), task_files.read_truths(truth), strict=True), 4)
         pairs = [with_pictures(*pair, at) for at, pair in enumerate(plain)]
-        kept = {name: about[name] for name in ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites")}
-        own = kept | {"suite": "aerial", "region": request.region.id}
-        folders.append(put_task(pairs, own, {"seed": 4}, out=out, tell=silent).folder.relative_to(out))
+        kept = {name: getattr(about, name) for name in KEPT}
+        own = TaskOrigin(**kept, suite="aerial", region=request.region.id)
+        folders.append(put_task(pairs, own, TruthManifest(seed=4), out=out, tell=silent).folder.relative_to(out))
     return out, folders
 
 
@@ -132,9 +136,9 @@ def test_views_of_a_flight_stay_in_order_and_a_tracker_follows_them(pictured):
     truth = Path("out/truth/aerial") / pictured[0].name
     both = zip(task_files.read_queries(pictured[0]), task_files.read_truths(truth), strict=True)
     pairs = [in_flight(*with_pictures(*pair, at), at) for at, pair in enumerate(both)]
-    own = {name: about[name] for name in ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites", "region")}
+    own = TaskOrigin(**{name: about[name] for name in (*KEPT, "region")}, suite="flight-image")
     pairs = sorted(pairs, key=lambda pair: pair[0].query_id)
-    task = put_task(pairs, own | {"suite": "flight-image"}, {"seed": 4}, out=Path("out"), tell=silent)
+    task = put_task(pairs, own, TruthManifest(seed=4), out=Path("out"), tell=silent)
     (made,) = of_oracle([task.folder])
     queries = list(task_files.read_queries(made))
     assert [query.step.frame for query in queries] == [0, 1, 0, 1]
@@ -181,7 +185,7 @@ def test_a_picture_that_a_segmenter_fails_at_has_no_evidence_and_is_told(picture
     lines = []
     made = segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"), tell=lines.append)
     assert "failed at 4 of 4 pictures, whose evidence is unknown" in lines[-1]
-    assert task_files.read_task(made[0])[task_files.FAILED_PICTURES] == 4
+    assert task_files.read_task(made[0])["failed_pictures"] == 4
     for query in task_files.read_queries(made[0]):
         assert (query.evidence.cells == UNKNOWN).all()
         assert query.evidence.confidence is not None

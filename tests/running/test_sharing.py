@@ -18,7 +18,6 @@ from sasgeo_bench.running.plan import RunRequest, by_map, plan_run
 from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.tasks import task_files
 
 TOWN, COPY = "town-riverside", "town-copy"
 PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
@@ -69,11 +68,11 @@ def test_tasks_on_one_map_share_a_process_and_no_process_has_two_maps(pair, else
     plan = plan_of((pair[0], elsewhere, pair[1]), tmp_path, jobs=jobs)
     assert run(plan, tell=quiet).counts == {"ok": 6}
     for part in plan.parts:
-        assert set(rows(part)) == set(task_files.read_ids(part.task)[:2])
+        assert set(rows(part)) == set(part.task.ids()[:2])
         assert told(part, "maps") == {1.0}
         assert told(part, "readable maps") == {1.0} or not HAS_LANDLOCK
         about = RunManifest.open(part.folder)
-        assert (about.suite, about.region) == (part.task.parent.name, part.task.name)
+        assert (about.suite, about.region) == part.task.manifest.name
         assert about.prepare_s > 0
         assert about.peak_bytes > 0
         assert about.isolation["truth"]

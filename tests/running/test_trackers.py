@@ -81,7 +81,7 @@ def counted(flown, tmp_path_factory):
 
 def test_views_of_a_flight_come_in_order_to_one_process(task, counted):
     assert len(counted) == 3
-    assert sum(map(len, counted.values())) == len(task_files.read_ids(task))
+    assert sum(map(len, counted.values())) == len(task_files.Task.open(task).ids())
     for rows in counted.values():
         assert views_of(rows) == list(range(1, len(rows) + 1))
         assert len({item.diagnostics["process"] for item in rows}) == 1
@@ -94,7 +94,7 @@ def test_what_a_tracker_learnt_reaches_every_step(task, tasks, tmp_path):
     flights = run_of(task, tmp_path, "Taught", train=(train,))
     lessons = {item.diagnostics["lessons"] for rows in flights.values() for item in rows}
     (count,) = lessons
-    assert 0 < count <= len(task_files.read_ids(train))
+    assert 0 < count <= len(task_files.Task.open(train).ids())
     untaught = run_of(task, tmp_path, "Taught")
     assert {item.diagnostics["lessons"] for rows in untaught.values() for item in rows} == {-1.0}
 
@@ -148,7 +148,7 @@ def test_a_fix_is_stored_with_its_covariance_and_modes(counted):
 def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_path, request, way, status, told):
     if way not in ("hangs", "dies"):  # what its process does not live through
         request.getfixturevalue("in_threads")
-    first = flight_id(min(task_files.read_ids(task)))
+    first = flight_id(min(task_files.Task.open(task).ids()))
     (flown / "fails").write_text(f"{first} {way}", encoding="utf-8")
     flights = run_of(task, tmp_path, "Failing", limits=replace(PATIENT, match_s=5.0 if way == "hangs" else 600.0))
     failed = flights.pop(first)
@@ -163,7 +163,7 @@ def test_a_failure_costs_the_rest_of_its_flight_and_no_other(task, flown, tmp_pa
 @pytest.mark.usefixtures("in_threads")
 def test_a_flight_that_was_cut_off_is_asked_from_its_first_view(task, tmp_path):
     """Rows of a whole flight stay; the other begins anew, since a tracker needs what came before."""
-    ids = sorted(task_files.read_ids(task))
+    ids = sorted(task_files.Task.open(task).ids())
     whole = [name for name in ids if flight_id(name) == flight_id(ids[0])]
     request = RunRequest(spec="wayward:Counting", tasks=(task,), out=tmp_path, limits=PATIENT, limit=len(whole) + 5)
     run(plan_run(request), tell=lambda _: None)
@@ -177,7 +177,7 @@ def test_shards_hold_whole_flights_and_all_of_them(task, tmp_path):
     request = RunRequest(spec="dead_reckoning", tasks=(task,), out=tmp_path, limits=PATIENT)
     parts = [plan_run(replace(request, shard=(number, 2))).parts[0].left for number in (1, 2)]
     assert not {flight_id(name) for name in parts[0]} & {flight_id(name) for name in parts[1]}
-    assert sorted([*parts[0], *parts[1]]) == sorted(task_files.read_ids(task))
+    assert sorted([*parts[0], *parts[1]]) == sorted(task_files.Task.open(task).ids())
 
 
 @pytest.mark.usefixtures("in_threads")

@@ -14,7 +14,7 @@ import pytest
 
 from sasgeo_bench.running import leak_scan, sandbox, worker
 from sasgeo_bench.running.worker import Limits, Reach, Worker
-from sasgeo_bench.tasks import task_files, task_rows
+from sasgeo_bench.tasks import task_files
 from tests.threaded import Threaded
 
 # Only what hangs has to run into its time; on a busy machine all others may take theirs.
@@ -27,7 +27,7 @@ shut_in = pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlo
 
 def ask(place, task, name, *, limits=PATIENT, times=1, is_shut_in=True, kind=Worker):
     """The replies of a hostile matcher to the first query, and its worker after its end."""
-    query = task_rows.query_bytes(next(iter(task_files.read_queries(task))))
+    query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
     region = place / "out" / "regions" / task.name
     reach = Reach(readable=[region], hidden=[place / "out" / "truth", place / "out" / "runs"], is_shut_in=is_shut_in)
     with kind(spec=f"hostile:{name}", reach=reach, limits=limits) as worker:
@@ -116,7 +116,7 @@ def test_after_a_crash_the_next_query_has_a_fresh_process(place, task):
 
 
 def test_an_end_between_two_questions_costs_one_and_the_map_is_prepared_again(place, task):
-    query = task_rows.query_bytes(next(iter(task_files.read_queries(task))))
+    query = task_files.query_bytes(next(iter(task_files.read_queries(task))))
     region = place / "out" / "regions" / task.name
     with Worker(spec="hostile:Plain", reach=Reach(readable=[region], hidden=[]), limits=PATIENT) as worker:
         assert worker.prepare(region).status == "ok"

@@ -29,14 +29,17 @@ def task(tmp_path_factory):
 
 @pytest.fixture
 def answers(task):
-    return [Prediction(query_id=name, candidates=((POSE, 1.0),), confidence=0.5) for name in task_files.read_ids(task)]
+    return [
+        Prediction(query_id=name, candidates=((POSE, 1.0),), confidence=0.5)
+        for name in task_files.Task.open(task).ids()
+    ]
 
 
 def faults(tmp_path, task, predictions):
     path = tmp_path / "mine.parquet"
     rows = [prediction_files.prediction_row(item) for item in predictions]
     pq.write_table(pa.Table.from_pylist(rows, schema=prediction_files.PREDICTION_SCHEMA), path)
-    return [(item.row, item.column, item.found, item.expected) for item in validate(path, [task])]
+    return [(item.row, item.column, item.found, item.expected) for item in validate(path, [task_files.Task.open(task)])]
 
 
 def test_a_sound_file_has_no_violation(tmp_path, task, answers):
@@ -111,9 +114,9 @@ def test_a_pose_without_a_place_is_named(tmp_path, task, answers):
     rows[1]["candidates"][0]["easting_m"] = float("nan")
     rows[2]["candidates"][0]["score"] = None
     pq.write_table(pa.Table.from_pylist(rows, schema=prediction_files.PREDICTION_SCHEMA), path)
-    listed = [(item.row, item.column) for item in validate(path, [task])]
+    listed = [(item.row, item.column) for item in validate(path, [task_files.Task.open(task)])]
     assert listed == [(1, "candidates"), (2, "candidates")]
-    (fault, _) = validate(path, [task])
+    (fault, _) = validate(path, [task_files.Task.open(task)])
     assert fault.to_text() == "mine.parquet, row 1, candidates: found easting_m is nan, expected -1e+08..1e+08"
 
 
@@ -129,9 +132,11 @@ def test_columns_that_are_missing_or_of_another_kind_are_named(tmp_path, task, a
         [prediction_files.prediction_row(item) for item in answers], schema=prediction_files.PREDICTION_SCHEMA
     )
     pq.write_table(full.drop_columns(["confidence"]), path)
-    assert ("confidence", "nothing") in [(item.column, item.found) for item in validate(path, [task])]
+    assert ("confidence", "nothing") in [
+        (item.column, item.found) for item in validate(path, [task_files.Task.open(task)])
+    ]
     pq.write_table(full.set_column(0, "query_id", pa.array(range(len(answers)))), path)
-    assert ("query_id", "int64") in [(item.column, item.found) for item in validate(path, [task])]
+    assert ("query_id", "int64") in [(item.column, item.found) for item in validate(path, [task_files.Task.open(task)])]
 
 
 @pytest.mark.parametrize("change", [{"query_id": None}, {"status": None}])
@@ -145,10 +150,10 @@ def test_more_columns_in_any_order_do_no_harm(tmp_path, task, answers):
     rows = [prediction_files.prediction_row(item) for item in answers]
     full = pa.Table.from_pylist(rows, schema=prediction_files.PREDICTION_SCHEMA)
     pq.write_table(full.select(full.column_names[::-1]).append_column("rank", pa.array(range(len(rows)))), path)
-    assert list(validate(path, [task])) == []
+    assert list(validate(path, [task_files.Task.open(task)])) == []
     candidates = pa.array([[item | {"rank": 1} for item in row["candidates"]] for row in rows])
     pq.write_table(full.set_column(1, "candidates", candidates), path)
-    assert list(validate(path, [task])) == []
+    assert list(validate(path, [task_files.Task.open(task)])) == []
     assert {item.candidates for item in prediction_files.read_predictions(path)} == {((POSE, 1.0),)}
 
 
@@ -157,6 +162,6 @@ def test_a_truncated_file_gets_one_line(tmp_path, task, answers):
     path = tmp_path / "mine.parquet"
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(StoreError, match="cannot be read"):
-        list(validate(path, [task]))
+        list(validate(path, [task_files.Task.open(task)]))
     with pytest.raises(StoreError, match="holds no predictions"):
         list(prediction_files.read_predictions(tmp_path / "nowhere"))

@@ -20,9 +20,18 @@ from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import Choice, Scene, Seeds
 from sasgeo_bench.tasks.suites.flights import LOITER_M
-from sasgeo_bench.tasks.task_files import read_queries, read_truths, write_task
+from sasgeo_bench.tasks.task_files import (
+    QUERY_SCHEMA,
+    asked_sha256,
+    query_bytes,
+    query_from,
+    query_of,
+    query_row,
+    read_queries,
+    read_truths,
+    write_task,
+)
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
-from sasgeo_bench.tasks.task_rows import QUERY_SCHEMA, asked_sha256, query_bytes, query_from, query_of, query_row
 from tests.tasks.test_task_files import ABOUT, one_query, one_truth
 
 TOWN = "town-grid"
@@ -273,7 +282,7 @@ def test_the_same_request_makes_the_same_bytes_and_more_sites_change_none_of_the
     more = {query.query_id: query_bytes(query) for query in read_queries(made.folder)}
     assert first == {name: more[name] for name in first}
     assert len(more) > len(first)
-    assert build.check_task(made.folder, out=own_out) == []
+    assert build.check_task(made, out=own_out) == []
     ids = [query.query_id for query in read_queries(made.folder)]
     assert ids == sorted(ids) == [truth.query_id for truth in read_truths(truths)]
 

@@ -19,9 +19,9 @@ from sasgeo_bench.geometry.pose import reckon, wrap_deg
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.tasks import flight_choice
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.flight_sheet import flight_panels, is_of_flights, write_flight_sheet
+from sasgeo_bench.tasks.flight_sheet import flight_panels, write_flight_sheet
 from sasgeo_bench.tasks.query import SEQUENCE_DIGITS, flight_id
-from sasgeo_bench.tasks.task_files import read_queries, read_task
+from sasgeo_bench.tasks.task_files import Task, read_queries
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 NAME = "flight-kidnap/town-grid"
@@ -40,7 +40,7 @@ def made(towns, tmp_path_factory) -> Path:
 
 
 def panels_of(out: Path, **options):
-    return flight_panels(out / "tasks" / NAME, out / "truth" / NAME, **options)
+    return flight_panels(Task.open(out / "tasks" / NAME), **options)
 
 
 @given(
@@ -86,8 +86,8 @@ def test_a_flight_is_found_by_the_beginning_of_its_id_and_a_wrong_one_gets_a_lin
 
 @pytest.mark.slow
 def test_a_sheet_is_a_picture_with_attribution_and_a_row_for_each_site(made, tmp_path):
-    about, path = read_task(made / "tasks" / NAME), tmp_path / "sheet.png"
-    assert is_of_flights(about)
+    about, path = Task.open(made / "tasks" / NAME).manifest, tmp_path / "sheet.png"
+    assert about.is_of_flights
     sizes = {}
     for count in (1, 12):
         shown = panels_of(made, count=count)
@@ -101,11 +101,14 @@ def test_a_sheet_is_a_picture_with_attribution_and_a_row_for_each_site(made, tmp
 
 def test_truths_of_other_flights_and_a_map_built_anew_are_refused(made, tmp_path):
     out = Path(shutil.copytree(made, tmp_path / "out"))
-    shown, about = panels_of(out, count=1), read_task(out / "tasks" / NAME)
+    shown, about = panels_of(out, count=1), Task.open(out / "tasks" / NAME).manifest
     region = out / "regions" / "town-grid"
     with pytest.raises(StoreError, match="built anew since"):
         write_flight_sheet(
-            tmp_path / "a.png", about=about | {"map_fingerprint": "0"}, shown=shown, region_folder=region
+            tmp_path / "a.png",
+            about=about.model_copy(update={"map_fingerprint": "0"}),
+            shown=shown,
+            region_folder=region,
         )
     truths = out / "truth" / NAME / "truth.parquet"
     pq.write_table(pq.read_table(truths).slice(1), truths)

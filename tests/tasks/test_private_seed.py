@@ -117,7 +117,7 @@ def test_make_queries_draws_by_a_private_seed_into_a_root_of_its_own(program, tm
     folders = [path.parent.relative_to(public) for path in sorted(public.rglob("task.json"))]
     assert folders == [path.parent.relative_to(private) for path in sorted(private.rglob("task.json"))]
     for folder in folders:
-        assert set(task_files.read_ids(public / folder)).isdisjoint(task_files.read_ids(private / folder))
+        assert set(task_files.Task.open(public / folder).ids()).isdisjoint(task_files.Task.open(private / folder).ids())
         said, other = (task_files.read_task(root / folder) for root in (private, public))
         assert said["private_seed"] == {"commitment": SEED.commitment, "bits": 128}
         assert "private_seed" not in other
@@ -146,14 +146,14 @@ def test_a_public_and_a_private_seed_at_once_are_refused(mistake, monkeypatch):
 
 def test_a_private_request_is_drawn_once_and_anew_by_another_seed(own_out):
     (folder,) = ensure_tasks(request_of(own_out, SEED), tell=lambda _: None)
-    before = task_files.read_ids(folder)
+    before = task_files.Task.open(folder).ids()
     lines = []
     assert ensure_tasks(request_of(own_out, SEED), tell=lines.append) == (folder,)
     assert lines == []
     other = request_of(own_out, PrivateSeed("ab" * 16))
     assert why_to_draw(other) == "drawn with another seed"
     ensure_tasks(other, tell=lambda _: None)
-    assert set(task_files.read_ids(folder)).isdisjoint(before)
+    assert set(task_files.Task.open(folder).ids()).isdisjoint(before)
 
 
 def test_public_and_private_queries_never_share_a_folder(own_out):
@@ -171,6 +171,6 @@ def test_the_papers_experiment_is_drawn_by_a_private_seed_under_its_own_names(tm
     assert folder.name == "paper-poc-42"
     public = Seeds(root=42, names=("paper-poc", "1"))
     drawn = {public.under("trial", index).digest("query").hex()[:24] for index in range(2)}
-    assert len(drawn.difference(task_files.read_ids(folder))) == 2
+    assert len(drawn.difference(task_files.Task.open(folder).ids())) == 2
     assert task_files.read_task(folder)["private_seed"] == {"commitment": SEED.commitment, "bits": 128}
     assert files_with(tmp_path, TEXT) == []

@@ -22,31 +22,35 @@ from sasgeo_bench.regions.evidence import Evidence, pack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.tasks.query import TASK_VERSION, TASK_VERSIONS, Detector, Query, Truth
 from sasgeo_bench.tasks.task_files import (
+    ASKED,
     QUERIES,
+    QUERY_SCHEMA,
     TASK,
     TRUTH,
     TRUTH_OF,
-    read_queries,
-    read_task,
-    read_truths,
-    read_view_bytes,
-    task_faults,
-    write_task,
-)
-from sasgeo_bench.tasks.task_rows import (
-    ASKED,
-    QUERY_SCHEMA,
+    Task,
+    TaskOrigin,
+    TruthManifest,
     asked_sha256,
     query_of,
     query_row,
+    read_queries,
+    read_task,
+    read_truths,
     truth_of,
     truth_row,
     truth_sha256,
+    write_task,
 )
 
 ROOT = Path(__file__).parents[2]
-ABOUT = {"suite": "clean", "title": "Clean", "region": "here", "map_fingerprint": "0"}
-SAID = ABOUT | {"schema_version": 1, "task_version": TASK_VERSION, "counts": {}, "files": {}}
+ABOUT = TaskOrigin(suite="clean", title="Clean", region="here", map_fingerprint="0")
+SAID = ABOUT.model_dump(exclude_unset=True) | {
+    "schema_version": 1,
+    "task_version": TASK_VERSION,
+    "counts": {},
+    "files": {},
+}
 
 metres = st.floats(-1e7, 1e7)
 shares = st.floats(0, 1)
@@ -218,6 +222,11 @@ def written(folders):
     return folders
 
 
+def opened(folders):
+    """The task in one folder, with the truths in another."""
+    return replace(Task.open(folders[0]), truth=folders[1])
+
+
 @given(queries)
 def test_a_query_comes_back_from_its_row_as_it_was(query):
     row = query_row(query)
@@ -246,12 +255,12 @@ def test_what_is_learned_from_the_published_detector_keeps_its_hash():
 @given(st.lists(st.tuples(queries, truths), min_size=1, max_size=3))
 def test_a_task_comes_back_from_disk_as_it_was(tmp_path_factory, pairs):
     task_folder, truth_folder = (tmp_path_factory.mktemp(name) for name in ("task", "truth"))
-    assert write_task(task_folder, truth_folder, pairs, ABOUT) == len(pairs)
+    assert write_task(task_folder, truth_folder, pairs, ABOUT).queries == len(pairs)
     for back, (query, _) in zip(read_queries(task_folder), pairs, strict=True):
         check_same(back, query)
     assert list(read_truths(truth_folder)) == [truth for _, truth in pairs]
     assert sum(read_task(task_folder)["counts"].values()) == len(pairs)
-    assert read_view_bytes(task_folder) == {query.query_id: observation_bytes(query) for query, _ in pairs}
+    assert Task.open(task_folder).view_bytes() == {query.query_id: observation_bytes(query) for query, _ in pairs}
 
 
 def test_more_queries_than_fit_into_a_row_group_keep_their_order(folders):
@@ -259,9 +268,9 @@ def test_more_queries_than_fit_into_a_row_group_keep_their_order(folders):
     write_task(*folders, ((one_query(query_id=name), one_truth(query_id=name)) for name in names), ABOUT)
     assert pq.ParquetFile(folders[0] / QUERIES).num_row_groups == 3
     assert [query.query_id for query in read_queries(folders[0])] == names
-    assert read_view_bytes(folders[0]) == dict.fromkeys(names, observation_bytes(one_query()))
+    assert Task.open(folders[0]).view_bytes() == dict.fromkeys(names, observation_bytes(one_query()))
     assert [truth.query_id for truth in read_truths(folders[1])] == names
-    assert task_faults(*folders) == []
+    assert opened(folders).faults() == []
 
 
 def test_what_is_asked_has_one_hash_for_good_and_another_for_whatever_decides_an_answer():
@@ -312,9 +321,9 @@ def test_the_same_queries_make_the_same_bytes(tmp_path):
 
 
 def test_a_good_task_has_no_faults_with_and_without_its_truths(written):
-    assert task_faults(*written) == []
+    assert opened(written).faults() == []
     (written[1] / TRUTH).unlink()
-    assert task_faults(*written) == []
+    assert opened(written).faults() == []
 
 
 def test_any_flipped_byte_is_a_fault_and_nothing_else_goes_wrong(written):
@@ -322,7 +331,7 @@ def test_any_flipped_byte_is_a_fault_and_nothing_else_goes_wrong(written):
     content = path.read_bytes()
     for at in range(0, len(content), 97):
         path.write_bytes(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :])
-        (fault,) = task_faults(*written)
+        (fault,) = opened(written).faults()
         assert fault.startswith(f"{path}: ")
         assert "SHA-256" in fault
 
@@ -348,20 +357,20 @@ def test_a_missing_truth_a_foreign_file_and_a_wrong_count_are_faults(written):
     (task_folder / "deep" / "note.txt").write_text("?")
     about = json.loads((task_folder / TASK).read_text(encoding="utf-8"))
     (task_folder / TASK).write_text(json.dumps(about | {"counts": {"retrieval": 4}}))
-    told = "\n".join(task_faults(*written))
+    told = "\n".join(opened(written).faults())
     assert "truth.parquet: 2 truths that are not those of the 3 queries" in told
     assert "note.txt: not part of a task" in told
     assert "holds 3 of retrieval, task.json says 4 of retrieval: make the queries again" in told
 
 
 def test_truths_say_which_queries_they_are_of_and_what_is_hidden_stays_with_them(folders):
-    write_task(*folders, [(one_query(), one_truth())], ABOUT, {"seed": 987_654_321})
+    write_task(*folders, [(one_query(), one_truth())], ABOUT, TruthManifest(seed=987_654_321))
     said = json.loads((folders[1] / TRUTH_OF).read_text(encoding="utf-8"))
     assert said == {"queries_sha256": read_task(folders[0])["files"][QUERIES]["sha256"], "seed": 987_654_321}
     assert "987654321" not in (folders[0] / TASK).read_text(encoding="utf-8")
     assert sorted(path.name for path in folders[0].iterdir()) == [QUERIES, TASK]
     assert sorted(path.name for path in folders[1].iterdir()) == [TRUTH_OF, TRUTH]
-    assert task_faults(*folders) == []
+    assert opened(folders).faults() == []
 
 
 def test_truths_of_other_queries_are_a_fault_though_their_ids_are_the_same(written, tmp_path):
@@ -370,7 +379,7 @@ def test_truths_of_other_queries_are_a_fault_though_their_ids_are_the_same(writt
         folder.mkdir(parents=True)
     names = [letter * 24 for letter in "abc"]
     write_task(*others, ((one_query(query_id=name, season="x"), one_truth(query_id=name)) for name in names), ABOUT)
-    (fault,) = task_faults(written[0], others[1])
+    (fault,) = opened((written[0], others[1])).faults()
     other = read_task(others[0])["files"][QUERIES]["sha256"]
     assert fault == f"{others[1]}/truth.json: the truths are of other queries, SHA-256 {other}: make the queries again"
 
@@ -380,19 +389,19 @@ def test_truths_that_do_not_say_which_queries_they_are_of_are_a_fault(text, writ
     (written[1] / TRUTH_OF).unlink()
     if text is not None:
         (written[1] / TRUTH_OF).write_text(text)
-    (fault,) = task_faults(*written)
+    (fault,) = opened(written).faults()
     assert fault.startswith(f"{written[1]}/truth.json: the truths are of other queries, SHA-256 ")
 
 
 def test_truths_in_another_order_are_a_fault(written):
     table = pq.read_table(written[1] / TRUTH)
     pq.write_table(table.take([1, 0, 2]), written[1] / TRUTH)
-    assert "in order" in task_faults(*written)[0]
+    assert "in order" in opened(written).faults()[0]
 
 
 def test_a_task_without_its_queries_has_that_one_fault(written):
     (written[0] / QUERIES).unlink()
-    assert task_faults(*written) == [f"{written[0]}/queries.parquet: missing: make the queries again"]
+    assert opened(written).faults() == [f"{written[0]}/queries.parquet: missing: make the queries again"]
 
 
 @pytest.mark.parametrize(
@@ -403,7 +412,7 @@ def test_a_task_without_its_queries_has_that_one_fault(written):
         ("3", "is damaged"),
         ("{}", "is damaged"),
         ('{"schema_version": 0}', "has schema version 0, this version reads 1"),
-        ('{"schema_version": 1}', "is damaged (task.json: 'task_version' is missing; 'suite' is missing"),
+        ('{"schema_version": 1}', "is damaged (task.json: 'suite' is missing; "),
         (json.dumps(SAID | {"files": {}}), "'files.queries.parquet' is missing"),
         (json.dumps(SAID | {"files": {"queries.parquet": {"sha256": 5, "bytes": 1}}}), "must be a string"),
         (json.dumps(SAID | {"counts": {"retrieval": -1}}), "greater than or equal to 0, got -1"),

@@ -31,10 +31,9 @@ from sasgeo_bench.leaderboard.tables import p_text
 from sasgeo_bench.leaderboard.text import markdown_table
 from sasgeo_bench.scoring.rows import is_unranked
 from sasgeo_bench.scoring.verdicts import Finding
-from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.panels import panels
-from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.sheet import Panel
+from sasgeo_bench.tasks.task_files import Task
 
 
 def paper_markdown(
@@ -202,9 +201,12 @@ CAPTIONS: Final = {
 
 def paper_extra(board: Board, *, root: Path) -> Extra:
     """Return the table next to the paper's, all trials, and figures; `root` holds tasks/, truth/ and regions/."""
-    regions = [str(about["region"]) for about in board.tasks if about["suite"] == SUITE]
-    truths = {region: list(task_files.read_truths(root / "truth" / SUITE / region)) for region in regions}
-    by_id = {truth.query_id: truth for found in truths.values() for truth in found}
+    tasks = [
+        Task(root / "tasks" / SUITE / about.region, about, root / "truth" / SUITE / about.region)
+        for about in board.tasks
+        if about.suite == SUITE
+    ]
+    by_id = {truth.query_id: truth for task in tasks for truth in task.truths}
     trials = trials_frame(_of_suite(board, SUITE), board.predictions, by_id)
     summary = _summaries(board, trials)
     seeds = sorted(set(trials["seed"]))
@@ -219,7 +221,7 @@ def paper_extra(board: Board, *, root: Path) -> Extra:
         figures={
             f"{name}.{kind}": draw
             for name, draw in {
-                "example": partial(draw_example, panel=_example(regions[0], truths[regions[0]], root), data=DATA),
+                "example": partial(draw_example, panel=_example(tasks[0], root), data=DATA),
                 "ablation": partial(draw_ablation, summary=_ablation(summary), chance=1 / CANDIDATES, data=DATA),
                 "robustness": partial(draw_robustness, table=robustness_frame(trials), data=DATA),
                 "risk-coverage": partial(draw_risk, table=risk_frame(trials), data=DATA),
@@ -236,7 +238,7 @@ def _of_suite(board: Board, suite: str) -> dict[str, pd.DataFrame]:
 
 def _summaries(board: Board, trials: pd.DataFrame) -> pd.DataFrame:
     """Return the summary of the suite; below it, where there are some, those of other readings of the crop."""
-    drawn = {str(about["suite"]) for about in board.tasks}
+    drawn = {about.suite for about in board.tasks}
     summaries = []
     for suite, crop in CROPS.items():
         if suite in drawn:
@@ -254,9 +256,8 @@ def _in_words(seeds: list[int], trials: int) -> str:
     )
 
 
-def _example(region: str, truths: list[Truth], root: Path) -> Panel:
-    folder, hidden = (root / kind / SUITE / region for kind in ("tasks", "truth"))
-    (panel,) = panels(folder, hidden, out=root, query_id=example_of(truths).query_id)
+def _example(task: Task, root: Path) -> Panel:
+    (panel,) = panels(task, out=root, query_id=example_of(task.truths).query_id)
     return panel
 
 

@@ -7,7 +7,7 @@ import json
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import shapely
@@ -44,8 +44,7 @@ from sasgeo_bench.regions.build import build_made
 from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.regions.region import DATA_VERSION, SCHEMA_VERSION, Region
 from sasgeo_bench.regions.region_spec import RegionFile
-from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.build import check_task, has_truths, put_task
+from sasgeo_bench.tasks.build import check_task, put_task
 from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup, Query, Truth
 from sasgeo_bench.tasks.sampling import make_prior
@@ -53,6 +52,7 @@ from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
 from sasgeo_bench.tasks.suites.base import Seeds, changed_share
 from sasgeo_bench.tasks.suites.mining import Windows as MinedWindows
 from sasgeo_bench.tasks.suites.mining import describe, mine
+from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
 from sasgeo_bench.tasks.task_plan import check_roots
 
 SUITE: Final = PAPER_SUITE  # names the draws of every reading of the crop, so that they share their trials
@@ -93,10 +93,10 @@ def make_paper_task(
     folder = build_made(_spec(seed), _generated(seed, seeds), out=out, tell=tell)
     drawer = PaperDrawer.of(region_files.read_region(folder), seeds, crop=crop)
     pairs = sorted((drawer.draw(index) for index in range(trials)), key=lambda pair: pair[0].query_id)
-    hidden = {**seed_record(private or seed), "request_sha256": _request_sha256(seed, trials, private, crop)}
+    hidden = TruthManifest(**seed_record(private or seed), request_sha256=_request_sha256(seed, trials, private, crop))
     views_cells = sorted({query.evidence.shape[0] for query, _ in pairs})
-    made = put_task(pairs, _about(drawer.region, crop, views_cells), hidden, out=out, tell=tell)
-    tell(f"{paper_suite(crop)} on {region_name(seed)}: {made.queries} trials in {made.folder}")
+    made = put_task(pairs, _origin(drawer.region, crop, views_cells), hidden, out=out, tell=tell)
+    tell(f"{paper_suite(crop)} on {region_name(seed)}: {made.manifest.queries} trials in {made.folder}")
     return made.folder
 
 
@@ -108,14 +108,15 @@ def made_paper_task(
     Task, truths and region are as they were written, and nothing that decides their content has changed since.
     """
     folder = out / "tasks" / paper_suite(crop) / region_name(seed)
-    record = task_files.read_hidden(out / "truth" / paper_suite(crop) / region_name(seed))
-    if record.get("request_sha256") != _request_sha256(seed, trials, private, crop):
+    record = TruthManifest.read(out / "truth" / paper_suite(crop) / region_name(seed))
+    if record.request_sha256 != _request_sha256(seed, trials, private, crop):
         return None
     try:
-        faults = [*check_task(folder, out=out), *region_files.differing_files(out / "regions" / region_name(seed))]
-        return folder if not faults and has_truths(folder, out=out) else None
+        task = Task.open(folder, out / "truth")
+        faults = [*check_task(task, out=out), *region_files.differing_files(out / "regions" / region_name(seed))]
     except StoreError:
         return None
+    return folder if not faults and task.has_truths else None
 
 
 def _request_sha256(seed: int, trials: int, private: PrivateSeed | None, crop: Crop) -> str:
@@ -178,24 +179,25 @@ _CROPPED: Final[dict[Crop, str]] = {
 }
 
 
-def _about(region: Region, crop: Crop, views_cells: list[int]) -> dict[str, Any]:
-    """Return the `task.json` of the queries, without their places."""
-    return {
-        "suite": paper_suite(crop),
-        "suite_version": VERSION,
-        "title": f"The paper's synthetic proof of concept{_CROPPED[crop]}",
-        "what": "turned, magnified, cropped, occluded and changed views of procedural regions; ten candidates",
-        "separates": "global description from spatial alignment",
-        "falsifier": "none",
-        "strength_unit": STRENGTH_UNIT,
-        "region": region.manifest.id,
-        "map_date": region.manifest.extract.date.isoformat(),
-        **task_files.map_of(region.manifest),
-        "sites": TILES,
-        "views_cells": views_cells,
-        "epsg": region.manifest.epsg,
-        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
-    }
+def _origin(region: Region, crop: Crop, views_cells: list[int]) -> TaskOrigin:
+    """Say how the queries were drawn, without their places."""
+    return TaskOrigin(
+        suite=paper_suite(crop),
+        suite_version=VERSION,
+        title=f"The paper's synthetic proof of concept{_CROPPED[crop]}",
+        what="turned, magnified, cropped, occluded and changed views of procedural regions; ten candidates",
+        separates="global description from spatial alignment",
+        falsifier="none",
+        strength_unit=STRENGTH_UNIT,
+        region=region.manifest.id,
+        map_date=region.manifest.extract.date.isoformat(),
+        map_fingerprint=region.manifest.fingerprint,
+        map_inputs_sha256=region.manifest.inputs_sha256,
+        sites=TILES,
+        views_cells=views_cells,
+        epsg=region.manifest.epsg,
+        made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

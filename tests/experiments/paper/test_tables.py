@@ -44,7 +44,7 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.region import DATA_VERSION, SCHEMA_VERSION
-from sasgeo_bench.tasks import task_files, task_rows
+from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import check_task
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup
@@ -287,10 +287,9 @@ def test_another_reading_is_up_to_date_by_itself(out, reading):
     crop, _ = reading
     found = made_paper_task(seed=42, out=out, trials=12, crop=crop)
     assert found == out / "tasks" / f"paper-poc-crop-{crop}" / "paper-poc-42"
-    assert check_task(found, out=out) == []
+    assert check_task(task_files.Task.open(found), out=out) == []
     assert made_paper_task(seed=42, out=out) is not None  # whose region was made again, the same to the byte
-    truth = out / "truth" / found.parent.name / found.name
-    assert len(panels(found, truth, out=out, count=2)) == 2
+    assert len(panels(task_files.Task.open(found), out=out, count=2)) == 2
 
 
 def test_the_request_of_the_experiment_has_the_hash_that_it_had_before_there_were_readings(out):
@@ -301,7 +300,7 @@ def test_the_request_of_the_experiment_has_the_hash_that_it_had_before_there_wer
         "trials": 220,
         "made_by": version("sasgeo-bench"),
     }
-    hidden = task_files.read_hidden(out / "truth" / "paper-poc" / "paper-poc-42")
+    hidden = task_files.TruthManifest.read(out / "truth" / "paper-poc" / "paper-poc-42")
     assert hidden["request_sha256"] == hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
@@ -354,7 +353,7 @@ def test_what_was_touched_or_lost_is_not_up_to_date(other, name):
 
 def test_the_region_and_the_task_are_as_their_manifests_say(out, region):
     assert region_files.differing_files(out / "regions" / "paper-poc-42") == []
-    assert check_task(out / "tasks" / "paper-poc" / "paper-poc-42", out=out) == []
+    assert check_task(task_files.Task.open(out / "tasks" / "paper-poc" / "paper-poc-42"), out=out) == []
     assert region.grid == mosaic_grid()
     assert "procedural, seed 42" in region.manifest.warnings[0]
     assert region.manifest.extract.bytes == 0
@@ -436,7 +435,7 @@ def test_another_process_makes_the_same_bytes_and_fewer_trials_are_the_first_of_
     # The map knows nothing of the trials, and what changes in them is the world.
     assert content(tmp_path, "regions") == content(out, "regions")
     whole, few = (
-        {query.query_id: (task_rows.query_bytes(query), truth) for query, truth in pairs_of(root)}
+        {query.query_id: (task_files.query_bytes(query), truth) for query, truth in pairs_of(root)}
         for root in (out, tmp_path)
     )
     assert len(few) == FEW
@@ -562,7 +561,7 @@ def test_strata_are_filled(pairs):
 
 def test_a_contact_sheet_shows_the_five_layers(out):
     folder = out / "tasks" / "paper-poc" / "paper-poc-42"
-    found = panels(folder, out / "truth" / "paper-poc" / "paper-poc-42", out=out, count=3)
+    found = panels(task_files.Task.open(folder), out=out, count=3)
     assert len(found) == 3
     assert all(panel.at_truth.classes == panel.at_decoy.classes == CLASSES for panel in found)
 

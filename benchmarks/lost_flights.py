@@ -84,7 +84,7 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
         folders = [path for path in unpack_tasks(folder, Path(scratch)) if path.parent.name == suite]
         tasks = [Task.open(path, Path(scratch) / "truth") for path in folders]
         truths = {truth.query_id: truth for task in tasks for truth in task.truths}
-        heads = sorted((head for task in tasks for head in task.heads), key=lambda head: head.query_id)
+        heads = sorted((head for task in tasks for head in task.heads()), key=lambda head: head.query_id)
         for matcher in matchers:
             mine = {item.query_id: item for item in read_stored_predictions(folder, matcher, queries=truths)}
             views = view_frame(heads, [truths[head.query_id] for head in heads], mine)

@@ -81,7 +81,7 @@ def whole(region: str, suite: str, count: int, out: Path, extracts: list[Path]) 
     start = time.perf_counter()
     made = make_tasks(request, tell=lambda _: None)
     seconds = time.perf_counter() - start
-    queries = sum(item.queries for item in made)
+    queries = sum(item.manifest.queries for item in made)
     size = sum((item.folder / "queries.parquet").stat().st_size for item in made)
     peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6
     return {"seconds": seconds, "queries": queries, "kb": size / queries / 1e3, "peak_mb": peak_mb}

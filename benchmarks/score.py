@@ -168,9 +168,9 @@ def write(root: Path, matchers: int, queries: int) -> None:
         folder, truth = (root / kind / task.suite / task.region for kind in ("tasks", "truth"))
         folder.mkdir(parents=True)
         truth.mkdir(parents=True)
-        about = {"suite": task.suite, "title": task.suite, "region": task.region, "map_fingerprint": ""}
-        task_files.write_task(folder, truth, zip(task.queries, task.truths, strict=True), about)
-        sha256 = task_files.read_task(folder)["files"][task_files.QUERIES]["sha256"]
+        origin = task_files.TaskOrigin(suite=task.suite, title=task.suite, region=task.region, map_fingerprint="")
+        pairs = zip(task.queries, task.truths, strict=True)
+        sha256 = task_files.write_task(folder, truth, pairs, origin).queries_sha256
         for at, skill in enumerate(skills):
             name = f"matcher-{at}"
             run = root / "runs" / name / task.suite / task.region

@@ -22,7 +22,7 @@ from sasgeo_bench.scoring.score import Questions, settle_not_applicable, some_ro
 from sasgeo_bench.scoring.validate import submission_faults, validate
 from sasgeo_bench.tasks.query import CONTROLS
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.task_files import TASK, Task
+from sasgeo_bench.tasks.task_files import QUERIES, TASK, Task, read_batches
 
 _MOST_KEPT_BYTES: Final = 128 * 1024**2  # of answers: some 120,000 of 25 poses
 
@@ -106,7 +106,8 @@ def _answered_folders(entries: Sequence[Entry], files: Collection[Answers], root
             yield root / "tasks" / suite / region
     held = {name for rows in files for name in rows.table["query_id"].to_pylist()}
     for path in sorted((root / "tasks").glob(f"*/*/{TASK}")) if held else ():
-        if not held.isdisjoint(Task.open(path.parent).ids()):
+        batches = read_batches(path.parent / QUERIES, ["query_id"])
+        if not held.isdisjoint(name for batch in batches for name in batch["query_id"].to_pylist()):
             yield path.parent
 
 

@@ -78,7 +78,7 @@ def inspect_command(
     task_folder, region_folder = find_task(target, out), find_built(target, out)
     if task_folder is not None:
         _refuse_strip(target, options.strip)
-        _inspect_task(Task.open(task_folder, out / "truth"), out, query=query, rows=options.rows)
+        _inspect_task(Task.open(task_folder, out), out, query=query, rows=options.rows)
         return
     if options.strip is not None and (Path(target) / BOARD).is_file():
         target = str(_best_run(Path(target), out))
@@ -130,14 +130,14 @@ def _inspect_task(task: Task, out: Path, *, query: str | None, rows: int) -> Non
     path = _sheet(out, *about.name, *([query] if query else []))
     is_of_view = query is not None and len(query) > SEQUENCE_DIGITS
     maps = flight_panels(task, count=rows, flight=query) if about.is_of_flights and not is_of_view else ()
-    chosen = () if maps else panels(task, out=out, count=rows, query_id=query)
+    chosen = () if maps else panels(task, count=rows, query_id=query)
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in about.to_json().items():
         table.add_row(name, _text_of(value))
     print_table(table)
     path.parent.mkdir(parents=True, exist_ok=True)
     if maps:
-        write_flight_sheet(path, about=about, shown=maps, region_folder=out / "regions" / about.region)
+        write_flight_sheet(path, task, maps)
     else:
         write_sheet(path, title=f"{about.title}: {about.region}", panels=chosen)
     say(f"contact sheet: {path}")
@@ -224,7 +224,7 @@ def _inspect_flights(cases: RunCases, out: Path, query: str | None) -> bool:
             return False
         row = flights[flights["query_id"] == flight].iloc[0]
     key = (str(row["suite"]), str(row["region"]))
-    task = Task.open(cases.root / "tasks" / key[0] / key[1])
+    task = Task.open(cases.root / "tasks" / key[0] / key[1], cases.root)
     views = {cases.entry.name: cases.flights[key].views}
     path = _sheet(out, cases.entry.name, str(row["query_id"]))
     write_png(path, flight_map_pixels(task, str(row["query_id"]), views))
@@ -306,9 +306,9 @@ def verify_command(
     """Check a region or a task against its hashes; search the parts of a split for ground they share."""
     task_folder, region_folder = find_task(target, out), find_built(target, out)
     if task_folder is not None:
-        task = Task.open(task_folder, out / "truth")
+        task = Task.open(task_folder, out)
         with_truths = "every query has its truth" if task.has_truths else "its truths are not here"
-        faults, good = check_task(task, out=out), f"all files are as task.json says, and {with_truths}"
+        faults, good = check_task(task), f"all files are as task.json says, and {with_truths}"
     elif region_folder is not None:
         faults, good = differing_files(region_folder), "all files are as the manifest says"
     elif is_split(target):

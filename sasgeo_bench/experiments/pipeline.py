@@ -130,7 +130,7 @@ def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: S
     """Report what the registered contrasts could show on the drawn queries; refuse one that cannot be reached."""
     if not contrasts:
         return
-    opened = [Task.open(folder, plan.out / "truth") for folder in tasks]
+    opened = [Task.open(folder, plan.out) for folder in tasks]
     for task in opened:
         task.check_truths()
     frames = [design_rows(task, plan.split) for task in opened]

@@ -111,7 +111,7 @@ def pictures_extra(
     if len(asked) < len(tasks):
         tell(f"pictures of {len(asked)} of {counted(len(tasks), 'task')}: {root / 'tasks'} lacks the views of the rest")
     _add_regions(found, list(asked), root, split)
-    _add_suites(found, asked, board, root)
+    _add_suites(found, asked, board)
     answers = {}
     if has_cases:
         failures = _failures(board, contrasts)
@@ -138,7 +138,7 @@ def _with_list(files: Mapping[str, bytes], listed: Mapping[str, Any]) -> dict[st
 def _there(about: TaskManifest, root: Path) -> Task | None:
     """Return the task with these queries, to the byte, if it is there: stored results hold no views of their own."""
     try:
-        task = Task.open(root / "tasks" / about.suite / about.region, root / "truth")
+        task = Task.open(root / "tasks" / about.suite / about.region, root)
     except StoreError:
         return None
     return task if task.manifest.files == about.files else None
@@ -176,7 +176,7 @@ def _map(folder: Path, manifest: Manifest) -> bytes:
     return fitted(np.ascontiguousarray((255 * colours[..., ::-1]).round().astype(np.uint8)), REGION_BYTES)
 
 
-def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], board: Board, root: Path) -> None:
+def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], board: Board) -> None:
     """Add for each suite a control and its strongest stress at one site."""
     drawn: dict[tuple[str, str], set[str]] = {}
     for frame in board.scores.values():
@@ -189,11 +189,11 @@ def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], board: Boa
         best[suite] = min(best.get(suite, (1, "")), (rank, region))
     for suite, (_, region) in sorted(best.items()):
         alt = f"Example of {suite} on {region}: view, map at the true place, difference, twin or hardest decoy"
-        found.add("suites", suite, partial(_example, asked[suite, region], root), {"suite": suite, "alt": alt})
+        found.add("suites", suite, partial(_example, asked[suite, region]), {"suite": suite, "alt": alt})
 
 
-def _example(task: Task, root: Path) -> bytes:
-    shown = panels(task, out=root, choose=control_and_stress)
+def _example(task: Task) -> bytes:
+    shown = panels(task, choose=control_and_stress)
     title = f"{task.manifest.title}: {task.manifest.region}"
     return fitted(pixels_of(sheet_figure(title, shown, dpi=_SHEET_DPI)), SUITE_BYTES)
 

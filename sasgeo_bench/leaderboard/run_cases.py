@@ -300,7 +300,7 @@ def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequ
     for source, manifest in zip(entry.sources, entry.runs, strict=True):
         name = (manifest.suite, manifest.region)
         try:
-            task = Task.open(root.joinpath("tasks", *name), root / "truth")
+            task = Task.open(root.joinpath("tasks", *name), root)
             mine = _answers(source, manifest, task)
             task.check_truths()
             asked = (tuple(task.heads()), task.truths)

@@ -68,11 +68,7 @@ def pack_board(
     if submitted is not None:
         raise ConfigError(f"{submitted} is a file of predictions: only boards of runs are stored")
     check_public(seed_of(board.tasks), str(request.board))
-    truth = request.truth or request.root / "truth"
-    tasks = [
-        Task(request.root / "tasks" / about.suite / about.region, about, truth / about.suite / about.region)
-        for about in board.tasks
-    ]
+    tasks = [Task.of(about, request.root, truth=request.truth) for about in board.tasks]
     ids = {task.manifest.name: task.ids() for task in tasks}
     runs = {entry.name: list(_runs_of(entry, board, ids)) for entry in board.everyone}
     packed = write_pack(

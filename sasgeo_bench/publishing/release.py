@@ -205,7 +205,7 @@ def _no_queries(suite: str, regions: Sequence[str], out: Path) -> StoreError:
 
 
 def _task(folder: Path, request: ReleaseRequest) -> ReleaseTask:
-    task = Task.open(folder, request.out / "truth")
+    task = Task.open(folder, request.out)
     parts = count_parts(task)
     odd = next((name for name in (folder.name, *parts) if not re.fullmatch(FOLDER, name)), None)
     if odd is not None:

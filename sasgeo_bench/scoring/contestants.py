@@ -191,7 +191,7 @@ def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: 
     Raise StoreError if a task or its truths are missing or damaged, or do not belong together.
     """
     chosen = dict.fromkeys(folders) or sorted({folder for item in answers for folder in item.held})
-    tasks = [Task.open(folder, truth) for folder in chosen]
+    tasks = [Task.open(folder, truth=truth) for folder in chosen]
     for task in tasks:
         task.check_truths()
     return tasks

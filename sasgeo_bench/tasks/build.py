@@ -87,8 +87,8 @@ def made_tasks(request: Request) -> tuple[Path, ...] | None:
         return None
     folders = tuple(request.out / "tasks" / request.suite / name for name in drawn)
     try:
-        tasks = [Task.open(folder, request.out / "truth") for folder in folders]
-        if any(check_task(task, out=request.out) or not task.has_truths for task in tasks):
+        tasks = [Task.open(folder, request.out) for folder in folders]
+        if any(check_task(task) or not task.has_truths for task in tasks):
             return None
     except StoreError:
         return None
@@ -325,7 +325,7 @@ def put_task(
         raise StoreError(
             f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
         ) from error
-    return Task(task_folder, manifest, truth_folder)
+    return Task(task_folder, manifest, truth_folder, out)
 
 
 def _check_unmixed(truth_folder: Path, hidden: TruthManifest) -> None:
@@ -365,11 +365,11 @@ def _origin(
     )
 
 
-def check_task(task: Task, *, out: Path) -> list[str]:
+def check_task(task: Task) -> list[str]:
     """Check a task against its hashes, its truths and its map; return a line for each fault."""
-    faults, region = task.faults(), task.manifest.region
-    if not task.manifest.is_of_map(region_files.read_manifest(out / "regions" / region)):
-        faults.append(built_anew(region))
+    faults = task.faults()
+    if not task.manifest.is_of_map(region_files.read_manifest(task.region)):
+        faults.append(built_anew(task.manifest.region))
     return faults
 
 

@@ -22,7 +22,7 @@ from sasgeo_bench.regions.preview import paint_overview
 from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
 from sasgeo_bench.tasks.build import built_anew
 from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, Truth, flight_id
-from sasgeo_bench.tasks.task_files import QUERIES, Task, TaskManifest, read_batches
+from sasgeo_bench.tasks.task_files import QUERIES, Task, read_batches
 
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -158,12 +158,12 @@ def _panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str, Any]]
     )
 
 
-def write_flight_sheet(path: Path, *, about: TaskManifest, shown: Sequence[FlightPanel], region_folder: Path) -> None:
-    """Write the maps of flights as PNG, a row for each site; `about` is `task.json`, `region_folder` its map's.
+def write_flight_sheet(path: Path, task: Task, shown: Sequence[FlightPanel]) -> None:
+    """Write the maps of flights of a task as PNG, a row for each site.
 
     Raise `StoreError` if the map has been rebuilt since the queries were drawn.
     """
-    manifest = region_files.read_manifest(region_folder)
+    about, manifest = task.manifest, region_files.read_manifest(task.region)
     if not about.is_of_map(manifest):
         raise StoreError(built_anew(about.region))
     places = list(_places(shown))
@@ -189,7 +189,7 @@ def write_flight_sheet(path: Path, *, about: TaskManifest, shown: Sequence[Fligh
             site = panel.truth.pair_id
             if site not in grounds:
                 bounds_m = bounds_of_m([other for other in shown if other.truth.pair_id == site])
-                grounds = {site: Ground.of(region_folder, manifest, bounds_m)}
+                grounds = {site: Ground.of(task.region, manifest, bounds_m)}
             draw_flight(charts[row][column], panel, grounds[site])
             charts[row][column].set_title("\n".join(_words(panel)))
 

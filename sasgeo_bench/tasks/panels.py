@@ -27,14 +27,13 @@ SOME_IDS: Final = 3  # that the refusal of an unknown id names
 def panels(
     task: Task,
     *,
-    out: Path,
     count: int = 12,
     query_id: str | None = None,
     choose: Callable[[Sequence[Truth]], Sequence[Truth]] | None = None,
 ) -> tuple[Panel, ...]:
     """Choose up to `count` queries of a task for a contact sheet: each kind and strength of a site, site by site.
 
-    `out` is the root of the regions. With `query_id` only the query whose id begins so is shown; `choose` selects and
+    With `query_id` only the query whose id begins so is shown; `choose` selects and
     orders the truths instead.
 
     Raises
@@ -45,7 +44,7 @@ def panels(
         If there is no such query.
     """
     name = task.manifest.region
-    region = region_files.read_region(out / "regions" / name)
+    region = region_files.read_region(task.region)
     if not task.manifest.is_of_map(region.manifest):
         raise StoreError(built_anew(name))
     state = State.of(region, name=name)

@@ -543,9 +543,9 @@ class TruthManifest(Document):
 
 @dataclass(frozen=True)
 class Task:
-    """A task on disk: its folder, what `task.json` says, and the folder where its truths are, if they are anywhere.
+    """A task on disk: its folder, what `task.json` says, the folder of its truths, and the root of its map.
 
-    Queries and truths are read when they are asked for.
+    Truths and map may be missing. Queries and truths are read when they are asked for.
 
     Examples
     --------
@@ -557,10 +557,20 @@ class Task:
     folder: Path
     manifest: TaskManifest = field(hash=False)
     truth: Path
+    root: Path
 
     @classmethod
-    def open(cls, folder: str | Path, truth: Path | None = None) -> Self:
-        """Read `task.json`; `truth` is the root of truths, that of the task's own root unless given.
+    def open(cls, folder: str | Path, root: Path | None = None, *, truth: Path | None = None) -> Self:
+        """Read `task.json`.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Folder of the task, as `out/tasks/<suite>/<region>`.
+        root : Path, optional
+            Folder of output with its map and truths, by default the one that holds the task.
+        truth : Path, optional
+            Root of truths, by default `root / "truth"`.
 
         Raises
         ------
@@ -569,17 +579,20 @@ class Task:
         """
         path = given_path(folder)
         manifest = _read_manifest(path, named=folder)
-        root = path.resolve().parent.parent.parent / "truth" if truth is None else truth
-        return cls(path, manifest, root / manifest.suite / manifest.region)
+        root = path.resolve().parent.parent.parent if root is None else root
+        truths = root / "truth" if truth is None else truth
+        return cls(path, manifest, truths / manifest.suite / manifest.region, root)
 
-    def __reduce__(self) -> tuple[type[Self], tuple[Path, TaskManifest, Path]]:
+    @classmethod
+    def of(cls, manifest: TaskManifest, root: Path, *, truth: Path | None = None) -> Self:
+        """Return the task of a manifest where it was written below a root; nothing is read."""
+        truths = root / "truth" if truth is None else truth
+        below = Path(manifest.suite, manifest.region)
+        return cls(root / "tasks" / below, manifest, truths / below, root)
+
+    def __reduce__(self) -> tuple[type[Self], tuple[Path, TaskManifest, Path, Path]]:
         """Leave behind what was read, where the task goes to another process."""
-        return type(self), (self.folder, self.manifest, self.truth)
-
-    @property
-    def root(self) -> Path:
-        """The folder of output that holds the task."""
-        return self.folder.resolve().parent.parent.parent
+        return type(self), (self.folder, self.manifest, self.truth, self.root)
 
     @property
     def region(self) -> Path:

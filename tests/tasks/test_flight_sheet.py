@@ -3,6 +3,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -86,12 +87,12 @@ def test_a_flight_is_found_by_the_beginning_of_its_id_and_a_wrong_one_gets_a_lin
 
 @pytest.mark.slow
 def test_a_sheet_is_a_picture_with_attribution_and_a_row_for_each_site(made, tmp_path):
-    about, path = Task.open(made / "tasks" / NAME).manifest, tmp_path / "sheet.png"
-    assert about.is_of_flights
+    task, path = Task.open(made / "tasks" / NAME), tmp_path / "sheet.png"
+    assert task.manifest.is_of_flights
     sizes = {}
     for count in (1, 12):
         shown = panels_of(made, count=count)
-        write_flight_sheet(path, about=about, shown=shown, region_folder=made / "regions" / "town-grid")
+        write_flight_sheet(path, task, shown)
         with Image.open(path) as picture:
             assert picture.text["Copyright"] == ATTRIBUTION
         sizes[count] = cv2.imread(str(path)).shape
@@ -101,15 +102,10 @@ def test_a_sheet_is_a_picture_with_attribution_and_a_row_for_each_site(made, tmp
 
 def test_truths_of_other_flights_and_a_map_built_anew_are_refused(made, tmp_path):
     out = Path(shutil.copytree(made, tmp_path / "out"))
-    shown, about = panels_of(out, count=1), Task.open(out / "tasks" / NAME).manifest
-    region = out / "regions" / "town-grid"
+    shown, task = panels_of(out, count=1), Task.open(out / "tasks" / NAME)
+    other = replace(task, manifest=task.manifest.model_copy(update={"map_fingerprint": "0"}))
     with pytest.raises(StoreError, match="built anew since"):
-        write_flight_sheet(
-            tmp_path / "a.png",
-            about=about.model_copy(update={"map_fingerprint": "0"}),
-            shown=shown,
-            region_folder=region,
-        )
+        write_flight_sheet(tmp_path / "a.png", other, shown)
     truths = out / "truth" / NAME / "truth.parquet"
     pq.write_table(pq.read_table(truths).slice(1), truths)
     with pytest.raises(StoreError, match="does not hold the truths of"):

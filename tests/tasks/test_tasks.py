@@ -416,7 +416,7 @@ def test_two_runs_of_different_counts_at_once_leave_the_map_of_the_last_and_its_
     folder = own_out / "tasks/topology-twins/town-grid+topology-twins"
     assert [sum(" queries at " in line for line in lines) for lines in told.values()] == [1, 1]
     assert [sum("is being written by another run" in line for line in lines) for lines in told.values()] == [0, 1]
-    assert check_task(Task.open(folder), out=own_out) == []
+    assert check_task(Task.open(folder)) == []
     assert leftovers(own_out) == []
     assert read_task(folder)["sites"] == len({truth.pose for truth in read_truths(truth_of(folder))}) == 1
     assert content(own_out) == {name: data for name, data in content(tasks).items() if "/topology-twins/" in name}
@@ -455,7 +455,7 @@ def test_a_run_that_is_killed_leaves_the_old_task_and_the_next_one_clears_up(own
     assert process.returncode == -signal.SIGKILL
     assert {name: data for name, data in content(own_out).items() if "/." not in name} == before
     assert leftovers(own_out)
-    assert check_task(Task.open(own_out / "tasks" / "absent" / RIVERSIDE), out=own_out) == []
+    assert check_task(Task.open(own_out / "tasks" / "absent" / RIVERSIDE)) == []
     make(own_out)
     assert content(own_out) == before
     assert leftovers(own_out) == []
@@ -486,7 +486,7 @@ def copied(tasks, tmp_path):
 
 def test_every_task_that_is_made_is_good(tasks):
     for folder in task_folders(tasks):
-        assert check_task(Task.open(folder), out=tasks) == []
+        assert check_task(Task.open(folder)) == []
         assert Task.open(folder).has_truths
 
 
@@ -498,7 +498,7 @@ def test_what_is_wrong_with_a_task_is_named(copied):
     manifest = copied / "regions" / RIVERSIDE / "region.json"
     said = json.loads(manifest.read_text(encoding="utf-8"))
     manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
-    told = "\n".join(check_task(Task.open(folder), out=copied))
+    told = "\n".join(check_task(Task.open(folder)))
     assert "notes.txt: not part of a task" in told
     count = sum(read_task(folder)["counts"].values())
     assert f"{count - 1} truths that are not those of the {count} queries" in told
@@ -517,17 +517,17 @@ def test_a_flipped_byte_in_the_middle_of_a_task_is_named(copied):
 def test_without_truths_a_task_can_be_checked_but_not_shown(copied):
     folder = copied / "tasks/clean" / RIVERSIDE
     shutil.rmtree(copied / "truth")
-    assert check_task(Task.open(folder), out=copied) == []
+    assert check_task(Task.open(folder)) == []
     assert not Task.open(folder).has_truths
     with pytest.raises(StoreError, match=r"truth.parquet cannot be read .*: make the queries again"):
-        panels(Task.open(folder), out=copied)
+        panels(Task.open(folder))
 
 
 def test_the_truths_of_another_task_are_not_shown(copied):
     folder = copied / "tasks/clean" / RIVERSIDE
     shutil.copy(truth_of(copied / "tasks/absent" / RIVERSIDE) / TRUTH, truth_of(folder) / TRUTH)
     with pytest.raises(StoreError, match="does not hold the truths of"):
-        panels(Task.open(folder), out=copied)
+        panels(Task.open(folder))
 
 
 def test_a_task_on_a_map_that_was_built_anew_is_not_shown(copied):
@@ -536,12 +536,12 @@ def test_a_task_on_a_map_that_was_built_anew_is_not_shown(copied):
     said = json.loads(manifest.read_text(encoding="utf-8"))
     manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
     with pytest.raises(StoreError, match="was built anew since: make the queries again"):
-        panels(Task.open(folder), out=copied)
+        panels(Task.open(folder))
 
 
 def test_a_sheet_shows_every_variant_of_a_task_before_it_shows_one_twice(tasks):
     folder = tasks / "tasks/clean" / RIVERSIDE
-    shown = panels(Task.open(folder), out=tasks, count=6)
+    shown = panels(Task.open(folder), count=6)
     variants = [(item.truth.kind, item.truth.strength) for item in shown[:5]]
     assert len(set(variants)) == 5
     assert all(item.at_truth is not None for item in shown)
@@ -549,7 +549,7 @@ def test_a_sheet_shows_every_variant_of_a_task_before_it_shows_one_twice(tasks):
 
 def test_a_perfect_view_is_what_the_map_shows_at_the_truth(tasks):
     folder = tasks / "tasks/clean" / RIVERSIDE
-    perfect = [item for item in panels(Task.open(folder), out=tasks, count=60) if item.truth.role == "control"]
+    perfect = [item for item in panels(Task.open(folder), count=60) if item.truth.role == "control"]
     assert perfect
     for item in perfect:
         np.testing.assert_array_equal(item.query.evidence.cells, item.at_truth.cells)
@@ -558,10 +558,10 @@ def test_a_perfect_view_is_what_the_map_shows_at_the_truth(tasks):
 def test_one_query_is_found_by_the_beginning_of_its_id_and_an_unknown_one_is_told(tasks):
     folder = tasks / "tasks/absent" / RIVERSIDE
     name = next(read_queries(folder)).query_id
-    (shown,) = panels(Task.open(folder), out=tasks, query_id=name[:10])
+    (shown,) = panels(Task.open(folder), query_id=name[:10])
     assert shown.query.query_id == name
     with pytest.raises(ConfigError, match="holds no query 'zzz'"):
-        panels(Task.open(folder), out=tasks, query_id="zzz")
+        panels(Task.open(folder), query_id="zzz")
 
 
 @pytest.mark.parametrize(

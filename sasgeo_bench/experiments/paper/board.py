@@ -201,11 +201,7 @@ CAPTIONS: Final = {
 
 def paper_extra(board: Board, *, root: Path) -> Extra:
     """Return the table next to the paper's, all trials, and figures; `root` holds tasks/, truth/ and regions/."""
-    tasks = [
-        Task(root / "tasks" / SUITE / about.region, about, root / "truth" / SUITE / about.region)
-        for about in board.tasks
-        if about.suite == SUITE
-    ]
+    tasks = [Task.of(about, root) for about in board.tasks if about.suite == SUITE]
     by_id = {truth.query_id: truth for task in tasks for truth in task.truths}
     trials = trials_frame(_of_suite(board, SUITE), board.predictions, by_id)
     summary = _summaries(board, trials)
@@ -221,7 +217,7 @@ def paper_extra(board: Board, *, root: Path) -> Extra:
         figures={
             f"{name}.{kind}": draw
             for name, draw in {
-                "example": partial(draw_example, panel=_example(tasks[0], root), data=DATA),
+                "example": partial(draw_example, panel=_example(tasks[0]), data=DATA),
                 "ablation": partial(draw_ablation, summary=_ablation(summary), chance=1 / CANDIDATES, data=DATA),
                 "robustness": partial(draw_robustness, table=robustness_frame(trials), data=DATA),
                 "risk-coverage": partial(draw_risk, table=risk_frame(trials), data=DATA),
@@ -256,8 +252,8 @@ def _in_words(seeds: list[int], trials: int) -> str:
     )
 
 
-def _example(task: Task, root: Path) -> Panel:
-    (panel,) = panels(task, out=root, query_id=example_of(task.truths).query_id)
+def _example(task: Task) -> Panel:
+    (panel,) = panels(task, query_id=example_of(task.truths).query_id)
     return panel
 
 

@@ -112,8 +112,8 @@ def made_paper_task(
     if record.request_sha256 != _request_sha256(seed, trials, private, crop):
         return None
     try:
-        task = Task.open(folder, out / "truth")
-        faults = [*check_task(task, out=out), *region_files.differing_files(out / "regions" / region_name(seed))]
+        task = Task.open(folder, out)
+        faults = [*check_task(task), *region_files.differing_files(out / "regions" / region_name(seed))]
     except StoreError:
         return None
     return folder if not faults and task.has_truths else None

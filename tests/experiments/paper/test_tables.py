@@ -287,9 +287,9 @@ def test_another_reading_is_up_to_date_by_itself(out, reading):
     crop, _ = reading
     found = made_paper_task(seed=42, out=out, trials=12, crop=crop)
     assert found == out / "tasks" / f"paper-poc-crop-{crop}" / "paper-poc-42"
-    assert check_task(task_files.Task.open(found), out=out) == []
+    assert check_task(task_files.Task.open(found)) == []
     assert made_paper_task(seed=42, out=out) is not None  # whose region was made again, the same to the byte
-    assert len(panels(task_files.Task.open(found), out=out, count=2)) == 2
+    assert len(panels(task_files.Task.open(found), count=2)) == 2
 
 
 def test_the_request_of_the_experiment_has_the_hash_that_it_had_before_there_were_readings(out):
@@ -353,7 +353,7 @@ def test_what_was_touched_or_lost_is_not_up_to_date(other, name):
 
 def test_the_region_and_the_task_are_as_their_manifests_say(out, region):
     assert region_files.differing_files(out / "regions" / "paper-poc-42") == []
-    assert check_task(task_files.Task.open(out / "tasks" / "paper-poc" / "paper-poc-42"), out=out) == []
+    assert check_task(task_files.Task.open(out / "tasks" / "paper-poc" / "paper-poc-42")) == []
     assert region.grid == mosaic_grid()
     assert "procedural, seed 42" in region.manifest.warnings[0]
     assert region.manifest.extract.bytes == 0
@@ -561,7 +561,7 @@ def test_strata_are_filled(pairs):
 
 def test_a_contact_sheet_shows_the_five_layers(out):
     folder = out / "tasks" / "paper-poc" / "paper-poc-42"
-    found = panels(task_files.Task.open(folder), out=out, count=3)
+    found = panels(task_files.Task.open(folder), count=3)
     assert len(found) == 3
     assert all(panel.at_truth.classes == panel.at_decoy.classes == CLASSES for panel in found)
 

@@ -212,7 +212,7 @@ def test_changed_maps_are_regions_of_their_own_and_their_tasks_hold_together(own
     names = [f"{TOWN}+{name}-1", f"{TOWN}+{name}-2"]
     assert sorted(item.folder.name for item in made) == sorted([TOWN, *names])
     for item in made:
-        assert check_task(item, out=own_town) == []
+        assert check_task(item) == []
         truths = list(read_truths(own_town / "truth" / name / item.folder.name))
         assert len({truth.role for truth in truths}) == 1
     base, *maps = (read_region(own_town / "regions" / item) for item in (TOWN, *names))

@@ -70,7 +70,7 @@ def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
     name = f"draws queries on {TOWN}"
     try:
         made = make_tasks(request, tell=_silent)
-        faults = [fault for task in made for fault in check_task(task.folder, out=folder)]
+        faults = [fault for task in made for fault in check_task(task)]
         drawer, sites = plan_draw(request, _silent)
     except SasgeoError as error:
         yield Check(name=name, outcome="not applicable", found=f"{error}: try it on a place that can")
@@ -78,7 +78,7 @@ def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
     except Exception as error:  # whatever a suite of somebody's own raises  # noqa: BLE001
         yield Check(name=name, outcome="fail", found=message_of(error))
         return
-    found = f"{sum(task.queries for task in made)} queries at {len(sites)} sites"
+    found = f"{sum(task.manifest.queries for task in made)} queries at {len(sites)} sites"
     yield check_of(name, faults[0] if faults else None, found)
     if not isinstance(drawer, Drawer):
         yield Check(name="single views", outcome="not applicable", found="queries are views of flights")

@@ -346,12 +346,11 @@ def _origin(
     state = drawer.scene.state(region)
     manifest = region_files.read_manifest(request.out / "regions" / region)
     spec = request.split.spec
-    texts = ("title", "what", "separates", "falsifier", "strength_unit")
+    texts = {name: getattr(card, name) for name in ("title", "what", "separates", "falsifier", "strength_unit")}
     return TaskOrigin(
         suite=card.name,
         suite_version=card.version,
-        **({"suite_sha256": code} if code else {}),
-        **{name: getattr(card, name) for name in texts},
+        **(texts if code is None else texts | {"suite_sha256": code}),
         region=region,
         map_date=state.date.isoformat(),
         map_fingerprint=manifest.fingerprint,

@@ -30,7 +30,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.leaderboard.board_files import read_board, read_scores
+from sasgeo_bench.leaderboard.board_files import read_board_manifest, read_scores
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive_file import read_stored_predictions
@@ -159,15 +159,15 @@ def lines(words: argparse.Namespace) -> list[str]:
     SasgeoError
         If the folder holds no board with such answers, or it is damaged.
     """
-    about, _ = read_board(words.board)
-    scores, split = read_scores(words.board), find_split(about["split"])
-    taught = {entry["name"]: bool(entry["learned"]) for entry in about["entries"]}
+    about = read_board_manifest(words.board)
+    scores, split = read_scores(words.board), find_split(about.split or "crossfit")
+    taught = {entry.name: bool(entry.learned) for entry in about.entries}
     chosen = scores["suite"].isin(SUITES) & (scores["track"] == "localization") & (scores["prior_group"] == PRIOR)
     found = [f"| matcher | rejector | {' | '.join(COLUMNS)} |", "|---|---|" + "---:|" * len(COLUMNS)]
     for matcher in words.matchers:
         rows = scores[chosen & (scores["matcher"] == matcher)].reset_index(drop=True)
         said = {one.query_id: one for one in read_stored_predictions(words.board, matcher)}
-        for rejector in (OWN, *(one["name"] for one in about["rejectors"])):
+        for rejector in (OWN, *(str(one.name) for one in about.rejectors)):
             judged = accepted(rejector, rows, said, split, words, is_taught=taught[matcher])
             cells = " | ".join(map(cell, figures(judged, words.absent)))
             found.append(f"| {matcher} | {rejector} | {cells} |")

@@ -33,8 +33,7 @@ import pandas as pd
 
 from benchmarks.sim_to_real import estimate, line
 from sasgeo_bench.errors import SasgeoError, StoreError
-from sasgeo_bench.leaderboard.board_files import MEND, SCHEMAS, read_scores
-from sasgeo_bench.leaderboard.board_files import read_board as read_table
+from sasgeo_bench.leaderboard.board_files import MEND, SCHEMAS, read_board_manifest, read_leaderboard, read_scores
 from sasgeo_bench.scoring.intervals import LEAST_CLUSTERS, difference_interval, wilson_share
 from sasgeo_bench.texts import markdown_code
 
@@ -88,7 +87,8 @@ NUMBERS = {"strength": np.inf, "view_cells": np.inf, "position_error_m": np.inf,
 
 def read_board(board: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return scores of views and flights, with `hit` and `is_control`, and the leaderboard's rows of two columns."""
-    _, rows = read_table(board)
+    read_board_manifest(board)  # which says in a line where there is no board
+    rows = read_leaderboard(board)
     SCHEMAS["leaderboard"].check(rows)
     scores = read_scores(board)
     scores = scores.reindex(columns=scores.columns.union([WAY]))  # a board without flights has none

@@ -9,9 +9,20 @@ import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar, get_origin
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar, get_origin
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    ModelWrapValidatorHandler,
+    PrivateAttr,
+    SerializerFunctionWrapHandler,
+    ValidationError,
+    model_serializer,
+    model_validator,
+)
 
 from sasgeo_bench.errors import ConfigError
 
@@ -48,6 +59,35 @@ class Document(BaseModel):
     """Base of every model read from TOML: frozen, unknown keys refused, no silent conversion."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class Record(BaseModel):
+    """Base of the models of what a program writes as JSON: frozen, no silent conversion.
+
+    What a later version says besides is kept. It is written with the keys that it was made of, in their order; those of
+    `without_empty` are left out where they are empty.
+
+    >>> Record.model_validate({"later": 1}).model_dump()
+    {'later': 1}
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow", strict=True, allow_inf_nan=False)
+    without_empty: ClassVar[frozenset[str]] = frozenset()
+    _keys: tuple[str, ...] = PrivateAttr(default=())
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _keep_keys(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:  # noqa: ANN401 - any input
+        made = handler(data)
+        if isinstance(data, dict):
+            made._keys = tuple(data)  # noqa: SLF001 - its own
+        return made
+
+    @model_serializer(mode="wrap")
+    def _as_made(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        found = handler(self)
+        keys = dict.fromkeys((*self._keys, *(name for name in found if name in self.model_fields_set)))
+        return {name: found[name] for name in keys if name in found and (found[name] or name not in self.without_empty)}
 
 
 class NamedDocument(Document):

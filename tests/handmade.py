@@ -12,6 +12,7 @@ import pandas as pd
 from sasgeo_bench.canvas import page
 from sasgeo_bench.leaderboard.board_files import ANSWER_SCHEMA, Extra, write_board
 from sasgeo_bench.leaderboard.board_plots import BoardPage
+from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, RUN_HERE, EntryLabel, Row, with_entry_labels
@@ -86,7 +87,7 @@ def about_of(entries, **changes):
     said = {"scorer_version": SCORER_VERSION, "task_version": 1, "data_version": 1, "made_by": "sasgeo-bench 0.1.0"}
     said |= {"libraries": {"numpy": "2"}, "pipeline": None, "split": "crossfit", "draws": 200, "by_region": []}
     said |= {"rejectors": [], "remarks": [], "entries": entries, "tasks": tasks}
-    return said | changes
+    return BoardManifest.model_validate(said | changes)
 
 
 def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), scored=None, extras=(), **about):

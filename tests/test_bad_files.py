@@ -37,6 +37,7 @@ from sasgeo_bench.importers.kinds import read_dataset
 from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
 from sasgeo_bench.leaderboard.board_files import SCHEMAS
+from sasgeo_bench.leaderboard.manifests import PackManifest
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.learned_file import read_learned
@@ -191,12 +192,14 @@ def make_pack(folder: Path, tiny: TinyPlace) -> None:
     task = task_of(tiny)
     board = put_board(folder.parent / f"{folder.name}-board")
     put_pictures(board)
+    settings = {"schema_version": 3, "split": None, "rejectors": [], "contrasts": [], "draws": 10, "by_region": []}
+    settings |= {"pipeline": {}, "contestants": ["mine"], "dropped": ""}
     write_pack(
         folder / "pack",
         board=board,
         tasks=[task_files.Task.open(task)],
         runs={"mine": [StoredRun(manifest=about_of(task), predictions=answers_of(task))]},
-        settings={"split": None, "rejectors": [], "contrasts": [], "draws": 10, "by_region": [], "pipeline": {}},
+        settings=PackManifest.model_validate(settings),
     )
 
 

@@ -18,6 +18,7 @@ import typer
 
 from sasgeo_bench import cli
 from sasgeo_bench.cli import program
+from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.matching.scaffold import plugin_files
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
@@ -215,7 +216,7 @@ def desk(towns: Path, lay_towns: Callable[..., Path], tmp_path_factory: pytest.T
     out = tmp_path_factory.mktemp("desk") / "out"
     lay_towns(Path(shutil.copytree(towns, out)), "town-suburb")
     world.answered(out, "random", world.drawn(out, "clean", "town-riverside", "town-suburb"))
-    pack_board(*world.scored(out, "demo", pipeline={"id": "demo", "sha256": "0"}), out / "results" / "demo")
+    pack_board(*world.scored(out, "demo", pipeline=PipelineRecord(id="demo", sha256="0")), out / "results" / "demo")
     return out.parent
 
 

@@ -19,6 +19,7 @@ from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_tables import Book
+from sasgeo_bench.leaderboard.manifests import SeedRecord
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
@@ -27,10 +28,9 @@ from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
-from sasgeo_bench.publishing.archive_folder import is_pack
+from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.publishing.submissions import submissions_for
 from sasgeo_bench.scoring.draws import DRAWS
-from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.task_files import TRUTH
 
 CONTROL_FAILED: Final = 3  # exit status
@@ -242,7 +242,8 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         return
     results, private = options.results, options.private
     if plan.private is not None and (results is not None or private is not None):
-        check_public(seed_record(plan.private), str(board_folder(plan)))
+        seed = SeedRecord(commitment=plan.private.commitment, bits=plan.private.bits)
+        check_public(seed, str(board_folder(plan)))
     if private is not None:
         read_private(private, plan.spec.identity)
     with shown_progress() as progress:
@@ -276,7 +277,7 @@ def check_controls(board: Board) -> None:
     """End with a status that a script sees where a control or a contestant failed; the board is written though."""
     for name, why in board.failures.found.items():
         complain(f"failed, and so not on the board: {name}: {why}")
-    unseen = segmenter_lines({"tasks": [task.to_json() for task in board.tasks]})
+    unseen = segmenter_lines(board.about)
     for line in unseen:
         complain(line)
     if board.failures.found and board.failures.log.is_file():
@@ -303,7 +304,7 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
 def show_board(board: Board) -> None:
     """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
     risks = risk_tables(board.table)
-    tables = (*summary(Book.of(board.table, {})), contrast_table(board.findings), *risks)
+    tables = (*summary(Book.of(board.table)), contrast_table(board.findings), *risks)
     for table in (one for one in tables if one.rows):
         say(table.title)
         shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)
@@ -314,5 +315,5 @@ def show_board(board: Board) -> None:
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
-    for line in (*map_lines(vars(board)), *warnings_of(board.table)):
+    for line in (*map_lines(board.about), *warnings_of(board.table)):
         tell(line)

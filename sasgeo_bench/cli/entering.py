@@ -12,7 +12,7 @@ from sasgeo_bench.cli.console import say, shown_progress, tell
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, failure_lines, plan_entry
-from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.publishing.elsewhere import elsewhere_lines
 
 
@@ -64,7 +64,7 @@ def enter_command(options: EnterOptions) -> None:
         folder, board = enter(entry, into=options.into, tell=tell, progress=progress)
     show_board(board)
     both = options.out / "boards" / f"{entry.board}-{folder.name}"
-    for line in elsewhere_lines(read_board(both)[0]):
+    for line in elsewhere_lines(read_board_manifest(both).elsewhere):
         say(line)
     name = checked.run.card.name
     for line in failure_lines(board.predictions.get(name, {}).values()):

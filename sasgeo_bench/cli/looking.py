@@ -14,7 +14,7 @@ from sasgeo_bench.cli.console import EXIT_USER, print_table, say, shown_progress
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.leaderboard.board_files import BOARD, read_board, read_scores
+from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest, read_scores
 from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
 from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
 from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels
@@ -27,6 +27,7 @@ from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
 from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_features, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
+from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.strata import STRESS
 from sasgeo_bench.tasks.build import check_task
 from sasgeo_bench.tasks.duplicates import constellations, search_split
@@ -161,16 +162,16 @@ def _text_of(value: object) -> str:
 
 def _best_run(board: Path, out: Path) -> Path:
     """Return the folder of the runs of the matcher of a board that finds most queries with pictures."""
-    about, _ = read_board(board)
+    about = read_board_manifest(board)
     scores = {str(name): frame for name, frame in read_scores(board).groupby("matcher")}
-    tasks = {(str(item["suite"]), str(item["region"])) for item in about["tasks"]}
+    tasks = {(item.suite, item.region) for item in about.tasks}
     name = best_on_pictures(scores, {key for key in tasks if BY in key[0]})
     if name is None:
         raise ConfigError(
             f"{board} holds no answers to queries with pictures: name a board of a suite such as aerial+..."
         )
-    entry = next(item for item in about["entries"] if item["name"] == name)
-    return out / "runs" / str(entry["card"]["name"]) / str(entry["hash"])
+    entry = next(item for item in about.entries if item.name == name)
+    return out / "runs" / name_alone(entry.name) / str(entry.hash)
 
 
 def _inspect_run(cases: RunCases, out: Path, query: str | None, strip: int | None) -> None:

@@ -2,20 +2,20 @@
 """The queries of a published board, drawn again by its pipeline and held against the hashes that it stores."""
 
 import difflib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.entry_cost import fetch_extracts
 from sasgeo_bench.experiments.pipeline import draw_all
 from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, plan_pipeline
-from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.board_files import read_board_manifest
+from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.progress import Progress, Tell
-from sasgeo_bench.publishing.archive import laid_tasks, stored_settings
-from sasgeo_bench.publishing.archive_folder import is_pack
+from sasgeo_bench.publishing.archive import laid_tasks
+from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.publishing.release_files import BoardTasks
 from sasgeo_bench.regions.build import package_version
 from sasgeo_bench.regions.region import DATA_VERSION
@@ -71,14 +71,14 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
         fault = "holds no stored results" if stored.is_dir() else "is no folder here"
         raise StoreError(f"{stored} {fault}: {mend}")
     _check_version(stored, tell)
-    made_by = stored_settings([stored]).pipeline
-    if not made_by.get("id"):
+    made_by = read_pack(stored).pipeline
+    if made_by is None:
         raise ConfigError(f"{stored} are stored results of no pipeline, so nobody knows how its queries are drawn")
-    spec = read_pipeline_file(request.pipeline or find_pipeline_file(str(made_by["id"])))
-    if spec.identity != dict(made_by):
+    spec = read_pipeline_file(request.pipeline or find_pipeline_file(made_by.id))
+    if spec.identity != made_by:
         raise ConfigError(
-            f"{stored} was made by another text of the pipeline {made_by['id']!r} than this one: take the version of "
-            f"the program that made it ({_version_of(read_board(stored)[0])}), or name the file by --pipeline"
+            f"{stored} was made by another text of the pipeline {made_by.id!r} than this one: take the version of "
+            f"the program that made it ({_version_of(read_board_manifest(stored))}), or name the file by --pipeline"
         )
     _check_seed(stored, request.sealed)
     plan = plan_pipeline(
@@ -120,31 +120,33 @@ def draw_board(request: BoardRequest, *, tell: Tell, progress: Progress | None =
     )
 
 
-def _version_of(about: Mapping[str, Any]) -> str:
+def _version_of(about: BoardManifest) -> str:
     """Name the version that made a board, by the numbers that its queries follow from."""
-    numbers = (f"{name} version {about.get(f'{name}_version', 'unknown')}" for name in ("data", "task"))
-    return f"{about.get('made_by') or 'an unknown version'}, {', '.join(numbers)}"
+    return _version_text(about.made_by, about.data_version, about.task_version)
+
+
+def _version_text(made_by: str | None, data: int | None, task: int | None) -> str:
+    made = made_by or "an unknown version"
+    return f"{made}, data version {data or 'unknown'}, task version {task or 'unknown'}"
 
 
 def _check_version(stored: Path, tell: Tell) -> None:
     """Refuse a board on maps that this version makes otherwise; tell of one whose tasks are of another version."""
-    about = read_board(stored)[0]
-    here = _version_of(
-        {"made_by": f"sasgeo-bench {package_version()}", "data_version": DATA_VERSION, "task_version": TASK_VERSION}
-    )
-    if about.get("data_version", DATA_VERSION) != DATA_VERSION:
+    about = read_board_manifest(stored)
+    here = _version_text(f"sasgeo-bench {package_version()}", DATA_VERSION, TASK_VERSION)
+    if (about.data_version or DATA_VERSION) != DATA_VERSION:
         raise ConfigError(
             f"{stored} was made by {_version_of(about)}, and this is {here}, which makes other maps: enter it with the "
             "version that made it, or enter a board of this one"
         )
-    if about.get("task_version", TASK_VERSION) != TASK_VERSION:
+    if (about.task_version or TASK_VERSION) != TASK_VERSION:
         tell(f"{stored} was made by {_version_of(about)}, this is {here}: queries are held against its hashes")
 
 
 def _check_seed(stored: Path, seed: PrivateSeed | None) -> None:
     """Refuse a seed that did not draw the sealed places of the board: none of their queries would be the same."""
-    opened = read_board(stored)[0].get("sealed", {})
-    if seed is not None and all(one.get("drawn_by") != seed.commitment for one in opened.values()):
+    opened = read_board_manifest(stored).sealed
+    if seed is not None and all(one.drawn_by != seed.commitment for one in opened.values()):
         raise ConfigError(
             f"{stored} was not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}: take the "
             "seed that was published with the board, or none"
@@ -173,7 +175,7 @@ def same_queries(stored: Path, tasks: Sequence[Path], *, tell: Tell) -> dict[str
     board = {name: asked for task in asked_tasks(stored) for name, asked in task.asked.items()}
     same = {name: asked for name, asked in board.items() if drawn.get(name) == asked}
     if not same:
-        made_by = _version_of(read_board(stored)[0])
+        made_by = _version_of(read_board_manifest(stored))
         raise ConfigError(
             f"none of the {len(board)} queries of {stored} is drawn here as it was: they were drawn by another "
             f"version of the program, or from other extracts; take the version that made the board ({made_by})"

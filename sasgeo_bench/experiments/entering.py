@@ -20,7 +20,7 @@ from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.results import SOUND, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
 from sasgeo_bench.progress import Progress, Tell
-from sasgeo_bench.publishing.archive import stored_settings
+from sasgeo_bench.publishing.archive_file import read_pack
 from sasgeo_bench.publishing.submissions import (
     SubmitRequest,
     beside_stored,
@@ -100,8 +100,7 @@ def check_entry(entry: Entry, *, into: Path | None = None) -> CheckedEntry:
     `ConfigError` if its name is on the board, or its card is no card of a submission; `StoreError` if `into` holds
     something else, or answers to another board.
     """
-    settings = stored_settings([entry.stored])
-    check_registered(settings.rejectors, source=str(entry.stored))
+    check_registered(read_pack(entry.stored).rejectors, source=str(entry.stored))
     found = plan_runs(entry.plan, entry.matcher, [])[0].plan
     card = _card_of(found.card, [], entry.plan.split, source=entry.matcher)
     check_card(card, entry.stored, source=entry.matcher)

@@ -13,11 +13,11 @@ from typing import Final, NamedTuple
 from sasgeo_bench.errors import ConfigError, ExtractError, StoreError, counted
 from sasgeo_bench.experiments.pipeline_plan import PipelinePlan
 from sasgeo_bench.files.parquet import read_table
-from sasgeo_bench.leaderboard.board_files import MEND, read_board, read_scores
+from sasgeo_bench.leaderboard.board_files import MEND, read_board_manifest, read_scores
 from sasgeo_bench.matching.matcher import is_followed
 from sasgeo_bench.osm.locate import FOLDERS_VARIABLE, find_extract, find_parts, missing_files
 from sasgeo_bench.progress import duration_text
-from sasgeo_bench.publishing.archive_folder import RUNS
+from sasgeo_bench.publishing.archive_file import RUNS
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunPlan
 from sasgeo_bench.scoring.rows import is_unranked
@@ -175,7 +175,7 @@ def _asking(stored: Path, whole: Sequence[OpenTask], run: RunPlan | None) -> _St
 
 def _scoring(stored: Path, queries: int) -> _Stage:
     """Return what it costs to score one row beside those of a board."""
-    rejectors = len(read_board(stored)[0].get("rejectors", ()))
+    rejectors = len(read_board_manifest(stored).rejectors)
     seconds = _SETUP_S + len(read_scores(stored)) * _SCORE_S + queries * (_SCORE_S + _FIT_S * rejectors)
     return _Stage("scoring {}", seconds, seconds)
 
@@ -214,13 +214,13 @@ def _prepare_s(stored: Path) -> dict[str, float]:
 
 def lost_lines(plan: PipelinePlan, stored: Path, tasks: Sequence[Task]) -> Iterator[str]:
     """Yield which queries of a board will have no answer: of older versions, sealed, or of regions left out."""
-    about, seal = read_board(stored)[0], plan.seal
-    if about.get("task_version") != TASK_VERSION:
+    about, seal = read_board_manifest(stored), plan.seal
+    if about.task_version != TASK_VERSION:
         yield (
-            f"  the board is of task version {about.get('task_version')}, and this program draws version "
+            f"  the board is of task version {about.task_version}, and this program draws version "
             f"{TASK_VERSION}: those that changed in between, if any, are not asked and count as misses"
         )
-    closed = set(about.get("sealed", {})) if seal is None or seal.seed is None else set()
+    closed = set(about.sealed) if seal is None or seal.seed is None else set()
     drawn = {item.region.id for item in (*plan.requests, *plan.controls)}
     places = {base_of(task.manifest.region): 0 for task in tasks}
     for task in tasks:

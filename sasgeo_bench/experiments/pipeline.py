@@ -30,8 +30,8 @@ from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.progress import Progress, Tell
-from sasgeo_bench.publishing.archive import contrast_of, pack_board
-from sasgeo_bench.publishing.archive_folder import check_results
+from sasgeo_bench.publishing.archive import pack_board
+from sasgeo_bench.publishing.archive_file import check_results
 from sasgeo_bench.running.failures import Failures, log_beside
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
@@ -78,7 +78,7 @@ def run_pipeline(
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
     if not asked:
         raise ConfigError(f"pipeline {plan.spec.id!r}: no region carries any of its suites")
-    contrasts = tuple(contrast_of(item.model_dump(exclude={"why", "pilot"})) for item in plan.spec.contrast)
+    contrasts = tuple(item.registered for item in plan.spec.contrast)
     _check_contrasts(plan, contrasts, asked, tell)
     failures = Failures(log_beside(board_folder(plan)), tell=tell)
     folders, names = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
@@ -104,6 +104,7 @@ def run_pipeline(
         contrasts=contrasts,
         draws=plan.spec.draws,
         pipeline=plan.spec.identity,
+        title=plan.spec.title,
         extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=() if plan.spec.paper is None or len(plan.spec.paper.seeds) == 1 else tuple(plan.spec.paper.crops),
         by_block=() if plan.spec.paper is None else tuple(plan.spec.paper.crops),

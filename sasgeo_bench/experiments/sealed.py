@@ -5,16 +5,15 @@ import datetime as dt
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.leaderboard.board_files import BOARD, read_board
+from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.tasks.openings import (
     Opening,
     Openings,
+    SealedPlace,
     joined_openings,
-    parse_openings,
     read_openings,
     record_openings,
     sealed_record,
@@ -72,8 +71,8 @@ def seal_of(
 
 def open_seal(
     seal: Seal, requests: Sequence[Request], *, opened: dt.date | None, stored: Path | None, tell: Tell
-) -> Any:  # noqa: ANN401 - JSON
-    """Record that sealed places are opened, before anything is drawn, and return the entry of `board.json` on them.
+) -> dict[str, SealedPlace]:
+    """Record that sealed places are opened, before anything is drawn, and return what `board.json` says of them.
 
     `opened` is the day, today (UTC) unless given. `stored` is the folder of stored results of this very pipeline,
     whose openings count, too, and came before those recorded here. Raise `ConfigError` if every test place of a
@@ -118,5 +117,4 @@ def _stored_openings(stored: Path) -> Openings:
     """Return the openings that the board of stored results tells of; none without such a board."""
     if not (stored / BOARD).is_file():
         return {}
-    record = read_board(stored)[0].get("sealed") or {}
-    return parse_openings({place: item.get("openings", ()) for place, item in record.items()}, stored / BOARD)
+    return {place: tuple(item.openings) for place, item in read_board_manifest(stored).sealed.items()}

@@ -4,26 +4,36 @@
 import platform
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 
 from sasgeo_bench.leaderboard.board_files import ACCEPTANCE, PROTECTION, Extra, write_board
 from sasgeo_bench.leaderboard.board_tables import step_tables
+from sasgeo_bench.leaderboard.manifests import (
+    BoardEntry,
+    BoardManifest,
+    BoardTask,
+    Elsewhere,
+    Learned,
+    PipelineRecord,
+    RejectorRecord,
+)
 from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
 from sasgeo_bench.leaderboard.private_board import OnPrivate, seed_of
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables
-from sasgeo_bench.leaderboard.stored_figures import StoredFigures
+from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import StoredAnswers
+from sasgeo_bench.running.run_manifest import CardRecord
 from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA, Falsifier, Verdict, failed_controls
@@ -32,12 +42,12 @@ from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
 from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
+from sasgeo_bench.tasks.openings import SealedPlace
 from sasgeo_bench.tasks.query import TASK_VERSION, Truth
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.task_files import PRIVATE, TaskManifest
+from sasgeo_bench.tasks.task_files import TaskManifest
 
 _LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
-_CARD: Final = ("name", "version", "title", "source", "licence", "is_calibrated")  # of a rejector, in board.json
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,11 +65,11 @@ class ScoreRequest:
     their maps. `jobs` processes fit rejectors, or workers of the cluster at `dask`. `extras` make, from the finished
     board, files that are written with it.
 
-    `pipeline` is name and hash of the pipeline that requests the board, if one does. `private` is a board of a private
-    seed of the same pipeline to compare rows with. `kept` is the `board.json` of stored results: it keeps the version
-    of their maps, and their results on a private seed where no private board is named; their sealed places, too.
-    `sealed` is the record of sealed places (`openings.sealed_record`). `failed` names entries that failed before
-    scoring, and why. `stored` are figures of entries that are not fitted again, `elsewhere` rows of other
+    `pipeline` is name and hash of the pipeline that requests the board, if one does, `title` its title. `private` is a
+    board of a private seed of the same pipeline to compare rows with. `kept` is the manifest of stored results: it
+    keeps the version of their maps, their title and their sealed places, and their results on a private seed where no
+    private board is named. `sealed` are the sealed places (`openings.sealed_record`). `failed` names entries that
+    failed before scoring, and why. `stored` is a board whose entries are not fitted again, `elsewhere` rows of other
     boards that asked the same queries.
     """
 
@@ -74,18 +84,19 @@ class ScoreRequest:
     draws: int = DRAWS
     by_region: Collection[str] = ()
     by_block: Collection[str] = ()
-    pipeline: Mapping[str, str] = field(default_factory=dict)
+    pipeline: PipelineRecord | None = None
+    title: str = ""
     extras: Sequence[Callable[["Board"], Extra]] = ()
     without: Collection[str] = ()
     submissions: Sequence[Path] = ()
     jobs: int = 1
     dask: str | None = None
     private: Path | None = None
-    kept: Mapping[str, Any] = field(default_factory=dict)
-    sealed: Mapping[str, Any] = field(default_factory=dict)
+    kept: BoardManifest | None = None
+    sealed: Mapping[str, SealedPlace] = field(default_factory=dict)
     failed: Mapping[str, str] = field(default_factory=dict)
-    stored: StoredFigures | None = None
-    elsewhere: Sequence[Mapping[str, Any]] = ()
+    stored: StoredBoard | None = None
+    elsewhere: Sequence[Elsewhere] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +110,8 @@ class Board:
     of flights those of their first view, `views` the rows of views of flights by matcher (`flights.view_frame`), and
     `truths` all truths, those of controls included. `everyone` also holds entries that were asked only controls; so
     does `predictions`. `apart` are the reasons for excluding entries from ranks, `on_private` the results on a private
-    seed, `failures` the entries that failed, and why. `data_version` is that of the maps that were asked about.
+    seed, `failures` the entries that failed, and why. `data_version` is that of the maps that were asked about, `about`
+    the manifest.
     """
 
     entries: tuple[Entry, ...]
@@ -122,6 +134,7 @@ class Board:
     everyone: tuple[Entry, ...] = ()
     apart: Mapping[str, str] = field(default_factory=dict)
     on_private: OnPrivate = field(default_factory=OnPrivate)
+    about: BoardManifest = field(default_factory=lambda: BoardManifest(scorer_version=0, entries=[], tasks=[]))
     data_version: int = DATA_VERSION
 
 
@@ -146,9 +159,9 @@ def _draw(draw: Callable[[Path], object], name: str, failures: Failures, path: P
     path.unlink(missing_ok=True)
 
 
-def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra], cards: Sequence[RejectorCard]) -> None:
-    """Write a board with its tables, texts and additional files; `cards` are those of its rejectors."""
-    about = record_of(request, board, cards)
+def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra]) -> None:
+    """Write a board with its tables, texts and additional files."""
+    about = board.about
     scores = pd.concat([frame.assign(matcher=name) for name, frame in board.scores.items()], ignore_index=True)
     queries = queries_of(board.scores)
     steps = steps_frame(board.table, queries, sorted(board.scores))
@@ -178,62 +191,75 @@ def write_files(request: ScoreRequest, board: Board, extras: Sequence[Extra], ca
             "leaderboard.tex": board_latex(board.table, about, findings=board.findings, verdicts=board.verdicts),
         },
         about=about,
+        failed=board.failures.found,
         extras=extras,
     )
 
 
-def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> dict[str, Any]:
-    """Return the content of `board.json`."""
-    seed, sealed = seed_of(board.tasks), request.sealed or request.kept.get("sealed")
-    return {
-        "scorer_version": SCORER_VERSION,
-        "task_version": max((item.task_version for item in board.tasks), default=TASK_VERSION),
-        "data_version": board.data_version,
-        "made_by": f"sasgeo-bench {version('sasgeo-bench')}",
-        "libraries": _libraries(),
-        "pipeline": dict(request.pipeline) or None,
-        **{name: seed for name, seed in ((PRIVATE, seed), ("private", board.on_private.seed)) if seed},
-        **({"sealed": dict(sealed)} if sealed else {}),
-        "split": None if request.split is None else request.split.spec.id,
-        "draws": request.draws,
-        "contrasts": [asdict(item) for item in request.contrasts],
-        "by_region": sorted(request.by_region),
-        "by_block": sorted(request.by_block),
-        "without": sorted(set(request.without)),
-        "rejectors": [{name: getattr(card, name) for name in _CARD} for card in cards],
-        "remarks": list(board.remarks),
-        **({"elsewhere": [dict(item) for item in request.elsewhere]} if request.elsewhere else {}),
-        "failed": board.failures.found,  # what fails while figures are drawn is added until the file is written
-        "entries": [
-            {
-                "name": entry.name,
-                "version": entry.version,
-                "hash": entry.hash,
-                "how": entry.how,
-                "card": entry.card,
-                "trained_on": entry.declared,
-                "set_apart": board.apart.get(entry.name),
-                "isolation": joined(run.isolation or {} for run in entry.runs) if entry.runs else None,
-                "learned": entry.learned(),
-                **({"private": board.on_private.rows[entry.name]} if entry.name in board.on_private.rows else {}),
-                **({"failed_controls": [item.to_text() for item in failed]} if failed else {}),
-            }
-            for entry in board.entries
-            for failed in [failed_controls(board.verdicts, entry.name)]
+def record_of(request: ScoreRequest, board: Board, cards: Sequence[RejectorCard]) -> BoardManifest:
+    """Return the manifest of a board."""
+    kept = request.kept or BoardManifest(scorer_version=SCORER_VERSION, entries=[], tasks=[])
+    return BoardManifest(
+        scorer_version=SCORER_VERSION,
+        task_version=max((item.task_version for item in board.tasks), default=TASK_VERSION),
+        data_version=board.data_version,
+        made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+        libraries=dict(_libraries()),
+        pipeline=request.pipeline,
+        title=request.title or kept.title,
+        private_seed=seed_of(board.tasks),
+        private=board.on_private.seed,
+        sealed=dict(request.sealed or kept.sealed),
+        split=None if request.split is None else request.split.spec.id,
+        draws=request.draws,
+        contrasts=list(request.contrasts),
+        by_region=sorted(request.by_region),
+        by_block=sorted(request.by_block),
+        without=sorted(set(request.without)),
+        rejectors=[
+            RejectorRecord(
+                name=card.name,
+                version=card.version,
+                title=card.title,
+                source=card.source,
+                licence=card.licence,
+                is_calibrated=card.is_calibrated,
+            )
+            for card in cards
         ],
-        "tasks": [
-            {
-                "suite": item.suite,
-                "suite_version": item.suite_version,
-                "region": item.region,
-                "map_date": item.map_date,
-                "queries_sha256": item.queries_sha256,
-                "map_fingerprint": item.map_fingerprint,
-                **({} if item.failed_pictures is None else {"failed_pictures": item.failed_pictures}),
-            }
+        remarks=list(board.remarks),
+        elsewhere=list(request.elsewhere),
+        failed=dict(board.failures.found),
+        entries=[_entry_of(entry, board) for entry in board.entries],
+        tasks=[
+            BoardTask(
+                suite=item.suite,
+                suite_version=item.suite_version,
+                region=item.region,
+                map_date=item.map_date,
+                queries_sha256=item.queries_sha256,
+                map_fingerprint=item.map_fingerprint,
+                failed_pictures=item.failed_pictures,
+            )
             for item in board.tasks
         ],
-    }
+    )
+
+
+def _entry_of(entry: Entry, board: Board) -> BoardEntry:
+    return BoardEntry(
+        name=entry.name,
+        version=entry.version,
+        hash=entry.hash,
+        how=entry.how,
+        card=None if entry.card is None else CardRecord.model_validate(entry.card),
+        trained_on=entry.declared,
+        set_apart=board.apart.get(entry.name),
+        isolation=joined(run.isolation or {} for run in entry.runs) if entry.runs else None,
+        learned=[Learned.model_validate(one) for one in entry.learned()],
+        private=board.on_private.rows.get(entry.name),
+        failed_controls=[item.to_text() for item in failed_controls(board.verdicts, entry.name)],
+    )
 
 
 @cache

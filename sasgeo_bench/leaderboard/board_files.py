@@ -4,10 +4,9 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
-import pyarrow as pa
 from pandas.api.types import is_numeric_dtype
 
 from sasgeo_bench.errors import SasgeoError, StoreError
@@ -21,10 +20,10 @@ from sasgeo_bench.files.folders import (
     fresh_folder,
     locked,
 )
-from sasgeo_bench.files.json import MOST_BYTES, parse_json
+from sasgeo_bench.files.json import MOST_BYTES
 from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.files.paths import read_bounded
-from sasgeo_bench.leaderboard.archive_record import BoardRecord, parse_record
+from sasgeo_bench.leaderboard.manifests import BoardManifest, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA
@@ -78,27 +77,33 @@ def write_board(
     *,
     tables: Mapping[str, pd.DataFrame],
     texts: Mapping[str, str],
-    about: Mapping[str, Any],
+    about: BoardManifest,
+    failed: Mapping[str, str] | None = None,
     extras: Sequence[Extra] = (),
 ) -> None:
     """Write a board completely or not at all; an older board of the same scorer version there is replaced.
 
     Each of `tables` becomes <name>.parquet, "leaderboard" and "protection" also a csv; `texts` are files by name,
-    `about` the content of `board.json`. Raise StoreError if the folder holds a board of another scorer version, or
-    something that is no part of a board, or cannot be written; an older board is then unchanged.
+    `about` the manifest; `failed` grows until the last file is made. Raise StoreError if the folder holds a board of
+    another scorer version, or something that is no part of a board, or cannot be written; an older board is then
+    unchanged.
     """
-    versions = {name: str(about[name]) for name in _VERSIONS if name in about}
+    versions = {name: str(getattr(about, name)) for name in _VERSIONS if getattr(about, name) is not None}
     metadata = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
-    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION}
     try:
         with locked(folder, tell=lambda _: None):
-            check_board(folder, scorer_version=int(about["scorer_version"]))
+            check_board(folder, scorer_version=about.scorer_version)
             with fresh_folder(folder) as scratch:
                 for part in (Extra(tables=tables, texts=texts), *extras):
                     _write_part(scratch, part, metadata)
                 for name in (one for one in _AS_CSV if one in tables):
                     (scratch / f"{name}.csv").write_text(csv_text(tables[name]), encoding="utf-8", newline="")
-                content = {name: value for name, value in content.items() if name != "failed" or value}
+                whole = about.model_copy(update={"failed": dict(about.failed if failed is None else failed)})
+                content = {
+                    **whole.model_dump(mode="json", exclude_unset=True),
+                    "licence": LICENCE,
+                    "attribution": ATTRIBUTION,
+                }
                 (scratch / BOARD).write_text(json_text(content), encoding="utf-8")
     except SasgeoError:
         raise
@@ -165,23 +170,21 @@ def _version(path: Path) -> str:
         return "unknown"
 
 
-def read_board(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Read `board.json` and the leaderboard.
-
-    Raise StoreError if there is none, or a file is damaged.
-    """
+def read_board_manifest(folder: Path) -> BoardManifest:
+    """Read `board.json`; raise StoreError if there is none, or it is damaged."""
     try:
-        data = read_bounded(folder / BOARD, MOST_BYTES)
-        parse_record(data, BoardRecord)
-        return dict(parse_json(data)), read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
-    except StoreError:
-        raise
+        return parse_record(read_bounded(folder / BOARD, MOST_BYTES), BoardManifest)
     except NotADirectoryError as error:
         raise StoreError(f"{folder} is a file: name the folder of a board") from error
     except FileNotFoundError as error:
         raise StoreError(f"{folder} holds no board: score some runs first") from error
-    except (OSError, ValueError, TypeError, KeyError, MemoryError, pa.ArrowException) as error:
+    except (OSError, ValueError, MemoryError) as error:
         raise StoreError(f"{folder} holds a damaged board ({one_line(str(error))}): score it again") from error
+
+
+def read_leaderboard(folder: Path) -> pd.DataFrame:
+    """Read every figure of a board; raise StoreError if the table is missing or damaged."""
+    return read_frame(folder / f"{LEADERBOARD}.parquet", mend=MEND)
 
 
 def read_scores(folder: Path) -> pd.DataFrame:

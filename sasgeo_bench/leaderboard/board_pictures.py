@@ -26,6 +26,7 @@ from sasgeo_bench.leaderboard.cases import (
     words_of,
 )
 from sasgeo_bench.leaderboard.flight_maps import MOST_TRACKERS, flight_map_pixels, shown_flight
+from sasgeo_bench.leaderboard.manifests import FailedCase, MapBlock, Picture, PictureStrip, RegionMap
 from sasgeo_bench.leaderboard.plot_tables import ranked_matchers, shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
@@ -64,12 +65,12 @@ class _Found:
     """Pictures so far, what `pictures.json` says of them, and why others are not among them."""
 
     files: dict[str, bytes] = field(default_factory=dict)
-    listed: dict[str, list[dict[str, Any]]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
+    listed: dict[str, list[Picture]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
     lacking: Counter[str] = field(default_factory=Counter)
     failures: Failures
 
-    def add(self, kind: str, name: str, draw: Callable[[], bytes], about: Mapping[str, Any]) -> None:
-        """Draw one, or note why not: a board is not lost for a picture."""
+    def add(self, kind: str, name: str, draw: Callable[[], bytes], make: Callable[..., Picture]) -> None:
+        """Draw one, and list what is made of its file, or note why not: a board is not lost for a picture."""
         try:
             data = draw()
         except SasgeoError as error:
@@ -83,9 +84,13 @@ class _Found:
         if sum(map(len, self.files.values())) + len(data) > MOST_BYTES:
             self.lacking[f"all pictures together take {MOST_BYTES / 1e6:g} MB at most"] += 1
             return
-        file = f"{kind}/{_PLAIN.sub('-', name).strip('-')}{WEBP}"
+        file = _file_of(kind, name)
         self.files[file] = data
-        self.listed[kind].append({**about, "file": file})
+        self.listed[kind].append(make(file=file))
+
+
+def _file_of(kind: str, name: str) -> str:
+    return f"{kind}/{_PLAIN.sub('-', name).strip('-')}{WEBP}"
 
 
 def pictures_extra(
@@ -130,8 +135,9 @@ def pictures_extra(
     return Extra(tables=answers, pictures=_with_list(found.files, found.listed) if found.files else {})
 
 
-def _with_list(files: Mapping[str, bytes], listed: Mapping[str, Any]) -> dict[str, bytes]:
-    content = {**listed, "licence": LICENCE, "attribution": ATTRIBUTION}
+def _with_list(files: Mapping[str, bytes], listed: Mapping[str, Sequence[Picture]]) -> dict[str, bytes]:
+    kinds = {kind: [item.model_dump(mode="json") for item in items] for kind, items in listed.items()}
+    content = {**kinds, "licence": LICENCE, "attribution": ATTRIBUTION}
     return {**files, PICTURES_FILE: json_text(content).encode()}
 
 
@@ -161,12 +167,13 @@ def _add_regions(found: _Found, asked: Sequence[tuple[str, str]], root: Path, sp
             found.lacking[one_line(str(error))] += 1
             continue
         blocks = () if split is None else split.blocks_in(base)
-        lies = {
-            "region": base,
-            "alt": f"Map of {base}: semantic classes in colours",
-            "bounds_m": list(manifest.bounds_m),
-            "blocks": [{"name": one.id, "bounds_m": list(one.bounds_m)} for one in blocks],
-        }
+        lies = partial(
+            RegionMap,
+            region=base,
+            alt=f"Map of {base}: semantic classes in colours",
+            bounds_m=list(manifest.bounds_m),
+            blocks=[MapBlock(name=one.id, bounds_m=list(one.bounds_m)) for one in blocks],
+        )
         found.add("regions", base, partial(_map, folder, manifest), lies)
 
 
@@ -189,7 +196,7 @@ def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], board: Boa
         best[suite] = min(best.get(suite, (1, "")), (rank, region))
     for suite, (_, region) in sorted(best.items()):
         alt = f"Example of {suite} on {region}: view, map at the true place, difference, twin or hardest decoy"
-        found.add("suites", suite, partial(_example, asked[suite, region]), {"suite": suite, "alt": alt})
+        found.add("suites", suite, partial(_example, asked[suite, region]), partial(Picture, suite=suite, alt=alt))
 
 
 def _example(task: Task) -> bytes:
@@ -236,7 +243,7 @@ def _add_strips(found: _Found, board: Board, asked: Mapping[tuple[str, str], Tas
             "strips",
             suite,
             partial(_strip, strip, cases, own, title=f"{name} on {suite}"),
-            {"suite": suite, "matcher": name, "alt": alt},
+            partial(PictureStrip, suite=suite, matcher=name, alt=alt),
         )
 
 
@@ -264,11 +271,12 @@ def _add_flights(found: _Found, board: Board, asked: Mapping[tuple[str, str], Ta
         region, flight = chosen
         shown = [name for name in names if (board.views[name]["sequence_id"] == flight).any()][:MOST_TRACKERS]
         views = {name: board.views[name] for name in shown}
+        alt = f"A flight of {suite} on {region}, with the estimates of {', '.join(shown)}"
         found.add(
             "flights",
             suite,
             partial(_flight_map, asked[suite, region], flight, views),
-            {"suite": suite, "alt": f"A flight of {suite} on {region}, with the estimates of {', '.join(shown)}"},
+            partial(Picture, suite=suite, alt=alt),
         )
 
 
@@ -296,10 +304,10 @@ def _add_cases(
             "cases",
             f"{case.matcher}-{case.query.query_id}",
             partial(_picture, outcome),
-            {**{str(name): value for name, value in row.items()}, "alt": alt, "said": facts},
+            partial(FailedCase, **{name: row[name] for name in COLUMNS}, alt=alt, said=facts),
         )
-    order = {key: at for at, key in enumerate(drawn)}
-    found.listed["cases"].sort(key=lambda one: order[one["query_id"], one["matcher"]])
+    order = {_file_of("cases", f"{matcher}-{query_id}"): at for at, (query_id, matcher) in enumerate(drawn)}
+    found.listed["cases"].sort(key=lambda one: order[one.file])
 
 
 def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:

@@ -11,6 +11,7 @@ import pandas as pd
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.columns import column, marks_of, prior_words, words
+from sasgeo_bench.leaderboard.manifests import BoardEntry
 from sasgeo_bench.leaderboard.tables import (
     Cell,
     Key,
@@ -64,7 +65,7 @@ class Book:
     figures: Mapping[tuple[str, ...], Record]
     matchers: Mapping[Key, tuple[str, ...]]
     strata: Mapping[Key, tuple[str, ...]]
-    entries: Mapping[str, Mapping[str, Any]]
+    entries: Mapping[str, BoardEntry]
     controls: frozenset[str]
     matcher_pages: Mapping[str, str]
     suite_pages: Mapping[str, str]
@@ -72,12 +73,12 @@ class Book:
     lost: Mapping[Key, str]
 
     @classmethod
-    def of(cls, board: pd.DataFrame, about: Mapping[str, Any], scores: pd.DataFrame | None = None) -> Self:
-        """Index a leaderboard with the content of its `board.json`, which may be empty, and its scored queries."""
-        entries = {str(entry["name"]): entry for entry in about.get("entries", ())}
+    def of(cls, board: pd.DataFrame, listed: Sequence[BoardEntry] = (), scores: pd.DataFrame | None = None) -> Self:
+        """Index a leaderboard with its entries, which may be listed, and its scored queries."""
+        entries = {entry.name: entry for entry in listed}
         for row in records_of(board.drop_duplicates("matcher")) if "set_apart" in board else ():
             reason: str | None = None if pd.isna(row["set_apart"]) else row["set_apart"]
-            entries.setdefault(row["matcher"], {"how": row["how"], "set_apart": reason})
+            entries.setdefault(row["matcher"], BoardEntry(name=row["matcher"], how=row["how"], set_apart=reason))
         scored = pd.DataFrame() if scores is None else scores
         plain = board[board["rejector"] == ""] if len(board) else board
         figures: dict[tuple[str, ...], Record] = {}
@@ -113,8 +114,8 @@ class Book:
 
     def name_cell(self, matcher: str) -> Cell:
         """Return the name of a matcher with its marks and a link to its page."""
-        entry = self.entries.get(matcher, {})
-        marks = marks_of(entry, is_control=matcher in self.controls)
+        entry = self.entries.get(matcher)
+        marks = marks_of(entry or BoardEntry(name=matcher), is_control=matcher in self.controls)
         return Cell(text=matcher, href=self.matcher_pages.get(matcher, ""), marks=marks)
 
     def short_name(self, matcher: str) -> Cell:
@@ -128,7 +129,7 @@ class Book:
 
     def is_set_apart(self, matcher: str) -> bool:
         """Return whether the board sets an entry apart."""
-        return bool(self.entries.get(matcher, {}).get("set_apart"))
+        return matcher in self.entries and bool(self.entries[matcher].set_apart)
 
 
 def _by_group(scores: pd.DataFrame) -> Iterator[tuple[Key, pd.DataFrame]]:
@@ -213,7 +214,7 @@ def _section(book: Book, key: Key) -> Section:
 
 def _apart(book: Book, key: Key, names: Sequence[str]) -> Table:
     table = suite_table(book, key, names)
-    reasons = tuple(f"{name}: {book.entries[name]['set_apart']}." for name in names)
+    reasons = tuple(f"{name}: {book.entries[name].set_apart}." for name in names)
     title = f"Set apart, not to be compared with those above: {key[0]}, {key[1]}"
     return replace(table, name=f"{table.name}-apart", title=title, notes=reasons)
 

@@ -11,8 +11,8 @@ import pandas as pd
 
 from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.files.folders import SITE
-from sasgeo_bench.leaderboard.board import Board, ScoreRequest, make_extras, write_files
-from sasgeo_bench.leaderboard.board_files import check_board, read_board
+from sasgeo_bench.leaderboard.board import Board, ScoreRequest, make_extras, record_of, write_files
+from sasgeo_bench.leaderboard.board_files import check_board, read_board_manifest
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
 from sasgeo_bench.progress import Lines, Progress, Tell
 from sasgeo_bench.regions.region import DATA_VERSION
@@ -61,6 +61,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
         board = _unranked(request, contest, failures, tell)
         ranks = _ranks(board, request.draws, tell, progress)
     costs = _costs(board, contest.tasks, tell)
+    known = set() if request.stored is None else {entry.name for entry in request.stored.about.entries}
     judgings = [
         RejectionTask(
             matcher=entry.name,
@@ -71,7 +72,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
             is_taught=entry.is_taught,
         )
         for entry in board.entries
-        if request.stored is None or entry.name not in request.stored.names
+        if entry.name not in known
     ]
     is_whole = request.stored is None
     rejection = evaluate_rejectors(
@@ -93,7 +94,9 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
         tell(f"{request.board} had rows of {names}, which this board has not; their answers are where they were")
     if (request.board / SITE).is_dir():
         tell(f"{request.board / SITE} is of the older board and is removed with it: publish again")
-    write_files(request, board, make_extras(request, board, tell), [rule.card for rule in rules.values()])
+    extras = make_extras(request, board, tell)
+    board = replace(board, about=record_of(request, board, [rule.card for rule in rules.values()]))
+    write_files(request, board, extras)
     return board
 
 
@@ -144,7 +147,7 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
             tell=tell,
         )
         for name, row in on_private.rows.items():
-            tell(f"{name}: {row['verdict']} ({row['why']})")
+            tell(f"{name}: {row.verdict} ({row.why})")
     else:
         on_private = OnPrivate() if request.without else kept_private(request.kept, entries, request.root)
     truths = {truth.query_id: truth for task in contest.tasks for truth in task.truths}
@@ -163,7 +166,7 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
         apart=apart,
         on_private=on_private,
         failures=failures,
-        data_version=request.kept.get("data_version") or DATA_VERSION,
+        data_version=(None if request.kept is None else request.kept.data_version) or DATA_VERSION,
     )
 
 
@@ -259,7 +262,7 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
         findings = hold_contrasts(request.contrasts, scores, rejection.judged, draws=draws, failed=failed)
         findings = with_causes(findings, gains_without_stress(falsifiers))
     else:
-        findings = request.stored.findings
+        findings = request.stored.findings()
     levels = []
     for name in scores:
         with board.failures.of(f"protection levels of {name}"):
@@ -280,7 +283,6 @@ def _validated(request: ScoreRequest, board: Board, rejection: RejectionResult) 
 def _names_before(folder: Path) -> set[str]:
     """Return the entries of an older board, whose authors may look for their rows; none if it cannot be read."""
     try:
-        about, _ = read_board(folder)
-        return {str(entry["name"]) for entry in about["entries"]}
-    except (StoreError, KeyError, TypeError):
+        return {entry.name for entry in read_board_manifest(folder).entries}
+    except StoreError:
         return set()

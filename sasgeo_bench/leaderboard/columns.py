@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Columns of tables, and the words next to names: what each means, for boards, the site and the documentation."""
 
-from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.board_files import SCHEMAS
+from sasgeo_bench.leaderboard.manifests import BoardEntry
 from sasgeo_bench.leaderboard.tables import DAGGER, Column, Mark
 from sasgeo_bench.scoring.metrics import METRICS
 from sasgeo_bench.scoring.rows import AS_SUBMITTED, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE
@@ -176,23 +176,23 @@ def suite_words(suite: str) -> str:
     return "" if card is None else f"{card.title}. {card.what}"
 
 
-def marks_of(entry: Mapping[str, Any], *, is_control: bool) -> tuple[Mark, ...]:
+def marks_of(entry: BoardEntry, *, is_control: bool) -> tuple[Mark, ...]:
     """Return the words next to an entry's name: control, how its answers were made, what it was trained on.
 
-    >>> [mark.text for mark in marks_of({"how": "as submitted", "trained_on": ["porto"]}, is_control=False)]
+    >>> mine = BoardEntry(name="mine", how="as submitted", trained_on=["porto"])
+    >>> [mark.text for mark in marks_of(mine, is_control=False)]
     ['as submitted', 'trained on 1 place']
     """
-    how = str(entry.get("how") or "")
-    how = RUN_HERE if how == REPRODUCED and not entry.get("private") else how  # older boards had no private seed
+    how = entry.how or ""
+    how = RUN_HERE if how == REPRODUCED and entry.private is None else how  # older boards had no private seed
     marks = [Mark(text=how, meaning=MARKS.get(how, "as the board says"), tone=_TONES.get(how, "plain"))] if how else []
     if is_control:
         return (CONTROL, *(mark for mark in marks if how == PACKED))
-    places = [str(place) for place in entry.get("trained_on") or ()]
-    if places:
-        meaning = f"its parameters come from {', '.join(places)}"
-        marks.append(Mark(text=f"trained on {counted(len(places), 'place')}", meaning=meaning))
-    if entry.get("failed_controls"):
-        marks.append(Mark(text=FAILED_CONTROL, meaning="; ".join(entry["failed_controls"]), tone="warn"))
-    if entry.get("set_apart"):
-        marks.append(Mark(text="set apart", meaning=str(entry["set_apart"]), tone="warn"))
+    if entry.trained_on:
+        meaning = f"its parameters come from {', '.join(entry.trained_on)}"
+        marks.append(Mark(text=f"trained on {counted(len(entry.trained_on), 'place')}", meaning=meaning))
+    if entry.failed_controls:
+        marks.append(Mark(text=FAILED_CONTROL, meaning="; ".join(entry.failed_controls), tone="warn"))
+    if entry.set_apart:
+        marks.append(Mark(text="set apart", meaning=entry.set_apart, tone="warn"))
     return tuple(marks)

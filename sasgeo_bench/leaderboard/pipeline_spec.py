@@ -22,6 +22,8 @@ from sasgeo_bench.config import (
     read_document,
 )
 from sasgeo_bench.files.plugins import YARDSTICK
+from sasgeo_bench.leaderboard.manifests import PipelineRecord
+from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.verdicts import (
     LESS,
     LOWER,
@@ -81,6 +83,21 @@ class ContrastSpec(Document):
     min_effect: Annotated[float, Field(gt=0, le=1)] = 0.03
     pilot: PilotSpec | None = None
     why: Prose = ""
+
+    @property
+    def registered(self) -> Contrast:
+        """Return the contrast as boards hold it."""
+        return Contrast(
+            name=self.name,
+            first=self.first,
+            second=self.second,
+            suites=tuple(self.suites),
+            kinds=tuple(self.kinds),
+            detectors=tuple(self.detectors),
+            metric=self.metric,
+            track=self.track,
+            min_effect=self.min_effect,
+        )
 
     @model_validator(mode="after")
     def _can_be_judged(self) -> Self:
@@ -295,9 +312,9 @@ class PipelineFile(NamedDocument):
         return hashlib.sha256(json.dumps(fields, separators=(",", ":"), ensure_ascii=False).encode()).hexdigest()
 
     @property
-    def identity(self) -> dict[str, str]:
+    def identity(self) -> PipelineRecord:
         """Return the pipeline as `board.json` holds it."""
-        return {"id": self.id, "sha256": self.sha256}
+        return PipelineRecord(id=self.id, sha256=self.sha256)
 
     @model_validator(mode="after")
     def _has_what_it_needs(self) -> Self:

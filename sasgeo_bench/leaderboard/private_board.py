@@ -10,8 +10,16 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.leaderboard.archive_record import SeedRecord
-from sasgeo_bench.leaderboard.board_files import read_board, read_scores
+from sasgeo_bench.leaderboard.board_files import read_board_manifest, read_scores
+from sasgeo_bench.leaderboard.manifests import (
+    BoardEntry,
+    BoardManifest,
+    PipelineRecord,
+    SeedFigure,
+    SeedRecord,
+    SeedResult,
+    SeedVerdict,
+)
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.sandbox import keeps_truth
 from sasgeo_bench.scoring.base import Bools
@@ -32,9 +40,10 @@ from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, PACKED, REPROD
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP
 from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
+from sasgeo_bench.tasks.openings import SealedPlace
 from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS
 from sasgeo_bench.tasks.query import TASK_VERSION
-from sasgeo_bench.tasks.task_files import PRIVATE, TaskManifest
+from sasgeo_bench.tasks.task_files import TaskManifest
 
 _ALL_PRIORS: Final = "all"
 SEEDS_NOTE: Final = (
@@ -52,22 +61,6 @@ _IS_PUBLIC: Final = (
     "Seeds: the queries of this board are drawn by a public seed, which code can draw again, truths and all. No row "
     "was held against a private one, so none is reproduced."
 )
-
-
-class SeedFigure(SeedRecord):
-    """One figure of one matcher on both seeds, and what it tells."""
-
-    @property
-    def is_decided(self) -> bool:
-        """Return whether there are enough blocks to decide."""
-        return min(self.blocks_public, self.blocks_private) >= LEAST_BLOCKS
-
-    def to_text(self) -> str:
-        """Both figures and their difference in a line."""
-        return (
-            f"{self.suite}, {self.track}, {self.metric}: private {self.private:.3f} against public {self.public:.3f}, "
-            f"difference {self.difference:.3f} [{self.lo:.3f}, {self.hi:.3f}]"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,101 +156,96 @@ def _wilson(values: "np.ndarray[Any, np.dtype[np.float64]]", frame: pd.DataFrame
     return wilson_share(float(values.mean()), effective_count(frame["pair_id"].tolist()), level=level)
 
 
-def verdict_of(figures: Sequence[SeedFigure]) -> tuple[str, str]:
-    """Return the label of a row by its figures on both seeds (`compare_seeds`), and the reason in a line.
+def result_of(figures: Sequence[SeedFigure]) -> SeedResult:
+    """Return the label of a row by its figures on both seeds (`compare_seeds`), with the reason in a line.
 
     `not reproduced` means that a figure is shown to be worse on the private seed, `reproduced` that none is, and `run
     here` that the blocks are too few to decide.
     """
     worse = [item for item in figures if item.is_worse]
     if worse:
-        return NOT_REPRODUCED, max(worse, key=lambda item: abs(item.difference)).to_text()
+        return _result(NOT_REPRODUCED, max(worse, key=lambda item: abs(item.difference)).to_text(), figures)
     whole = [item for item in figures if item.suite == ALL_SUITES]
     if not whole:
-        return RUN_HERE, "nothing was asked on both seeds"
+        return _result(RUN_HERE, "nothing was asked on both seeds", figures)
     few = next((item for item in whole if not item.is_decided), None)
     if few is not None:
         blocks = counted(min(few.blocks_public, few.blocks_private), "block")
-        return RUN_HERE, f"{few.track} is asked in {blocks} of a seed, at least {LEAST_BLOCKS} are needed to decide"
-    return REPRODUCED, whole[0].to_text()
+        why = f"{few.track} is asked in {blocks} of a seed, at least {LEAST_BLOCKS} are needed to decide"
+        return _result(RUN_HERE, why, figures)
+    return _result(REPRODUCED, whole[0].to_text(), figures)
 
 
-def record_of(verdict: str, why: str, figures: Sequence[SeedFigure] = ()) -> dict[str, Any]:
-    """Return the entry of `board.json` on both seeds of one matcher."""
-    return {"verdict": verdict, "why": why, "figures": [item.model_dump() for item in figures]}
+def _result(verdict: SeedVerdict, why: str, figures: Sequence[SeedFigure] = ()) -> SeedResult:
+    return SeedResult(verdict=verdict, why=why, figures=list(figures))
 
 
-def seed_lines(about: Mapping[str, Any]) -> list[str]:
+def seed_lines(about: BoardManifest) -> list[str]:
     """Return whether the rows of a board were compared with a private seed, and the result of each."""
-    if about.get("private_seed"):
+    if about.private_seed is not None:
         return [_IS_PRIVATE]
-    seed = about.get("private")
-    if not seed:
+    seed = about.private
+    if seed is None:
         return [_IS_PUBLIC]
-    words = f"a private seed of {seed['bits']} bits, commitment {seed['commitment'][:12]}"
-    rows = [(entry["name"], entry.get("private")) for entry in about.get("entries", ())]
+    words = f"a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}"
+    rows = [(entry.name, entry.private) for entry in about.entries]
     return [
         f"Seeds: rows were held against the same pipeline on {words}.",
-        *(f"{name}: {row['verdict']} ({row['why']})." for name, row in rows if row),
+        *(f"{name}: {row.verdict} ({row.why})." for name, row in rows if row is not None),
     ]
 
 
-def sealed_lines(about: Mapping[str, Any]) -> list[str]:
+def sealed_lines(sealed: Mapping[str, SealedPlace]) -> list[str]:
     """Return whether the board holds the sealed places, and when they were opened: a line for those of one state.
 
-    >>> sealed_lines({"sealed": {name: {"drawn_by": None, "openings": []} for name in ("porto", "monaco")}})
+    >>> sealed_lines({name: SealedPlace(drawn_by=None, openings=[]) for name in ("porto", "monaco")})
     ['Sealed places porto, monaco: not opened, and so not on this board.']
     """
     places: dict[str, list[str]] = {}
-    for place, item in (about.get("sealed") or {}).items():
+    for place, item in sealed.items():
         places.setdefault(_sealed_state(item), []).append(place)
     return [
         f"Sealed place{'s' if len(names) > 1 else ''} {', '.join(names)}: {state}." for state, names in places.items()
     ]
 
 
-def _sealed_state(item: Mapping[str, Any]) -> str:
-    days = {
-        one["commitment"]: f"{one['opened']} by a seed of commitment {one['commitment'][:12]}"
-        for one in item["openings"]
-    }
+def _sealed_state(item: SealedPlace) -> str:
+    days = {one.commitment: f"{one.opened} by a seed of commitment {one.commitment[:12]}" for one in item.openings}
     if not days:
         return "not opened, and so not on this board"
     first = next(iter(days))
-    if item["drawn_by"] is None:
+    if item.drawn_by is None:
         return f"opened on {days[first]}, and not on this board"
-    if item["drawn_by"] == first:
+    if item.drawn_by == first:
         return f"opened on {days[first]}"
-    number = list(days).index(item["drawn_by"]) + 1
+    number = list(days).index(item.drawn_by) + 1
     return (
-        f"opened on {days[item['drawn_by']]}; this is opening {number}, after {days[first]}, so the place was no "
+        f"opened on {days[item.drawn_by]}; this is opening {number}, after {days[first]}, so the place was no "
         "longer unseen"
     )
 
 
 _VERSIONS: Final = {"scorer_version": SCORER_VERSION, "task_version": TASK_VERSION, "data_version": DATA_VERSION}
-_WHOSE: Final = ("version", "hash")
-_TASK: Final = ("suite", "region", "map_date")
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnPrivate:
     """Results of a private board for the rows of a public one; empty if the public one was not compared with it.
 
-    `seed` are commitment and bits, `rows` the entries of `board.json` by name of matcher.
+    `rows` are the results by name of entry.
     """
 
-    seed: Mapping[str, Any] | None = None
-    rows: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    seed: SeedRecord | None = None
+    rows: Mapping[str, SeedResult] = field(default_factory=dict)
 
     def how(self, entry: Entry) -> str:
         """Return how an entry's answers were made, and how they fared on the private seed, but of packed ones."""
         if entry.how == PACKED:
             return PACKED
-        return str(self.rows[entry.name]["verdict"]) if entry.name in self.rows else entry.how
+        return self.rows[entry.name].verdict if entry.name in self.rows else entry.how
 
 
-def seed_of(tasks: Sequence[TaskManifest]) -> dict[str, str | int] | None:
+def seed_of(tasks: Sequence[TaskManifest]) -> SeedRecord | None:
     """Return the commitment and bits of the private seed that tasks were drawn by; None for public tasks.
 
     Raise ConfigError if they are of several seeds, or some are public.
@@ -267,10 +255,10 @@ def seed_of(tasks: Sequence[TaskManifest]) -> dict[str, str | int] | None:
         raise ConfigError(
             "these tasks are drawn by several seeds, and one is private: draw them by one, and score those alone"
         )
-    return seeds[0] if seeds else None
+    return SeedRecord.model_validate(seeds[0]) if seeds and seeds[0] else None
 
 
-def check_public(seed: Mapping[str, Any] | None, what: str) -> None:
+def check_public(seed: SeedRecord | None, what: str) -> None:
     """Refuse to publish results of a private seed: once its queries or truths are known, it proves nothing.
 
     Raise ConfigError that names `what`.
@@ -288,96 +276,94 @@ def hold_private(
     entries: Sequence[Entry],
     scores: Mapping[str, pd.DataFrame],
     tasks: Sequence[TaskManifest],
-    pipeline: Mapping[str, str],
+    pipeline: PipelineRecord | None,
     draws: int,
     tell: Callable[[str], None],
 ) -> OnPrivate:
     """Compare the rows of a public board with a board of a private seed in `folder`.
 
-    `entries`, `scores`, `tasks` and `pipeline` (its id and hash) are those of the public
-    board. Report by `tell` which tasks the two boards do not share. Raise ConfigError if the folder holds no board of a
-    private seed, or one of another pipeline or version, or the public one is itself of a private seed. Raise StoreError
-    if it holds no sound board.
+    `entries`, `scores`, `tasks` and `pipeline` are those of the public board. Report by `tell` which tasks the two
+    boards do not share. Raise ConfigError if the folder holds no board of a private seed, or one of another pipeline or
+    version, or the public one is itself of a private seed. Raise StoreError if it holds no sound board.
     """
-    about = read_private(folder, pipeline)
+    about, seed = read_private(folder, pipeline)
     if seed_of(tasks) is not None:
         raise ConfigError(
             "the rows to be held against a private seed are of a private seed themselves: name a public board"
         )
-    asked = {(task.suite, task.region, str(task.map_date)) for task in tasks}
-    both = asked & {tuple(str(item.get(name)) for name in _TASK) for item in about["tasks"]}
+    asked = {(task.suite, task.region, task.map_date) for task in tasks}
+    both = asked & {(item.suite, item.region, item.map_date) for item in about.tasks}
     alone = len(tasks) - len(both)
     if alone:
         tell(f"{folder}: {counted(alone, 'task')} of this board {'is' if alone == 1 else 'are'} not on the private one")
-    named = {tuple(item[:2]) for item in both}
+    named = {item[:2] for item in both}
     theirs = read_scores(folder)
     theirs = theirs[_is_of(theirs, named)]
-    known = {_whose(entry["name"], entry): entry for entry in about["entries"]}
+    known = {_whose(entry): entry for entry in about.entries}
     rows = {}
     for entry in entries:
         if not entry.runs or entry.how == PACKED:
             continue
-        other = known.get(_whose(entry.name, {"version": entry.version, "hash": entry.hash}))
-        why = _lack(other, about[PRIVATE])
+        other = known.get(_whose(entry))
+        why = _lack(other, seed)
         if other is None or why:
-            rows[entry.name] = record_of(RUN_HERE, why)
+            rows[entry.name] = _result(RUN_HERE, why)
             continue
-        mine, frame = scores[entry.name], theirs[theirs["matcher"] == other["name"]]
-        figures = compare_seeds(mine[_is_of(mine, named)], frame, draws=draws)
-        rows[entry.name] = record_of(*verdict_of(figures), figures)
-    return OnPrivate(seed=about[PRIVATE], rows=rows)
+        mine, frame = scores[entry.name], theirs[theirs["matcher"] == other.name]
+        rows[entry.name] = result_of(compare_seeds(mine[_is_of(mine, named)], frame, draws=draws))
+    return OnPrivate(seed=seed, rows=rows)
 
 
-def read_private(folder: Path, pipeline: Mapping[str, str]) -> dict[str, Any]:
-    """Read the `board.json` of a private board that rows of a pipeline are compared with."""
-    about, _ = read_board(folder)
-    if not about.get(PRIVATE):
+def read_private(folder: Path, pipeline: PipelineRecord | None) -> tuple[BoardManifest, SeedRecord]:
+    """Read the manifest of a private board that rows of a pipeline are compared with, and the seed that drew it."""
+    about = read_board_manifest(folder)
+    if about.private_seed is None:
         raise ConfigError(f"{folder} is a board of a public seed: name one that 'leaderboard --seed-file' has made")
-    if not pipeline or about.get("pipeline") != dict(pipeline):
+    if pipeline is None or about.pipeline != pipeline:
         raise ConfigError(
             f"{folder} is of another pipeline file, or of other --matcher, than this board: run both with the same"
         )
-    stale = next((name for name, number in _VERSIONS.items() if about.get(name) != number), None)
+    stale = next((name for name, number in _VERSIONS.items() if getattr(about, name) != number), None)
     if stale is not None:
         raise ConfigError(
-            f"{folder} has {stale} {about.get(stale)}, this program {_VERSIONS[stale]}: run the seed again"
+            f"{folder} has {stale} {getattr(about, stale)}, this program {_VERSIONS[stale]}: run the seed again"
         )
-    return about
+    return about, about.private_seed
 
 
-def _is_of(scores: pd.DataFrame, named: set[tuple[str, ...]]) -> "pd.Series[bool]":
+def _is_of(scores: pd.DataFrame, named: set[tuple[str, str]]) -> "pd.Series[bool]":
     keys = zip(scores["suite"], scores["region"], strict=True)
     return pd.Series([key in named for key in keys], index=scores.index, dtype=bool)
 
 
-def _whose(name: str, entry: Mapping[str, Any]) -> tuple[str, ...]:
+def _whose(entry: Entry | BoardEntry) -> tuple[str, str | None, str | None]:
     """Return name, version, and hash of code and settings, which identify an entry on both boards."""
-    return (name_alone(name), *(str(entry.get(item)) for item in _WHOSE))
+    return (name_alone(entry.name), entry.version, entry.hash)
 
 
-def _lack(entry: Mapping[str, Any] | None, seed: Mapping[str, Any]) -> str:
+def _lack(entry: BoardEntry | None, seed: SeedRecord) -> str:
     """Return why a private board cannot confirm any row, or not this one; empty where it can."""
-    if seed["bits"] < REPRODUCING_BITS:
-        return f"the private seed has {seed['bits']} bits, {REPRODUCING_BITS} are needed"
+    if seed.bits < REPRODUCING_BITS:
+        return f"the private seed has {seed.bits} bits, {REPRODUCING_BITS} are needed"
     if entry is None:
         return "this version, code and settings are not on the private board"
-    isolation = entry.get("isolation") or {}
+    isolation = entry.isolation or {}
     if keeps_truth(isolation):
         return ""
     return f"on the private seed its truths were not kept from it ({isolation.get('truth', 'not protected')})"
 
 
-def kept_private(about: Mapping[str, Any], entries: Sequence[Entry], root: Path) -> OnPrivate:
+def kept_private(about: BoardManifest | None, entries: Sequence[Entry], root: Path) -> OnPrivate:
     """Return the results on a private seed that stored results keep, for entries whose answers all come from them.
 
-    `about` is the `board.json` of the stored results, `root` the folder that they are unpacked to.
+    `about` is the manifest of the stored results, if any, `root` the folder that they are unpacked to.
     """
-    if not about.get("private"):
+    if about is None or about.private is None:
         return OnPrivate()
-    known = {_whose(entry["name"], entry): entry.get("private") for entry in about["entries"]}
+    known = {_whose(entry): entry.private for entry in about.entries}
     rows = {}
     for entry in entries:
-        row = known.get(_whose(entry.name, {"version": entry.version, "hash": entry.hash}))
-        if entry.runs and row and all(source.is_relative_to(root) for source in entry.sources):
+        row = known.get(_whose(entry))
+        if entry.runs and row is not None and all(source.is_relative_to(root) for source in entry.sources):
             rows[entry.name] = row
-    return OnPrivate(seed=about["private"], rows=rows)
+    return OnPrivate(seed=about.private, rows=rows)

@@ -1,26 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board from its folder as data frames and figures: what a notebook reads."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Self
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.leaderboard import board_files
-from sasgeo_bench.leaderboard.board_files import ANSWERS, MEND, SCHEMAS, SCORES, TABLES
+from sasgeo_bench.leaderboard.board_files import (
+    LEADERBOARD,
+    MEND,
+    SCHEMAS,
+    TABLES,
+    read_board_manifest,
+    read_leaderboard,
+)
+from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.plot_tables import MOST_MATCHERS, ranked_matchers, risk_frame, shown_matchers
 from sasgeo_bench.leaderboard.plots import draw_risk
 from sasgeo_bench.leaderboard.pooled_plots import draw_contrasts, draw_tradeoff
 from sasgeo_bench.leaderboard.pooled_tables import price_frame
-from sasgeo_bench.scoring.rejection import OWN, own_confidence
+from sasgeo_bench.matching.matcher import RejectorCard
+from sasgeo_bench.scoring.rejection import OWN, RejectionResult, own_confidence
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
-from sasgeo_bench.scoring.rows import ALL_SUITES, LEADERBOARD_SCHEMA, is_unranked
+from sasgeo_bench.scoring.rows import ALL_SUITES, FIGURE_SCHEMA, is_unranked
+from sasgeo_bench.scoring.score import SCORER_VERSION
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.texts import html_facts
 
 
@@ -32,7 +43,7 @@ class StoredBoard:
     ----------
     folder : Path
         Where it was read.
-    about : mapping
+    about : BoardManifest
         Content of `board.json`: pipeline, versions, entries with their cards, tasks.
     leaderboard : DataFrame
         Every figure with its interval: a row for each matcher, rejector, suite, stratum and metric.
@@ -49,15 +60,43 @@ class StoredBoard:
     """
 
     folder: Path
-    about: Mapping[str, Any]
+    about: BoardManifest
     leaderboard: pd.DataFrame = field(repr=False)
-    scores: pd.DataFrame = field(repr=False)
-    contrasts: pd.DataFrame = field(repr=False)
-    controls: pd.DataFrame = field(repr=False)
-    falsifiers: pd.DataFrame = field(repr=False)
-    acceptance: pd.DataFrame = field(repr=False)
-    protection: pd.DataFrame = field(repr=False)
-    answers: pd.DataFrame = field(repr=False)
+    scores: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+    contrasts: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+    controls: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+    falsifiers: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+    acceptance: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+    protection: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+    answers: pd.DataFrame = field(repr=False, default_factory=pd.DataFrame)
+
+    @classmethod
+    def open(cls, folder: Path) -> Self:
+        """Read the manifest and every table of a board; raise `StoreError` if there is none, or one is damaged."""
+        about, leaderboard = read_board_manifest(folder), read_leaderboard(folder)
+        files = {name: folder / f"{name}.parquet" for name in TABLES}
+        tables = {name: read_frame(file, mend=MEND) for name, file in files.items() if file.is_file()}
+        for name, table in {LEADERBOARD: leaderboard, **tables}.items():
+            SCHEMAS[name].check(table)
+        return cls(folder=folder, about=about, leaderboard=leaderboard, **tables)
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return the registered contrasts as they were found."""
+        return tuple(CONTRAST_SCHEMA.rows(Finding, self.contrasts))
+
+    def joined(self, mine: RejectionResult) -> RejectionResult:
+        """Return results of rejectors with those of the board, by the names of entries as on one that is scored whole.
+
+        They depend on the answers of one entry alone. Ranks do not: a new entry changes them, and they are made anew.
+        """
+        rows = self.leaderboard.loc[self.leaderboard["rejector"] != "", list(FIGURE_SCHEMA.names)]
+        acceptance = [part for part in (self.acceptance, mine.acceptance) if len(part)]
+        return replace(
+            mine,
+            rows=[_by_name([rows, *mine.rows])],
+            acceptance=_by_name(acceptance) if acceptance else mine.acceptance,
+            remarks=(*self.about.remarks, *mine.remarks),
+        )
 
     def plot_tradeoff(self, suite: str | None = None, *, track: str = "localization") -> Figure:
         """Draw success with its 95 % interval against the median latency, a panel for each prior group.
@@ -111,18 +150,18 @@ class StoredBoard:
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows of a board."""
-        pipeline, entries, tasks = (self.about.get(name) or () for name in ("pipeline", "entries", "tasks"))
-        failed = [str(one.get("name")) for one in entries if one.get("failed_controls")]
+        about = self.about
+        failed = [one.name for one in about.entries if one.failed_controls]
         facts = {
-            "pipeline": dict(pipeline).get("id", "none"),
-            "entries": ", ".join(str(one.get("name")) for one in entries),
-            "suites": ", ".join(sorted({str(one.get("suite")) for one in tasks})),
-            "maps": len({str(one.get("region")) for one in tasks}),
+            "pipeline": "none" if about.pipeline is None else about.pipeline.id,
+            "entries": ", ".join(one.name for one in about.entries),
+            "suites": ", ".join(sorted({one.suite for one in about.tasks})),
+            "maps": len({one.region for one in about.tasks}),
             "scored": counted(len(self.scores), "answer"),
             "contrasts": len(self.contrasts),
             "failed controls": ", ".join(failed) or "none",
-            "scorer version": self.about.get("scorer_version"),
-            "data": self.about.get("attribution"),
+            "scorer version": about.scorer_version,
+            "data": about.attribution,
         }
         return html_facts(f"board {self.folder.name}", facts)
 
@@ -130,6 +169,27 @@ class StoredBoard:
 def _by_matcher(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return the scored rows of each matcher."""
     return {str(name): frame for name, frame in scores.groupby("matcher", sort=False)}
+
+
+def _by_name(parts: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    whole = pd.concat([part for part in parts if len(part)] or parts[:1], ignore_index=True)
+    return whole.iloc[np.argsort(whole["matcher"].to_numpy(str), kind="stable")].reset_index(drop=True)
+
+
+def why_anew(about: BoardManifest, cards: Sequence[RejectorCard]) -> str | None:
+    """Return why the figures of a stored board are no longer those of this program, None if they are.
+
+    `about` is its manifest, `cards` those of the rejectors here. The version of tasks does not matter:
+    answers are scored against the stored queries, whoever draws which others today.
+
+    >>> why_anew(BoardManifest(scorer_version=1, entries=[], tasks=[]), [])
+    'the board is of scorer version 1, this program of 6'
+    """
+    if about.scorer_version != SCORER_VERSION:
+        return f"the board is of scorer version {about.scorer_version}, this program of {SCORER_VERSION}"
+    stored, here = ({(str(one.name), str(one.version)) for one in some} for some in (about.rejectors, cards))
+    changed = sorted({name for name, _ in stored ^ here})  # another version fits otherwise
+    return f"the rejector {changed[0]} has another version here" if changed else None
 
 
 def read_board(path: str | Path) -> StoredBoard:
@@ -156,13 +216,4 @@ def read_board(path: str | Path) -> StoredBoard:
     >>> board.contrasts[["name", "difference", "lo", "hi", "verdict"]]  # doctest: +SKIP
     >>> board.plot_tradeoff().savefig("tradeoff.png")  # doctest: +SKIP
     """
-    folder = given_path(path)
-    about, leaderboard = board_files.read_board(folder)
-    tables = {}
-    for name in TABLES:
-        file = folder / f"{name}.parquet"
-        tables[name] = read_frame(file, mend=MEND) if file.is_file() else pd.DataFrame()
-        if name in (SCORES, "contrasts", ANSWERS):
-            SCHEMAS[name].check(tables[name])
-    LEADERBOARD_SCHEMA.check(leaderboard)
-    return StoredBoard(folder=folder, about=about, leaderboard=leaderboard, **tables)
+    return StoredBoard.open(given_path(path))

@@ -2,7 +2,7 @@
 """A leaderboard as Markdown, and as lines for a terminal; the parquet tables hold everything."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, Final
 
@@ -11,6 +11,7 @@ import pandas as pd
 from sasgeo_bench.errors import counted, named
 from sasgeo_bench.leaderboard.board_tables import Book, cost_table, sections_of
 from sasgeo_bench.leaderboard.columns import NOTE, RANKS_NOTE, TERMS
+from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
@@ -52,22 +53,25 @@ def warnings_of(board: pd.DataFrame) -> list[str]:
     return warnings
 
 
-def map_lines(about: Mapping[str, Any]) -> list[str]:
+def map_lines(about: BoardManifest) -> list[str]:
     """Return what is wrong with the maps of a board that an earlier data version read; empty if nothing is.
 
-    >>> tasks = [{"region": name, "map_date": "2014-11-04"} for name in ("bayreuth", "bayreuth+alias", "krems")]
-    >>> print(*map_lines({"data_version": 2, "tasks": tasks}))  # doctest: +NORMALIZE_WHITESPACE
+    >>> from sasgeo_bench.leaderboard.manifests import BoardTask
+    >>> maps = ("bayreuth", "bayreuth+alias", "krems")
+    >>> tasks = [BoardTask(suite="clean", region=name, map_date="2014-11-04") for name in maps]
+    >>> board = BoardManifest(scorer_version=6, data_version=2, entries=[], tasks=tasks)
+    >>> print(*map_lines(board))  # doctest: +NORMALIZE_WHITESPACE
     Old maps: its 2 maps of before 2017 were read with old-style multipolygons as areas of their outer ways (yards and
     clearings filled, areas of several open ways missing); maps of data version 3 and later have them right.
-    >>> map_lines({"data_version": 3, "tasks": tasks})
+    >>> map_lines(board.model_copy(update={"data_version": 3}))
     []
     """
-    if (about.get("data_version") or DATA_VERSION) >= OLD_STYLE_DATA_VERSION:
+    if (about.data_version or DATA_VERSION) >= OLD_STYLE_DATA_VERSION:
         return []
     old = {
-        str(task["region"]).split("+")[0]
-        for task in about.get("tasks", ())
-        if (task.get("map_date") or _NEW_STYLE) < _NEW_STYLE and not str(task["region"]).startswith(MADE_UP)
+        task.region.split("+")[0]
+        for task in about.tasks
+        if (task.map_date or _NEW_STYLE) < _NEW_STYLE and not task.region.startswith(MADE_UP)
     }
     if not old:
         return []
@@ -115,39 +119,42 @@ def _held_lines(verdicts: Sequence[Verdict]) -> list[str]:
     return [f"{head} Do not trust the rows of {', '.join(rivals)}{more}:", *lines]
 
 
-def training_lines(about: Mapping[str, Any]) -> list[str]:
+def training_lines(about: BoardManifest) -> list[str]:
     """Return which rows are set apart, and which entries were trained on which places.
 
-    >>> record = {"file": "learned/ab.json", "trained_on": ["monaco", "porto"], "pairs": 24, "asked": ["clean/vaduz"]}
-    >>> training_lines({"entries": [{"name": "mine", "learned": [record]}]})
+    >>> from sasgeo_bench.leaderboard.manifests import Learned
+    >>> one = Learned(file="learned/ab.json", trained_on=["monaco", "porto"], pairs=24, asked=["clean/vaduz"])
+    >>> mine = BoardEntry(name="mine", learned=[one])
+    >>> training_lines(BoardManifest(scorer_version=6, entries=[mine], tasks=[]))
     ['mine: for 1 task (clean/vaduz) trained on 24 queries of 2 places (monaco, porto).']
     """
     set_apart = [
-        f"{entry['name']} is set apart: {entry['set_apart']}. It has no rank; its figures stand in other tables."
-        for entry in about.get("entries", ())
-        if entry.get("set_apart")
+        f"{entry.name} is set apart: {entry.set_apart}. It has no rank; its figures stand in other tables."
+        for entry in about.entries
+        if entry.set_apart
     ]
     return set_apart + [
-        f"{entry['name']}: for {named(one['asked'], 'task')} {'trained on' if one['file'] else 'could not train on'} "
-        f"{counted(one['pairs'], 'query', 'queries')} of {named(one['trained_on'], 'place')}."
-        for entry in about.get("entries", ())
-        for one in entry.get("learned", ())
+        f"{entry.name}: for {named(one.asked, 'task')} {'trained on' if one.file else 'could not train on'} "
+        f"{counted(one.pairs, 'query', 'queries')} of {named(one.trained_on, 'place')}."
+        for entry in about.entries
+        for one in entry.learned
     ]
 
 
-def segmenter_lines(about: Mapping[str, Any]) -> list[str]:
+def segmenter_lines(about: BoardManifest) -> list[str]:
     """Return at how many pictures segmenters failed, suite by suite.
 
-    >>> tasks = [{"suite": "aerial+mine", "region": name, "failed_pictures": 2} for name in ("monaco", "vaduz")]
-    >>> segmenter_lines({"tasks": tasks})
+    >>> from sasgeo_bench.leaderboard.manifests import BoardTask
+    >>> tasks = [BoardTask(suite="aerial+mine", region=name, failed_pictures=2) for name in ("monaco", "vaduz")]
+    >>> segmenter_lines(BoardManifest(scorer_version=6, entries=[], tasks=tasks))
     ['aerial+mine: the segmenter failed at 4 pictures of 2 tasks (monaco, vaduz), whose evidence is unknown.']
     """
     regions: dict[str, list[str]] = {}
     counts: Counter[str] = Counter()
-    for task in about.get("tasks", ()):
-        if failed := task.get("failed_pictures"):
-            regions.setdefault(task["suite"], []).append(task["region"])
-            counts[task["suite"]] += failed
+    for task in about.tasks:
+        if task.failed_pictures:
+            regions.setdefault(task.suite, []).append(task.region)
+            counts[task.suite] += task.failed_pictures
     return [
         f"{suite}: the segmenter failed at {counted(counts[suite], 'picture')} of {named(names, 'task')}, whose "
         "evidence is unknown."
@@ -157,7 +164,7 @@ def segmenter_lines(about: Mapping[str, Any]) -> list[str]:
 
 def tables_of(
     board: pd.DataFrame,
-    about: Mapping[str, Any],
+    entries: Sequence[BoardEntry] = (),
     findings: Sequence[Finding] = (),
     falsifiers: Sequence[Falsifier] = (),
     verdicts: Sequence[Verdict] = (),
@@ -165,9 +172,9 @@ def tables_of(
 ) -> Iterator[Table]:
     """Yield the tables of a board in the order of its pages; those without a row are left out.
 
-    `about` is the content of `board.json`; `others` are the tables of absence and of steps.
+    `others` are the tables of absence and of steps.
     """
-    book = Book.of(board, about)
+    book = Book.of(board, entries)
     suites = [
         table
         for section in sections_of(book)
@@ -177,7 +184,7 @@ def tables_of(
         )
     ]
     found = (
-        seed_table(about),
+        seed_table(entries),
         contrast_table(findings),
         falsifier_table(falsifiers),
         *suites,
@@ -189,27 +196,27 @@ def tables_of(
     yield from (table for table in found if table is not None and table.rows)
 
 
-def board_markdown(board: pd.DataFrame, about: Mapping[str, Any], **more: Any) -> str:  # noqa: ANN401 - see tables_of
+def board_markdown(board: pd.DataFrame, about: BoardManifest, **more: Any) -> str:  # noqa: ANN401 - see tables_of
     """Return the board as a document; arguments as of `tables_of`."""
-    tables = list(tables_of(board, about, **more))
+    tables = list(tables_of(board, about.entries, **more))
     lines = [
         *control_lines(more.get("verdicts", ())),
         *seed_lines(about),
-        *sealed_lines(about),
+        *sealed_lines(about.sealed),
         *map_lines(about),
         *warnings_of(board),
         *training_lines(about),
         *segmenter_lines(about),
-        *(f"Failed, and not on this board: {name}: {why}" for name, why in about.get("failed", {}).items()),
+        *(f"Failed, and not on this board: {name}: {why}" for name, why in about.failed.items()),
     ]
     columns = {column.term: column.meaning for table in tables for column in table.columns}
     return "\n".join(
         (
-            f"# Board: scorer version {about['scorer_version']}, task version {about['task_version']}",
+            f"# Board: scorer version {about.scorer_version}, task version {about.task_version}",
             "",
-            f"Made by {markdown(about['made_by'])}. Split: {markdown(about['split'] or 'none')}. Data: {ATTRIBUTION}.",
+            f"Made by {markdown(about.made_by or '?')}. Split: {markdown(about.split or 'none')}. Data: {ATTRIBUTION}.",
             "",
-            f"{NOTE.format(draws=about['draws'])} {RANKS_NOTE}",
+            f"{NOTE.format(draws=about.draws)} {RANKS_NOTE}",
             "",
             *(f"- {markdown_item(line)}" for line in lines),
             "",
@@ -253,10 +260,10 @@ _HEAD: Final = (
 )
 
 
-def board_latex(board: pd.DataFrame, about: Mapping[str, Any], **more: Any) -> str:  # noqa: ANN401 - see tables_of
+def board_latex(board: pd.DataFrame, about: BoardManifest, **more: Any) -> str:  # noqa: ANN401 - see tables_of
     """Return the tables of a board for a paper, which needs the package booktabs; arguments as of `text.tables_of`."""
-    head = f"% {tex(about['made_by'])}, scorer version {about['scorer_version']}; {ATTRIBUTION}"
-    tables = tables_of(board, about, **more)
+    head = f"% {tex(about.made_by or '?')}, scorer version {about.scorer_version}; {ATTRIBUTION}"
+    tables = tables_of(board, about.entries, **more)
     return "\n".join((head, *_HEAD, *(line for table in tables for line in _lines(table)))) + "\n"
 
 

@@ -2,13 +2,14 @@
 """Tables of what a board can be trusted for: contrasts, falsifiers, controls, public and private seed."""
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Final
 
 import pandas as pd
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.columns import column, words
+from sasgeo_bench.leaderboard.manifests import BoardEntry
 from sasgeo_bench.leaderboard.private_board import SEEDS_NOTE
 from sasgeo_bench.leaderboard.tables import (
     Cell,
@@ -39,7 +40,7 @@ _FALSIFIERS_NOTE: Final = (
 )
 
 
-def seed_table(about: Mapping[str, Any]) -> Table | None:
+def seed_table(entries: Sequence[BoardEntry]) -> Table | None:
     """Return figures on the public and on a private seed: of all suites, and whatever is shown to be worse.
 
     None where no row was compared with a private seed.
@@ -47,21 +48,21 @@ def seed_table(about: Mapping[str, Any]) -> Table | None:
     rows = [
         Row(
             cells=text_cells(
-                entry["name"],
-                item["suite"],
-                item["track"],
-                item["metric"],
-                number_text(item["public"]),
-                number_text(item["private"]),
-                interval_text(item["difference"], item["lo"], item["hi"]),
-                f"{item['n_public']} and {item['n_private']}",
-                f"{item['blocks_public']} and {item['blocks_private']}, {item['blocks_shared']} in both",
-                "worse" if item["is_worse"] else "not shown to be worse",
+                entry.name,
+                item.suite,
+                item.track,
+                item.metric,
+                number_text(item.public),
+                number_text(item.private),
+                interval_text(item.difference, item.lo, item.hi),
+                f"{item.n_public} and {item.n_private}",
+                f"{item.blocks_public} and {item.blocks_private}, {item.blocks_shared} in both",
+                "worse" if item.is_worse else "not shown to be worse",
             )
         )
-        for entry in about.get("entries", ())
-        for item in (entry.get("private") or {}).get("figures", ())
-        if item["suite"] == ALL_SUITES or item["is_worse"]
+        for entry in entries
+        for item in (() if entry.private is None else entry.private.figures)
+        if item.suite == ALL_SUITES or item.is_worse
     ]
     if not rows:
         return None

@@ -1,35 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
 """A board with all it was made of -> stored results, and stored results -> what a board is made of."""
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.plugins import check_registered
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
-from sasgeo_bench.leaderboard.board_files import BOARD, read_board
+from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.manifests import PackManifest
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
 from sasgeo_bench.progress import Progress, Tell
 from sasgeo_bench.publishing.archive_file import (
     MOST_BYTES,
+    SCHEMA_VERSION,
     Packed,
     StoredRun,
+    check_results,
+    is_pack,
+    read_pack,
     unpack,
     unpack_tasks,
     write_pack,
 )
-from sasgeo_bench.publishing.archive_folder import check_results, is_pack, read_settings
 from sasgeo_bench.publishing.elsewhere import asked_elsewhere
-from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.tasks.split import find_split
 from sasgeo_bench.tasks.task_files import Task
@@ -76,7 +78,7 @@ def pack_board(
         board=request.board,
         tasks=tasks,
         runs=runs,
-        settings=_settings_of(request),
+        settings=_settings_of(request, list(runs)),
         lacks=lacks,
         most_bytes=most_bytes,
     )
@@ -95,33 +97,26 @@ def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[
         )
 
 
-def _settings_of(request: ScoreRequest) -> dict[str, Any]:
-    return {
-        "split": None if request.split is None else request.split.spec.id,
-        "rejectors": list(request.rejectors),
-        "contrasts": [asdict(item) for item in request.contrasts],
-        "draws": request.draws,
-        "by_region": sorted(request.by_region),
-        "by_block": sorted(request.by_block),
-        "pipeline": dict(request.pipeline),
-    }
+def _settings_of(request: ScoreRequest, contestants: Sequence[str]) -> PackManifest:
+    return PackManifest(
+        schema_version=SCHEMA_VERSION,
+        split=None if request.split is None else request.split.spec.id,
+        rejectors=list(request.rejectors),
+        contrasts=list(request.contrasts),
+        draws=request.draws,
+        by_region=sorted(request.by_region),
+        by_block=sorted(request.by_block),
+        pipeline=request.pipeline,
+        contestants=list(contestants),
+        dropped="",
+        licence=LICENCE,
+        attribution=ATTRIBUTION,
+        files=None,
+    )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Settings:
-    """Settings that stored results were scored with; the defaults without any."""
-
-    split: str | None = None
-    rejectors: Sequence[str] = ()
-    contrasts: Sequence[Contrast] = ()
-    draws: int = DRAWS
-    by_region: Collection[str] = ()
-    by_block: Collection[str] = ()
-    pipeline: Mapping[str, str] = field(default_factory=dict)
-
-
-def stored_settings(predictions: Sequence[Path]) -> Settings:
-    """Read the settings of the stored results among some predictions, defaults if there are none.
+def stored_settings(predictions: Sequence[Path]) -> PackManifest | None:
+    """Read how the stored results among some predictions were scored; None if there are none.
 
     Raise `ConfigError` if there are two stored results, whose tasks may differ, and `StoreError` if they are damaged.
     """
@@ -130,16 +125,7 @@ def stored_settings(predictions: Sequence[Path]) -> Settings:
         raise ConfigError(
             f"{stored[0]} and {stored[1]} are both stored results: name one, and runs and files of your own"
         )
-    if not stored:
-        return Settings()
-    record = read_settings(stored[0])
-    names = ("split", "rejectors", "draws", "by_region", "by_block", "pipeline")
-    return Settings(**{name: record[name] for name in names}, contrasts=tuple(map(contrast_of, record["contrasts"])))
-
-
-def contrast_of(record: Mapping[str, Any]) -> Contrast:
-    """Return a registered contrast from its record in a file."""
-    return Contrast(**{**record, **{name: tuple(record.get(name, ())) for name in ("suites", "kinds", "detectors")}})
+    return read_pack(stored[0]) if stored else None
 
 
 def request_of(
@@ -162,12 +148,15 @@ def request_of(
     'crossfit'
     """
     settings, stored = stored_settings(predictions), stored_among(predictions)
+    if settings is None or stored is None:
+        chosen = find_split(split or "crossfit", folders=folders)
+        return ScoreRequest(predictions=predictions, root=root, split=chosen, rejectors=rejectors, board=board)
     if not rejectors:
         check_registered(settings.rejectors, source=str(stored))
-    name = split or settings.split or (None if stored else "crossfit")
+    name = split or settings.split
     failed: dict[str, str] = {}  # contrasts may name entries that failed when results were stored
-    if stored is not None and (stored / BOARD).is_file():
-        failed = dict(read_board(stored)[0].get("failed", {}))
+    if (stored / BOARD).is_file():
+        failed = read_board_manifest(stored).failed
     return ScoreRequest(
         predictions=predictions,
         root=root,
@@ -180,7 +169,7 @@ def request_of(
         by_block=settings.by_block,
         pipeline=settings.pipeline,
         failed=failed,
-        elsewhere=() if stored is None else asked_elsewhere(stored),
+        elsewhere=asked_elsewhere(stored),
     )
 
 
@@ -213,11 +202,11 @@ def score_all(
             has_cases=has_cases,
             jobs=request.jobs,
         )
-        record = {} if kept is None else read_board(kept)[0]
+        manifest = None if kept is None else read_board_manifest(kept)
         extras = (figures, pictures) if request.stored is None else ()  # which need what was fitted for every entry
-        board = make_board(replace(laid, extras=extras, kept=record), tell=tell, progress=progress)
+        board = make_board(replace(laid, extras=extras, kept=manifest), tell=tell, progress=progress)
         if results is not None:
-            lacks = "" if kept is None else str(read_settings(kept)["dropped"])
+            lacks = "" if kept is None else read_pack(kept).dropped
             tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())
         return board
 
@@ -295,4 +284,5 @@ def board_of(paths: Sequence[Path]) -> str:
 
     Raise as `stored_settings` does.
     """
-    return str(stored_settings(paths).pipeline.get("id", ""))
+    settings = stored_settings(paths)
+    return "" if settings is None or settings.pipeline is None else settings.pipeline.id

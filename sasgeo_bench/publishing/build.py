@@ -3,12 +3,12 @@
 
 import os
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pandas as pd
 
@@ -17,20 +17,18 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import SITE, absolute, resolve_link
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.leaderboard.board_files import (
-    ANSWERS,
     BOARD_FILES,
     FIGURES,
-    LEADERBOARD,
-    SCHEMAS,
-    SCORES,
     csv_text,
-    read_board,
+    read_leaderboard,
 )
+from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
+from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.progress import Progress, Tell
-from sasgeo_bench.publishing.archive import contrast_of, request_of, score_all
-from sasgeo_bench.publishing.archive_folder import is_pack
+from sasgeo_bench.publishing.archive import request_of, score_all
+from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.publishing.site import site_pages
 from sasgeo_bench.publishing.site_files import (
     MOST_BYTES,
@@ -45,11 +43,7 @@ from sasgeo_bench.publishing.site_files import (
 from sasgeo_bench.publishing.site_pages import places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
 from sasgeo_bench.publishing.site_source import (
-    Case,
     Download,
-    Picture,
-    Pictures,
-    RegionMap,
     SiteFigure,
     SiteSource,
     Spot,
@@ -61,7 +55,6 @@ from sasgeo_bench.scoring.scenes import scene_frame
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import GROUP
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
-from sasgeo_bench.tasks.task_files import PRIVATE
 from sasgeo_bench.texts import one_line
 
 _MAP: Final = "places.svg"
@@ -97,12 +90,11 @@ def publish(
             f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
         )
     with held(board, target, root=root, tell=tell), _with_figures(board, root, jobs, tell, progress) as folder:
-        files = read_board_files(folder)
-        check_public(files.about.get(PRIVATE), str(board))
         with _sound(board):
-            for name, table in {LEADERBOARD: files.board, **files.tables}.items():
-                SCHEMAS[name].check(table)
-            scenes = _scenes(files)
+            files = read_board_files(folder)
+        check_public(files.board.about.private_seed, str(board))
+        with _sound(board):
+            scenes = _scenes(files.board)
             files = replace(files, downloads=(*files.downloads, *_scenes_file(scenes)))
             source = replace(_source(files, tell), scenes=scenes)
             pages = site_pages(source)
@@ -112,7 +104,7 @@ def publish(
                 files,
                 pages=pages,
                 figures=filter(None, (*source.figures, source.rates_figure, source.map_figure)),
-                about={"board": source.name, "made_by": files.about.get("made_by")},
+                name=source.name,
             )
     if written.site_bytes > MOST_BYTES:
         tell(f"the site is larger than {MOST_BYTES / 1e6:g} MB without pictures and downloads: slow to open from afar")
@@ -130,7 +122,7 @@ def _with_figures(board: Path, root: Path, jobs: int, tell: Tell, progress: Prog
         folder = scratch / board.resolve().name
         request = replace(request_of([board], board=folder, root=root), jobs=jobs)
         score_all(request, tell=tell, progress=progress)
-        if not read_board(folder)[1].equals(read_board(board)[1]):
+        if not read_leaderboard(folder).equals(read_leaderboard(board)):
             tell(f"the site shows the tables of this version, which differ from those in {board}: store them anew")
         for name in BOARD_FILES:  # those of the paper's experiment are made where it is run
             if (board / name).is_file() and not (folder / name).exists():
@@ -154,38 +146,29 @@ def _sound(board: Path) -> Iterator[None]:
 
 def _source(files: BoardFiles, tell: Tell) -> SiteSource:
     """Return the content of all pages, with figures of places and rates drawn for them."""
-    about, name = files.about, _name_of(files)
-    spec = _pipeline_of(about)
-    spots, parts = _spots(), _parts(about)
-    lost = [region for region in regions_of(about) if region not in spots]
+    about, name = files.board.about, _name_of(files.board)
+    spec = _pipeline_of(about.pipeline)
+    spots, parts = _spots(), _parts(about.split)
+    lost = [region for region in regions_of(about.tasks) if region not in spots]
     if lost:
         tell(f"not on the map of places, for no region of that name ships: {', '.join(lost)}")
-    places = places_on_map(about, spots, parts)
+    places = places_on_map(about.tasks, spots, parts)
     book = load_ratebook()
     drawing: dict[str, Callable[[Path], None]] = {_RATES: partial(draw_rates, book=book)}
     if places:
         drawing[_MAP] = partial(draw_places, places=places)
     with scratch_folder("figures") as folder:
         drawn = {file: SiteFigure.of(file, draw_text(draw, folder)) for file, draw in drawing.items()}
-    tables = files.tables
     return SiteSource(
         name=name,
-        title=name if spec is None else spec.title,
-        about=about,
+        title=about.title or (name if spec is None else spec.title),
         board=files.board,
         rates=book,
-        contrasts=tables["contrasts"],
-        falsifiers=tables["falsifiers"],
-        controls=tables["controls"],
-        scores=tables["scores"],
-        protection=tables["protection"],
-        acceptance=tables["acceptance"],
-        answers=tables[ANSWERS],
         registered=_registered(files, spec),
         reasons={} if spec is None else {item.name: " ".join(item.why.split()) for item in spec.contrast},
         figures=files.figures,
         downloads=files.downloads,
-        pictures=_pictures(files.pictures),
+        pictures=files.pictures,
         spots=spots,
         parts=parts,
         rates_figure=drawn[_RATES],
@@ -193,14 +176,14 @@ def _source(files: BoardFiles, tell: Tell) -> SiteSource:
     )
 
 
-def _scenes(files: BoardFiles) -> pd.DataFrame:
+def _scenes(board: StoredBoard) -> pd.DataFrame:
     """Return success by kind of place from the board's own scored rows; empty where these do not tell."""
-    scores = files.tables[SCORES]
+    scores = board.scores
     if not set(SCORED) <= set(scores):
         return pd.DataFrame()
-    apart = {str(entry["name"]) for entry in files.about.get("entries", ()) if entry.get("set_apart")}
+    apart = {entry.name for entry in board.about.entries if entry.set_apart}
     by_matcher = {str(name): rows for name, rows in scores.groupby("matcher", sort=False)}
-    return scene_frame(by_matcher, draws=int(files.about.get("draws", DRAWS)), excluded=apart)
+    return scene_frame(by_matcher, draws=board.about.draws or DRAWS, excluded=apart)
 
 
 def _scenes_file(scenes: pd.DataFrame) -> Iterator[Download]:
@@ -210,34 +193,29 @@ def _scenes_file(scenes: pd.DataFrame) -> Iterator[Download]:
         yield Download(file="kinds-of-place.csv", data=csv_text(table).encode(), what=what)
 
 
-def _name_of(files: BoardFiles) -> str:
-    pipeline = files.about.get("pipeline")
-    return str(pipeline["id"]) if pipeline else files.folder.resolve().name
+def _name_of(board: StoredBoard) -> str:
+    pipeline = board.about.pipeline
+    return pipeline.id if pipeline is not None else board.folder.resolve().name
 
 
-def _pipeline_of(about: Mapping[str, Any]) -> PipelineFile | None:
+def _pipeline_of(pipeline: PipelineRecord | None) -> PipelineFile | None:
     """Return the shipped pipeline that a board was made by; None for any other, even of the same name."""
-    pipeline = about.get("pipeline")
-    if not pipeline:
+    if pipeline is None:
         return None
     try:
-        spec = read_pipeline_file(find_pipeline_file(str(pipeline["id"])))
+        spec = read_pipeline_file(find_pipeline_file(pipeline.id))
     except ConfigError:
         return None
-    return spec if spec.sha256 == pipeline["sha256"] else None
+    return spec if spec.sha256 == pipeline.sha256 else None
 
 
 def _registered(files: BoardFiles, spec: PipelineFile | None) -> tuple[Contrast, ...]:
     """Return contrasts as registered: from the board, its stored settings, or its pipeline."""
-    records = files.about.get("contrasts") or files.settings.get("contrasts")
-    if records is None:
-        records = [] if spec is None else [item.model_dump(exclude={"why"}) for item in spec.contrast]
-    try:
-        return tuple(map(contrast_of, records))
-    except (KeyError, TypeError) as error:
-        raise StoreError(
-            f"{files.folder} does not state which contrasts were registered ({error!r}): score again"
-        ) from error
+    if files.board.about.contrasts:
+        return tuple(files.board.about.contrasts)
+    if files.settings is not None:
+        return tuple(files.settings.contrasts)
+    return () if spec is None else tuple(item.registered for item in spec.contrast)
 
 
 def _spots() -> dict[str, Spot]:
@@ -257,38 +235,10 @@ def _spots() -> dict[str, Spot]:
     return found
 
 
-def _parts(about: Mapping[str, Any]) -> dict[str, tuple[str, str]]:
+def _parts(split: str | None) -> dict[str, tuple[str, str]]:
     """Return, by region of a shipped split, its place and its half or part; nothing for another split."""
     try:
-        spec = read_split_file(find_split_file(str(about.get("split") or "")))
+        spec = read_split_file(find_split_file(split or ""))
     except ConfigError:
         return {}
     return {region: (place.name, place.half or place.part or "") for place in spec.place for region in place.region_ids}
-
-
-def _pictures(record: Mapping[str, Any]) -> Pictures:
-    def plain(item: Mapping[str, Any], *names: str) -> dict[str, str]:
-        """Return some fields of a picture as text, empty where it has none."""
-        return {name: str(item.get(name, "")) for name in names}
-
-    of_kind = {
-        kind: tuple(Picture(of=str(item.get(what, "")), **plain(item, "file", "alt")) for item in record.get(kind, ()))
-        for kind, what in (("suites", "suite"), ("strips", "suite"), ("flights", "suite"))
-    }
-    regions = tuple(
-        RegionMap(
-            of=str(item.get("region", "")),
-            **plain(item, "file", "alt"),
-            bounds_m=item.get("bounds_m") and tuple(item["bounds_m"]),
-            blocks_m={str(block["name"]): tuple(block["bounds_m"]) for block in item.get("blocks", ())},
-        )
-        for item in record.get("regions", ())
-    )
-    cases = tuple(
-        Case(
-            **plain(item, "query_id", "matcher", "failure", "file", "alt", "suite", "region", "kind"),
-            facts={str(name): str(value) for name, value in dict(item.get("said") or {}).items()},
-        )
-        for item in record.get("cases", ())
-    )
-    return Pictures(**of_kind, regions=regions, cases=cases)

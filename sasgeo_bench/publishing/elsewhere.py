@@ -1,19 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Who answered the very same queries on another stored board: a good row here may be a poor one there."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.files.parquet import read_table
-from sasgeo_bench.leaderboard.archive_record import ElsewhereRecord
-from sasgeo_bench.leaderboard.board_files import MEND, read_board
+from sasgeo_bench.leaderboard.board_files import MEND, read_board_manifest, read_leaderboard
 from sasgeo_bench.leaderboard.board_tables import Book
 from sasgeo_bench.leaderboard.columns import column
+from sasgeo_bench.leaderboard.manifests import Elsewhere, ElsewhereRow
 from sasgeo_bench.leaderboard.tables import Cell, Key, Row, Table, figure_cell, file_stem, interval_text
-from sasgeo_bench.publishing.archive_folder import is_pack
+from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.scoring.metrics import primary_of
 
 _MOST: Final = 7  # rows of one board
@@ -21,14 +21,14 @@ _ASKED: Final = ("suite", "track", "prior_group", "asked_sha256")
 _QUERIES: Final = "queries.parquet"
 
 
-def asked_elsewhere(stored: Path) -> tuple[dict[str, Any], ...]:
+def asked_elsewhere(stored: Path) -> tuple[Elsewhere, ...]:
     """Return the best rows of the stored boards beside one that asked the same queries, for its `board.json`.
 
     The hashes of all queries of a suite, track and prior group must be equal. Controls, entries that are set apart and
     those that the board itself has are left out, and so is a board that cannot be read.
     """
     mine, own = _asked(stored), _book(stored)
-    found: list[dict[str, Any]] = []
+    found: list[Elsewhere] = []
     for other in sorted(stored.resolve().parent.glob("*")):
         if is_pack(other) and other != stored.resolve():
             with suppress(SasgeoError, KeyError, TypeError, ValueError):
@@ -48,45 +48,45 @@ def _asked(stored: Path) -> dict[Key, frozenset[str]]:
 
 
 def _book(stored: Path) -> Book:
-    about, table = read_board(stored)
-    return Book.of(table, about)
+    return Book.of(read_leaderboard(stored), read_board_manifest(stored).entries)
 
 
-def _best(board: str, book: Book, keys: Sequence[Key], own: Book) -> Iterator[dict[str, Any]]:
+def _best(board: str, book: Book, keys: Sequence[Key], own: Book) -> Iterator[Elsewhere]:
     for key in keys:
-        metric = primary_of(key[1]).name
+        suite, track, prior_group = key
+        metric = primary_of(track).name
         names = {*book.matchers.get(key, ())} - {*own.matchers.get(key, ())} - book.controls
         rows = [(name, book.main(key, name, metric)) for name in sorted(names) if not book.is_set_apart(name)]
         known = [(name, row) for name, row in rows if row is not None and row["is_applicable"]]
         known.sort(key=lambda item: (-float(item[1]["value"]), item[0]))
         best = [
-            {"matcher": name, "n": int(row["n"]), **{part: float(row[part]) for part in ("value", "lo", "hi")}}
+            ElsewhereRow(
+                matcher=name, n=int(row["n"]), value=float(row["value"]), lo=float(row["lo"]), hi=float(row["hi"])
+            )
             for name, row in known[:_MOST]
         ]
         if best:
-            kept = dict(zip(("suite", "track", "prior_group"), key, strict=True))
-            yield {"board": board, **kept, "metric": metric, "rows": best}
+            yield Elsewhere(board=board, suite=suite, track=track, prior_group=prior_group, metric=metric, rows=best)
 
 
-def elsewhere_lines(about: Mapping[str, Any]) -> Iterator[str]:
+def elsewhere_lines(found: Sequence[Elsewhere]) -> Iterator[str]:
     """Yield a line for each table of a board whose queries another board asked, too.
 
-    >>> row = {"matcher": "graph", "n": 155, "value": 0.81, "lo": 0.7, "hi": 0.9}
-    >>> one = {"board": "systems", "suite": "clean", "track": "localization", "prior_group": "r500-weak-s3"}
-    >>> for line in elsewhere_lines({"elsewhere": [{**one, "metric": "success_25m", "rows": [row]}]}):
-    ...     print(line)
+    >>> row = ElsewhereRow(matcher="graph", n=155, value=0.81, lo=0.7, hi=0.9)
+    >>> key = {"suite": "clean", "track": "localization", "prior_group": "r500-weak-s3"}
+    >>> print(*elsewhere_lines([Elsewhere(board="systems", **key, metric="success_25m", rows=[row])]))
     clean, localization: the same 155 queries on the board systems, success_25m: graph 0.810 [0.700, 0.900]
     """
-    for item in _records(about):
+    for item in found:
         rows = ", ".join(f"{row.matcher} {interval_text(row.value, row.lo, row.hi)}" for row in item.rows)
         where = f"the same {item.rows[0].n} queries on the board {item.board}, {item.metric}"
         yield f"{item.suite}, {item.track}: {where}: {rows}"
 
 
-def elsewhere_tables(about: Mapping[str, Any]) -> dict[Key, tuple[Table, ...]]:
+def elsewhere_tables(listed: Sequence[Elsewhere]) -> dict[Key, tuple[Table, ...]]:
     """Return the same as tables, by suite, track and prior group."""
     found: dict[Key, tuple[Table, ...]] = {}
-    for item in _records(about):
+    for item in listed:
         key = (item.suite, item.track, item.prior_group)
         more = {"unit": "1", "interval": "", "is_applicable": True}
         cells = [(Cell(text=row.matcher), figure_cell({**row.model_dump(), **more})) for row in item.rows]
@@ -98,7 +98,3 @@ def elsewhere_tables(about: Mapping[str, Any]) -> dict[Key, tuple[Table, ...]]:
         )
         found[key] = (*found.get(key, ()), table)
     return found
-
-
-def _records(about: Mapping[str, Any]) -> list[ElsewhereRecord]:
-    return [ElsewhereRecord.model_validate(item) for item in about.get("elsewhere", ())]

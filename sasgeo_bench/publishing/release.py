@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.leaderboard.private_board import check_public
+from sasgeo_bench.leaderboard.private_board import check_public, seed_of
 from sasgeo_bench.progress import Tell
 from sasgeo_bench.publishing.dataset_card import CARD, DATASHEET, card_text, datasheet_text
 from sasgeo_bench.publishing.release_files import (
@@ -239,7 +239,7 @@ def _map(folder: Path) -> ReleaseMap:
 
 def _check_task(task: Task, manifest: Manifest, split: SplitFile) -> None:
     about = task.manifest
-    check_public(about.private_seed, str(task.folder))
+    check_public(seed_of([about]), str(task.folder))
     if not about.is_of_map(manifest):
         raise StoreError(built_anew(about.region))
     if about.split != split.id and about.suite != CONTROLS:  # controls of every board have a split of theirs

@@ -17,6 +17,7 @@ from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of
 from sasgeo_bench.leaderboard.cases import MEANINGS as FAILURE_MEANINGS
 from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE, column, suite_card
+from sasgeo_bench.leaderboard.manifests import FailedCase
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
 from sasgeo_bench.leaderboard.rejection_tables import (
@@ -41,7 +42,7 @@ from sasgeo_bench.publishing.site_pages import (
     region_table,
     suites_of,
 )
-from sasgeo_bench.publishing.site_source import Case, SiteSource
+from sasgeo_bench.publishing.site_source import SiteSource
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.verdicts import LOWER
@@ -82,7 +83,7 @@ class ContrastSummary:
 
 def contrasts_of(source: SiteSource) -> tuple[ContrastSummary, ...]:
     """Return registered contrasts, decided ones first."""
-    records = [{str(name): value for name, value in row.items()} for row in source.contrasts.to_dict("records")]
+    records = [{str(name): value for name, value in row.items()} for row in source.board.contrasts.to_dict("records")]
     ends = [abs(float(row[name])) for row in records for name in ("lo", "hi", "difference")]
     reach = max((end for end in ends if math.isfinite(end)), default=1.0) or 1.0
     found = [_summary(row, source, reach) for row in records]
@@ -91,7 +92,7 @@ def contrasts_of(source: SiteSource) -> tuple[ContrastSummary, ...]:
 
 def _summary(row: Record, source: SiteSource, reach: float) -> ContrastSummary:
     verdict, name = str(row["verdict"]), str(row["name"])
-    falsifier = _falsifier_of(source.falsifiers, name)
+    falsifier = _falsifier_of(source.board.falsifiers, name)
     outcome = str(row["outcome"])
     contrast = next((item for item in source.registered if item.name == name), None)
     figure = next((item.file for item in source.figures if item.file == f"{file_stem('contrast', name)}.svg"), "")
@@ -178,7 +179,7 @@ def _unstressed(row: Record) -> str:
 def _contrast_facts(row: Record, source: SiteSource, contrast: Contrast | None) -> Iterator[str]:
     p = float(row["p_holm"])
     if not math.isnan(p):
-        yield f"adjusted p {p_text(p)} (Holm, {counted(len(source.contrasts), 'contrast')})"
+        yield f"adjusted p {p_text(p)} (Holm, {counted(len(source.board.contrasts), 'contrast')})"
     yield f"n = {counted(int(row['n']), 'query', 'queries')}"
     yield counted(int(row["blocks"]), "block")
     yield counted(int(row["places"]), "place")
@@ -226,7 +227,7 @@ class Group:
 
     title: str
     stem: str
-    cases: tuple[tuple[int, Case], ...]
+    cases: tuple[tuple[int, FailedCase], ...]
 
 
 def site_pages(source: SiteSource) -> dict[str, str]:
@@ -235,12 +236,12 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     Pages refer to other hosts only by links, and each can be read without the script.
     """
     templates = environment()
-    book = Book.of(source.board, source.about, source.scores)
+    book = Book.of(source.board.leaderboard, source.board.about.entries, source.board.scores)
     maps = place_maps(source)
     scenes = tuple(scene_tables(source.scenes, book)) if len(source.scenes) else ()
-    rejection = rejection_tables(source.board)
-    protection = protection_tables(source.protection)
-    acceptance = acceptance_tables(source.acceptance)
+    rejection = rejection_tables(source.board.leaderboard)
+    protection = protection_tables(source.board.protection)
+    acceptance = acceptance_tables(source.board.acceptance)
     optional = {
         "kinds-of-place.html": scenes,
         "rejection.html": rejection or protection,
@@ -253,11 +254,11 @@ def site_pages(source: SiteSource) -> dict[str, str]:
     kinds = figures_by_kind(source.figures)
     common: dict[str, Any] = {
         "source": source,
-        "about": source.about,
+        "about": source.board.about,
         "book": book,
         "there": there,
         "navigation": [(name, _NAMES[name]) for name in there],
-        "note": NOTE.format(draws=source.about.get("draws", "?")),
+        "note": NOTE.format(draws=source.board.about.draws or "?"),
     }
     special = {
         "index.html": _index(source, book, sections),
@@ -265,7 +266,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "suites.html": {"suites": suites},
         "matchers.html": {"matchers": matchers, "costs": cost_table(book)},
         "rejection.html": {
-            "risks": (*risk_tables(source.board), *risk_tables_by_suite(source.board)),
+            "risks": (*risk_tables(source.board.leaderboard), *risk_tables_by_suite(source.board.leaderboard)),
             "tables": rejection,
             "acceptance": acceptance,
             "protection": protection,
@@ -278,8 +279,8 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "regions.html": {"table": region_table(source)},
         "ageing.html": {"table": rate_table(source.rates), "kinds": kinds},
         "method.html": {
-            "controls": control_table(source.controls),
-            "learned": [*training_lines(source.about), *segmenter_lines(source.about)],
+            "controls": control_table(source.board.controls),
+            "learned": [*training_lines(source.board.about), *segmenter_lines(source.board.about)],
             "meanings": MEANINGS | MARKS,
         },
     }
@@ -303,13 +304,13 @@ def _map_files(templates: Environment, scripts: Mapping[str, str]) -> dict[str, 
 
 def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
     """Return what the first page shows."""
-    controls = CONTROL_SCHEMA.rows(Verdict, source.controls)
+    controls = CONTROL_SCHEMA.rows(Verdict, source.board.controls)
     overview = tuple(table for table in summary(book) if _has_rivals(table))
     contrasts = contrasts_of(source)
     prices = {table.name.replace("summary", "price", 1) for table in overview}
     return {
         "sections": sections,
-        "elsewhere": elsewhere_tables(source.about),
+        "elsewhere": elsewhere_tables(source.board.about.elsewhere),
         "words_of": {item.prior_group: item.prior for item in sections},
         "overview": overview,
         "prices": tuple(item for item in source.figures if item.file.removesuffix(".svg") in prices),
@@ -320,10 +321,10 @@ def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[
         "control_lines": control_lines(controls),
         "controls_state": _controls_state(controls),
         "has_controls": bool(controls),
-        "seed_line": seed_lines(source.about)[0],
-        "sealed_lines": sealed_lines(source.about),
-        "seeds": seed_table(source.about),
-        "warnings": [*map_lines(source.about), *warnings_of(source.board)],
+        "seed_line": seed_lines(source.board.about)[0],
+        "sealed_lines": sealed_lines(source.board.about.sealed),
+        "seeds": seed_table(source.board.about.entries),
+        "warnings": [*map_lines(source.board.about), *warnings_of(source.board.leaderboard)],
         "meanings": {one.name: one.meaning for item in sections for one in item.table.columns} | MARKS,
         "size": _size_text(source, book),
     }
@@ -368,7 +369,7 @@ def _failures(source: SiteSource, mapped: Collection[str]) -> dict[str, Any]:
     }
 
 
-def _on_map(case: Case) -> str:
+def _on_map(case: FailedCase) -> str:
     """Return the address of a case on the map of its place."""
     asked = {"place": base_of(case.region), "matcher": case.matcher, "suite": case.suite, "outcome": "failures"}
     return f"map.html?{urlencode(asked | {'query': case.query_id})}"
@@ -420,7 +421,7 @@ def _controls_state(verdicts: Sequence[Verdict]) -> str:
 
 def _size_text(source: SiteSource, book: Book) -> str:
     """Count matchers, suites, queries and flights, blocks and places of the board."""
-    board, scores = source.board, source.scores
+    board, scores = source.board.leaderboard, source.board.scores
     asked = scores.drop_duplicates("query_id")["track"] if "query_id" in scores else pd.Series(dtype=object)
     flights = int((asked == SEQUENCE).sum())
     blocks, places = (int(board[name].max()) if len(board) else 0 for name in ("blocks", "places"))
@@ -433,7 +434,7 @@ def _size_text(source: SiteSource, book: Book) -> str:
     return f"{', '.join(parts)} in {counted(blocks, 'block')} of {counted(places, 'place')}."
 
 
-def groups_of(cases: Sequence[Case]) -> tuple[Group, ...]:
+def groups_of(cases: Sequence[FailedCase]) -> tuple[Group, ...]:
     """Return failures by class, numbered through from 1."""
     counts = Counter(case.failure for case in cases)
     names = [name for name in FAILURES if name in counts]

@@ -5,37 +5,31 @@ import difflib
 import gzip
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 from xml.etree import ElementTree as ET
 
-import pandas as pd
 import pyarrow as pa
 
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import IMAGES, SITE_FOLDERS, check_site, fresh_folder, list_files, locked
 from sasgeo_bench.files.folders import SITE_MANIFEST as MANIFEST
-from sasgeo_bench.files.json import parse_json
-from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.leaderboard.archive_record import PicturesRecord, parse_record
 from sasgeo_bench.leaderboard.board_files import (
     ACCEPTANCE,
     ANSWERS,
     BOARD,
     FIGURES,
     LEADERBOARD,
-    MEND,
     PROTECTION,
     SCORES,
-    TABLES,
-    read_board,
 )
-from sasgeo_bench.leaderboard.board_pictures import KINDS
-from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
+from sasgeo_bench.leaderboard.manifests import PackManifest, PicturesManifest, parse_record
+from sasgeo_bench.leaderboard.stored_board import StoredBoard
+from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.publishing.site_maps import MAPS
 from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -121,18 +115,14 @@ _MOST_UNPACKED: Final = 50_000_000  # bytes of a .gz; none of our texts is large
 class BoardFiles:
     """Files of a board's folder that a site shows.
 
-    `tables` are contrasts, controls, scores and protection, empty where there is none; `pictures` is the content of
-    `pictures.json`; `settings` those that stored results were scored with, empty for a board that is not stored.
+    `settings` are those of stored results, None for a board that is not stored.
     """
 
-    folder: Path
-    about: Mapping[str, Any]
-    board: pd.DataFrame
-    tables: Mapping[str, pd.DataFrame]
+    board: StoredBoard
     figures: tuple[SiteFigure, ...]
     downloads: tuple[Download, ...]
-    pictures: Mapping[str, Sequence[Mapping[str, Any]]]
-    settings: Mapping[str, Any]
+    pictures: PicturesManifest
+    settings: PackManifest | None
 
 
 def read_board_files(folder: Path) -> BoardFiles:
@@ -142,17 +132,12 @@ def read_board_files(folder: Path) -> BoardFiles:
     """
     with _sound(folder):
         list_files(folder, without=SITE_FOLDERS)
-    about, board = read_board(folder)
-    with _sound(folder):
         return BoardFiles(
-            folder=folder,
-            about=about,
-            board=board,
-            tables={name: _read_table(folder / f"{name}.parquet") for name in TABLES},
+            board=StoredBoard.open(folder),
             figures=tuple(_read_figures(folder / FIGURES)),
             downloads=tuple(_read_downloads(folder)),
             pictures=_read_pictures(folder / PICTURES),
-            settings=read_settings(folder) if is_pack(folder) else {},
+            settings=read_pack(folder) if is_pack(folder) else None,
         )
 
 
@@ -170,10 +155,6 @@ def _sound(folder: Path) -> Iterator[None]:
         raise StoreError(
             f"{folder} holds a damaged board ({text}): score it again, or fetch the results again"
         ) from error
-
-
-def _read_table(path: Path) -> pd.DataFrame:
-    return read_frame(path, mend=MEND) if path.is_file() else pd.DataFrame()
 
 
 def _plain_or_packed(path: Path) -> bytes | None:
@@ -225,21 +206,18 @@ def _read_downloads(folder: Path) -> Iterator[Download]:
             yield Download(file=f"{name}.gz" if is_packed else name, data=data, what=what)
 
 
-def _read_pictures(folder: Path) -> dict[str, list[dict[str, Any]]]:
-    """Read regions, suites, strips, flights and cases of `pictures.json`, and check each file against the folder."""
+def _read_pictures(folder: Path) -> PicturesManifest:
+    """Read the list of pictures, and check each file against the folder; empty where there is none."""
     path = folder / f"{PICTURES}.json"
     if not path.is_file():
-        return {}
+        return PicturesManifest()
     try:
-        data = plain_file(path).read_bytes()
-        parse_record(data, PicturesRecord)
-        content = parse_json(data)
-        found = {kind: [dict(item) for item in content.get(kind, [])] for kind in KINDS}
-        for item in (one for listed in found.values() for one in listed):
-            _check_picture(folder, str(item["file"]))
+        found = parse_record(plain_file(path).read_bytes(), PicturesManifest)
+        for name in found.files:
+            _check_picture(folder, name)
     except SasgeoError:
         raise
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except ValueError as error:
         text = one_line(str(error))
         raise StoreError(f"{path} is damaged ({text}): make the pictures again, or move the folder away") from error
     return found
@@ -310,31 +288,38 @@ def check_target(target: Path) -> None:
 
 def write_site(
     target: Path,
-    board: BoardFiles,
+    files: BoardFiles,
     *,
     pages: Mapping[str, str],
     figures: Iterable[SiteFigure],
-    about: Mapping[str, Any],
+    name: str,
 ) -> Written:
     """Write a site, whole or not at all; an older one in the target folder is replaced.
 
-    `pages` are the texts of pages, style and script by file name, `about` further content of `site.json`; downloads and
-    pictures come from the board. Raise `StoreError` if the site cannot be written; an older site then stays as it was.
+    `pages` are the texts of pages, style and script by file name, `name` that of the board; downloads and pictures come
+    from its files. Raise `StoreError` if the site cannot be written; an older site then stays as it was.
     """
     check_target(target)
-    named = {str(item["file"]) for listed in board.pictures.values() for item in listed}
-    files: dict[str, bytes] = {name: text.encode() for name, text in pages.items()}
-    files |= {f"{FIGURES}/{item.file}": item.text.encode() for item in figures}
-    files |= {f"{FILES}/{item.file}": item.data for item in board.downloads}
-    pictures = {f"{PICTURES}/{name}": board.folder / PICTURES / name for name in sorted(named)}
-    content = {**about, "licence": LICENCE, "attribution": ATTRIBUTION, "files": sorted({*files, *pictures})}
-    files[MANIFEST] = json_text(content).encode()
+    written: dict[str, bytes] = {file: text.encode() for file, text in pages.items()}
+    written |= {f"{FIGURES}/{item.file}": item.text.encode() for item in figures}
+    written |= {f"{FILES}/{item.file}": item.data for item in files.downloads}
+    pictures = {
+        f"{PICTURES}/{file}": files.board.folder / PICTURES / file for file in sorted(set(files.pictures.files))
+    }
+    content = {
+        "board": name,
+        "made_by": files.board.about.made_by,
+        "licence": LICENCE,
+        "attribution": ATTRIBUTION,
+        "files": sorted({*written, *pictures}),
+    }
+    written[MANIFEST] = json_text(content).encode()
     try:
         with fresh_folder(target) as scratch:
-            for name, data in files.items():
-                _put(scratch / name, data)
-            for name, path in pictures.items():
-                _put(scratch / name, plain_file(path).read_bytes())
+            for file, data in written.items():
+                _put(scratch / file, data)
+            for file, path in pictures.items():
+                _put(scratch / file, plain_file(path).read_bytes())
         picture_bytes = sum(
             path.stat().st_size for kind in (PICTURES, MAPS) for path in (target / kind).rglob("*") if path.is_file()
         )
@@ -347,10 +332,10 @@ def write_site(
         ) from error
     return Written(
         folder=target,
-        site_bytes=sum(len(data) for name, data in files.items() if not name.startswith((f"{FILES}/", f"{MAPS}/"))),
-        download_bytes=sum(len(item.data) for item in board.downloads),
+        site_bytes=sum(len(data) for file, data in written.items() if not file.startswith((f"{FILES}/", f"{MAPS}/"))),
+        download_bytes=sum(len(item.data) for item in files.downloads),
         picture_bytes=picture_bytes,
-        pages=sum(name.endswith(".html") for name in pages),
+        pages=sum(file.endswith(".html") for file in pages),
     )
 
 

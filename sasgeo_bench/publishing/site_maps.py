@@ -15,8 +15,9 @@ import pandas as pd
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.cases import FAILURES, MEANINGS
+from sasgeo_bench.leaderboard.manifests import RegionMap
 from sasgeo_bench.leaderboard.tables import file_stem
-from sasgeo_bench.publishing.site_source import RegionMap, SiteSource
+from sasgeo_bench.publishing.site_source import SiteSource
 from sasgeo_bench.scoring.draws import seed_of_text
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.texts import plain
@@ -55,23 +56,23 @@ def place_maps(source: SiteSource) -> dict[PlaceMap, str]:
     larger than `MOST_BYTES`, the same share of each place's queries is drawn: those with a picture, then others by a
     hash of their ids.
     """
-    if not len(source.answers):
+    if not len(source.board.answers):
         return {}
-    _check(source.answers)
-    answers = source.answers.assign(base=source.answers["region"].map(base_of))
+    _check(source.board.answers)
+    answers = source.board.answers.assign(base=source.board.answers["region"].map(base_of))
     pictures = {plain(case.query_id): at for at, case in enumerate(source.pictures.cases, start=1)}
     share = MOST_BYTES / (_QUERY_BYTES * answers["query_id"].nunique() + _ANSWER_BYTES * len(answers))
     found = {}
     for at, item in enumerate(one for one in source.pictures.regions if one.bounds_m is not None):
-        whole = answers[answers["base"] == item.of]
+        whole = answers[answers["base"] == item.region]
         if not len(whole):
             continue
         part = _sampled(whole, share, pictures)
-        spot = source.spots.get(item.of)
-        title = item.of if spot is None else spot.title
+        spot = source.spots.get(item.region)
+        title = item.region if spot is None else spot.title
         place = PlaceMap(
-            region=item.of,
-            file=f"{MAPS}/{file_stem(item.of)}-{at}.js",
+            region=item.region,
+            file=f"{MAPS}/{file_stem(item.region)}-{at}.js",
             title=plain(title),
             queries=int(whole["query_id"].nunique()),
             drawn=int(part["query_id"].nunique()),
@@ -110,7 +111,7 @@ def _script(place: PlaceMap, item: RegionMap, answers: pd.DataFrame, cases: Mapp
         "corner_m": [west_m, south_m],
         "blocks": [
             [plain(name), left - west_m, low - south_m, right - west_m, high - south_m]
-            for name, (left, low, right, high) in item.blocks_m.items()
+            for name, (left, low, right, high) in {block.name: block.bounds_m for block in item.blocks}.items()
         ],
         "queries": list(_queries(queries, west_m, south_m)),
         "cases": {str(number[name]): at for name, at in cases.items() if name in number},

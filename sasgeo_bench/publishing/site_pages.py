@@ -12,6 +12,7 @@ from sasgeo_bench.ageing.ratebook import ClassAgeing, Estimate, RateBook
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, strata_tables, suite_table
 from sasgeo_bench.leaderboard.columns import column, prior_words, suite_card
+from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardTask, Learned, Picture
 from sasgeo_bench.leaderboard.rejection_tables import rejection_of
 from sasgeo_bench.leaderboard.tables import (
     Cell,
@@ -26,7 +27,8 @@ from sasgeo_bench.leaderboard.tables import (
     rank_cell,
 )
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.publishing.site_source import Picture, SiteFigure, SiteSource, Spot
+from sasgeo_bench.publishing.site_source import SiteFigure, SiteSource, Spot
+from sasgeo_bench.running.run_manifest import CardRecord
 from sasgeo_bench.scoring.metrics import primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.score import FIX_M
@@ -87,7 +89,7 @@ def suites_of(source: SiteSource, book: Book) -> tuple[SuitePage, ...]:
 def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
     keys = [key for key in book.matchers if key[0] == name]
     starts = tuple(f"{file_stem(kind, name, track)}-" for kind in KINDS for _, track, _ in keys)
-    tasks = [str(task["region"]) for task in source.about.get("tasks", ()) if task["suite"] == name]
+    regions = sorted({base_of(task.region) for task in source.board.about.tasks if task.suite == name})
     return SuitePage(
         name=name,
         page=page,
@@ -99,9 +101,9 @@ def _suite(name: str, page: str, source: SiteSource, book: Book) -> SuitePage:
         pictures=tuple(
             item
             for item in (*source.pictures.suites, *source.pictures.strips, *source.pictures.flights)
-            if item.of == name
+            if item.suite == name
         ),
-        regions=tuple(sorted({base_of(region) for region in tasks})),
+        regions=tuple(regions),
     )
 
 
@@ -114,9 +116,9 @@ class MatcherPage:
 
     name: str
     page: str
-    entry: Mapping[str, Any]
+    entry: BoardEntry
     cell: Cell
-    card: Mapping[str, Any]
+    card: CardRecord | None
     trained: str
     training: tuple[str, ...]
     cannot: tuple[str, ...]
@@ -127,20 +129,20 @@ class MatcherPage:
 
 def matchers_of(source: SiteSource, book: Book) -> tuple[MatcherPage, ...]:
     """Return a page for each entry of the board."""
-    return tuple(_matcher(name, book, source.board) for name in book.matcher_pages)
+    return tuple(_matcher(name, book, source.board.leaderboard) for name in book.matcher_pages)
 
 
 def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
-    entry = book.entries.get(name, {})
-    card = entry.get("card") or {}
+    entry = book.entries.get(name) or BoardEntry(name=name)
+    card = entry.card or CardRecord()
     results = [_results_table(book, name, group, keys) for group, keys in _groups(book).items()]
     return MatcherPage(
         name=name,
         page=book.matcher_pages[name],
         entry=entry,
         cell=book.name_cell(name),
-        card=card,
-        trained=_trained(card.get("trained_on"), entry.get("learned") or ()),
+        card=entry.card,
+        trained=_trained(card.trained_on, entry.learned),
         training=tuple(_training(entry)),
         cannot=tuple(_cannot(book, name, card)),
         results=tuple(table for table in results if table.rows),
@@ -152,7 +154,7 @@ def _matcher(name: str, book: Book, board: pd.DataFrame) -> MatcherPage:
 _NO_PLACE: Final = "no place that its card names"
 
 
-def _trained(stated: object, learned: Sequence[Mapping[str, Any]]) -> str:
+def _trained(stated: object, learned: Sequence[Learned]) -> str:
     """Return where an entry was trained: by its author on the places that its card names, and by the runner."""
     named = _stated(stated)
     if not learned:
@@ -169,24 +171,24 @@ def _stated(places: object) -> str:
     return ", ".join(named) or _NO_PLACE
 
 
-def _training(entry: Mapping[str, Any]) -> Iterator[str]:
+def _training(entry: BoardEntry) -> Iterator[str]:
     """Yield the training of an entry by the runner, and the regions it was then tested on: tasks are hundreds."""
-    for one in entry.get("learned") or ():
-        verb = "Trained on" if one["file"] else "Could not be trained on"
-        regions = sorted({base_of(task.partition("/")[2]) for task in one["asked"]})
+    for one in entry.learned:
+        verb = "Trained on" if one.file else "Could not be trained on"
+        regions = sorted({base_of(task.partition("/")[2]) for task in one.asked})
         yield (
-            f"{verb} {counted(one['pairs'], 'query', 'queries')} of {', '.join(one['trained_on'])}; then tested in "
-            f"{counted(len(one['asked']), 'task')} on {', '.join(regions)}."
+            f"{verb} {counted(one.pairs, 'query', 'queries')} of {', '.join(one.trained_on)}; then tested in "
+            f"{counted(len(one.asked), 'task')} on {', '.join(regions)}."
         )
 
 
-def _cannot(book: Book, name: str, card: Mapping[str, Any]) -> Iterator[str]:
+def _cannot(book: Book, name: str, card: CardRecord) -> Iterator[str]:
     """Yield the limits that an entry states, and those that the board shows."""
-    if card.get("limits"):
-        yield str(card["limits"])
-    if card.get("needs"):
-        yield f"Needs {', '.join(map(str, card['needs']))}; where a query lacks that it is not applicable"
-    tracks = card.get("tracks")
+    if card.limits:
+        yield card.limits
+    if card.needs:
+        yield f"Needs {', '.join(card.needs)}; where a query lacks that it is not applicable"
+    tracks = card.tracks
     yield from (f"Does not answer {track}" for track in ("localization", "retrieval") if tracks and track not in tracks)
     rows = [(key, book.main(key, name, primary_of(key[1]).name)) for key in book.matchers if name in book.matchers[key]]
     out = [f"{key[0]} ({key[1]})" for key, row in rows if row is not None and not row["is_applicable"]]
@@ -291,24 +293,24 @@ class PlaceOnMap:
     is_made_up: bool
 
 
-def regions_of(about: Mapping[str, Any]) -> dict[str, list[Mapping[str, Any]]]:
+def regions_of(tasks: Sequence[BoardTask]) -> dict[str, list[BoardTask]]:
     """Return the tasks of a board by region, whatever date or copy of it they search.
 
-    >>> list(regions_of({"tasks": [{"region": "vaduz@2015-07-27"}, {"region": "vaduz+alias"}]}))
+    >>> list(regions_of([BoardTask(suite="clean", region=name) for name in ("vaduz@2015-07-27", "vaduz+alias")]))
     ['vaduz']
     """
-    found: dict[str, list[Mapping[str, Any]]] = {}
-    for task in about.get("tasks", ()):
-        found.setdefault(base_of(str(task["region"])), []).append(task)
+    found: dict[str, list[BoardTask]] = {}
+    for task in tasks:
+        found.setdefault(base_of(task.region), []).append(task)
     return dict(sorted(found.items()))
 
 
 def places_on_map(
-    about: Mapping[str, Any], spots: Mapping[str, Spot], parts: Mapping[str, tuple[str, str]]
+    tasks: Sequence[BoardTask], spots: Mapping[str, Spot], parts: Mapping[str, tuple[str, str]]
 ) -> tuple[PlaceOnMap, ...]:
     """Return the places of a board with known positions, numbered; the middle of several regions."""
     by_place: dict[str, list[Spot]] = {}
-    for region in (name for name in regions_of(about) if name in spots):
+    for region in (name for name in regions_of(tasks) if name in spots):
         by_place.setdefault(parts.get(region, (region, ""))[0], []).append(spots[region])
     halves = dict(parts.values())
     return tuple(
@@ -326,13 +328,13 @@ def places_on_map(
 
 def region_table(source: SiteSource) -> Table:
     """Return a table of every region of the board, its position and what was drawn there."""
-    numbers = {item.name: item.number for item in places_on_map(source.about, source.spots, source.parts)}
+    numbers = {item.name: item.number for item in places_on_map(source.board.about.tasks, source.spots, source.parts)}
     rows = []
-    for region, tasks in regions_of(source.about).items():
+    for region, tasks in regions_of(source.board.about.tasks).items():
         place, part = source.parts.get(region, (region, "-"))
         spot = source.spots.get(region)
-        dates = sorted({str(task["map_date"]) for task in tasks if task.get("map_date")})
-        suites = sorted({str(task["suite"]) for task in tasks})
+        dates = sorted({task.map_date for task in tasks if task.map_date})
+        suites = sorted({task.suite for task in tasks})
         rows.append(
             Row(
                 cells=(

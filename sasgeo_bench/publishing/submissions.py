@@ -11,14 +11,15 @@ from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
-from sasgeo_bench.leaderboard.board_files import read_board
-from sasgeo_bench.leaderboard.stored_figures import read_stored_figures, why_anew
+from sasgeo_bench.leaderboard.board_files import read_board_manifest
+from sasgeo_bench.leaderboard.manifests import PackManifest
+from sasgeo_bench.leaderboard.stored_board import StoredBoard, why_anew
 from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, AnsweredTask, Card, Submission
 from sasgeo_bench.progress import Tell
-from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_among, stored_settings
-from sasgeo_bench.publishing.archive_folder import is_pack, read_settings
+from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_among
+from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.run_manifest import RUN, RunManifest
@@ -101,8 +102,9 @@ def check_card(card: Card, board: Path, *, source: str) -> Split | None:
 
     Raise `ConfigError` if its name is that of another row or of a matcher that ships, or training places are unknown.
     """
-    split = _split_of(stored_settings([board]).split)
-    check_name(card.name, _names_on(board), source=source)
+    settings = read_pack(board)
+    split = _split_of(settings.split)
+    check_name(card.name, _names_on(settings), source=source)
     _check_places(card, board, split, source)
     return split
 
@@ -111,9 +113,9 @@ def _split_of(name: str | None) -> Split | None:
     return None if name is None else find_split(name)
 
 
-def _names_on(board: Path) -> set[str]:
+def _names_on(settings: PackManifest) -> set[str]:
     """Return the names of the matchers on a board, without their versions."""
-    return {name_alone(str(name)) for name in read_settings(board).get("contestants", ())}
+    return {name_alone(name) for name in settings.contestants}
 
 
 def _check_places(card: Card, board: Path, split: Split | None, source: str) -> None:
@@ -238,8 +240,9 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
     """
     submission = read_submission(folder)
     stored = stored_among(tasks)
-    check_name(submission.card.name, () if stored is None else _names_on(stored), source=str(folder))
-    split = _split_of(submission.split if stored is None else stored_settings([stored]).split)
+    settings = None if stored is None else read_pack(stored)
+    check_name(submission.card.name, () if settings is None else _names_on(settings), source=str(folder))
+    split = _split_of(submission.split if settings is None else settings.split)
     if not tasks:
         return submission, tuple(submission_faults(folder, submission, None, split))
     board = board_of(tasks)
@@ -311,9 +314,9 @@ def beside_stored(
     """
     request = _request(stored, [submission], board, tell=tell, root=root, jobs=jobs)
     reason = why_anew(
-        read_board(stored)[0], [rule.card for rule in rules_of(request.rejectors, request.split).values()]
+        read_board_manifest(stored), [rule.card for rule in rules_of(request.rejectors, request.split).values()]
     )
     if reason is not None:
         tell(f"all entries are scored anew: {reason}")
         return score_all(request, tell=tell)
-    return score_all(replace(request, stored=read_stored_figures(stored)), tell=tell)
+    return score_all(replace(request, stored=StoredBoard.open(stored)), tell=tell)

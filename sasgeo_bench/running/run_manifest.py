@@ -6,6 +6,7 @@ from typing import Any, Final, Self
 
 from pydantic import ValidationError, ValidationInfo, ValidatorFunctionWrapHandler, field_validator
 
+from sasgeo_bench import config
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.json import read_json
@@ -27,7 +28,7 @@ _EXPECTED: Final = {
 Number = int | float | None
 
 
-class CardRecord(Record):
+class CardRecord(config.Record):
     """Card of a matcher as boards and pages show it; a card of an older version may lack some texts."""
 
     name: str = ""

@@ -4,10 +4,11 @@
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Annotated, ClassVar, Final
 
 import numpy as np
 import pandas as pd
+from pydantic import ConfigDict, Field
 from scipy.sparse import hstack
 
 from sasgeo_bench.errors import ConfigError
@@ -41,7 +42,7 @@ from sasgeo_bench.scoring.verdicts import (
     ContrastMetric,
     Finding,
 )
-from sasgeo_bench.tasks.query import PUBLISHED, SEQUENCE, UNRIVALLED, Detector
+from sasgeo_bench.tasks.query import PUBLISHED, SEQUENCE, UNRIVALLED, Detector, Track
 
 PRIMARY: Final = "primary"
 AREAS: Final = {"aurc": aurc, "e_aurc": excess_aurc, "auroc": auroc}
@@ -67,6 +68,8 @@ class Contrast:
     relevant difference: of fractions, or for "aurc" and "e_aurc" relative to the second method.
     """
 
+    __pydantic_config__: ClassVar = ConfigDict(extra="forbid")  # where manifests hold contrasts
+
     name: str
     first: str
     second: str
@@ -74,8 +77,8 @@ class Contrast:
     kinds: tuple[str, ...] = ()
     detectors: tuple[Detector, ...] = ()
     metric: ContrastMetric = "primary"
-    track: str = "localization"
-    min_effect: float = 0.03
+    track: Track = "localization"
+    min_effect: Annotated[float, Field(ge=0, le=1, strict=True)] = 0.03
 
     def queries_text(self) -> str:
         """Name the queries that count.

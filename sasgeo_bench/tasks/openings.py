@@ -4,10 +4,11 @@
 import datetime as dt
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, Final, Self
+from typing import Annotated, Final, Self
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
+from sasgeo_bench.config import Record
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import fresh_file, locked
 from sasgeo_bench.files.json import read_json
@@ -40,6 +41,13 @@ class Opening(BaseModel):
     def to_text(self) -> str:
         """Return the day and the first digits of the commitment."""
         return f"{self.opened.isoformat()} by seed {self.commitment[:12]}"
+
+
+class SealedPlace(Record):
+    """A sealed place: the commitment of the seed that the board draws it by, if it does, and every opening."""
+
+    drawn_by: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None
+    openings: list[Opening]
 
 
 Openings = Mapping[str, tuple[Opening, ...]]  # by place, the first one first
@@ -96,15 +104,16 @@ def record_openings(out: Path, split: str, places: Iterable[str], opening: Openi
     return known
 
 
-def sealed_record(openings: Openings, places: Iterable[str], drawn: Iterable[str], seed: PrivateSeed | None) -> Any:  # noqa: ANN401 - JSON
-    """Return the entry of `board.json` on sealed places: by which seed this board draws each, and every opening.
+def sealed_record(
+    openings: Openings, places: Iterable[str], drawn: Iterable[str], seed: PrivateSeed | None
+) -> dict[str, SealedPlace]:
+    """Return sealed places for `board.json`: by which seed this board draws each, and every opening.
 
-    >>> sealed_record({}, ["porto"], [], None)
-    {'porto': {'drawn_by': None, 'openings': []}}
+    >>> sealed_record({}, ["porto"], [], None)["porto"].model_dump()
+    {'drawn_by': None, 'openings': []}
     """
-    commitment = None if seed is None else seed.commitment
-    shown = _ADAPTER.dump_python({place: openings.get(place, ()) for place in places}, mode="json")
-    there = set(drawn)
+    commitment, there = None if seed is None else seed.commitment, set(drawn)
     return {
-        place: {"drawn_by": commitment if place in there else None, "openings": list(shown[place])} for place in shown
+        place: SealedPlace(drawn_by=commitment if place in there else None, openings=list(openings.get(place, ())))
+        for place in places
     }

@@ -20,6 +20,7 @@ from sasgeo_bench.experiments.board_queries import asked_tasks, same_queries
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, plan_entry
 from sasgeo_bench.experiments.pipeline import ask, draw_all, run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline, plan_runs
+from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.osm.locate import Extract
@@ -27,6 +28,7 @@ from sasgeo_bench.publishing import submissions
 from sasgeo_bench.publishing.submissions import beside_stored, hold_submission, with_submissions
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.scoring.submission_files import read_submission
+from sasgeo_bench.tasks.openings import SealedPlace
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.query import TASK_VERSION
 from sasgeo_bench.tasks.task_plan import Request
@@ -227,8 +229,9 @@ def test_answers_to_another_board_are_not_replaced(request_, entered, monkeypatc
 
 def test_a_seed_that_did_not_draw_the_board_is_refused(request_, monkeypatch):
     seed = PrivateSeed("3f" * 16, is_sealed=True)
-    about = {"sealed": {"porto": {"drawn_by": "ab" * 32}}}
-    monkeypatch.setattr(board_queries, "read_board", lambda _: (about, None))
+    sealed = {"porto": SealedPlace(drawn_by="ab" * 32, openings=[])}
+    about = BoardManifest(scorer_version=6, entries=[], tasks=[], sealed=sealed)
+    monkeypatch.setattr(board_queries, "read_board_manifest", lambda _: about)
     with pytest.raises(
         ConfigError, match=f"not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}"
     ):
@@ -236,10 +239,11 @@ def test_a_seed_that_did_not_draw_the_board_is_refused(request_, monkeypatch):
 
 
 def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_, monkeypatch):
-    about = {"sealed": {"town-suburb": {"drawn_by": "ab" * 32}}, "task_version": 3}
+    sealed = {"town-suburb": SealedPlace(drawn_by="ab" * 32, openings=[])}
+    about = BoardManifest(scorer_version=6, entries=[], tasks=[], sealed=sealed, task_version=3)
     entry = plan_entry(request_, tell=silent)
     assert not any("count as misses" in line for line in cost_lines(entry))
-    monkeypatch.setattr(entry_cost, "read_board", lambda _: (about, None))
+    monkeypatch.setattr(entry_cost, "read_board_manifest", lambda _: about)
     told = "\n".join(cost_lines(entry))
     assert "of task version 3, and this program draws version" in told
     assert "are of sealed places, and count as misses without --sealed-seed-file" in told
@@ -424,8 +428,8 @@ def test_the_command_says_who_answered_the_same_queries_elsewhere(program, monke
     for name in ("show_board", "check_controls"):
         monkeypatch.setattr(cli_entering, name, lambda _: None)
     monkeypatch.setattr(cli_entering, "enter", lambda *_, **__: (Path("sent/mine"), board))
-    monkeypatch.setattr(cli_entering, "read_board", lambda folder: ({"of": folder.name}, None))
-    monkeypatch.setattr(cli_entering, "elsewhere_lines", lambda about: [f"the same queries, of {about['of']}"])
+    monkeypatch.setattr(cli_entering, "read_board_manifest", lambda folder: SimpleNamespace(elsewhere=folder.name))
+    monkeypatch.setattr(cli_entering, "elsewhere_lines", lambda found: [f"the same queries, of {found}"])
     assert program("enter", "small", "--matcher", "mine")[1].splitlines() == [
         "the same queries, of small-mine",
         "sent/mine",

@@ -15,12 +15,20 @@ from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.experiments.sealed import open_seal
 from sasgeo_bench.experiments.training_groups import TrainingGroups
-from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.board_files import read_board_manifest
+from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import LearningSpec, PipelineFile
 from sasgeo_bench.leaderboard.private_board import sealed_lines
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks
-from sasgeo_bench.tasks.openings import Opening, joined_openings, openings_file, read_openings, record_openings
+from sasgeo_bench.tasks.openings import (
+    Opening,
+    SealedPlace,
+    joined_openings,
+    openings_file,
+    read_openings,
+    record_openings,
+)
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.split import find_split
 from tests.handmade import split_file
@@ -58,7 +66,7 @@ def plan_of(split, out, tell=lambda _: None, *, regions=None, **seeds):
 
 
 def about_board(out):
-    return read_board(out / "boards" / "closed")[0]
+    return read_board_manifest(out / "boards" / "closed")
 
 
 @pytest.mark.slow
@@ -73,7 +81,7 @@ def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_
     board = run_pipeline(plan, tell=lambda _: None)
     assert {place for frame in board.scores.values() for place in frame["place"]} == {OPEN}
     assert [path for path in out.rglob("*") if SEALED in path.name and "regions" not in path.parts] == []
-    assert about_board(out)["sealed"] == {SEALED: {"drawn_by": None, "openings": []}}
+    assert about_board(out).sealed == {SEALED: SealedPlace(drawn_by=None, openings=[])}
     text = (out / "boards" / "closed" / "leaderboard.md").read_text(encoding="utf-8")
     assert f"- Sealed place {SEALED}: not opened, and so not on this board." in text
 
@@ -81,8 +89,8 @@ def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_
     assert f"  sealed {SEALED}: to be opened, by seed {SEED.commitment[:12]}" in plan.to_text().splitlines()
     board = run_pipeline(plan, tell=lambda _: None, opened=FIRST)
     assert {place for frame in board.scores.values() for place in frame["place"]} == {OPEN, SEALED}
-    opening = {"commitment": SEED.commitment, "bits": 128, "opened": "2026-03-01"}
-    assert about_board(out)["sealed"] == {SEALED: {"drawn_by": SEED.commitment, "openings": [opening]}}
+    opened = SealedPlace(drawn_by=SEED.commitment, openings=[Opening.of(SEED, FIRST)])
+    assert about_board(out).sealed == {SEALED: opened}
     about = task_files.read_task(out / "tasks" / "clean" / SEALED)
     assert about["sealed_seed"] == {"commitment": SEED.commitment, "bits": 128}
     assert "private_seed" not in about
@@ -95,8 +103,8 @@ def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_
     again = plan_of(split, out, sealed=OTHER)
     assert "opened again, after 2026-03-01 by seed" in again.to_text()
     record = open_seal(again.seal, again.requests, opened=SECOND, stored=None, tell=lambda _: None)
-    assert [item["opened"] for item in record[SEALED]["openings"]] == ["2026-03-01", "2026-04-01"]
-    (line,) = sealed_lines({"sealed": record})
+    assert [item.opened for item in record[SEALED].openings] == [FIRST, SECOND]
+    (line,) = sealed_lines(record)
     assert line.startswith(f"Sealed place {SEALED}: opened on 2026-04-01")
     assert "this is opening 2, after 2026-03-01" in line
     assert record == open_seal(again.seal, again.requests, opened=SECOND, stored=None, tell=lambda _: None)
@@ -191,14 +199,14 @@ def test_a_hold_out_whose_test_places_are_all_sealed_can_be_planned_and_not_run(
 
 def test_stored_results_keep_the_openings_of_another_root(split, tmp_path, monkeypatch):
     """Whoever opens a place again in an empty root does not lose the record of the board that is replaced."""
-    record = {"sealed": {SEALED: {"drawn_by": SEED.commitment, "openings": []}}}
-    record["sealed"][SEALED]["openings"] = [Opening.of(SEED, FIRST).model_dump(mode="json")]
+    place = SealedPlace(drawn_by=SEED.commitment, openings=[Opening.of(SEED, FIRST)])
+    record = BoardManifest(scorer_version=1, entries=[], tasks=[], sealed={SEALED: place})
     (tmp_path / "stored").mkdir()
     (tmp_path / "stored" / "board.json").write_text("{}", encoding="utf-8")
-    monkeypatch.setattr(sealed, "read_board", lambda _: (record, None))
+    monkeypatch.setattr(sealed, "read_board_manifest", lambda _: record)
     plan = plan_of(split, tmp_path / "out", sealed=OTHER)
     found = open_seal(plan.seal, plan.requests, opened=SECOND, stored=tmp_path / "stored", tell=lambda _: None)
-    assert [item["commitment"] for item in found[SEALED]["openings"]] == [SEED.commitment, OTHER.commitment]
+    assert [item.commitment for item in found[SEALED].openings] == [SEED.commitment, OTHER.commitment]
 
 
 def test_the_order_of_openings_is_that_of_their_records():
@@ -216,8 +224,8 @@ def test_openings_are_kept_in_order_each_seed_once_and_a_damaged_file_is_refused
 
 
 def test_a_board_tells_of_a_place_that_was_opened_and_is_not_on_it():
-    openings = [{"commitment": "ab" * 32, "bits": 128, "opened": "2026-03-01"}]
-    (line,) = sealed_lines({"sealed": {"porto": {"drawn_by": None, "openings": openings}}})
+    opening = Opening(commitment="ab" * 32, bits=128, opened=FIRST)
+    (line,) = sealed_lines({"porto": SealedPlace(drawn_by=None, openings=[opening])})
     assert (
         line == "Sealed place porto: opened on 2026-03-01 by a seed of commitment abababababab, and not on this board."
     )

@@ -18,7 +18,7 @@ from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.parquet import read_table
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.flights.drift_profile import read_drift_profile
-from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
 from sasgeo_bench.matching.learned_file import read_learned
 from sasgeo_bench.regions.layers import read_bits, read_layers, read_overview
@@ -74,7 +74,7 @@ def test_a_pipe_is_refused_not_waited_for(pipe: Path, read: Callable[[Path], obj
 def test_a_pipe_in_place_of_a_file_of_a_folder_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "board.json")
     with pytest.raises(SasgeoError, match="it is a pipe"):
-        read_board(tmp_path)
+        read_board_manifest(tmp_path)
     os.mkfifo(tmp_path / "mine.tar.xz")
     stated = ArchiveSpec(sha256="0" * 64)
     with pytest.raises(SasgeoError, match="mine"):
@@ -107,7 +107,7 @@ def test_a_file_that_nobody_has_written_by_hand_is_refused(tmp_path: Path, name:
     with path.open("wb") as file:
         file.truncate(6 * 10**7)
     others: dict[str, Callable[[Path], object]] = {
-        "a board": lambda path: read_board(path.parent),
+        "a board": lambda path: read_board_manifest(path.parent),
         "TOML": lambda path: read_document(path, RegionFile, "regions"),
     }
     read = {**READERS, **others}[name]

@@ -12,7 +12,8 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.errors import StoreError
-from sasgeo_bench.leaderboard.board_files import Extra, check_board, read_board, write_board
+from sasgeo_bench.leaderboard.board_files import Extra, check_board, read_leaderboard, write_board
+from sasgeo_bench.leaderboard.manifests import BoardManifest
 
 KILLED = """
 import os, signal, sys
@@ -34,13 +35,13 @@ def put(folder, value, *, extras=(), version=1):
         folder,
         tables={"leaderboard": table, "scores": table},
         texts={"leaderboard.md": f"{value}\n"},
-        about={"scorer_version": version, "entries": [], "tasks": []},
+        about=BoardManifest(scorer_version=version, entries=[], tasks=[]),
         extras=extras,
     )
 
 
 def values(folder):
-    return read_board(folder)[1]["value"].tolist()
+    return read_leaderboard(folder)["value"].tolist()
 
 
 def contents(folder):

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.cli.boards import score
-from sasgeo_bench.leaderboard.board_files import read_board, read_scores
+from sasgeo_bench.leaderboard.board_files import read_leaderboard, read_scores
 from sasgeo_bench.leaderboard.board_pictures import FLIGHT_BYTES
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.build import publish
@@ -66,7 +66,7 @@ def out(tmp_path_factory, lay_towns):
 
 
 def test_figures_of_flights_stand_on_the_board(out):
-    table = read_board(out / "boards" / "mine")[1]
+    table = read_leaderboard(out / "boards" / "mine")
     whole = table[table["stratum"] == "all"].set_index(["matcher", "metric"])["value"]
     assert (whole["near", "distance_within_25m"], whole["far", "distance_within_25m"]) == (1.0, 0.0)
     assert (whole["near", "false_accepted"], whole["far", "distance_within_50m"]) == (0.0, 1.0)
@@ -120,7 +120,7 @@ def test_stored_results_give_the_same_board(out):
     again = score(predictions=out / "results" / "mine", out=out, name="again", draws=100, cases=False, tell=quiet)
     first, second = (
         frame.sort_values(["matcher", "suite", "stratum", "metric"], ignore_index=True)
-        for frame in (read_board(out / "boards" / "mine")[1], again.table)
+        for frame in (read_leaderboard(out / "boards" / "mine"), again.table)
     )
     columns = ["matcher", "suite", "stratum", "metric", "n", "value", "lo", "hi"]
     pd.testing.assert_frame_equal(first[columns], second[columns], check_dtype=False)

@@ -21,9 +21,10 @@ from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.leaderboard import build as boards
 from sasgeo_bench.leaderboard.board import ScoreRequest
-from sasgeo_bench.leaderboard.board_files import Extra, read_board
+from sasgeo_bench.leaderboard.board_files import Extra, read_board_manifest, read_leaderboard
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
+from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
@@ -171,21 +172,21 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
         assert set(absent["value"]) == {0.0}
     columns = [name for name in board.scores["mine"].columns if name != "latency_s"]
     pd.testing.assert_frame_equal(board.scores["mine"][columns], board.scores["oracle_pose"][columns])
-    about, table = read_board(out / "boards" / "mine")
-    assert [(entry["name"], entry["how"]) for entry in about["entries"]] == [
+    about, table = read_board_manifest(out / "boards" / "mine"), read_leaderboard(out / "boards" / "mine")
+    assert [(entry.name, entry.how) for entry in about.entries] == [
         ("mine", "as submitted"),
         ("oracle_pose", "run here"),
     ]
-    assert about["attribution"] == "(c) OpenStreetMap contributors, ODbL"
+    assert about.attribution == "(c) OpenStreetMap contributors, ODbL"
     assert len(table) == len(board.table)
-    assert about["libraries"]["numpy"] == np.__version__
-    assert about["pipeline"] is None
-    assert about["rejectors"] == []
+    assert about.libraries["numpy"] == np.__version__
+    assert about.pipeline is None
+    assert about.rejectors == []
     said = pq.read_schema(out / "boards" / "mine" / "leaderboard.parquet").metadata
     assert said[b"scorer_version"] == str(SCORER_VERSION).encode()
     assert b"OpenStreetMap" in said[b"attribution"]
     read = pd.read_parquet(out / "boards" / "mine" / "leaderboard.parquet")
-    assert read.attrs["attribution"] == about["attribution"]
+    assert read.attrs["attribution"] == about.attribution
     assert read.attrs["scorer_version"] == str(SCORER_VERSION)
     assert set(read.attrs) > {"licence", "task_version", "data_version", "made_by"}
     assert str(read["rank_best"].dtype) == "Int64"
@@ -241,17 +242,17 @@ def test_a_board_of_equal_confidences_or_none_and_of_no_false_fix_or_nothing_els
     assert set(rows[(rows["rejector"] == "own") & (rows["metric"] == "brier")]["value"]) == (
         {0.25} if confidence else set()
     )
-    assert len(read_board(out / "boards" / "mine")[1]) == len(board.table)
+    assert len(read_leaderboard(out / "boards" / "mine")) == len(board.table)
 
 
 def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_path, split):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, tmp_path / "mine.parquet", rejectors=[f"{__name__}:Doubt"], split=split)
-    asked = {"pipeline": {"id": "mine", "sha256": "0" * 64}, "rejectors": [f"{__name__}:Order"], "split": split}
+    asked = {"pipeline": PipelineRecord(id="mine", sha256="0" * 64), "rejectors": [f"{__name__}:Order"], "split": split}
     order = board_of(out, tmp_path / "mine.parquet", **asked).table
-    about, _ = read_board(out / "boards" / "mine")
-    assert about["pipeline"] == asked["pipeline"]
-    assert [(card["name"], card["is_calibrated"]) for card in about["rejectors"]] == [("order", False)]
+    about = read_board_manifest(out / "boards" / "mine")
+    assert about.pipeline == asked["pipeline"]
+    assert [(card.name, card.is_calibrated) for card in about.rejectors] == [("order", False)]
     assert not {"brier", "cost_20"} & set(order[order["rejector"] == "order"]["metric"])
     rows = board.table[board.table["rejector"] == "doubt"]
     by_name = {row["metric"]: row for _, row in rows[rows["stratum"] == "as drawn"].iterrows()}
@@ -301,7 +302,7 @@ def test_what_a_rejector_remarks_of_its_fits_is_told_and_kept(out, tmp_path, spl
     assert said == list(board.remarks)
     assert said[0].startswith("sasgeo_logistic on mine: 0 of ")  # the answers are right, all of them
     assert said[0].endswith(" judged so)")
-    assert read_board(out / "boards" / "mine")[0]["remarks"] == said
+    assert read_board_manifest(out / "boards" / "mine").remarks == said
 
 
 def test_protection_levels_are_counted_where_answers_tell_them(out, tmp_path, split):
@@ -758,11 +759,11 @@ def test_a_rival_that_knows_too_much_is_set_apart_and_the_board_stands(out, tmp_
     assert "Controls: 1 of 2 held. Do not trust the rows of mine:" in err
     why = 'right 8 of 8 times at the control "shuffled map at chance", where guessing is right 0.8 times'
     assert f"mine: set apart, {why}" in err
-    about, table = read_board(out / "boards" / "both")
-    mine, oracle = about["entries"]
-    assert mine["set_apart"] == why
-    assert mine["failed_controls"] == [failed.to_text()]
-    assert "failed_controls" not in oracle
+    about, table = read_board_manifest(out / "boards" / "both"), read_leaderboard(out / "boards" / "both")
+    mine, oracle = about.entries
+    assert mine.set_apart == why
+    assert mine.failed_controls == [failed.to_text()]
+    assert not oracle.failed_controls
     assert table.loc[table["matcher"] == "mine", "rank_best"].isna().all()
     text = (out / "boards" / "both" / "leaderboard.md").read_text(encoding="utf-8")
     assert "do not trust this board" not in text
@@ -837,8 +838,8 @@ def test_answers_that_are_none_cost_their_author_alone(out, both, alone, column,
     pd.testing.assert_frame_equal(board.table, alone.table)
     assert why in board.failures.found["bad"]
     assert [finding.verdict for finding in board.findings] == ["not decided: bad failed"]
-    about, _ = read_board(out / "boards" / "mine")
-    assert about["failed"] == board.failures.found
+    about = read_board_manifest(out / "boards" / "mine")
+    assert about.failed == board.failures.found
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
     assert "- Failed, and not on this board: bad: " in text
 
@@ -937,7 +938,7 @@ def test_a_figure_that_cannot_be_drawn_leaves_the_others(out, both):
     board = board_of(out, *both, extras=[lambda _: Extra(figures={"age.svg": drawn, "risk.svg": broken})])
     assert list(board.failures.found) == ["figure risk.svg"]
     assert [path.name for path in (out / "boards" / "mine" / "figures").iterdir()] == ["age.svg"]
-    assert list(read_board(out / "boards" / "mine")[0]["failed"]) == ["figure risk.svg"]
+    assert list(read_board_manifest(out / "boards" / "mine").failed) == ["figure risk.svg"]
 
 
 def test_a_rejector_that_fails_with_one_judges_the_others(out, both, split):

@@ -14,11 +14,12 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.leaderboard.board import ScoreRequest
-from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
+from sasgeo_bench.leaderboard.manifests import BoardEntry, PipelineRecord, SeedResult
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, seed_lines, verdict_of
+from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, result_of, seed_lines
 from sasgeo_bench.leaderboard.tables import Cell, text_of
 from sasgeo_bench.leaderboard.validity_tables import seed_table
 from sasgeo_bench.publishing.archive import pack_board, request_of, score_all
@@ -75,9 +76,9 @@ def test_a_row_is_reproduced_where_the_private_figure_is_not_shown_to_be_worse(p
     assert [item.suite for item in figures] == ["all suites", "occlusion"]
     assert all(item.lo <= item.difference <= item.hi for item in figures)
     assert figures[0].blocks_shared == 12
-    found, why = verdict_of(figures)
-    assert found == verdict
-    assert f"private {private:.3f} against public {public:.3f}, difference {private - public:.3f} [" in why
+    found = result_of(figures)
+    assert found.verdict == verdict
+    assert f"private {private:.3f} against public {public:.3f}, difference {private - public:.3f} [" in found.why
 
 
 def test_a_single_suite_that_falls_is_found_among_others_that_hold():
@@ -85,19 +86,18 @@ def test_a_single_suite_that_falls_is_found_among_others_that_hold():
         shares = {"clean": 0.5, "occlusion": 0.5, "alias": 0.5, "season": fallen}
         return pd.concat([rows(share, suite=suite, seed=seed) for suite, share in shares.items()], ignore_index=True)
 
-    assert verdict_of(compare_seeds(frame(0.5, "public"), frame(0.5, "private"), draws=400))[0] == "reproduced"
-    found, why = verdict_of(compare_seeds(frame(0.95, "public"), frame(0.05, "private"), draws=400))
-    assert (found, why.split(",")[0]) == ("not reproduced", "season")
+    assert result_of(compare_seeds(frame(0.5, "public"), frame(0.5, "private"), draws=400)).verdict == "reproduced"
+    found = result_of(compare_seeds(frame(0.95, "public"), frame(0.05, "private"), draws=400))
+    assert (found.verdict, found.why.split(",")[0]) == ("not reproduced", "season")
 
 
 def test_few_blocks_make_no_row_reproduced_and_nothing_in_common_neither():
     figures = compare_seeds(rows(0.5, blocks=5), rows(0.5, blocks=12, seed="private"), draws=400)
-    assert verdict_of(figures) == (
-        "run here",
-        "localization is asked in 5 blocks of a seed, at least 6 are needed to decide",
-    )
+    found = result_of(figures)
+    assert found.verdict == "run here"
+    assert found.why == "localization is asked in 5 blocks of a seed, at least 6 are needed to decide"
     other = rows(0.5, seed="private", suite="alias")
-    assert verdict_of(compare_seeds(rows(0.5), other.iloc[:0], draws=400))[1] == "nothing was asked on both seeds"
+    assert result_of(compare_seeds(rows(0.5), other.iloc[:0], draws=400)).why == "nothing was asked on both seeds"
 
 
 def test_more_false_fixes_on_the_private_seed_are_worse_too():
@@ -108,7 +108,7 @@ def test_more_false_fixes_on_the_private_seed_are_worse_too():
     for public, private, verdict in ((0.1, 0.9, "not reproduced"), (0.9, 0.1, "reproduced")):
         figures = compare_seeds(frame(public, "public"), frame(private, "private"), draws=400)
         assert {item.metric for item in figures} == {"answered_absent"}
-        assert verdict_of(figures)[0] == verdict
+        assert result_of(figures).verdict == verdict
 
 
 def test_ground_that_both_seeds_have_in_common_is_drawn_for_both():
@@ -146,11 +146,11 @@ def made(tmp_path_factory):
 
 def request_on(out, **changes):
     board = ScoreRequest(predictions=[out / "runs"], root=out, board=out / "boards" / "little", draws=200)
-    return replace(board, pipeline=PIPELINE, **changes)
+    return replace(board, pipeline=PipelineRecord(**PIPELINE), **changes)
 
 
 def entry_of(folder):
-    (entry,) = read_board(folder)[0]["entries"]
+    (entry,) = read_board_manifest(folder).entries
     return entry
 
 
@@ -162,10 +162,10 @@ def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_bo
     private = made / "out" / "private" / "boards" / "little"
     board = make_board(request_on(made / "out", board=tmp_path / "board", private=private), tell=lines.append)
     entry = entry_of(tmp_path / "board")
-    assert entry["how"] == "not reproduced"
-    (figure,) = [item for item in entry["private"]["figures"] if item["suite"] == "clean"]
-    assert (figure["public"], figure["private"]) == (1.0, 0.0)
-    assert figure["hi"] < 0
+    assert entry.how == "not reproduced"
+    (figure,) = [item for item in entry.private.figures if item.suite == "clean"]
+    assert (figure.public, figure.private) == (1.0, 0.0)
+    assert figure.hi < 0
     assert set(board.table["how"]) == {"not reproduced"}
     assert any(
         line.startswith("redrawer: not reproduced (all suites, localization, success_25m: private") for line in lines
@@ -183,11 +183,11 @@ def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_bo
 @has_landlock
 def test_without_a_private_seed_a_row_says_run_here(made, tmp_path):
     make_board(request_on(made / "out", board=tmp_path / "board"), tell=silent)
-    about, _ = read_board(tmp_path / "board")
-    assert entry_of(tmp_path / "board")["how"] == "run here"
-    assert not {"private", "private_seed"} & about.keys()
+    about = read_board_manifest(tmp_path / "board")
+    assert entry_of(tmp_path / "board").how == "run here"
+    assert not {"private", "private_seed"} & about.model_fields_set
     assert "so none is reproduced" in seed_lines(about)[0]
-    assert seed_table(about) is None
+    assert seed_table(about.entries) is None
 
 
 @has_landlock
@@ -200,8 +200,8 @@ def test_stored_results_keep_both_figures_and_nothing_else_of_the_private_seed(m
     assert not [name for name in asked for data in packed if name.encode() in data]
     again = request_of([tmp_path / "pack"], board=tmp_path / "again", root=tmp_path)
     score_all(again, tell=silent)
-    assert entry_of(tmp_path / "again")["private"] == entry_of(tmp_path / "board")["private"]
-    assert entry_of(tmp_path / "again")["how"] == "not reproduced"
+    assert entry_of(tmp_path / "again").private == entry_of(tmp_path / "board").private
+    assert entry_of(tmp_path / "again").how == "not reproduced"
 
 
 @has_landlock
@@ -248,21 +248,24 @@ def test_a_private_board_of_something_else_is_refused(made, tmp_path, changes, w
 
 @has_landlock
 def test_only_the_same_code_shut_in_on_128_bits_vouches_for_a_row(made, tmp_path):
-    (entry,) = read_board(made / "out" / "private" / "boards" / "little")[0]["entries"]
+    said = entry_of(made / "out" / "private" / "boards" / "little").model_dump()
     seed = {"commitment": SEED.commitment, "bits": 80}
     for number, (changes, words) in enumerate(
         (
             ({"private_seed": seed}, "the private seed has 80 bits, 128 are needed"),
-            ({"entries": [entry | {"hash": "other"}]}, "this version, code and settings are not on the private board"),
             (
-                {"entries": [entry | {"isolation": {"truth": "not in its root | trusted code, not shut in"}}]},
+                {"entries": [said | {"hash": "other"}]},
+                "this version, code and settings are not on the private board",
+            ),
+            (
+                {"entries": [said | {"isolation": {"truth": "not in its root | trusted code, not shut in"}}]},
                 "on the private seed its truths were not kept from it (not in its root | trusted code, not shut in)",
             ),
         )
     ):
         private = changed(made, tmp_path / str(number), **changes)
         make_board(request_on(made / "out", board=tmp_path / f"board-{number}", private=private), tell=silent)
-        assert entry_of(tmp_path / f"board-{number}")["private"] == {"verdict": "run here", "why": words, "figures": []}
+        assert entry_of(tmp_path / f"board-{number}").private == SeedResult(verdict="run here", why=words, figures=[])
 
 
 @has_landlock
@@ -299,17 +302,21 @@ def test_a_private_pipeline_stores_no_results(program, tmp_path, monkeypatch):
 
 
 def test_boards_of_older_programs_do_not_pass_for_reproduced():
-    for entry, shown in (({"how": "reproduced"}, "run here"), ({"how": "reproduced", "private": {}}, "run here")):
+    fared = SeedResult(verdict="reproduced", why="", figures=[])
+    for private, shown in ((None, "run here"), (fared, "reproduced")):
+        entry = BoardEntry(name="mine", how="reproduced", private=private)
         assert [mark.text for mark in marks_of(entry, is_control=False)] == [shown]
-    entry = {"how": "reproduced", "private": {"verdict": "reproduced", "why": "", "figures": []}}
-    assert [mark.text for mark in marks_of(entry, is_control=False)] == ["reproduced"]
 
 
 def test_rows_of_answers_that_came_packed_say_so_whatever_a_private_seed_shows():
     packed = Entry(name="mine", version="1", hash="ab", how=PACKED, sources=())
     for verdict in ("run here", "reproduced"):
-        assert OnPrivate(rows={"mine": {"verdict": verdict}}).how(packed) == "answers came packed"
+        assert (
+            OnPrivate(rows={"mine": SeedResult(verdict=verdict, why="", figures=[])}).how(packed)
+            == "answers came packed"
+        )
+    shown = BoardEntry(name="random", how=PACKED)
     for is_control in (True, False):
-        assert "answers came packed" in [mark.text for mark in marks_of({"how": PACKED}, is_control=is_control)]
-        shown = Cell(text="random", marks=marks_of({"how": PACKED}, is_control=is_control))
-        assert "(answers came packed)" in text_of(shown)
+        assert "answers came packed" in [mark.text for mark in marks_of(shown, is_control=is_control)]
+        cell = Cell(text="random", marks=marks_of(shown, is_control=is_control))
+        assert "(answers came packed)" in text_of(cell)

@@ -35,7 +35,7 @@ def test_there_are_results_of_the_registered_experiment():
 @pytest.mark.parametrize("name", BOARDS)
 def test_results_are_of_the_pipeline_as_it_is_registered(name):
     spec = read_pipeline_file(find_pipeline_file(name))
-    assert stored_settings([RESULTS / name]).pipeline == {"id": name, "sha256": spec.sha256}
+    assert stored_settings([RESULTS / name]).pipeline == spec.identity
     said = json.loads((RESULTS / name / "board.json").read_text(encoding="utf-8"))
     assert {entry["name"] for entry in said["entries"]} >= set(spec.matchers) - {"oracle_pose"}
 

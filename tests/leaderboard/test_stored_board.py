@@ -30,7 +30,7 @@ def texts(figure):
 
 def test_a_board_has_its_tables_as_data_frames(board):
     about = json.loads((TOWNS / "board.json").read_text(encoding="utf-8"))
-    assert board.about["entries"] == about["entries"]
+    assert [entry.model_dump() for entry in board.about.entries] == about["entries"]
     assert set(board.leaderboard["matcher"]) == {entry["name"] for entry in about["entries"]}
     assert {"name", "difference", "lo", "hi", "verdict"} <= set(board.contrasts)
     assert {"matcher", "query_id", "is_right"} <= set(board.scores)

@@ -26,8 +26,7 @@ from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.publishing import archive, archive_file
 from sasgeo_bench.publishing.archive import laid_out, pack_board, score_all, stored_settings
-from sasgeo_bench.publishing.archive_file import read_stored_predictions, unpack, unpack_tasks
-from sasgeo_bench.publishing.archive_folder import read_settings
+from sasgeo_bench.publishing.archive_file import read_pack, read_stored_predictions, unpack, unpack_tasks
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.tasks.query import base_of
@@ -144,7 +143,7 @@ def test_stored_results_hold_the_board_and_what_it_was_made_of(kept):
     count = sum(len(rows) for rows in board.predictions.values())
     (said,) = [line for line in lines if f"{count} predictions" in line]
     assert said.startswith(f"{folder}: 0.")
-    assert read_settings(folder)["dropped"] == ""
+    assert read_pack(folder).dropped == ""
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -198,10 +197,10 @@ def test_stored_again_nothing_but_the_board_changes(kept, program, tmp_path):
     lean = tmp_path / "lean" / "kept"  # what is left out stays said
     total = pack_board(board, request_of(plan), lean).packed.total_bytes
     pack_board(board, request_of(plan), lean, most_bytes=total - 1)
-    dropped = read_settings(lean)["dropped"]
+    dropped = read_pack(lean).dropped
     assert "heading and scale" in dropped
     _, _, err = program("score", "--predictions", lean, "--name", "kept", "--results", lean.parent, "--out", tmp_path)
-    assert read_settings(lean)["dropped"] == dropped, err
+    assert read_pack(lean).dropped == dropped, err
 
 
 @pytest.mark.parametrize(
@@ -330,7 +329,7 @@ def test_a_file_that_differs_is_missing_or_is_more_is_named(own, mistake, name):
     with pytest.raises(StoreError, match="more is not in its list"):
         unpack_tasks(own, own.parent)
     (own / "more").unlink()
-    assert read_settings(own)["split"] == "crossfit"
+    assert read_pack(own).split == "crossfit"
 
 
 def as_former(folder, version):
@@ -383,7 +382,7 @@ def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replace
     del said["files"]
     (own / "pack.json").write_text(json.dumps(said), encoding="utf-8")
     former = shutil.copytree(own, tmp_path / "former")
-    assert read_settings(own)["files"] is None
+    assert read_pack(own).files is None
     assert len(unpack(own, tmp_path / "into").runs) == len(pq.read_table(own / "runs.parquet"))
     pack_board(kept[0], request_of(kept[1]), own)
     assert json.loads((own / "pack.json").read_text(encoding="utf-8"))["schema_version"] == 3
@@ -433,7 +432,6 @@ def test_publishing_stored_results_whose_tables_are_of_another_version_says_so(o
         ('{"draws": 1000000000}', "draws is 1000000000"),
         ('{"by_region": 5}', "by_region is 5"),
         ('{"pipeline": 5}', "is 5"),
-        ('{"pipeline": null}', "is None"),
         ('{"pipeline": "x"}', "is 'x'"),
         ('{"pipeline": {"id": "../../x", "sha256": ""}}', "'../../x'"),
         ('{"contrasts": [5]}', "contrasts.0 is 5"),
@@ -442,7 +440,7 @@ def test_publishing_stored_results_whose_tables_are_of_another_version_says_so(o
         ('{"files": null}', "lists no files"),
         ('{"files": {"a": 5}}', "files.a is 5"),
         ('{"splitt": "crossfit"}', "splitt is 'crossfit': Extra inputs are not permitted"),
-        ('{"pipeline": {"id": "demo", "sha256": "", "x": 1}}', "pipeline.PipelineRecord.x is 1: Extra inputs"),
+        ('{"pipeline": {"id": "demo", "sha256": "", "x": 1}}', "pipeline.x is 1: Extra inputs"),
         ('{"schema_version": 4}', "has schema version 4"),
         ("[" * 200_000, "nested too deep"),
     ],
@@ -513,7 +511,7 @@ def test_a_table_of_other_columns_is_one_line(own, mistake):
 def test_a_link_in_stored_results_is_refused_and_a_site_is_not(own, mistake, tmp_path):
     (own / "site").mkdir()
     (own / "site" / "index.html").touch()
-    assert read_settings(own)
+    assert read_pack(own)
     (tmp_path / "secret").write_text("secret", encoding="utf-8")
     (own / "leaderboard.md").unlink()
     (own / "leaderboard.md").symlink_to(tmp_path / "secret")
@@ -567,7 +565,7 @@ def test_results_are_stored_where_a_link_leads(kept, own, tmp_path):
     (tmp_path / "kept").symlink_to(own)
     pack_board(kept[0], request_of(kept[1]), tmp_path / "kept")
     assert (tmp_path / "kept").is_symlink()
-    assert read_settings(own)["split"] == "crossfit"
+    assert read_pack(own).split == "crossfit"
     (tmp_path / "one").symlink_to(tmp_path / "two")
     (tmp_path / "two").symlink_to(tmp_path / "one")
     with pytest.raises(StoreError, match="leads in a circle"):

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rows of other boards that asked the same queries stand beside those of a board."""
 
-import json
 from pathlib import Path
 
 import pandas as pd
@@ -37,8 +36,8 @@ def test_the_best_rows_of_a_board_with_the_same_queries_are_told_and_shown(tmp_p
     stored(tmp_path / "others", {"better": 1.0}, ["a", "c"])
     stored(tmp_path / "older", {"unknown": 1.0}, ["a", None])
     (stored(tmp_path / "damaged", {"spoilt": 1.0}, ["a", "b"]) / BOARD).write_text("{")
-    found = {"elsewhere": list(asked_elsewhere(mine))}
-    (line,) = elsewhere_lines(json.loads(json.dumps(found)))
+    found = asked_elsewhere(mine)
+    (line,) = elsewhere_lines(found)
     assert line.startswith("clean, localization: the same ")
     assert "queries on the board systems, success_25m: dense 0.900 [" in line
     assert [name for name in ("raster", "graph", "random", "better", "unknown", "spoilt") if name in line] == ["raster"]

@@ -14,17 +14,27 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.leaderboard.board_files import TABLES
 from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, cost_table, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
+from sasgeo_bench.leaderboard.manifests import (
+    BoardTask,
+    Elsewhere,
+    ElsewhereRow,
+    FailedCase,
+    PicturesManifest,
+    RegionMap,
+)
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables, risk_tables_by_suite
+from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, text_of, ties_of
 from sasgeo_bench.publishing import site_maps
 from sasgeo_bench.publishing.site import contrasts_of, site_pages
 from sasgeo_bench.publishing.site_maps import place_maps
 from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
 from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
-from sasgeo_bench.publishing.site_source import Case, Pictures, RegionMap, SiteSource, Spot
+from sasgeo_bench.publishing.site_source import SiteSource, Spot
 from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, Falsifier
 from sasgeo_bench.scoring.rows import ALL_SUITES, FIGURE_SCHEMA, Row
 from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
@@ -58,12 +68,15 @@ KEY = ("real-age", "localization", "r500-weak-s3")
 def source(table=None, findings=(), entries=(), **changes):
     board = many_rows(6) if table is None else table
     about = about_of([entry_of(name, **said) for name, said in dict(entries).items()])
-    made = SiteSource(name="mine", title="Mine", about=about, board=board, rates=load_ratebook())
-    return replace(made, contrasts=CONTRAST_SCHEMA.frame(findings), **changes)
+    tables = {name: changes.pop(name) for name in TABLES if name in changes}
+    made = StoredBoard(
+        folder=Path("mine"), about=about, leaderboard=board, **{"contrasts": CONTRAST_SCHEMA.frame(findings), **tables}
+    )
+    return SiteSource(name="mine", title="Mine", board=made, rates=load_ratebook(), **changes)
 
 
 def book_of(given):
-    return Book.of(given.board, given.about, given.scores)
+    return Book.of(given.board.leaderboard, given.board.about.entries, given.board.scores)
 
 
 @given(st.lists(st.text(max_size=80), unique=True, max_size=12))
@@ -102,12 +115,13 @@ def test_controls_and_those_without_a_rank_are_in_no_tie():
 
 
 def test_rows_of_another_board_with_the_same_queries_stand_on_the_first_page():
-    row = {"matcher": "dense", "n": 7, "value": 0.9, "lo": 0.8, "hi": 1.0}
+    row = ElsewhereRow(matcher="dense", n=7, value=0.9, lo=0.8, hi=1.0)
     given = source()
     (key,) = {(item.suite, item.track, item.prior_group) for item in sections_of(book_of(given))}
     where = dict(zip(("suite", "track", "prior_group"), key, strict=True))
-    other = {"board": "systems", **where, "metric": "success_25m", "rows": [row]}
-    page = site_pages(replace(given, about={**given.about, "elsewhere": [other]}))["index.html"]
+    other = Elsewhere(board="systems", **where, metric="success_25m", rows=[row])
+    board = replace(given.board, about=given.board.about.model_copy(update={"elsewhere": [other]}))
+    page = site_pages(replace(given, board=board))["index.html"]
     assert "The same 7 queries on the board systems: its best rows, not ranked here" in page
 
 
@@ -225,10 +239,10 @@ def test_places_lie_in_the_middle_of_their_regions_and_unknown_ones_nowhere():
         for name, lon in (("vaduz", 9.0), ("eschen", 10.0), ("unasked", 50.0))
     }
     parts = {"vaduz": ("liechtenstein", "a"), "eschen": ("liechtenstein", "a")}
-    about = {"tasks": [{"region": name} for name in ("vaduz@2015-07-27", "eschen+alias", "mine")]}
-    (place,) = places_on_map(about, spots, parts)
+    tasks = [BoardTask(suite="clean", region=name) for name in ("vaduz@2015-07-27", "eschen+alias", "mine")]
+    (place,) = places_on_map(tasks, spots, parts)
     assert (place.number, place.name, place.part, place.longitude_deg) == (1, "liechtenstein", "a", 9.5)
-    assert list(regions_of(about)) == ["eschen", "mine", "vaduz"]
+    assert list(regions_of(tasks)) == ["eschen", "mine", "vaduz"]
 
 
 def test_the_drawings_of_a_site_say_what_they_show_and_whose_data_it_is(tmp_path):
@@ -237,7 +251,7 @@ def test_the_drawings_of_a_site_say_what_they_show_and_whose_data_it_is(tmp_path
         for name, lon, lat in (("vaduz", 9.5, 47.1), ("town", 11.0, 48.0), ("oakland", -122.0, 37.8))
     }
     parts = {"vaduz": ("liechtenstein", "a"), "oakland": ("oakland", "b")}
-    places = places_on_map({"tasks": [{"region": name} for name in spots]}, spots, parts)
+    places = places_on_map([BoardTask(suite="clean", region=name) for name in spots], spots, parts)
     draw_places(tmp_path / "places.svg", places)
     draw_rates(tmp_path / "rates.svg", load_ratebook())
     texts = {
@@ -393,11 +407,11 @@ def test_the_training_of_a_matcher_is_listed_by_region_because_tasks_are_hundred
 
 
 def test_a_place_has_its_answers_in_metres_from_the_corner_of_its_map():
-    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
-    unknown = RegionMap(of="balzers", file="balzers.png", alt="")
-    cases = (Case(query_id="q1", matcher="graph", failure="aliased", file="a.png", alt=""),)
-    pictures = Pictures(regions=(unknown, item), cases=cases)
-    whole = replace(source(), answers=answers_of([MARKUP]), pictures=pictures)
+    item = RegionMap(region="vaduz", file="vaduz.png", bounds_m=BOUNDS_M)
+    unknown = RegionMap(region="balzers", file="balzers.png")
+    cases = [FailedCase(query_id="q1", matcher="graph", failure="aliased", file="a.png")]
+    pictures = PicturesManifest(regions=[unknown, item], cases=cases)
+    whole = source(answers=answers_of([MARKUP]), pictures=pictures)
     ((place, script),) = place_maps(whole).items()
     assert (place.region, place.queries) == ("vaduz", 3)
     said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
@@ -405,13 +419,13 @@ def test_a_place_has_its_answers_in_metres_from_the_corner_of_its_map():
     assert said["answers"] == [[MARKUP, [[0, 0, 100.0, 200.0, 90.0], [1, 1, 400.0, 200.0, 90.0], [2, -1]]]]
     assert said["cases"] == {"1": 1}
     assert script.isascii()
-    assert place_maps(replace(whole, answers=pd.DataFrame())) == {}
+    assert place_maps(source(pictures=pictures)) == {}
 
 
 def test_what_was_not_asked_is_no_failure_on_a_map():
-    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
+    item = RegionMap(region="vaduz", file="vaduz.png", bounds_m=BOUNDS_M)
     answers = answers_of(["graph"]).assign(status="not applicable", failure="")
-    ((_, script),) = place_maps(replace(source(), answers=answers, pictures=Pictures(regions=(item,)))).items()
+    ((_, script),) = place_maps(source(answers=answers, pictures=PicturesManifest(regions=[item]))).items()
     said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
     number = list(site_maps.OUTCOMES).index("not applicable")
     assert {row[1] for row in said["answers"][0][1]} == {number}
@@ -436,11 +450,11 @@ def test_costs_are_sorted_by_the_first_of_them():
 
 
 def test_of_many_answers_a_share_is_drawn_those_with_a_picture_first_and_the_page_says_so(monkeypatch):
-    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
+    item = RegionMap(region="vaduz", file="vaduz.png", bounds_m=BOUNDS_M)
     some = answers_of(["graph", "raster"])
     many = pd.concat([some.assign(query_id=some["query_id"] + f"-{at}") for at in range(100)], ignore_index=True)
-    cases = (Case(query_id="q1-42", matcher="graph", failure="aliased", file="a.png", alt=""),)
-    given = replace(source(), answers=many, pictures=Pictures(regions=(item,), cases=cases))
+    cases = [FailedCase(query_id="q1-42", matcher="graph", failure="aliased", file="a.png")]
+    given = source(answers=many, pictures=PicturesManifest(regions=[item], cases=cases))
     ((place, whole),) = place_maps(given).items()
     assert (place.queries, place.drawn) == (300, 300)
     assert "Every query of a place" in site_pages(given)["map.html"]
@@ -463,13 +477,13 @@ def test_of_many_answers_a_share_is_drawn_those_with_a_picture_first_and_the_pag
     [("true_northing_m", math.nan), ("fix_easting_m", math.inf), ("view_m", 0.0), ("view_m", 1e308)],
 )
 def test_answers_that_lie_nowhere_are_refused_by_row(column, value):
-    item = RegionMap(of="vaduz", file="vaduz.png", alt="", bounds_m=tuple(BOUNDS_M))
+    item = RegionMap(region="vaduz", file="vaduz.png", bounds_m=BOUNDS_M)
     answers = answers_of(["mine"])
     answers.loc[1, column] = value
     with pytest.raises(
         StoreError, match=r"^answers\.parquet holds a view or a pose that lies nowhere, in row 1: score"
     ):
-        place_maps(replace(source(), answers=answers, pictures=Pictures(regions=(item,))))
+        place_maps(source(answers=answers, pictures=PicturesManifest(regions=[item])))
 
 
 def test_false_fixes_stand_beside_the_success_of_a_suite_with_absent_places():

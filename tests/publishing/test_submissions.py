@@ -17,11 +17,13 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import file_record
 from sasgeo_bench.leaderboard.board import ScoreRequest
-from sasgeo_bench.leaderboard.board_files import read_board
+from sasgeo_bench.leaderboard.board_files import read_board_manifest, read_leaderboard
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import Card, example_card
-from sasgeo_bench.publishing.archive import laid_tasks, pack_board, stored_settings
+from sasgeo_bench.publishing.archive import laid_tasks, pack_board
+from sasgeo_bench.publishing.archive_file import read_pack
 from sasgeo_bench.publishing.submissions import (
     SubmitRequest,
     hold_submission,
@@ -76,7 +78,7 @@ def stored(tasks, tmp_path_factory):
         board=out / "boards" / "kept",
         split=find_split("crossfit"),
         draws=100,
-        pipeline={"id": "kept", "sha256": "0"},
+        pipeline=PipelineRecord(id="kept", sha256="0"),
     )
     pack_board(make_board(request, tell=silent), request, out.parent / "kept")
     return out.parent / "kept"
@@ -490,7 +492,7 @@ def test_rows_and_versions_that_do_not_fit_the_board_are_listed_and_never_scored
     assert fault in out
     (entry,) = find_entries([], [copied])
     with laid_tasks([stored]) as folders, pytest.raises(ConfigError) as refused:
-        check_submitted(entry, [*map(task_files.Task.open, folders)], find_split(stored_settings([stored]).split))
+        check_submitted(entry, [*map(task_files.Task.open, folders)], find_split(read_pack(stored).split))
     assert fault in str(refused.value)
 
 
@@ -501,10 +503,10 @@ def test_a_submission_with_a_fault_costs_nobody_the_board(copied, stored, progra
     assert code == CONTESTANT_FAILED
     assert "failed, and so not on the board: mine: " in err
     assert "confidence is -0.5" in err
-    about, _ = read_board(tmp_path / "boards" / "both")
-    assert list(about["failed"]) == ["mine"]
-    assert about["entries"]
-    assert "mine" not in {entry["name"] for entry in about["entries"]}
+    about = read_board_manifest(tmp_path / "boards" / "both")
+    assert list(about.failed) == ["mine"]
+    assert about.entries
+    assert "mine" not in {entry.name for entry in about.entries}
 
 
 def test_every_submission_of_the_repository_is_sound() -> None:
@@ -578,14 +580,14 @@ def test_what_is_named_must_be_a_submission_or_a_folder_of_them(copied):
 def test_submissions_stand_beside_what_was_run_and_say_so(copied, stored, tmp_path):
     change_said(copied, lambda said: said["card"].update(title="<script>alert(1)</script>"))
     with_submissions(stored, [copied.parent], tmp_path / "both", tell=silent)
-    about, table = read_board(tmp_path / "both")
-    said = {entry["name"]: entry for entry in about["entries"]}
-    assert {name: entry["how"] for name, entry in said.items()} == {
+    about, table = read_board_manifest(tmp_path / "both"), read_leaderboard(tmp_path / "both")
+    said = {entry.name: entry for entry in about.entries}
+    assert {name: entry.how for name, entry in said.items()} == {
         "mine": "as submitted",
         "prior_centre": "run here",
     }
-    assert said["mine"]["card"]["source"] == "original"
-    assert (said["mine"]["trained_on"], said["mine"]["set_apart"]) == ([], None)
+    assert said["mine"].card.source == "original"
+    assert (said["mine"].trained_on, said["mine"].set_apart) == ([], None)
     rows = table[(table["matcher"] == "mine") & (table["metric"] == "success_25m") & (table["stratum"] == "all")]
     assert set(rows["value"]) == {1.0}
     assert set(rows["how"]) == {"as submitted"}
@@ -611,9 +613,9 @@ def test_who_was_taught_by_a_test_place_is_set_apart(copied, stored, tmp_path, t
     lines = []
     board = with_submissions(stored, [copied], tmp_path / "both", tell=lines.append)
     assert board.apart == ({} if why is None else {"mine": why})
-    (entry,) = [one for one in read_board(tmp_path / "both")[0]["entries"] if one["name"] == "mine"]
-    assert entry["set_apart"] == why
-    assert set(entry["trained_on"]) <= {"munich", "town-riverside"}
+    (entry,) = [one for one in read_board_manifest(tmp_path / "both").entries if one.name == "mine"]
+    assert entry.set_apart == why
+    assert set(entry.trained_on) <= {"munich", "town-riverside"}
     text = (tmp_path / "both" / "leaderboard.md").read_text(encoding="utf-8")
     assert ("## Set apart, not to be compared with those above: clean, localization" in text) == (why is not None)
     assert (f"- mine is set apart: {why}." in text) == (why is not None)
@@ -648,7 +650,7 @@ def test_one_command_scores_stored_results_and_submissions(copied, stored, progr
     code, out, err = program(*words)
     assert code == 0, err
     assert "as submitted" in out
-    assert read_board(tmp_path / "boards" / "both")[0]["entries"][0]["name"] == "mine"
+    assert read_board_manifest(tmp_path / "boards" / "both").entries[0].name == "mine"
 
 
 def test_of_submissions_that_share_a_name_none_is_scored_and_the_others_are(copied, tmp_path):
@@ -694,4 +696,4 @@ def test_a_submission_that_has_the_name_of_another_entry_is_left_out(copied, sto
     code, _, err = program(*words)
     assert code == CONTESTANT_FAILED
     assert f"{copied}: 'mine' is the name of another entry of the board: choose another name" in err
-    assert [entry["name"] for entry in read_board(tmp_path / "boards" / "board")[0]["entries"]].count("mine") == 1
+    assert [entry.name for entry in read_board_manifest(tmp_path / "boards" / "board").entries].count("mine") == 1

@@ -89,7 +89,7 @@ def test_who_is_set_apart_has_no_row_and_is_nobodys_rival():
 def test_kinds_of_few_places_are_marked_and_rank_nobody():
     rows = {"mine": asked(places=10), "other": asked((MISS, HIT), places=10)}
     frame = scene_frame(rows, draws=50)
-    (table,) = scene_tables(frame, Book.of(leaderboard(rows, draws=50), {}))
+    (table,) = scene_tables(frame, Book.of(leaderboard(rows, draws=50)))
     assert [column.name for column in table.columns] == ["matcher", "all", "urban", "alpine", "coastal"]
     places, queries, *_ = table.rows
     assert [cell.text for cell in places.cells] == ["places", "10", "5", "5", "5"]
@@ -101,7 +101,7 @@ def test_kinds_of_few_places_are_marked_and_rank_nobody():
 
 def test_the_suite_of_most_places_comes_first():
     rows = {"mine": pd.concat([asked(places=2, suite="aerial+forest"), asked(places=8)], ignore_index=True)}
-    tables = scene_tables(scene_frame(rows, draws=50), Book.of(leaderboard(rows, draws=50), {}))
+    tables = scene_tables(scene_frame(rows, draws=50), Book.of(leaderboard(rows, draws=50)))
     assert [table.title.partition(": ")[0] for table in tables] == [
         "With a map 2 to 10 years old (real-age)",
         "With a picture and a map of the day (aerial+forest)",

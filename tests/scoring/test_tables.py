@@ -10,6 +10,7 @@ import pytest
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.leaderboard.board_tables import Book
+from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown, tables_of, warnings_of
@@ -26,7 +27,9 @@ from sasgeo_bench.scoring.tables import cost_figures, leaderboard
 from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
 from sasgeo_bench.texts import markdown
 
-ABOUT = {"scorer_version": 1, "task_version": 1, "made_by": "tests", "split": "crossfit", "draws": 200}
+ABOUT = BoardManifest(
+    scorer_version=1, task_version=1, made_by="tests", split="crossfit", draws=200, entries=[], tasks=[]
+)
 
 
 def scores(errors_m, *, blocks=4, track="localization", **changes):
@@ -114,7 +117,7 @@ def test_a_fix_that_is_near_and_turned_is_no_success_and_yet_within():
     board = leaderboard({"mine": table}, draws=200)
     assert pick(board, "mine", "success_25m")["value"] == 0.25
     assert pick(board, "mine", "within_25m")["value"] == 0.75 == table["is_right"].mean()
-    (shown,) = tables_of(board, {})
+    (shown,) = tables_of(board)
     assert column_of(shown, "within_25m")[0].startswith("0.750 [")
 
 
@@ -223,7 +226,7 @@ def test_what_is_set_apart_has_figures_and_no_rank_and_is_nobodys_rival():
         assert ranks(mine) == ranks(before)
         assert mine["detectable"] == before["detectable"]
     said = {name: EntryLabel("1", "", "as submitted", "for a reason" if name == "best" else None) for name in tables}
-    first, apart = tables_of(with_entry_labels(board, said), {})
+    first, apart = tables_of(with_entry_labels(board, said))
     assert set(column_of(first, "matcher")) == {"good (as submitted)", "bad (as submitted)"}
     assert column_of(apart, "matcher") == ["best (as submitted) (set apart)"]
     assert apart.notes == ("best: for a reason.",)
@@ -313,7 +316,7 @@ def test_the_texts_say_the_figures_and_what_is_missing():
     latex = board_latex(board, ABOUT)
     assert latex.count(r"\begin{table}") == latex.count(r"\end{table}") == 1
     assert "success_25m" not in latex.replace(r"\_", "~")
-    (short,) = summary(Book.of(board, {}))
+    (short,) = summary(Book.of(board))
     assert short.title.startswith("success_25m [95 %] (rank), localization, searched: disc of 500 m")
     one, none = wilson(1, 4), wilson(0, 4)
     expected = [f"0.250 [{one.lo:.2f}, {one.hi:.2f}] (-)", f"0.000 [0.00, {none.hi:.2f}] (control)"]
@@ -329,9 +332,9 @@ def test_the_head_of_a_suite_counts_the_queries_of_its_figures_whoever_does_not_
     said = {"role": ["stress", "control"] * 4}
     able = scores([1.0, 99.0] * 4, **said)
     board = leaderboard({"able": able, "not": scores([math.inf] * 8, status="not applicable", **said)}, draws=200)
-    (short,) = summary(Book.of(board, {}))
+    (short,) = summary(Book.of(board))
     assert short.rows[0].cells[1].text == "4"
-    (alone,) = summary(Book.of(board[board["matcher"] == "not"], {}))
+    (alone,) = summary(Book.of(board[board["matcher"] == "not"]))
     assert alone.rows[0].cells[1].text == "8"
 
 
@@ -340,7 +343,7 @@ def test_two_versions_of_a_control_are_controls_both():
     board = leaderboard({name: scores([1.0, 99.0] * 10, blocks=6) for name in names}, draws=200)
     found = {name: ranks(pick(board, name, "success_25m")) for name in names}
     assert found == {names[0]: (None, None), names[1]: (None, None), "mine": (1, 1)}
-    (short,) = summary(Book.of(board, {}))
+    (short,) = summary(Book.of(board))
     shown = [text_of(row.cells[1]).partition("] ")[2] for row in short.rows[1:]]
     assert shown == ["(control)", "(control)", "(1)"]
 
@@ -366,7 +369,7 @@ def test_the_board_says_what_each_of_its_columns_is():
     board = pd.concat([leaderboard(tables, draws=200), costs, rows], ignore_index=True)
     text = board_markdown(board, ABOUT).split("## How to read")[1]
     terms = {line.split("**")[1] for line in text.splitlines() if line}
-    shown = {column.term for table in tables_of(board, {}) for column in table.columns}
+    shown = {column.term for table in tables_of(board) for column in table.columns}
     assert {markdown(name) for name in shown} <= terms
     assert {"rejector", "false fixes", "latency_p50"} <= shown
     assert "no meaning" not in text
@@ -402,7 +405,7 @@ def test_of_candidates_a_board_says_what_guessing_is_worth():
     board = leaderboard({"mine": scores([math.nan] * 4, track="retrieval", pool=[10, 10, 50, 50], **found)}, draws=200)
     assert pick(board, "mine", "chance_1")["value"] == pytest.approx((0.1 + 0.02) / 2)
     assert "chance 0.060 (n = 4)" in board_markdown(board, ABOUT)
-    (short,) = summary(Book.of(board, {}))
+    (short,) = summary(Book.of(board))
     heads = [[cell.text for cell in row.cells] for row in short.rows if row.tone == "head"]
     assert heads == [["queries", "4"], ["chance", "0.060"]]
 

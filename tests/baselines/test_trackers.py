@@ -160,10 +160,8 @@ def test_a_lost_step_is_found_again(name, prepared, flight) -> None:
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 40), (3, 3), (513, 5)], ids=lambda shape: f"{shape[0]} x {shape[1]}")
 @pytest.mark.parametrize("name", NEAR_M)
-def test_a_map_of_any_size_is_read(name, shape, region, flight, request) -> None:
+def test_a_map_of_any_size_is_read(name, shape, region, flight) -> None:
     """Of 513 rows the last is alone in its strip and its block."""
-    if (name, shape) == ("lsvl_belief", (1, 40)):
-        request.applymarker(pytest.mark.xfail(raises=ValueError, reason="its grid is scaled by rows alone"))
     tracker = made(name, count=100)
     small = region_of(region.layers[:, : shape[0], : shape[1]].copy())
     small.manifest = region.manifest

@@ -67,13 +67,14 @@ class Shares:
     @classmethod
     def of(cls, region: sgb.Region) -> Self:
         """Read a map in cells of a whole number of its own, of about `CELL_M`."""
-        grid = region.grid.coarsen(max(1, round(CELL_M / region.grid.cell_size_m)))
+        factor = max(1, round(CELL_M / region.grid.cell_size_m))
+        grid = region.grid.coarsen(factor)
         is_known = region.known()
         classes = tuple(name for name in region.classes if (region.layer(name) == sgb.PRESENT).any())
         present = np.zeros((len(classes), *grid.shape), dtype=np.uint8)
         for name, into in zip(classes, present, strict=True):
-            into[:] = _share((region.layer(name) == sgb.PRESENT) & is_known, grid)
-        return cls(grid=grid, classes=classes, present=present, known=_share(is_known, grid))
+            into[:] = _share((region.layer(name) == sgb.PRESENT) & is_known, grid, factor)
+        return cls(grid=grid, classes=classes, present=present, known=_share(is_known, grid, factor))
 
     def described(self, part_m: float) -> "Described":
         """Average over discs as large as a part of a view, so that the heading does not matter."""
@@ -155,9 +156,8 @@ def _disc(radius: float) -> Floats:
     return np.asarray(kernel / kernel.sum())
 
 
-def _share(layer: NDArray[np.bool_], grid: sgb.Grid) -> NDArray[np.uint8]:
+def _share(layer: NDArray[np.bool_], grid: sgb.Grid, factor: int) -> NDArray[np.uint8]:
     """Return the share of each cell of a coarser grid, 0..255."""
-    factor = -(-layer.shape[0] // grid.rows)
     around = [(0, count * factor - size) for count, size in zip(grid.shape, layer.shape, strict=True)]
     marked = np.pad(layer.view(np.uint8) * np.uint8(_FULL), around)
     return np.asarray(cv2.resize(marked, (grid.cols, grid.rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self, TypeVar
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import shapely
 from pydantic import ConfigDict, Field, JsonValue
 
@@ -660,13 +659,15 @@ class Task:
     def parts(self) -> set[str]:
         """Read which parts of a split the queries belong to."""
         batches = read_batches(self.folder / QUERIES, ["part"])
-        return {str(part) for batch in batches for part in pc.unique(batch["part"]).to_pylist()}
+        return {str(part) for batch in batches for part in batch["part"].unique().to_pylist()}
 
     def view_bytes(self) -> dict[str, int]:
         """Return the bytes of each query's view as it travels: packed cells, confidences and vectors, uncompressed.
 
         The size of packed cells follows from their shape, so that no view is read. Stored results record the bytes.
         """
+        import pyarrow.compute as pc  # noqa: PLC0415 - slow, and no process of a matcher needs it
+
         path = self.folder / QUERIES
         if VIEW_BYTES in read_schema(path, mend=_MEND).names:
             table = read_table(path, mend=_MEND, columns=["query_id", VIEW_BYTES])

@@ -165,7 +165,7 @@ class Answers:
     def open(cls, folder: Path, asked: Mapping[str, str], *, is_tied: bool = True) -> Self:
         """Read answers to some queries from a run's folder; of two for one query, the one that was written last.
 
-        `asked` gives the hash of each query, by id (`task_files.read_asked`); a row must carry it, tied to what
+        `asked` gives the hash of each query, by id (`Task.asked`); a row must carry it, tied to what
         `run.json` says. `is_tied` states whether rows without a hash are known to answer these queries. A run that was
         killed before its first row has no answers. Raise `StoreError` if a part cannot be read.
         """

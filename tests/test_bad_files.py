@@ -36,7 +36,6 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.importers.kinds import read_dataset
 from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
-from sasgeo_bench.leaderboard.board_files import SCHEMAS
 from sasgeo_bench.leaderboard.manifests import PackManifest
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
 from sasgeo_bench.matching.card_file import read_card_file
@@ -247,11 +246,7 @@ def read_pack(folder: Path) -> object:
 
 
 def read_board(folder: Path) -> object:
-    files = read_board_files(folder / "board")
-    SCHEMAS["leaderboard"].check(files.board)
-    for name, table in files.tables.items():
-        SCHEMAS[name].check(table)
-    return files
+    return read_board_files(folder / "board")
 
 
 def read_scores(folder: Path) -> object:

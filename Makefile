@@ -141,9 +141,6 @@ ageing: $(STAMP) ## measure docs/ageing anew: EXTRACTS=<folder of the dated extr
 figures: $(STAMP) ## draw docs/figures anew: EXTRACTS=<folder of the dated extracts>, default SASGEO_EXTRACTS
 	@test -n "$(EXTRACTS)" || { echo "name the folder of the extracts: make figures EXTRACTS=~/osm" >&2; exit 2; }
 	$(SASGEO) build-region vaduz --extracts "$(EXTRACTS)" --out $(OUT)
-	$(SASGEO) build-region vaduz --date 2015-07-27 --extracts "$(EXTRACTS)" --out $(OUT)
-	$(SASGEO) lookalike vaduz@2015-07-27 --world vaduz --out $(OUT)
-	cp $(OUT)/sheets/lookalike-vaduz-2015-07-27.png docs/figures/lookalike.png
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/regions/vaduz/preview.png docs/figures/region.webp
 	$(SASGEO) publish --board docs/results/modules --into $(OUT)/public
 	$(VENV_PYTHON) docs/figures/shrink.py $(OUT)/public/index.html docs/figures/board.webp

@@ -50,7 +50,6 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "new": "doors",
         "check": "doors",
         "weights": "weights",
-        "lookalike": "weights",
     },
     "Runs": {
         "run": "runs",

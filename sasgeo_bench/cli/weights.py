@@ -10,11 +10,9 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, say, tell
+from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.leaderboard.lookalike import SIDE_M, find_lookalike, sheet_of
-from sasgeo_bench.leaderboard.lookalike_plot import draw_lookalike
 from sasgeo_bench.matching.learned_file import WHERE, read_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Region
@@ -79,30 +77,6 @@ def weights_command(
             say(f"map of weights: {path}")
 
 
-def lookalike_command(
-    region: Annotated[str, typer.Argument(help="a built region or its folder: the map, as in vaduz@2015-07-27")],
-    world: Annotated[
-        str | None, typer.Option(help="the same region at a later date: what is seen; default: the map itself")
-    ] = None,
-    learned: Learned = None,
-    side_m: Annotated[float, typer.Option(min=64, max=1000, help="side of the view, metres")] = SIDE_M,
-    out: Out = Path("out"),
-) -> None:
-    """Draw a place, the weights of its map, and the place most like it by class shares; with both scores."""
-    model = read_model(learned)
-    mapped = find_region(region, out=out)
-    seen = mapped if world is None else find_region(world, out=out)
-    known = check_classes(model or ScorerModel.by_hand(mapped.classes), mapped.classes)
-    tell(f"searching {region} for the place that is most like another")
-    found = find_lookalike(mapped, seen, known, side_m=side_m)
-    for table in (_numbers(found.scores), _numbers(found.terms)):
-        print_table(table)
-    path = out / "sheets" / f"lookalike-{mapped.manifest.id}-{mapped.manifest.extract.date}.png"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    draw_lookalike(path, sheet_of(found, mapped, known))
-    say(f"lookalike: {path}")
-
-
 def read_model(path: Path | None) -> ScorerModel | None:
     """Read a fitted model whose classes this program knows; None if no file is named."""
     if path is None:
@@ -140,15 +114,6 @@ def _table(wide: pd.DataFrame, digits: int) -> Table:
         column.justify = "right"
     for name, row in zip(wide.index, wide.to_numpy(), strict=True):
         table.add_row(name, *(f"{value:.{digits}f}" for value in row))
-    return table
-
-
-def _numbers(frame: pd.DataFrame) -> Table:
-    table = Table(str(frame.index.name or "nats"), *frame.columns, box=None, pad_edge=False)
-    for column in table.columns[1:]:
-        column.justify = "right"
-    for name, row in zip(frame.index, frame.to_numpy(), strict=True):
-        table.add_row(str(name), *(f"{value:.3f}" for value in row))
     return table
 
 

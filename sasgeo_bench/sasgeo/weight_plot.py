@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of the weights of a map: of a region, and parts for the picture of a place and its lookalike."""
+"""Pictures of the weights of the map of a region."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

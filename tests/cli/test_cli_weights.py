@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`weights` and `lookalike` as a user meets them."""
+"""`weights` as a user meets it."""
 
 import json
 
@@ -46,23 +46,13 @@ def test_a_region_gets_a_picture_for_each_age(program, own_out):
     assert (young != old).any()
 
 
-def test_a_lookalike_is_drawn_and_its_scores_are_printed(program, own_out, learnt_file):
-    words = ("lookalike", TOWN, "--side-m", "96", "--learned", learnt_file, "--out", own_out)
-    code, told, _ = program(*words)
-    assert code == 0
-    assert [line.split()[0] for line in told.splitlines() if line.startswith(("raster", "graph", "joint"))]
-    path = told.strip().splitlines()[-1].removeprefix("lookalike: ")
-    assert image.imread(path).shape[1] > 1000
-
-
 @pytest.mark.parametrize("age", ["-1", "nan", "inf"])
 def test_what_is_no_age_gets_one_line(mistake, age):
     assert "at least 0 years and finite" in mistake("weights", f"--age={age}")
 
 
 def test_an_unknown_region_gets_the_nearest_name(mistake, own_out):
-    for command in ("weights", "lookalike"):
-        assert f"did you mean {TOWN!r}?" in mistake(command, "town-riversite", "--out", own_out)
+    assert f"did you mean {TOWN!r}?" in mistake("weights", "town-riversite", "--out", own_out)
     assert "build-region it first" in mistake("weights", "vaduz", "--out", own_out)
 
 

@@ -150,7 +150,7 @@ def _request_sha256(request: Request) -> str:
 
 def _foreign_code(request: Request) -> tuple[str, ...]:
     """Return the hash of a suite that is not ours: another code draws other queries."""
-    code = suite_code(request.suite_spec)
+    code = suite_code(request.suite_spec or request.suite)
     return () if code is None else (code,)
 
 
@@ -342,7 +342,7 @@ def _origin(
     request: Request, drawer: Drawer | FlightDrawer, region: str, sites: Sequence[Site], jobs: Sequence[Job]
 ) -> TaskOrigin:
     """Say how the queries were drawn, but not where they lie."""
-    card, code = drawer.suite.card, suite_code(request.suite_spec)
+    card, code = drawer.suite.card, suite_code(request.suite_spec or request.suite)
     state = drawer.scene.state(region)
     manifest = region_files.read_manifest(request.out / "regions" / region)
     spec = request.split.spec

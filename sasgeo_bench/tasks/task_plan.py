@@ -47,11 +47,11 @@ class Settings:
 class Request(Settings):
     """One suite on one region, with the split and the region for views of a wrong place.
 
-    `suite` is its name, which folders have; `suite_spec` is what it is found by in each process (`find_suite`).
+    `suite` is its name, which folders have; `suite_spec` is what it is found by, if that is not the name.
     """
 
     suite: str
-    suite_spec: str
+    suite_spec: str = ""
     region: RegionFile
     split: Split
     elsewhere: RegionFile | None = None
@@ -59,7 +59,7 @@ class Request(Settings):
     @property
     def found(self) -> Suite:
         """Return the suite."""
-        return find_suite(self.suite_spec)
+        return find_suite(self.suite_spec or self.suite)
 
     @property
     def most(self) -> int:

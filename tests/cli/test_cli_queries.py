@@ -315,7 +315,7 @@ def test_what_is_wrong_with_a_task_is_told_on_one_line(program, out):
     [
         ("{", "is damaged"),
         ('{"schema_version": 0}', "has schema version 0, this version reads 1: make the queries again"),
-        ('{"schema_version": 1}', "is damaged (task.json: 'task_version' is missing; 'suite'"),
+        ('{"schema_version": 1}', "is damaged (task.json: 'suite' is missing; 'title' is missing"),
     ],
 )
 @pytest.mark.parametrize("command", ["inspect", "verify"])

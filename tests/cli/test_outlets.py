@@ -75,7 +75,7 @@ def test_every_command_has_both_flags_and_they_end_with_it(program, tmp_path):
     assert (code, out) == (2, "")
     assert "did you mean 'vaduz'" in err
     lines = logged(tmp_path / "all.log")
-    assert lines[0] == "sasgeo-bench list-regions --quiet --log all.log"
+    assert lines[0] == "sasgeo-bench list regions --quiet --log all.log"
     assert lines[-3:] == ["sasgeo-bench build-region vadus --quiet --log all.log", err.strip(), "ended with status 2"]
     assert lines.count("ended with status 0") == 1
     assert not {progress.QUIET, console.LOG} & set(os.environ)

@@ -21,6 +21,8 @@ from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.submission import Card, example_card
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.publishing.submissions import SubmitRequest, hold_submission, make_submission
+from sasgeo_bench.tasks.suites.all_suites import find_suite
+from sasgeo_bench.tasks.task_plan import Request
 from tests.experiments.test_pipeline import TEXT as PIPELINE
 from tests.threaded import threaded
 
@@ -111,7 +113,7 @@ def test_the_program_of_the_page_answers_without_this_package(request_, released
 
 
 def test_a_board_of_pictures_is_refused_before_anything_is_drawn(request_, monkeypatch):
-    monkeypatch.setattr(board_queries, "PICTURED", {"clean"})
+    monkeypatch.setattr(Request, "found", find_suite("aerial"))
     monkeypatch.setattr(board_queries, "draw_all", pytest.fail)
     with pytest.raises(ConfigError, match="'small' asks about pictures, which a release does not hold: its queries"):
         draw_board(request_, tell=silent)

@@ -46,7 +46,10 @@ def cases(rights, suites=None):
     names = suites or ["aerial+good"] * len(rights)
     rows = rows.assign(query_id=[f"q{at:02}" for at in range(len(rows))], region="town", suite=names, role="stress")
     rows = rows.assign(yaw_error_deg=0.0, detector="rendered")
-    tasks = {(name, "town"): SimpleNamespace(about={"frames": 3} if "+" in name else {}) for name in set(names)}
+    tasks = {
+        (name, "town"): SimpleNamespace(manifest=SimpleNamespace(frames=3 if "+" in name else None))
+        for name in set(names)
+    }
     return SimpleNamespace(scores=rows.assign(is_present=True), tasks=tasks, run="out/runs/good")
 
 

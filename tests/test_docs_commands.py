@@ -67,7 +67,7 @@ ONLY_PARSED = {
 }
 # Commands of other programs that are not run, each with its reason.
 OTHERS = {
-    r"^pip install -e my-(matcher|segmenter|tracker)$": "done by hand: an installation needs the package registry",
+    r"^pip install -e my-(matcher|segmenter|tracker|suite)$": "done by hand: it needs the package registry",
     r"^(sha256sum |install -m 600 |source \.venv/bin/activate$)": "programs of the system, and of the shell",
     r"^podman ": "downloads and builds an image; tests/test_repository.py reads what it is built by",
     r"^bash findings/": "installs packages from the registry",
@@ -87,6 +87,8 @@ my-matcher = my_matcher.matcher:MyMatcher
 
 [sasgeo_bench.segmenters]
 my-segmenter = my_segmenter.segmenter:MySegmenter
+[sasgeo_bench.suites]
+my-suite = my_suite.suite:SUITE
 """
 
 
@@ -228,7 +230,12 @@ def reader(desk: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     about.mkdir(parents=True)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: my-matcher\nVersion: 0.1.0\n", encoding="utf-8")
     (about / "entry_points.txt").write_text(PLUGIN, encoding="utf-8")
-    for path in (tmp_path / "site", folder / "my-matcher" / "src", folder / "my-segmenter" / "src"):
+    for path in (
+        tmp_path / "site",
+        folder / "my-matcher" / "src",
+        folder / "my-segmenter" / "src",
+        folder / "my-suite" / "src",
+    ):
         monkeypatch.syspath_prepend(str(path))
     monkeypatch.chdir(folder)
     monkeypatch.delenv("SASGEO_EXTRACTS", raising=False)
@@ -255,7 +262,7 @@ def write_plugin(folder: Path) -> None:
 def enter_suites(document: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Suites that a document tells its reader to write."""
     for _, code in blocks(document, "python"):
-        if "SUITE: Final" in code:
+        if "SUITE = " in code:
             found: dict[str, object] = {}
             exec(code, found)  # noqa: S102 - of our own documents
             monkeypatch.setitem(EVERY_SUITE, found["SUITE"].card.name, found["SUITE"])  # type: ignore[attr-defined]

@@ -28,7 +28,7 @@ from sasgeo_bench.files.plugins import (
     list_entry_points,
     unknown,
 )
-from sasgeo_bench.texts import plain
+from sasgeo_bench.texts import one_line, plain
 
 _OF_DEMO: Final = "demo-"  # too many made-up towns to list
 
@@ -104,6 +104,8 @@ def list_command(
 ) -> None:
     """List regions, suites or installed plugins, and where each comes from; or show the card of one."""
     if kind is Listed.REGIONS:
+        if name is not None:
+            raise ConfigError(f"a region has no card: sasgeo-bench inspect {one_line(name)} shows a built one")
         _list_regions(regions)
         return
     door = _DOORS[kind.removesuffix("s")]

@@ -23,7 +23,7 @@ from sasgeo_bench.running.checks import Check, kept_check, listing_of, loaded_ch
 from sasgeo_bench.running.replies import Reply
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.query import Query, Truth
+from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth
 from sasgeo_bench.tasks.task_files import query_bytes
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
@@ -201,6 +201,10 @@ class _Kit:
     def checks(self) -> Iterator[Check]:
         """Run every check in turn."""
         able = _chosen(query for query in self.place.queries if self._lacks(query) is None)
+        if not able and self.card.tracks == (SEQUENCE,):
+            fault = "it follows flights: check it as a tracker (--kind tracker)"
+            yield Check(name="answers a query", outcome="fail", found=fault)
+            return
         if not able:
             yield Check(name="answers a query", outcome="not applicable", found="the card's needs leave no query")
             return

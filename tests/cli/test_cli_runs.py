@@ -126,6 +126,10 @@ def test_the_names_of_before_still_work(old, new, program) -> None:
     assert program(*old) == program(*new)
 
 
+def test_a_region_has_no_card_to_be_shown(mistake) -> None:
+    assert "a region has no card: sasgeo-bench inspect vaduz shows a built one" in mistake("list", "regions", "vaduz")
+
+
 def test_a_name_that_nothing_has_is_not_checked(check, mistake) -> None:
     del check
     words = "there is no matcher, tracker, segmenter or suite 'raster_uniformm', did you mean 'raster_uniform'?"
@@ -187,6 +191,7 @@ def test_a_good_matcher_gets_a_table_and_exit_0(check) -> None:
     ("spec", "words"),
     [
         ("faulty:NoCard", "faulty:NoCard: card is a NoneType, expected a sasgeo_bench.matching.matcher.MatcherCard"),
+        ("sasgeo_bench.matching.controls.reckoning:DeadReckoning", "it follows flights: check it as a tracker"),
     ],
 )
 def test_a_matcher_with_a_fault_gets_its_row_a_line_on_stderr_and_exit_2(check, spec, words) -> None:

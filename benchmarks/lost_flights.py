@@ -82,7 +82,7 @@ def flights_of(folder: Path, suite: str) -> pd.DataFrame:
         raise StoreError(f"{folder} has no flights of suite {suite!r}: it has {there}")
     with tempfile.TemporaryDirectory() as scratch:
         folders = [path for path in unpack_tasks(folder, Path(scratch)) if path.parent.name == suite]
-        tasks = [Task.open(path, Path(scratch) / "truth") for path in folders]
+        tasks = [Task.open(path, truth=Path(scratch) / "truth") for path in folders]
         truths = {truth.query_id: truth for task in tasks for truth in task.truths}
         heads = sorted((head for task in tasks for head in task.heads()), key=lambda head: head.query_id)
         for matcher in matchers:

@@ -3,8 +3,10 @@
 
 from typing import Final
 
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.files.plugins import SUITES
 from sasgeo_bench.matching.scaffold import package_files
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
 _SUITE: Final = '''\
 """The suite {name}: here is where your stress goes."""
@@ -77,4 +79,8 @@ def suite_files(name: str) -> dict[str, str]:
     >>> sorted(suite_files("my-suite"))[-1]
     'tests/test_conforms.py'
     """
+    if name in EVERY_SUITE:
+        raise ConfigError(
+            f"{name!r} is a suite of sasgeo-bench itself, which would be used instead of yours; choose another"
+        )
     return package_files(name, group=SUITES, code=_SUITE, readme=_README, attribute="SUITE")

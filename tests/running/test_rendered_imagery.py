@@ -60,6 +60,7 @@ def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(dra
     ask(plain, "oracle_pose")
     bare = about(plain, "oracle_pose").map_bytes
     (count,) = ask(seen, "orb_vlad").values()
+    assert about(seen, "orb_vlad").model_fields_set == about(plain, "oracle_pose").model_fields_set
     assert about(seen, "orb_vlad").rendered_imagery is about(plain, "oracle_pose").rendered_imagery is None
 
     render_imagery(folder, folder, LOOK, tell=quiet)

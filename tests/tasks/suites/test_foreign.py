@@ -101,3 +101,9 @@ def test_what_is_no_suite_is_refused_in_one_line(written, name, words):
         find_suite(name)
     assert words in str(raised.value)
     assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["clean", "My_Suite", "numpy"])
+def test_a_name_that_a_suite_cannot_have_is_refused_before_anything_is_written(name):
+    with pytest.raises(ConfigError, match=name):
+        suite_files(name)

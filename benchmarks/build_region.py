@@ -60,7 +60,7 @@ def build_once(spec: RegionFile, extracts: list[Path]) -> tuple[float, float, fl
     out = Path(tempfile.mkdtemp(prefix="sasgeo-bench-"))
     try:
         start, start_cpu = time.perf_counter(), time.process_time()
-        made = build_region(plan_build(spec, out=out, extract_folders=extracts), tell=lambda _: None)
+        made = build_region(plan_build(spec, out=out, extract_folders=extracts))
         mapped_km2 = made.coverage.share * made.rows * made.cols * made.cell_size_m**2 / 1e6
         return time.perf_counter() - start, time.process_time() - start_cpu, mapped_km2
     finally:

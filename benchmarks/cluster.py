@@ -69,7 +69,7 @@ def unit_of(out: Path, count: int) -> Unit:
     tasks = [out / "tasks" / suite / TOWN for suite in SUITES]
     queries = sum(len(task_files.Task.open(task).ids()) for task in tasks)
     plan = plan_run(RunRequest(spec="random", tasks=tasks, out=out))
-    run(plan, tell=lambda _: None)
+    run(plan)
     return Unit(
         drawing_s=drawing_s / queries,
         query_bytes=(size_of(out / "tasks") + size_of(out / "truth")) / queries,

@@ -107,7 +107,7 @@ def _region(name: str, out: Path, extracts: Path) -> Region | None:
     if not folder.is_dir():
         try:
             plan = plan_build(read_region_file(find_region_file(name)), out=out, extract_folders=[extracts])
-            build_region(plan, tell=lambda _: None)
+            build_region(plan)
         except SasgeoError as error:
             print(f"without {name}: {error}")
             return None

@@ -56,7 +56,7 @@ def request_for(region: str, suite: str, count: int, out: Path, extracts: list[P
         extract_folders=tuple(extracts),
         may_be_fewer=True,
     )
-    return plan_requests(wanted, tell=lambda _: None)[0]
+    return plan_requests(wanted)[0]
 
 
 def draws_per_second(suite: Suite, scene: Scene, runs: int) -> float:
@@ -79,7 +79,7 @@ def whole(region: str, suite: str, count: int, out: Path, extracts: list[Path]) 
     """Draw and write one task: seconds, queries, bytes, and the peak memory of this process."""
     request = request_for(region, suite, count, out, extracts)
     start = time.perf_counter()
-    made = make_tasks(request, tell=lambda _: None)
+    made = make_tasks(request)
     seconds = time.perf_counter() - start
     queries = sum(item.manifest.queries for item in made)
     size = sum((item.folder / "queries.parquet").stat().st_size for item in made)

@@ -10,6 +10,7 @@ from pathlib import Path
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
 from sasgeo_bench.experiments.paper.decoys import decoys_frame, decoys_markdown, every_reading
 from sasgeo_bench.experiments.paper.task import TRIALS, region_name
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
 
 
@@ -21,7 +22,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("out"), help="root of what is built (default: out)")
     words = parser.parse_args()
     asked = {"seed": words.seed, "trials": words.trials, "out": words.out}
-    made_paper_task(**asked) or make_paper_task(**asked, tell=print)
+    with reporting(print):
+        made_paper_task(**asked) or make_paper_task(**asked)
     region = read_region(words.out / "regions" / region_name(words.seed))
     table = decoys_frame(region, seed=words.seed, trials=words.trials, readings=list(every_reading()))
     text = decoys_markdown(table)

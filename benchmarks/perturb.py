@@ -68,7 +68,7 @@ def town_views() -> list[Evidence]:
     with tempfile.TemporaryDirectory(prefix="sasgeo-bench-") as folder:
         for town in TOWNS:
             plan = plan_build(read_region_file(find_region_file(town)), out=Path(folder))
-            build_region(plan, tell=lambda _: None)
+            build_region(plan)
             region = read_region(plan.folder)
             bits = LayerBits.of(region.layers)
             west_m, south_m, east_m, north_m = region.grid.bounds_m

@@ -69,7 +69,7 @@ def _region(name: str, out: Path, extracts: Path | None) -> Region:
     if not folder.is_dir():
         spec = read_region_file(find_region_file(name))
         plan = plan_build(spec, out=out, date=None, extract_folders=[extracts] if extracts else [])
-        build_region(plan, tell=lambda _: None)
+        build_region(plan)
     region = read_region(folder)
     len(region.features)
     return region

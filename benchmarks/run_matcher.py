@@ -41,7 +41,7 @@ def town_task(out: Path) -> Path:
     wanted = Wanted(
         suites=("occlusion",), regions=(TOWN,), split="crossfit", count=8, seed=0, out=out, may_be_fewer=True
     )
-    (made,) = make_tasks(plan_requests(wanted, tell=lambda _: None)[0], tell=lambda _: None)
+    (made,) = make_tasks(plan_requests(wanted)[0])
     return made.folder
 
 
@@ -77,7 +77,7 @@ def whole_run(spec: str, task: Path, jobs: int) -> float:
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
         plan = plan_run(RunRequest(spec=spec, tasks=(task,), out=Path(folder), jobs=jobs))
-        run(plan, tell=lambda _: None)
+        run(plan)
         count = len(list(prediction_files.read_predictions(plan.parts[0].folder)))
     return count / (time.perf_counter() - begun)
 

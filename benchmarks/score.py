@@ -201,7 +201,7 @@ def score(root: Path, *, is_whole: bool) -> dict[str, float]:
         contrasts=contrasts if is_whole and len(names) > 1 else (),
     )
     begun = time.perf_counter()
-    (score_all if is_whole else make_board)(request, tell=lambda _: None)
+    (score_all if is_whole else make_board)(request)
     usage = resource.getrusage(resource.RUSAGE_SELF)
     used = usage.ru_utime + usage.ru_stime
     return {"s": time.perf_counter() - begun, "cpu_s": used, "mb": usage.ru_maxrss * 1024 / 1e6}

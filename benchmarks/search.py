@@ -90,7 +90,7 @@ def region_of(name: str, date: dt.date | None, given: argparse.Namespace) -> Reg
     if not folder.exists():
         spec = read_region_file(find_region_file(name))
         plan = plan_build(spec, out=given.out, date=date, extract_folders=given.extracts)
-        build_region(plan, tell=lambda _: None)
+        build_region(plan)
     return read_region(folder)
 
 

@@ -64,7 +64,7 @@ SAME_M, HIGHER = 2.0, 1e-6
 def region_of(name: str, given: argparse.Namespace) -> Path:
     """Return the folder of a region, built first if it is missing."""
     plan = plan_build(read_region_file(find_region_file(name)), out=given.out, extract_folders=given.extracts)
-    build_region(plan, tell=lambda _: None)
+    build_region(plan)
     return plan.folder
 
 

@@ -114,7 +114,7 @@ def built_region(name: str, given: argparse.Namespace, folders: Sequence[Path]) 
     spec = read_region_file(find_region_file(name))
     if not (given.out / "regions" / name).exists():
         plan = plan_build(spec, out=given.out, extract_folders=folders, imagery_folders=folders)
-        build_region(plan, tell=lambda _: None)
+        build_region(plan)
     return sgb.read_region(given.out / "regions" / name)
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, chdir, contextmanager
+from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import wait
@@ -33,6 +34,8 @@ _DIGITS: Final = 10
 _ADDRESS: Final = re.compile(r"(?:(?:tcp|tls)://)?[^\s/:]+:\d{1,5}|(?:tcp|tls)://\[[0-9a-fA-F:.%]+\]:\d{1,5}")
 
 Tell = Callable[[str], None]
+Item = TypeVar("Item")
+Found = TypeVar("Found")
 
 
 class Progress(Protocol):
@@ -111,8 +114,63 @@ class Lines:
         return f"{text}, about {duration_text(left_s)} left"
 
 
-Item = TypeVar("Item")
-Found = TypeVar("Found")
+def silent(line: object) -> None:
+    """Print nothing."""
+
+
+@dataclass
+class _Outlet:
+    """Where lines and counts of this process go."""
+
+    tell: Tell = silent
+    progress: Progress = field(default_factory=lambda: Lines(silent))
+
+
+_outlet = _Outlet()  # of the process, not of a thread or context: whoever works for a command reports to its user
+
+
+def tell(line: str) -> None:
+    """Report one line on the work to whoever listens: the user of a command, nobody in a program by default."""
+    _outlet.tell(line)
+
+
+def begin(label: str, total: int) -> None:
+    """Begin a piece of work with so many items."""
+    _outlet.progress.begin(label, total)
+
+
+def advance(label: str, count: int) -> None:
+    """Count so many more items as done."""
+    _outlet.progress.advance(label, count)
+
+
+@contextmanager
+def reporting(tell: Tell | None = None, progress: Progress | None = None) -> Iterator[None]:
+    """Send lines and counts of all that this process does inside to `tell` and `progress`.
+
+    Without `tell`, lines go on to where they went before; without `progress`, counts become lines.
+
+    >>> with reporting(print):
+    ...     tell("2 regions to be built")
+    2 regions to be built
+    """
+    before = _outlet.tell, _outlet.progress
+    _outlet.tell = tell or before[0]
+    _outlet.progress = progress or (Lines(tell) if tell else before[1])
+    try:
+        yield
+    finally:
+        _outlet.tell, _outlet.progress = before
+
+
+def reported(work: Callable[[Item], Found]) -> Callable[[Item], Found]:
+    """Return work that reports to whoever listens here from another process, too."""
+    return partial(_reported, work, _outlet.tell)
+
+
+def _reported(work: Callable[[Item], Found], tell: Tell, item: Item) -> Found:
+    with reporting(tell):
+        return work(item)
 
 
 def check_jobs(jobs: int) -> None:
@@ -174,11 +232,10 @@ def spread(
     jobs: int = 1,
     dask: str | None = None,
     label: str = "",
-    progress: Progress | None = None,
 ) -> Iterator[Found]:
     """Yield `work(item)` for each item, in order, computed by several processes if there are several jobs and items.
 
-    `progress` counts the items that are done, under `label`. Another process must be able to import `work`, and to
+    Items that are done are counted under `label`, if it is given. Another process must be able to import `work`, and to
     receive items and send results. The first error is raised here.
 
     `dask` is the address of a scheduler, or local:N, whose workers reach the same folders: an item whose worker dies,
@@ -188,11 +245,11 @@ def spread(
     check_jobs(jobs)
     if dask is not None and jobs > 1:
         raise ConfigError(f"--jobs {jobs} and --dask {dask} both share out the work: leave one of them out")
-    if progress is not None:
-        progress.begin(label, len(items))
+    if label:
+        begin(label, len(items))
     for found in _found(work, items, jobs) if dask is None else _found_on_cluster(work, items, dask):
-        if progress is not None:
-            progress.advance(label, 1)
+        if label:
+            advance(label, 1)
         yield found
 
 

@@ -116,7 +116,7 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, Callab
 
 def _build(out: Path, name: str) -> None:
     plan = plan_build(read_region_file(find_region_file(name)), out=out)
-    build_region(plan, tell=lambda _: None)
+    build_region(plan)
 
 
 def _made_once(factory: pytest.TempPathFactory, name: str, make: Callable[[Path], None]) -> Path:
@@ -149,8 +149,8 @@ def tasks(towns: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         for suite, region in (*made, ("topology-twins", "town-grid"), ("no-priors", "town-riverside")):
             count = 2 if suite == "clean" else 1
             wanted = Wanted(suites=(suite,), regions=(region,), split="crossfit", count=count, seed=0, out=out)
-            for request in plan_requests(wanted, tell=lambda _: None):
-                make_tasks(request, tell=lambda _: None)
+            for request in plan_requests(wanted):
+                make_tasks(request)
 
     return _made_once(tmp_path_factory, "tasks", draw)
 

@@ -15,7 +15,7 @@ import pytest
 
 import sasgeo_bench as sgb
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.progress import spread
+from sasgeo_bench.progress import reporting, spread
 
 distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
 dask = pytest.importorskip("dask")
@@ -175,7 +175,8 @@ def test_results_come_in_order_from_a_cluster_and_counts_are_told():
             self.done += count
 
     counts = Counts()
-    found = list(spread(square, range(9), dask="local:2", label="squares", progress=counts))
+    with reporting(progress=counts):
+        found = list(spread(square, range(9), dask="local:2", label="squares"))
     assert found == [at * at for at in range(9)]
     assert (counts.label, counts.total, counts.done) == ("squares", 9, 9)
 

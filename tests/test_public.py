@@ -15,6 +15,7 @@ import sasgeo_bench as sgb
 from sasgeo_bench.cli.program import load
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
 
 ROOT = Path(__file__).parents[1]
@@ -90,7 +91,8 @@ def test_a_town_is_driven_from_region_to_site_by_functions_alone(tmp_path, capfd
     truths = list(sgb.read_truths(str(out / "truth/clean/town-grid")))
     assert [truth.query_id for truth in truths] == [query.query_id for query in sgb.read_queries(str(tasks[0]))]
     for matcher in (names := {"oracle_pose", "prior_centre"}):
-        report = sgb.run(matcher=matcher, tasks=tasks, out=out, tell=notes.append)
+        with reporting(notes.append):
+            report = sgb.run(matcher=matcher, tasks=tasks, out=out)
         assert report.counts == {"ok": len(list(sgb.read_queries(tasks[0])))}
         answers = list(sgb.read_predictions(str(report.folders[0])))
         assert len(answers) == len(truths)

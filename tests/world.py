@@ -25,22 +25,22 @@ def built(spec: RegionFile | str, out: Path, **options: Any) -> Path:
     """Build a region from its file, or from the shipped one of that name; return its folder."""
     read = read_region_file(find_region_file(spec)) if isinstance(spec, str) else spec
     plan = plan_build(read, out=out, **options)
-    build_region(plan, tell=quiet)
+    build_region(plan)
     return plan.folder
 
 
 def drawn(out: Path, suite: str, *regions: str, count: int = 1) -> list[Path]:
     """Draw a suite in regions, which are built where they are missing; return the folders of the tasks."""
     wanted = Wanted(suites=(suite,), regions=regions, split="crossfit", count=count, seed=0, out=out)
-    for request in plan_requests(wanted, tell=quiet):
-        make_tasks(request, tell=quiet)
+    for request in plan_requests(wanted):
+        make_tasks(request)
     return [out / "tasks" / suite / region for region in regions]
 
 
 def answered(out: Path, matcher: str, tasks: list[Path], **options: Any) -> Path:
     """Ask a matcher, which a thread serves, every query of some tasks; return the folder of all runs."""
     with threaded():
-        run(plan_run(RunRequest(spec=matcher, tasks=tasks, out=out, **options)), tell=quiet)
+        run(plan_run(RunRequest(spec=matcher, tasks=tasks, out=out, **options)))
     return out / "runs"
 
 
@@ -48,4 +48,4 @@ def scored(out: Path, name: str = "board", **options: Any) -> tuple[Any, ScoreRe
     """Score all runs of a root on a board of that name; return the board, and what was asked for."""
     about = {"split": find_split("crossfit"), "draws": 100} | options
     request = ScoreRequest(predictions=[out / "runs"], root=out, board=out / "boards" / name, **about)
-    return make_board(request, tell=quiet), request
+    return make_board(request), request

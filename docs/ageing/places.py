@@ -10,6 +10,7 @@ from typing import Final
 
 import shapely
 
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_region
@@ -46,7 +47,8 @@ def stock_of(spec: RegionFile, blocks: Sequence[Block], *, is_newest: bool, out:
     dates = [item.date for item in spec.extract]
     plan = plan_build(spec, out=out, date=max(dates) if is_newest else min(dates))
     if not plan.is_current:
-        build_region(plan, tell=_tell)
+        with reporting(_tell):
+            build_region(plan)
     features = read_region(plan.folder).features
     seen = features[features["is_visible"]]
     area = shapely.union_all([block.polygon() for block in blocks])

@@ -8,7 +8,7 @@ import typer
 
 from sasgeo_bench.ageing.files import read_ageing, write_ageing, write_ratebook, write_summary
 from sasgeo_bench.ageing.measure import measure_ageing
-from sasgeo_bench.cli.console import read_day, say, tell
+from sasgeo_bench.cli.console import read_day, say
 from sasgeo_bench.cli.options import Out
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.history import MARGIN_M, date_extracts, read_history
@@ -32,7 +32,7 @@ def measure_ageing_command(
     if out.exists() and not out.is_dir():
         raise ConfigError(f"--out {out} is a file: name a folder")
     dated = date_extracts(extract, at=[read_day(text, flag="--at") for text in at or ()])
-    history = read_history(dated, bounds=box, margin_m=margin_m, tell=tell)
+    history = read_history(dated, bounds=box, margin_m=margin_m)
     name = place or extract[0].name.split(".")[0].split("-")[0]
     for path in write_ageing(out, measure_ageing(history, place=name)):
         say(path)

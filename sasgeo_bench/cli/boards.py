@@ -136,7 +136,7 @@ def score(options: ScoreOptions) -> Board:
     if options.truth is not None and not any(map(is_pack, options.predictions)):  # stored results hold their truths
         _check_truths(options.truth)
     submissions = options.submissions
-    submitted = submissions_for(board_of(options.predictions), submissions, tell=options.tell) if submissions else ()
+    submitted = submissions_for(board_of(options.predictions), submissions) if submissions else ()
     usual = request_of(
         options.predictions,
         board=options.out / "boards" / options.name,
@@ -156,15 +156,13 @@ def score(options: ScoreOptions) -> Board:
         jobs=options.jobs,
         dask=options.dask,
     )
-    return score_all(
-        request, tell=options.tell, progress=options.progress, has_cases=options.cases, results=options.results
-    )
+    return score_all(request, has_cases=options.cases, results=options.results)
 
 
 def score_command(options: ScoreOptions) -> None:
     """Score predictions against the truths and write a board: OUT/boards/NAME/leaderboard.parquet and more."""
-    with shown_progress() as progress:
-        board = score(**vars(options) | {"tell": tell, "progress": progress})
+    with shown_progress():
+        board = score(**vars(options))
     show_board(board)
     folder = options.out / "boards" / options.name
     say(folder)
@@ -223,11 +221,10 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     plan = plan_pipeline(
         spec.model_copy(update={"matchers": list(dict.fromkeys((*spec.matchers, *(options.matcher or ()))))}),
         out=options.out,
-        tell=tell,
         extract_folders=tuple(options.extracts or ()),
         region_folders=tuple(options.region_files or ()),
-        private=private_seed(options.seed_file, tell=tell),
-        sealed=sealed_seed(options.sealed_seed_file, tell=tell),
+        private=private_seed(options.seed_file),
+        sealed=sealed_seed(options.sealed_seed_file),
     )
     plan = replace(plan, jobs=options.jobs, dask=options.dask)
     if opened is not None:
@@ -246,11 +243,9 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
         check_public(seed, str(board_folder(plan)))
     if private is not None:
         read_private(private, plan.spec.identity)
-    with shown_progress() as progress:
+    with shown_progress():
         board = run_pipeline(
             plan,
-            tell=tell,
-            progress=progress,
             results=results,
             has_cases=options.cases,
             private=private,
@@ -294,9 +289,9 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
     if options.seed_file:
         return
     if not options.dry_run:
-        unpack_head_start(file, stated, options.out, tell=tell)
+        unpack_head_start(file, stated, options.out)
         return
-    packed = packed_for(file, stated, tell=tell)
+    packed = packed_for(file, stated)
     if packed is not None:
         tell(f"{packed.name} beside the file is unpacked first: what it holds counts below as not there yet")
 

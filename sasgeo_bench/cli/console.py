@@ -65,7 +65,8 @@ def outlets() -> Iterator[None]:
     """
     before = {name: os.environ.get(name) for name in (progress.QUIET, LOG)}
     try:
-        yield
+        with progress.reporting(tell):
+            yield
         if _heard.result:
             typer.echo(_heard.result)
     finally:
@@ -222,15 +223,16 @@ class Bars(progress.Lines):
 
 
 @contextmanager
-def shown_progress() -> Iterator[progress.Progress]:
-    """Yield bars on a terminal, lines elsewhere."""
+def shown_progress() -> Iterator[None]:
+    """Show the progress of what is done inside: as bars on a terminal, as lines elsewhere."""
     if not sys.stderr.isatty() or progress.QUIET in os.environ:
         _heard.counts = progress.Lines(tell)
-        yield _heard.counts
+        with progress.reporting(tell, _heard.counts):
+            yield
         return
-    with Bars() as bars:
+    with Bars() as bars, progress.reporting(tell, bars):
         _heard.counts = bars
-        yield bars
+        yield
 
 
 def print_table(table: Table) -> None:

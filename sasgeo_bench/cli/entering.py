@@ -49,19 +49,19 @@ def enter_command(options: EnterOptions) -> None:
         pipeline=options.pipeline,
         extract_folders=tuple(options.extracts or ()),
         region_folders=tuple(options.region_files or ()),
-        sealed=sealed_seed(options.sealed_seed_file, tell=tell),
+        sealed=sealed_seed(options.sealed_seed_file),
         without=tuple(options.without or ()),
         jobs=options.jobs,
         is_again=options.again,
     )
-    entry = plan_entry(request, tell=tell)
+    entry = plan_entry(request)
     checked = check_entry(entry, into=options.into)
     for line in cost_lines(entry, checked.run):
         (say if options.dry_run else tell)(line)
     if options.dry_run:
         return
-    with shown_progress() as progress:
-        folder, board = enter(entry, into=options.into, tell=tell, progress=progress)
+    with shown_progress():
+        folder, board = enter(entry, into=options.into)
     show_board(board)
     both = options.out / "boards" / f"{entry.board}-{folder.name}"
     for line in elsewhere_lines(read_board_manifest(both).elsewhere):

@@ -89,7 +89,6 @@ def read_flight_command(flight: FlightOptions) -> None:
             least_m=SHORTEST_M if flight.least_m is None else flight.least_m,
             height_m=flight.height_m,
             facts=flight.facts,
-            tell=tell,
         )
         say(f"over {region.manifest.id}: {_summary(flown)}")
         if flight.tum is not None:

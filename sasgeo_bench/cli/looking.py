@@ -86,7 +86,7 @@ def inspect_command(
     if Path(target).is_dir() and is_run(Path(target)):
         grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
         chosen = make_split(read_split_file(find_split_file(options.split)), grids)
-        cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=options.rejector or (), tell=tell)
+        cases = read_run_cases(Path(target), out=out, split=chosen, rejectors=options.rejector or ())
         _inspect_run(cases, out, query, options.strip)
         return
     if region_folder is None and not is_split(target):
@@ -335,10 +335,8 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
         raise ConfigError(
             f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
         )
-    with shown_progress() as progress:
-        read = spread(
-            lambda name: read_features(out / "regions" / name), built, label="regions read", progress=progress
-        )
+    with shown_progress():
+        read = spread(lambda name: read_features(out / "regions" / name), built, label="regions read")
         maps = dict(zip(built, map(constellations, read), strict=True))
     faults = [
         f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"

@@ -17,11 +17,10 @@ from typer.models import ParameterInfo
 
 from sasgeo_bench.errors import ConfigError, check_given
 from sasgeo_bench.files.paths import given_path
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import Progress, Tell, reporting, silent
 from sasgeo_bench.texts import one_line
 
 Words = ParamSpec("Words")
-Object = TypeVar("Object")
 Result = TypeVar("Result")
 
 Out = Annotated[Path, typer.Option(envvar="SASGEO_OUT", help="root of what is built")]
@@ -61,10 +60,6 @@ progress : Progress, optional
     Counts what is done; notes now and then unless given."""
 
 
-def silent(line: object) -> None:
-    """Print nothing."""
-
-
 @dataclass(frozen=True, kw_only=True)
 class Options:
     """Base of the options objects: reads what a caller gives as the flags would be read.
@@ -83,7 +78,7 @@ class Options:
     """
 
     say: Callable[[object], None] = silent
-    tell: Tell = silent
+    tell: Tell | None = None
     progress: Progress | None = None
 
     def __post_init__(self) -> None:
@@ -96,6 +91,9 @@ def flags_of(options: type) -> dict[str, Any]:
     """Names and annotations of the flags of an options object, in their order."""
     hints = get_type_hints(options, include_extras=True)
     return {item.name: hints[item.name] for item in fields(options) if get_origin(hints[item.name]) is Annotated}
+
+
+Object = TypeVar("Object", bound=Options)
 
 
 def takes(options: Callable[Words, Object]) -> Callable[[Callable[[Object], Result]], Callable[Words, Result]]:
@@ -126,7 +124,9 @@ def takes(options: Callable[Words, Object]) -> Callable[[Callable[[Object], Resu
         @wraps(function)
         def called(*args: Words.args, **words: Words.kwargs) -> Result:
             """Build the options object, and call the function with it."""
-            return function(options(*args, **words))
+            found = options(*args, **words)
+            with reporting(found.tell, found.progress):
+                return function(found)
 
         kinds = flags_of(cast("type", options))
         words = inspect.signature(options).parameters

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import say, shown_progress, tell
+from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import Options, Out
 from sasgeo_bench.publishing.profile_page import PAGE, check_profile, facts, write_profile
 from sasgeo_bench.running.profiling import ProfileRequest, plan_profile, profile
@@ -54,9 +54,9 @@ def profile_command(options: ProfileOptions) -> None:
     plan = plan_profile(request)
     folder = options.into or options.out / "profiles" / plan.card.name
     check_profile(folder)  # before the minutes that it takes
-    with shown_progress() as progress:
-        found = profile(request, plan=plan, tell=tell, progress=progress)
-    write_profile(found, folder, tell=tell)
+    with shown_progress():
+        found = profile(request, plan=plan)
+    write_profile(found, folder)
     for name, value, meaning in facts(found):
         say(f"{name}: {value} ({meaning})")
     others = {status: count for status, count in found.statuses.items() if status != "ok"}

@@ -38,7 +38,7 @@ class PublishOptions(Options):
 def publish(options: PublishOptions) -> Written:
     """Make the static site of a board: plain files that open without a server.
 
-    Submissions that have a fault are left out, and `tell` gets a line about each.
+    Submissions that have a fault are left out, with a line about each.
 
     Returns
     -------
@@ -63,7 +63,7 @@ name another one with --into
     """
     written, scored = _published(options)
     for name, why in scored.failures.found.items() if scored else ():
-        options.tell(f"failed, and so not on the board: {name}: {why}")
+        tell(f"failed, and so not on the board: {name}: {why}")
     return written
 
 
@@ -72,24 +72,20 @@ def _published(options: PublishOptions) -> tuple[Written, Board | None]:
     folder, scored = options.board, None
     if options.submissions:
         folder = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
-        scored = with_submissions(
-            options.board, options.submissions, folder, tell=options.tell, root=options.out, jobs=options.jobs
-        )
+        scored = with_submissions(options.board, options.submissions, folder, root=options.out, jobs=options.jobs)
     written = build.publish(
         folder,
         options.into,
-        tell=options.tell,
         root=options.out,
         jobs=options.jobs,
-        progress=options.progress,
     )
     return written, scored
 
 
 def publish_command(options: PublishOptions) -> None:
     """Make the static site of a board: plain files that open without a server, to be put on any host."""
-    with shown_progress() as progress:
-        written, scored = _published(replace(options, say=say, tell=tell, progress=progress))
+    with shown_progress():
+        written, scored = _published(replace(options, say=say))
     tell(written.to_text())
     say(written.folder / "index.html")
     if scored is not None:

@@ -14,7 +14,7 @@ from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, OwnRegi
 from sasgeo_bench.cli.seeds import SeedFile, private_seed
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import Lines, Tell, spread
+from sasgeo_bench.progress import reported, spread
 from sasgeo_bench.tasks import build
 from sasgeo_bench.tasks.perturbations.perception_profile import read_profile
 from sasgeo_bench.tasks.query import PROFILE, Detector, PriorGroup
@@ -86,7 +86,7 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
     >>> folders = sgb.make_tasks(suite="clean", regions="town-grid", n=4, dry_run=True, say=print)
     clean on town-grid: at most 4 sites, 112 queries, out/tasks/clean/town-grid
     """
-    private = private_seed(options.seed_file, public=options.seed, tell=options.tell)
+    private = private_seed(options.seed_file, public=options.seed)
     wanted = Wanted(
         suites=tuple(options.suite or SUITES),
         regions=tuple(options.regions or ()),
@@ -100,21 +100,20 @@ def make_tasks(options: QueryOptions) -> tuple[Path, ...]:
         may_be_fewer=options.up_to,
         choice=_choice(options),
     )
-    requests = plan_requests(wanted, tell=options.tell)
+    requests = plan_requests(wanted)
     if options.dry_run:
         for item in requests:
             options.say(_in_words(item))
         return tuple(map(_folder, requests))
-    make = partial(_make, skip=options.skip, tell=options.tell)
-    progress = options.progress or Lines(options.tell)
-    made = spread(make, requests, jobs=options.jobs, dask=options.dask, label="tasks drawn", progress=progress)
+    make = partial(_make, skip=options.skip)
+    made = spread(reported(make), requests, jobs=options.jobs, dask=options.dask, label="tasks drawn")
     return tuple(folder for folders in made for folder in folders)
 
 
 def make_queries_command(options: QueryOptions) -> None:
     """Draw queries into OUT/tasks/<suite>/<region>/ and their truths into OUT/truth/<suite>/<region>/."""
-    with shown_progress() as progress:
-        make_tasks(**vars(options) | {"say": say, "tell": tell, "progress": progress})
+    with shown_progress():
+        make_tasks(**vars(options) | {"say": say})
 
 
 def _folder(request: Request) -> Path:
@@ -128,7 +127,7 @@ def _choice(options: QueryOptions) -> Choice:
     profile = read_profile(options.profile)
     perfect = [name for name in load_taxonomy().names if name not in profile.classes]
     if perfect:
-        options.tell(f"{options.profile} has no rates of {', '.join(perfect)}: views show that without errors")
+        tell(f"{options.profile} has no rates of {', '.join(perfect)}: views show that without errors")
     return Choice(detectors=_detectors([*(options.detector or ()), PROFILE]), profile=profile)
 
 
@@ -149,10 +148,10 @@ def _in_words(request: Request) -> str:
     return f"{request.suite} on {request.region.id}: {most}, {_folder(request)}"
 
 
-def _make(request: Request, *, skip: bool, tell: Tell) -> list[Path]:
+def _make(request: Request, *, skip: bool) -> list[Path]:
     """Make the tasks of one suite on one region."""
     try:
-        return [made.folder for made in build.make_tasks(request, tell=tell)]
+        return [made.folder for made in build.make_tasks(request)]
     except ConfigError as error:
         if not skip:
             raise

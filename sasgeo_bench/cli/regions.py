@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from sasgeo_bench.cli.console import read_date, say, shown_progress, tell
+from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, ImageryFolders, Options, Out, RegionFolders, takes
-from sasgeo_bench.progress import Lines, spread
+from sasgeo_bench.progress import reported, spread
 from sasgeo_bench.regions import build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
@@ -73,8 +73,7 @@ def build_region(options: BuildOptions) -> tuple[Path, ...]:
     if options.dry_run:
         options.say("\n".join(plan.to_text() for plan in plans))
     else:
-        work, progress = partial(build.build_region, tell=options.tell), options.progress or Lines(options.tell)
-        built = spread(work, plans, jobs=options.jobs, dask=options.dask, label="regions built", progress=progress)
+        built = spread(reported(build.build_region), plans, jobs=options.jobs, dask=options.dask, label="regions built")
         deque(built, maxlen=0)
     return tuple(plan.folder for plan in plans)
 
@@ -140,21 +139,19 @@ def render_imagery(options: RenderOptions) -> tuple[Path, ...]:
         date=read_date(options.date),
         out=options.out,
         extract_folders=options.extracts or (),
-        tell=options.tell,
     )
-    progress = options.progress or Lines(options.tell)
-    return tuple(spread(render, specs, jobs=options.jobs, label="regions rendered", progress=progress))
+    return tuple(spread(reported(render), specs, jobs=options.jobs, label="regions rendered"))
 
 
 def render_imagery_command(options: RenderOptions) -> None:
     """Render reference imagery of built regions: OUT/regions/<id>/ortho.tif, of any date, in a look no query has."""
-    with shown_progress() as progress:
-        paths = render_imagery(**vars(options) | {"tell": tell, "progress": progress})
+    with shown_progress():
+        paths = render_imagery(**vars(options))
     for path in paths:
         say(path)
 
 
 def build_region_command(options: BuildOptions) -> None:
     """Build regions from dated extracts: layers, features, graph, imagery and preview in OUT/regions/<id>/."""
-    with shown_progress() as progress:
-        build_region(**vars(options) | {"say": say, "tell": tell, "progress": progress})
+    with shown_progress():
+        build_region(**vars(options) | {"say": say})

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import read_date, say, shown_progress, tell
+from sasgeo_bench.cli.console import read_date, say, shown_progress
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
 from sasgeo_bench.errors import ConfigError, counted
@@ -64,7 +64,7 @@ def release_command(options: ReleaseOptions) -> None:
         url=options.url,
         board=board,
     )
-    release = make_release(request, tell=tell)
+    release = make_release(request)
     maps, queries = counted(len(release.maps), "map"), counted(release.queries, "query", "queries")
     suites_said = counted(len(release.suites), "suite")
     say(f"{request.into}: {maps}, {queries} of {suites_said}, {release.bytes / 1e6:.1f} MB")
@@ -85,8 +85,8 @@ def _queries_of(options: ReleaseOptions, board: Path) -> BoardTasks:
         out=options.out,
         pipeline=options.pipeline,
         extract_folders=tuple(options.extracts or ()),
-        sealed=sealed_seed(options.sealed_seed_file, tell=tell),
+        sealed=sealed_seed(options.sealed_seed_file),
         jobs=options.jobs,
     )
-    with shown_progress() as progress:
-        return draw_board(request, tell=tell, progress=progress)
+    with shown_progress():
+        return draw_board(request)

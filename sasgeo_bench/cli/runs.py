@@ -117,11 +117,11 @@ def run(options: RunOptions) -> RunReport:
     if options.dry_run:
         options.say(plan.to_text())
         return RunReport(counts={}, messages={}, folders=tuple(part.folder for part in plan.parts))
-    report = runner.run(plan, tell=options.tell, progress=options.progress)
+    report = runner.run(plan)
     counts = ", ".join(f"{count} {status}" for status, count in sorted(report.counts.items())) or "nothing left"
-    options.tell(f"{plan.card.name} {plan.card.version}: {counts}")
+    tell(f"{plan.card.name} {plan.card.version}: {counts}")
     for status, message in sorted(report.messages.items()):
-        options.tell(f"  {status}, one of {report.counts[status]}: {message}")
+        tell(f"  {status}, one of {report.counts[status]}: {message}")
     for folder in report.folders:
         options.say(folder)
     return report
@@ -130,8 +130,8 @@ def run(options: RunOptions) -> RunReport:
 def run_command(options: RunOptions) -> None:
     """Ask a matcher every query of some tasks; goes on where an earlier run was cut off."""
     lines: list[object] = []  # printed once the progress bars are gone: they redirect stdout to stderr
-    with shown_progress() as progress:
-        report = run(**vars(options) | {"say": lines.append, "tell": tell, "progress": progress})
+    with shown_progress():
+        report = run(**vars(options) | {"say": lines.append})
     for line in lines:
         say(line)
     if report.counts and not report.counts.keys() & SOUND:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.tasks.private_seed import (
     LEAST_BITS,
     REPRODUCING_BITS,
@@ -34,7 +34,7 @@ SealedSeedFile = Annotated[
 ]
 
 
-def private_seed(file: Path | None, *, tell: Tell, public: int | None = None) -> PrivateSeed | None:
+def private_seed(file: Path | None, *, public: int | None = None) -> PrivateSeed | None:
     """Take the private seed of a file or of the environment, and say what is to be known of it; None without one."""
     seed = take_seed(file)
     if seed is None:
@@ -42,21 +42,21 @@ def private_seed(file: Path | None, *, tell: Tell, public: int | None = None) ->
     if public is not None:
         raise ConfigError("--seed is public and a private seed is given too: leave one of them out")
     tell(f"drawing by a private seed of {seed.bits} bits, commitment {seed.commitment[:12]}, into OUT/{PRIVATE_ROOT}")
-    _warn_of_bits(seed, tell)
+    _warn_of_bits(seed)
     if LEAST_BITS <= seed.bits < REPRODUCING_BITS:
         tell(f"warning: a board of this seed makes no row reproduced: that takes {REPRODUCING_BITS} bits")
     return seed
 
 
-def sealed_seed(file: Path | None, *, tell: Tell) -> PrivateSeed | None:
+def sealed_seed(file: Path | None) -> PrivateSeed | None:
     """Take the seed of sealed places of a file or of the environment; None without one."""
     seed = take_seed(file, is_sealed=True)
     if seed is not None:
         tell(f"sealed places are drawn by a seed of {seed.bits} bits, commitment {seed.commitment[:12]}")
-        _warn_of_bits(seed, tell)
+        _warn_of_bits(seed)
     return seed
 
 
-def _warn_of_bits(seed: PrivateSeed, tell: Tell) -> None:
+def _warn_of_bits(seed: PrivateSeed) -> None:
     if seed.bits < LEAST_BITS:
         tell(f"warning: {seed.bits} bits are no secret: anyone who sees a query can find the seed; use 32 hex digits")

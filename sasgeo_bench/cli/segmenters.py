@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress
 from sasgeo_bench.cli.options import Options, Out, RegionFolders, takes
 from sasgeo_bench.running.segment_tasks import SegmentTasks, segment_tasks
 from sasgeo_bench.running.worker import Limits
@@ -73,15 +73,13 @@ def segment(options: SegmentOptions) -> tuple[Path, ...]:
             is_shut_in=not options.trusted,
             jobs=options.jobs,
         ),
-        tell=options.tell,
-        progress=options.progress,
     )
 
 
 def segment_command(options: SegmentOptions) -> None:
     """Make evidence of the pictures of tasks, so that every matcher can answer them: OUT/tasks/SUITE+SEGMENTER/."""
-    with shown_progress() as progress:
-        folders = segment(**vars(options) | {"tell": tell, "progress": progress})
+    with shown_progress():
+        folders = segment(**vars(options))
     for folder in folders:
         say(folder)
     if any(Task.open(folder).manifest.failed_pictures for folder in folders):

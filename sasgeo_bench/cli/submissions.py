@@ -51,7 +51,7 @@ def submit_command(
         raise ConfigError(
             f"submit needs {' and '.join(lacking)}: name the answers, the card and the stored results of the board"
         )
-    folder = make_submission(SubmitRequest(predictions=predictions, card=card, board=board, into=into), tell=tell)
+    folder = make_submission(SubmitRequest(predictions=predictions, card=card, board=board, into=into))
     say(str(folder))
     tell(f"next: validate --predictions {folder} --for {board}; then open a pull request with the folder")
 

@@ -13,7 +13,7 @@ from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, plan_pipeline
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import laid_tasks
 from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.publishing.release_files import BoardTasks
@@ -48,7 +48,7 @@ def _boards_beside(stored: Path) -> list[str]:
     return [path.name for path in stored.parent.glob("*") if is_pack(path)] if stored.parent.is_dir() else []
 
 
-def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tell) -> PipelinePlan:
+def plan_board(request: BoardRequest, *, matchers: Sequence[str] = ()) -> PipelinePlan:
     """Plan to draw all queries of a published board and ask `matchers`; only files of settings are read.
 
     Raises
@@ -70,7 +70,7 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
         )
         fault = "holds no stored results" if stored.is_dir() else "is no folder here"
         raise StoreError(f"{stored} {fault}: {mend}")
-    _check_version(stored, tell)
+    _check_version(stored)
     made_by = read_pack(stored).pipeline
     if made_by is None:
         raise ConfigError(f"{stored} are stored results of no pipeline, so nobody knows how its queries are drawn")
@@ -84,7 +84,6 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
     plan = plan_pipeline(
         _asking(spec, matchers),
         out=request.out,
-        tell=tell,
         extract_folders=request.extract_folders,
         region_folders=request.region_folders,
         sealed=request.sealed,
@@ -96,21 +95,21 @@ def plan_board(request: BoardRequest, *, matchers: Sequence[str] = (), tell: Tel
     return replace(plan, requests=kept, jobs=request.jobs)
 
 
-def draw_board(request: BoardRequest, *, tell: Tell, progress: Progress | None = None) -> BoardTasks:
+def draw_board(request: BoardRequest) -> BoardTasks:
     """Draw the queries of a published board, and return its tasks, for a release; what is there is not drawn again.
 
     Raise as `plan_board` does, and `ConfigError` if extracts are missing or no query is drawn as it was.
     """
-    plan = plan_board(request, tell=tell)
+    plan = plan_board(request)
     if plan.split is None or any(item.found.is_pictured for item in plan.requests):
         what = "has no split" if plan.split is None else "asks about pictures, which a release does not hold"
         raise ConfigError(f"the board {plan.spec.id!r} {what}: its queries cannot be released so far")
     fetch_extracts(plan)
-    tasks, controls = draw_all(plan, tell=tell, progress=progress)
+    tasks, controls = draw_all(plan)
     board = asked_tasks(request.stored)
     names = {task.manifest.name for task in board}
     folders = tuple(task for task in [*tasks, *controls] if (task.parent.name, task.name) in names)
-    same = same_queries(request.stored, folders, tell=tell)
+    same = same_queries(request.stored, folders)
     return BoardTasks(
         name=plan.spec.id,
         split=plan.split.spec.id,
@@ -130,7 +129,7 @@ def _version_text(made_by: str | None, data: int | None, task: int | None) -> st
     return f"{made}, data version {data or 'unknown'}, task version {task or 'unknown'}"
 
 
-def _check_version(stored: Path, tell: Tell) -> None:
+def _check_version(stored: Path) -> None:
     """Refuse a board on maps that this version makes otherwise; tell of one whose tasks are of another version."""
     about = read_board_manifest(stored)
     here = _version_text(f"sasgeo-bench {package_version()}", DATA_VERSION, TASK_VERSION)
@@ -166,8 +165,8 @@ def asked_tasks(stored: Path) -> list[Task]:
         return [task for task in tasks if task.asked is not None]
 
 
-def same_queries(stored: Path, tasks: Sequence[Path], *, tell: Tell) -> dict[str, str]:
-    """Return the hash of each query of a board that tasks hold as the board does, by id; `tell` gets how many.
+def same_queries(stored: Path, tasks: Sequence[Path]) -> dict[str, str]:
+    """Return the hash of each query of a board that tasks hold as the board does, by id, and tell how many.
 
     Raise `ConfigError` if there is none.
     """

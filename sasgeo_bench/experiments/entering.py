@@ -19,7 +19,7 @@ from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.results import SOUND, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive_file import read_pack
 from sasgeo_bench.publishing.submissions import (
     SubmitRequest,
@@ -67,9 +67,9 @@ class Entry:
         return self.plan.spec.id
 
 
-def plan_entry(request: EntryRequest, *, tell: Tell) -> Entry:
+def plan_entry(request: EntryRequest) -> Entry:
     """Plan to ask a matcher all queries of a published board; raise as `plan_board` does."""
-    plan = plan_board(request, matchers=[request.matcher], tell=tell)
+    plan = plan_board(request, matchers=[request.matcher])
     return Entry(stored=request.stored, plan=plan, matcher=request.matcher, is_again=request.is_again)
 
 
@@ -111,7 +111,9 @@ def check_entry(entry: Entry, *, into: Path | None = None) -> CheckedEntry:
 
 
 def enter(
-    entry: Entry, *, into: Path | None = None, tell: Tell, progress: Progress | None = None
+    entry: Entry,
+    *,
+    into: Path | None = None,
 ) -> tuple[Path, Board]:
     """Draw the queries of a board, ask the matcher, write the submission, and score it beside the stored answers.
 
@@ -130,23 +132,21 @@ def enter(
     """
     folder, run = check_entry(entry, into=into)
     entry_cost.fetch_extracts(entry.plan, mend=_WITHOUT)
-    tasks, controls = draw_all(entry.plan, tell=tell, progress=progress)
-    same = same_queries(entry.stored, [*tasks, *controls], tell=tell)
+    tasks, controls = draw_all(entry.plan)
+    same = same_queries(entry.stored, [*tasks, *controls])
     since_ns = (begin_round if entry.is_again else open_round)(run.run_folder)
     plan = replace(entry.plan, only=same, since_ns=since_ns)
     runs = plan_runs(plan, entry.matcher, [*tasks, *controls])
     planned = runs[0].plan
     for line in _changed(planned):
         tell(line)
-    ask(entry.matcher, runs, tell=tell, progress=progress)
+    ask(entry.matcher, runs)
     end_round(run.run_folder)
     _check_answered(planned, same, folder)
     card = _card_of(planned.card, runs, plan.split, source=entry.matcher)
-    make_submission(
-        SubmitRequest(predictions=planned.run_folder, card=card, board=entry.stored, into=folder), tell=tell
-    )
+    make_submission(SubmitRequest(predictions=planned.run_folder, card=card, board=entry.stored, into=folder))
     both = plan.out / "boards" / f"{entry.board}-{card.name}"
-    board = beside_stored(entry.stored, folder, both, tell=tell, root=plan.out, jobs=plan.jobs)
+    board = beside_stored(entry.stored, folder, both, root=plan.out, jobs=plan.jobs)
     if card.trained_elsewhere:
         tell(f"{card.name}: trained elsewhere than in the places of the split, not set apart: {card.trained_elsewhere}")
     return folder, board

@@ -21,7 +21,7 @@ from sasgeo_bench.files.folders import locked, remove_tree
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.running.leak_scan import PACKED
 from sasgeo_bench.running.run_manifest import RUN, mark_packed
 from sasgeo_bench.texts import one_line
@@ -52,7 +52,7 @@ def head_start_of(pipeline_file: Path) -> Path | None:
     return None
 
 
-def packed_for(pipeline_file: Path, stated: ArchiveSpec | None, *, tell: Tell) -> Path | None:
+def packed_for(pipeline_file: Path, stated: ArchiveSpec | None) -> Path | None:
     """Return the archive beside a pipeline file that states one; None, and a line that says why, where one is lacking.
 
     Raise `StoreError` as `head_start_of` does.
@@ -69,19 +69,19 @@ def packed_for(pipeline_file: Path, stated: ArchiveSpec | None, *, tell: Tell) -
     return archive
 
 
-def unpack_head_start(pipeline_file: Path, stated: ArchiveSpec | None, out: Path, *, tell: Tell) -> None:
+def unpack_head_start(pipeline_file: Path, stated: ArchiveSpec | None, out: Path) -> None:
     """Lay answers that are packed beside a pipeline file into `out`; nothing where it states no archive.
 
     The answers to each task are laid down whole where no run of their name has any, and replace nothing. They count as
     answers that were asked here do: to the same queries, by the same code. Raise `StoreError` if the archive is not the
     one that the file states, is damaged, holds something else or too much, or `out` cannot be written.
     """
-    archive = packed_for(pipeline_file, stated, tell=tell)
+    archive = packed_for(pipeline_file, stated)
     if archive is None or stated is None:
         return
     data = _read(archive, stated.sha256, pipeline_file)
     try:
-        with locked(out / "head-start", tell=tell):
+        with locked(out / "head-start"):
             for left in out.glob(f"{_SCRATCH}*"):  # of a run that was killed: nobody else unpacks now
                 remove_tree(left)
             with TemporaryDirectory(prefix=_SCRATCH, dir=out) as folder:

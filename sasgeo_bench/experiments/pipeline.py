@@ -3,6 +3,7 @@
 
 import datetime as dt
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 from itertools import product
@@ -22,14 +23,13 @@ from sasgeo_bench.experiments.pipeline_plan import (
     count_queries,
     is_train,
     plan_runs,
-    silent,
 )
 from sasgeo_bench.experiments.sealed import open_seal
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import reporting, silent, tell
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.publishing.archive_file import check_results
 from sasgeo_bench.running.failures import Failures, log_beside
@@ -53,8 +53,6 @@ from sasgeo_bench.tasks.task_plan import Request
 def run_pipeline(
     plan: PipelinePlan,
     *,
-    tell: Tell,
-    progress: Progress | None = None,
     results: Path | None = None,
     has_cases: bool = True,
     private: Path | None = None,
@@ -73,21 +71,20 @@ def run_pipeline(
     if stored is not None:
         check_results(stored, board_folder(plan))
     rules_of(plan.spec.rejectors, plan.split)
-    sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored, tell=tell)
-    tasks, controls = draw_all(plan, tell=tell, progress=progress)
+    sealed = {} if plan.seal is None else open_seal(plan.seal, plan.requests, opened=opened, stored=stored)
+    tasks, controls = draw_all(plan)
     asked = [task for task in tasks if not is_train(plan, base_of(task.name))]
     if not asked:
         raise ConfigError(f"pipeline {plan.spec.id!r}: no region carries any of its suites")
     contrasts = tuple(item.registered for item in plan.spec.contrast)
-    _check_contrasts(plan, contrasts, asked, tell)
-    failures = Failures(log_beside(board_folder(plan)), tell=tell)
-    folders, names = _run_all(plan, tasks, controls, failures, tell=tell, progress=progress)
+    _check_contrasts(plan, contrasts, asked)
+    failures = Failures(log_beside(board_folder(plan)))
+    folders, names = _run_all(plan, tasks, controls, failures)
     contrasts = tuple(named_on_board(item, names) for item in contrasts)
     split = plan.split
-    figures = partial(figures_extra, tell=tell, contrasts=contrasts, split=split)
+    figures = partial(figures_extra, contrasts=contrasts, split=split)
     pictures = partial(
         pictures_extra,
-        tell=tell,
         root=plan.out,
         contrasts=contrasts,
         split=split,
@@ -113,21 +110,21 @@ def run_pipeline(
         sealed=sealed,
         failed=failures.found,
     )
-    board = make_board(request, tell=tell, progress=progress)
+    board = make_board(request)
     if stored is not None:
         tell(pack_board(board, request, stored).to_text())
     return board
 
 
-def draw_all(plan: PipelinePlan, *, tell: Tell, progress: Progress | None) -> tuple[list[Path], list[Path]]:
+def draw_all(plan: PipelinePlan) -> tuple[list[Path], list[Path]]:
     """Draw what is missing of a pipeline's queries and of its controls, and return the folders of both."""
-    drawn = _draw(plan.requests, tell, jobs=plan.jobs, progress=progress)
-    _render(plan, tell)
-    tasks = [*_with_evidence(plan, drawn, tell=tell, progress=progress), *_draw_paper(plan, tell)]
-    return tasks, _draw(plan.controls, tell, jobs=1, progress=progress)
+    drawn = _draw(plan.requests, jobs=plan.jobs)
+    _render(plan)
+    tasks = [*_with_evidence(plan, drawn), *_draw_paper(plan)]
+    return tasks, _draw(plan.controls, jobs=1)
 
 
-def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: Sequence[Path], tell: Tell) -> None:
+def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: Sequence[Path]) -> None:
     """Report what the registered contrasts could show on the drawn queries; refuse one that cannot be reached."""
     if not contrasts:
         return
@@ -137,7 +134,7 @@ def _check_contrasts(plan: PipelinePlan, contrasts: Sequence[Contrast], tasks: S
     frames = [design_rows(task, plan.split) for task in opened]
     design = rows_to_rank({plan.spec.id: pd.concat(frames, ignore_index=True)}, plan.split)[plan.spec.id]
     pilots = {item.name: Pilot(**item.pilot.model_dump()) for item in plan.spec.contrast if item.pilot is not None}
-    check_contrasts(contrasts, pilots, design, tell=tell)
+    check_contrasts(contrasts, pilots, design)
 
 
 def _run_all(
@@ -145,9 +142,6 @@ def _run_all(
     tasks: list[Path],
     controls: list[Path],
     failures: Failures,
-    *,
-    tell: Tell,
-    progress: Progress | None,
 ) -> tuple[list[Path], dict[str, str]]:
     """Run every matcher, and return the folders of all runs, and by matcher of the file the name of its card.
 
@@ -160,7 +154,7 @@ def _run_all(
     folders: list[Path] = []
     for spec, found in runs.items():
         with failures.of(spec, but=(ConfigError,)):
-            folders += ask(spec, found, tell=tell, progress=progress)
+            folders += ask(spec, found)
     if not folders and failures.first is not None:
         raise failures.first
     return folders, {spec: found[0].plan.card.name for spec, found in runs.items()}
@@ -179,7 +173,7 @@ def named_on_board(contrast: Contrast, names: Mapping[str, str]) -> Contrast:
     return replace(contrast, first=first, second=second)
 
 
-def ask(spec: str, runs: Sequence[Run], *, tell: Tell, progress: Progress | None) -> list[Path]:
+def ask(spec: str, runs: Sequence[Run]) -> list[Path]:
     """Run one matcher on all queries without a row, and return the folders of its runs."""
     folders: list[Path] = []
     for one in runs:
@@ -188,16 +182,17 @@ def ask(spec: str, runs: Sequence[Run], *, tell: Tell, progress: Progress | None
         tell(f"{label}: {left} queries to ask, {done} answered before")
         for line in () if one.plan.training_set is not None else one.lines():
             tell(f"{label}: {line}")
-        run(one.plan, tell=tell if left else silent, progress=progress)
+        with nullcontext() if left else reporting(silent):
+            run(one.plan)
         folders += [part.folder for part in one.plan.parts]
     return folders
 
 
-def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int, progress: Progress | None) -> list[Path]:
+def _draw(requests: Sequence[Request], *, jobs: int) -> list[Path]:
     """Draw every request that a region carries, unless it is up to date, and return the task folders."""
     tasks: list[Path] = []
     lacking: list[str] = []
-    for drawn in carry_out(requests, jobs=jobs, progress=progress):
+    for drawn in carry_out(requests, jobs=jobs):
         for line in drawn.lines:
             tell(line)
         tasks += drawn.folders
@@ -209,7 +204,7 @@ def _draw(requests: Sequence[Request], tell: Tell, *, jobs: int, progress: Progr
     return tasks
 
 
-def _render(plan: PipelinePlan, tell: Tell) -> None:
+def _render(plan: PipelinePlan) -> None:
     """Render the reference imagery of the file, unless it is up to date."""
     said = plan.spec.reference_imagery
     if said is None:
@@ -222,11 +217,10 @@ def _render(plan: PipelinePlan, tell: Tell) -> None:
             date=date,
             out=plan.out,
             extract_folders=request.extract_folders,
-            tell=tell,
         )
 
 
-def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path], *, tell: Tell, progress: Progress | None) -> list[Path]:
+def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path]) -> list[Path]:
     """Return tasks with those of pictures replaced by what each segmenter of the file made of them."""
     pictured = [task for task in tasks if BY not in task.parent.name and is_pictured(task.parent.name)]
     found = [task for task in tasks if task not in pictured]
@@ -246,16 +240,16 @@ def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path], *, tell: Tell, pro
             is_recalibrated=segmenter.endswith(RECALIBRATED),
             jobs=plan.jobs,
         )
-        found += segment_tasks(wanted, tell=tell, progress=progress)
+        found += segment_tasks(wanted)
     return found
 
 
-def _draw_paper(plan: PipelinePlan, tell: Tell) -> list[Path]:
+def _draw_paper(plan: PipelinePlan) -> list[Path]:
     """Draw every seed and reading of the paper's experiment, unless up to date, and return the task folders."""
     paper = plan.spec.paper
     if paper is None:
         return []
     asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
-    made, draw = partial(made_paper_task, **asked), partial(make_paper_task, tell=tell, **asked)
+    made, draw = partial(made_paper_task, **asked), partial(make_paper_task, **asked)
     each = product(paper.crops.values(), paper.seeds)
     return [made(seed=seed, crop=crop) or draw(seed=seed, crop=crop) for crop, seed in each]

@@ -3,6 +3,7 @@
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -16,7 +17,7 @@ from sasgeo_bench.experiments.sealed import Seal, seal_of
 from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
 from sasgeo_bench.files.plugins import ORACLE, YARDSTICK, check_names, is_tracker
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import reporting, silent, tell
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run
@@ -244,7 +245,6 @@ def plan_pipeline(
     spec: PipelineFile,
     *,
     out: Path,
-    tell: Tell,
     extract_folders: tuple[Path, ...] = (),
     region_folders: tuple[Path, ...] = (),
     private: PrivateSeed | None = None,
@@ -252,7 +252,7 @@ def plan_pipeline(
 ) -> PipelinePlan:
     """Turn a pipeline file into requests; only files of settings are read.
 
-    `out` is the root of what is built; `tell` gets a line for what is left out. The folders of extracts and regions
+    `out` is the root of what is built; a line tells what is left out. The folders of extracts and regions
     serve regions that are not built yet, and files of one's own. `private` draws all queries instead of the file's
     seed, below `out/private`. `sealed` draws the sealed places of the split, which are left out without it. Raise
     `ConfigError` for an unknown suite, region or split, or if no region can be built here, or learned from, or ranked;
@@ -282,7 +282,8 @@ def plan_pipeline(
             ),
         )
         try:
-            requests += plan_requests(asked, tell=tell if number == 0 else silent)
+            with nullcontext() if number == 0 else reporting(silent):
+                requests += plan_requests(asked)
         except ConfigError as error:
             raise ConfigError(f"pipeline {spec.id!r}, [[task]] {number + 1} of {len(spec.task)}: {error}") from error
     if spec.task and not requests:
@@ -394,17 +395,13 @@ def _plan_controls(seed: Seed, out: Path, split: Split | None) -> tuple[Request,
         out=out,
         may_be_fewer=True,
     )
-    return plan_requests(controls, tell=silent)
+    with reporting(silent):
+        return plan_requests(controls)
 
 
 def _may_control(region: str, split: Split | None) -> bool:
     """Return whether controls may be drawn on an embedded town."""
     return split is None or not (trains(split, region) or split.sealed_place(region))
-
-
-def silent(line: str) -> None:
-    """Report nothing: what is left out is reported once, not for every group of suites."""
-    del line
 
 
 @dataclass(frozen=True, kw_only=True)

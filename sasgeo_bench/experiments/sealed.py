@@ -8,7 +8,6 @@ from pathlib import Path
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
-from sasgeo_bench.progress import Tell
 from sasgeo_bench.tasks.openings import (
     Opening,
     Openings,
@@ -70,7 +69,7 @@ def seal_of(
 
 
 def open_seal(
-    seal: Seal, requests: Sequence[Request], *, opened: dt.date | None, stored: Path | None, tell: Tell
+    seal: Seal, requests: Sequence[Request], *, opened: dt.date | None, stored: Path | None
 ) -> dict[str, SealedPlace]:
     """Record that sealed places are opened, before anything is drawn, and return what `board.json` says of them.
 
@@ -90,7 +89,7 @@ def open_seal(
         if opened is not None:
             check_day(opened, seal, openings)
         opening = Opening.of(seal.seed, opened or _today())
-        now = record_openings(seal.out, split.spec.id, seal.drawn, opening, tell=tell)
+        now = record_openings(seal.out, split.spec.id, seal.drawn, opening)
         openings = joined_openings(openings, now)
     return sealed_record(openings, split.sealed, seal.drawn, seal.seed)
 

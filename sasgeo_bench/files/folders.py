@@ -6,7 +6,7 @@ import hashlib
 import os
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,6 +19,7 @@ from sasgeo_bench.config import Document
 from sasgeo_bench.errors import SasgeoError, StoreError, named
 from sasgeo_bench.files.json import read_json
 from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.progress import tell
 from sasgeo_bench.texts import one_line
 
 
@@ -88,7 +89,7 @@ def _opened(name: str, parent: int | None) -> int:
 
 
 @contextmanager
-def locked(folder: Path, *, tell: Callable[[str], None]) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder; a second run says so and waits. Raise `StoreError` if the lock cannot be made.
 
     The file of the lock is removed while it is still held. Whoever waits for it then holds a file without a name, sees

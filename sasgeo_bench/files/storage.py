@@ -119,7 +119,7 @@ def fetch(url: str, folder: str | Path) -> Moved:
     if target.is_symlink() or (target.exists() and not target.is_dir()):
         raise StoreError(f"{target} is a link, or no folder, and would be lost: name another folder")
     check_room(target)
-    with _storage(url) as (system, root), locked(target, tell=lambda _: None):
+    with _storage(url) as (system, root), locked(target):
         sent = _read_list(system, root, LIST, url)
         if sent is None:
             is_cut = _read_list(system, root, _SENDING, url) is not None

@@ -2,7 +2,6 @@
 """Flights out of files: GPX, KML, tables with latitude and longitude, TUM; brought onto a region and cut to it."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Final
@@ -22,6 +21,7 @@ from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.flights.tum import read_tum
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.geometry.projection import from_lonlat
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.texts import plain
 
@@ -100,7 +100,7 @@ def is_tum(path: Path) -> bool:
     return path.name.lower().endswith(_TUM)
 
 
-def read_flight(  # noqa: PLR0913 - each is a wish of its own
+def read_flight(
     path: Path,
     region: Region,
     *,
@@ -109,7 +109,6 @@ def read_flight(  # noqa: PLR0913 - each is a wish of its own
     height_m: float | None = None,
     facts: LogFacts | None = None,
     step_s: float = 0.2,
-    tell: Callable[[str], None] = lambda _: None,
 ) -> Trajectory:
     r"""Read a flight log and return its longest stretch inside a region.
 

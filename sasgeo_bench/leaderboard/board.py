@@ -29,7 +29,7 @@ from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables
 from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
 from sasgeo_bench.matching.matcher import RejectorCard
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import StoredAnswers
@@ -138,7 +138,7 @@ class Board:
     data_version: int = DATA_VERSION
 
 
-def make_extras(request: ScoreRequest, board: Board, tell: Tell) -> list[Extra]:
+def make_extras(request: ScoreRequest, board: Board) -> list[Extra]:
     """Return the additional files; leave out what cannot be made, and figures that cannot be drawn."""
     if request.extras:
         tell("drawing figures and pictures")

@@ -47,7 +47,7 @@ from sasgeo_bench.leaderboard.pooled_tables import (
     price_frame,
     recall_frame,
 )
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.scoring.contrasts import Contrast, by_place
 from sasgeo_bench.scoring.protection import ProtectionLevels, protection_levels
 from sasgeo_bench.scoring.score import FIX_M, single_views
@@ -61,10 +61,10 @@ MOST_STANFORD: Final = 5  # matchers
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
 
 
-def figures_extra(board: Board, *, tell: Tell, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
+def figures_extra(board: Board, *, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
     """Return the figures of a board, as SVG.
 
-    Report by `tell` the kinds of figures that lack data. `contrasts` are the registered ones; `split` assigns the
+    Report the kinds of figures that lack data. `contrasts` are the registered ones; `split` assigns the
     places that calibrate conformal protection levels.
     """
     shown = shown_matchers(board.table, contrasts)

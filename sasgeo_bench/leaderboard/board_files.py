@@ -91,7 +91,7 @@ def write_board(
     versions = {name: str(getattr(about, name)) for name in _VERSIONS if getattr(about, name) is not None}
     metadata = {"attribution": ATTRIBUTION, "licence": LICENCE, **versions}
     try:
-        with locked(folder, tell=lambda _: None):
+        with locked(folder):
             check_board(folder, scorer_version=about.scorer_version)
             with fresh_folder(folder) as scratch:
                 for part in (Extra(tables=tables, texts=texts), *extras):

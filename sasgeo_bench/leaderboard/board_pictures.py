@@ -30,7 +30,7 @@ from sasgeo_bench.leaderboard.manifests import FailedCase, MapBlock, Picture, Pi
 from sasgeo_bench.leaderboard.plot_tables import ranked_matchers, shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
-from sasgeo_bench.progress import Tell, spread
+from sasgeo_bench.progress import spread, tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import paint_overview
@@ -96,7 +96,6 @@ def _file_of(kind: str, name: str) -> str:
 def pictures_extra(
     board: Board,
     *,
-    tell: Tell,
     root: Path,
     contrasts: Sequence[Contrast] = (),
     split: Split | None = None,
@@ -106,9 +105,9 @@ def pictures_extra(
     """Draw pictures of a board, and list them in `pictures.json`; empty if there is none.
 
     `root` holds regions/, tasks/ and truth/; tasks that are missing there, or of other queries, have no picture. Report
-    by `tell` which pictures cannot be drawn, and how many there are. `contrasts` are the registered ones, `split` has
-    the blocks of a map; `has_cases` adds failed queries, drawn by `jobs` processes, and `answers.parquet` with the
-    place of every query.
+    which pictures cannot be drawn, and how many there are. `contrasts` are the registered ones, `split` has the blocks
+    of a map; `has_cases` adds failed queries, drawn by `jobs` processes, and `answers.parquet` with the place of every
+    query.
     """
     found = _Found(failures=board.failures)
     tasks = [about for about in board.tasks if about.suite != CONTROLS]

@@ -14,7 +14,7 @@ from sasgeo_bench.files.folders import SITE
 from sasgeo_bench.leaderboard.board import Board, ScoreRequest, make_extras, record_of, write_files
 from sasgeo_bench.leaderboard.board_files import check_board, read_board_manifest
 from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, kept_private, seed_of
-from sasgeo_bench.progress import Lines, Progress, Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
@@ -43,24 +43,22 @@ from sasgeo_bench.tasks.task_files import Task
 _M2_PER_KM2: Final = 1e6
 
 
-def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None = None) -> Board:
+def make_board(request: ScoreRequest) -> Board:
     """Score everything, and write and return the board.
 
-    Report lines by `tell`, and the state of intervals and rejectors by `progress`, by default in lines. Raise
-    StoreError if predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named by
-    itself answers none of the queries; nothing is written. Raise ConfigError if there is nothing to score, or rejectors
-    are named without a split.
+    Raise StoreError if predictions, tasks or truths are missing, damaged, or of other versions, or a run that is named
+    by itself answers none of the queries; nothing is written. Raise ConfigError if there is nothing to score, or
+    rejectors are named without a split.
     """
-    progress = progress or Lines(tell)
     check_board(request.board, scorer_version=SCORER_VERSION)
     rules = rules_of(request.rejectors, request.split)
-    failures = Failures(log_beside(request.board), tell=lambda _: None)  # reported with the board, or raised
+    failures = Failures(log_beside(request.board), is_told=False)  # reported with the board, or raised
     ranks = None
     while ranks is None:  # once more for each time that the comparison of entries fails because of some of them
-        contest = _contest(request, failures, tell)
-        board = _unranked(request, contest, failures, tell)
-        ranks = _ranks(board, request.draws, tell, progress)
-    costs = _costs(board, contest.tasks, tell)
+        contest = _contest(request, failures)
+        board = _unranked(request, contest, failures)
+        ranks = _ranks(board, request.draws)
+    costs = _costs(board, contest.tasks)
     known = set() if request.stored is None else {entry.name for entry in request.stored.about.entries}
     judgings = [
         RejectionTask(
@@ -81,8 +79,6 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
         jobs=request.jobs,
         dask=request.dask,
         failures=failures,
-        tell=tell,
-        progress=progress,
     )
     rejection = rejection if request.stored is None else request.stored.joined(rejection)
     figures = pd.concat([part for part in (*ranks, *costs, *rejection.rows) if len(part)], ignore_index=True)
@@ -94,7 +90,7 @@ def make_board(request: ScoreRequest, *, tell: Tell, progress: Progress | None =
         tell(f"{request.board} had rows of {names}, which this board has not; their answers are where they were")
     if (request.board / SITE).is_dir():
         tell(f"{request.board / SITE} is of the older board and is removed with it: publish again")
-    extras = make_extras(request, board, tell)
+    extras = make_extras(request, board)
     board = replace(board, about=record_of(request, board, [rule.card for rule in rules.values()]))
     write_files(request, board, extras)
     return board
@@ -109,16 +105,14 @@ def _asked_rows(scores: pd.DataFrame, views: pd.DataFrame | None) -> pd.DataFram
     return pd.concat([part for part in parts if len(part)], ignore_index=True)
 
 
-def _contest(request: ScoreRequest, failures: Failures, tell: Tell) -> Contest:
+def _contest(request: ScoreRequest, failures: Failures) -> Contest:
     """Read the answers of all entries that have not failed, and score them."""
     entries = find_entries(request.predictions, request.submissions, failures=failures)
     entries = leave_out(entries, request.without)
     names = {name for entry in entries for name in (entry.name, name_alone(entry.name))}
     failures.found |= {name: why for name, why in request.failed.items() if name not in names}
     folders = [folder for folder in request.tasks if base_of(folder.name) not in request.without]
-    answers = read_entry_answers(
-        entries, folders, root=request.root, named=request.predictions, tell=tell, failures=failures
-    )
+    answers = read_entry_answers(entries, folders, root=request.root, named=request.predictions, failures=failures)
     tasks = read_tasks(answers, folders, request.truth or request.root / "truth")
     seed_of([task.manifest for task in tasks])  # refuse a mixture of seeds before it is scored
     return score_entries(
@@ -126,10 +120,10 @@ def _contest(request: ScoreRequest, failures: Failures, tell: Tell) -> Contest:
     )
 
 
-def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell: Tell) -> Board:
+def _unranked(request: ScoreRequest, contest: Contest, failures: Failures) -> Board:
     """Return the board with the entries to rank, which of them are set apart, and how they fared on a private seed."""
     verdicts = hold_controls(contest.scores)
-    scored = scored_rows(contest, request.split, tell=tell)
+    scored = scored_rows(contest, request.split)
     scores = rows_to_rank(scored, request.split)
     entries = tuple(item.entry for item in contest.answers if item.entry.name in scores)
     apart = set_apart(entries, scores, request.split, verdicts)
@@ -144,7 +138,6 @@ def _unranked(request: ScoreRequest, contest: Contest, failures: Failures, tell:
             tasks=tasks,
             pipeline=request.pipeline,
             draws=request.draws,
-            tell=tell,
         )
         for name, row in on_private.rows.items():
             tell(f"{name}: {row.verdict} ({row.why})")
@@ -187,9 +180,9 @@ def _of_rows(views: Mapping[str, pd.DataFrame], scores: Mapping[str, pd.DataFram
     }
 
 
-def _ranks(board: Board, draws: int, tell: Tell, progress: Progress) -> list[pd.DataFrame] | None:
+def _ranks(board: Board, draws: int) -> list[pd.DataFrame] | None:
     """Return the figures of all entries together; None if one of them fails, which is noted."""
-    compare = partial(leaderboards, draws=draws, excluded=board.apart, progress=progress)
+    compare = partial(leaderboards, draws=draws, excluded=board.apart)
     try:
         return compare(board.scores)
     except Exception as error:
@@ -199,7 +192,7 @@ def _ranks(board: Board, draws: int, tell: Tell, progress: Progress) -> list[pd.
     return None
 
 
-def _costs(board: Board, tasks: Sequence[Task], tell: Tell) -> list[pd.DataFrame]:
+def _costs(board: Board, tasks: Sequence[Task]) -> list[pd.DataFrame]:
     """Return the costs of each entry, and report how many queries it answered, and the status of the others."""
     views = {name: size for task in tasks for name, size in task.view_bytes().items()}
     areas = {task.manifest.region: area for task in tasks if (area := _area_km2(task.region)) is not None}

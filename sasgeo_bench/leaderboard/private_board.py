@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare a public board with one of a private seed of the same pipeline: which rows are reproduced."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -20,6 +20,7 @@ from sasgeo_bench.leaderboard.manifests import (
     SeedResult,
     SeedVerdict,
 )
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.sandbox import keeps_truth
 from sasgeo_bench.scoring.base import Bools
@@ -278,11 +279,10 @@ def hold_private(
     tasks: Sequence[TaskManifest],
     pipeline: PipelineRecord | None,
     draws: int,
-    tell: Callable[[str], None],
 ) -> OnPrivate:
     """Compare the rows of a public board with a board of a private seed in `folder`.
 
-    `entries`, `scores`, `tasks` and `pipeline` are those of the public board. Report by `tell` which tasks the two
+    `entries`, `scores`, `tasks` and `pipeline` are those of the public board. Report which tasks the two
     boards do not share. Raise ConfigError if the folder holds no board of a private seed, or one of another pipeline or
     version, or the public one is itself of a private seed. Raise StoreError if it holds no sound board.
     """

@@ -18,7 +18,7 @@ from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart, disc_of, se
 from sasgeo_bench.leaderboard.cases import find_cases, operating_rejector, words_of
 from sasgeo_bench.matching.matcher import SAME_PLACE_M
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.layers import read_layers
@@ -278,11 +278,11 @@ def is_run(folder: Path) -> bool:
     return any(next(folder.glob(pattern), None) is not None for pattern in patterns)
 
 
-def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequence[str] = (), tell: Tell) -> RunCases:
+def read_run_cases(run: Path, *, out: Path, split: Split | None, rejectors: Sequence[str] = ()) -> RunCases:
     """Score the answers of a run, in a folder with runs of one matcher.
 
     `out` is the root of tasks and truths of runs that lie elsewhere; `split` assigns the places that calibrate.
-    `rejectors` are names, or module:Class; the matcher's own confidence is always among them. Report by `tell` which
+    `rejectors` are names, or module:Class; the matcher's own confidence is always among them. Report which
     runs are left out. Raise StoreError if no task of the run is there as it was asked, or a truth is missing. Raise
     ConfigError if the folder holds runs of several matchers.
     """

@@ -4,7 +4,7 @@
 import datetime as dt
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ from sasgeo_bench.osm.read import Reading, read_extract
 from sasgeo_bench.osm.scan import Box, Tally, line_wkb
 from sasgeo_bench.osm.snapshot import OBJECTS, elements, is_history, open_snapshot, own_id, read_header
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.progress import tell
 
 # Prefixes of https://wiki.openstreetmap.org/wiki/Lifecycle_prefix for what is gone, on the keys of our classes.
 _PREFIXES: Final = ("demolished", "razed", "removed", "was", "abandoned", "destroyed")
@@ -196,7 +197,6 @@ CELL_M: Final = 10.0  # of the grid that frames the reading; nothing is burnt in
 _EDGE_DEG: Final = 0.01  # spacing of corners: a box's straight sides in degrees bend when projected
 _LEAST_STATES: Final = 2
 _NAMED_DATE: Final = re.compile(r"(?<!\d)(\d{4}-\d{2}-\d{2})(?!\d)")
-_SILENT: Final[Callable[[str], None]] = lambda _: None  # noqa: E731 - a default
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -294,9 +294,8 @@ def read_history(
     *,
     bounds: Box | None = None,
     margin_m: float = MARGIN_M,
-    tell: Callable[[str], None] = _SILENT,
 ) -> History:
-    """Read dated extracts over the area that all of them map, in a UTM zone; `tell` takes a line about each.
+    """Read dated extracts over the area that all of them map, in a UTM zone, with a line about each.
 
     `bounds` (west, south, east, north, degrees) limits the area. `margin_m` is cut off along estimated edges: two
     extracts of a country are seldom cut along one line, and what lies between their lines would vanish or appear in a

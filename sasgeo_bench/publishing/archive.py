@@ -17,7 +17,7 @@ from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.manifests import PackManifest
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive_file import (
     MOST_BYTES,
     SCHEMA_VERSION,
@@ -176,8 +176,6 @@ def request_of(
 def score_all(
     request: ScoreRequest,
     *,
-    tell: Tell,
-    progress: Progress | None = None,
     has_cases: bool = True,
     results: Path | None = None,
 ) -> Board:
@@ -192,10 +190,9 @@ def score_all(
         check_results(results / request.board.name, request.board)
     kept = stored_among(request.predictions)
     with laid_out(request) as laid:
-        figures = partial(figures_extra, tell=tell, contrasts=request.contrasts, split=request.split)
+        figures = partial(figures_extra, contrasts=request.contrasts, split=request.split)
         pictures = partial(
             pictures_extra,
-            tell=tell,
             root=request.root,
             contrasts=request.contrasts,
             split=request.split,
@@ -204,7 +201,7 @@ def score_all(
         )
         manifest = None if kept is None else read_board_manifest(kept)
         extras = (figures, pictures) if request.stored is None else ()  # which need what was fitted for every entry
-        board = make_board(replace(laid, extras=extras, kept=manifest), tell=tell, progress=progress)
+        board = make_board(replace(laid, extras=extras, kept=manifest))
         if results is not None:
             lacks = "" if kept is None else read_pack(kept).dropped
             tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())

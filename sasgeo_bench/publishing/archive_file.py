@@ -345,7 +345,7 @@ def write_pack(
     check_replaced(folder)
     folder = resolve_link(folder)
     try:
-        with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
+        with locked(folder), fresh_folder(folder) as scratch:
             _copy_tables(board, scratch)
             _write_tasks(scratch, tasks)
             _write_runs(scratch, runs)

@@ -26,7 +26,7 @@ from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.leaderboard.stored_board import StoredBoard
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.publishing.site import site_pages
@@ -69,17 +69,15 @@ def publish(
     board: Path,
     into: Path | None = None,
     *,
-    tell: Tell,
     root: Path = Path("out"),
     jobs: int = 1,
-    progress: Progress | None = None,
 ) -> Written:
     """Make the site of a board from its folder; stored results are scored again for their figures and pictures.
 
     `into` is the folder to write, by default `site` in the board's own. Pictures of stored results, which hold no
-    views, come from regions/, tasks/ and truth/ below `root`. `jobs` counts the processes that score, `progress` shows
-    how far they are (lines by `tell` by default). Raise `StoreError` if there is no sound board or the site cannot be
-    written, and an older site then stays as it was; `ConfigError` if the board is of a private seed.
+    views, come from regions/, tasks/ and truth/ below `root`. `jobs` counts the processes that score. Raise
+    `StoreError` if there is no sound board or the site cannot be written, and an older site then stays as it was;
+    `ConfigError` if the board is of a private seed.
     """
     if into is None and (board / SITE).is_symlink():
         raise StoreError(f"{board / SITE} is a link: name where it leads with --into")
@@ -89,16 +87,16 @@ def publish(
         raise StoreError(
             f"{target} is the board itself, or would be a strange folder in it: name another one with --into"
         )
-    with held(board, target, root=root, tell=tell), _with_figures(board, root, jobs, tell, progress) as folder:
+    with held(board, target, root=root), _with_figures(board, root, jobs) as folder:
         with _sound(board):
             files = read_board_files(folder)
         check_public(files.board.about.private_seed, str(board))
         with _sound(board):
             scenes = _scenes(files.board)
             files = replace(files, downloads=(*files.downloads, *_scenes_file(scenes)))
-            source = replace(_source(files, tell), scenes=scenes)
+            source = replace(_source(files), scenes=scenes)
             pages = site_pages(source)
-        with site_lock(board, target, tell=tell):
+        with site_lock(board, target):
             written = write_site(
                 target,
                 files,
@@ -112,7 +110,7 @@ def publish(
 
 
 @contextmanager
-def _with_figures(board: Path, root: Path, jobs: int, tell: Tell, progress: Progress | None) -> Iterator[Path]:
+def _with_figures(board: Path, root: Path, jobs: int) -> Iterator[Path]:
     """Yield the folder of a board with figures: stored results are scored into one that goes when the block ends."""
     if not is_pack(board) or (board / FIGURES).is_dir():  # results of a former layout hold their figures
         yield board
@@ -121,7 +119,7 @@ def _with_figures(board: Path, root: Path, jobs: int, tell: Tell, progress: Prog
     with scratch_folder("answers") as scratch:
         folder = scratch / board.resolve().name
         request = replace(request_of([board], board=folder, root=root), jobs=jobs)
-        score_all(request, tell=tell, progress=progress)
+        score_all(request)
         if not read_leaderboard(folder).equals(read_leaderboard(board)):
             tell(f"the site shows the tables of this version, which differ from those in {board}: store them anew")
         for name in BOARD_FILES:  # those of the paper's experiment are made where it is run
@@ -144,7 +142,7 @@ def _sound(board: Path) -> Iterator[None]:
         raise StoreError(f"{board} holds a board that no page can be made of ({text}): score it again") from error
 
 
-def _source(files: BoardFiles, tell: Tell) -> SiteSource:
+def _source(files: BoardFiles) -> SiteSource:
     """Return the content of all pages, with figures of places and rates drawn for them."""
     about, name = files.board.about, _name_of(files.board)
     spec = _pipeline_of(about.pipeline)

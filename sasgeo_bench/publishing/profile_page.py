@@ -14,7 +14,6 @@ from matplotlib.lines import Line2D
 from sasgeo_bench.canvas import Page, page
 from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.files.folders import check_known, check_room, fresh_folder, is_ours, locked
-from sasgeo_bench.progress import Tell
 from sasgeo_bench.publishing.site import environment
 from sasgeo_bench.regions.build import package_version
 from sasgeo_bench.regions.region import ATTRIBUTION
@@ -68,7 +67,7 @@ def check_profile(folder: Path) -> None:
     check_room(folder)
 
 
-def write_profile(of: Profile, folder: Path, *, tell: Tell) -> None:
+def write_profile(of: Profile, folder: Path) -> None:
     """Write a profile, its page and its figure, whole or not at all; an earlier profile is replaced.
 
     Raise `StoreError` if the folder holds other files, or cannot be written.
@@ -76,7 +75,7 @@ def write_profile(of: Profile, folder: Path, *, tell: Tell) -> None:
     check_profile(folder)
     made_by = f"sasgeo-bench {package_version()}"
     try:
-        with locked(folder, tell=tell), fresh_folder(folder) as scratch:
+        with locked(folder), fresh_folder(folder) as scratch:
             record = json.dumps({"attribution": ATTRIBUTION, "made_by": made_by, **of.to_dict()}, indent=1)
             (scratch / RECORD).write_text(record, encoding="utf-8")
             _draw(of, scratch / FIGURE)

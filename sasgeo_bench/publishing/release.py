@@ -13,7 +13,7 @@ from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.dataset_card import CARD, DATASHEET, card_text, datasheet_text
 from sasgeo_bench.publishing.release_files import (
     BoardTasks,
@@ -71,14 +71,14 @@ class ReleaseRequest:
     board: BoardTasks | None = None
 
 
-def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
+def make_release(request: ReleaseRequest) -> Release:
     """Write a release, whole or not at all; the same regions and tasks give the same bytes.
 
-    `tell` gets one line for every step. Raise `SasgeoError` if anything is refused (see `plan_release`) or cannot be
+    Raise `SasgeoError` if anything is refused (see `plan_release`) or cannot be
     written; an older release then stays as it was.
     """
-    planned = plan_release(request, tell=tell)
-    with open_release(request.into, tell=tell) as folder:
+    planned = plan_release(request)
+    with open_release(request.into) as folder:
         tell(f"copying {counted(len(planned.maps), 'map')} and {counted(len(planned.tasks), 'task')}")
         copy_data(folder, planned)
         release = replace(planned, files=read_records(folder, planned))
@@ -92,7 +92,7 @@ def make_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     return release
 
 
-def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
+def plan_release(request: ReleaseRequest) -> Release:
     """Return the content of a release; everything that can be refused is refused here, before anything is written.
 
     Raise `ConfigError` if a region, suite, split or address is wrong, there are no tasks, or the extra packages are
@@ -106,7 +106,7 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
     if request.board is None:
         for name in regions:
             _check_region(name, split, request.out)
-    tasks = _tasks(regions, request, tell) if request.board is None else _tasks_of_board(request.board)
+    tasks = _tasks(regions, request) if request.board is None else _tasks_of_board(request.board)
     names = sorted({*regions, *(task.map_name for task in tasks)})
     maps = tuple(_map(request.out / "regions" / name) for name in names)
     manifests = {item.name: item.manifest for item in maps}
@@ -115,7 +115,7 @@ def plan_release(request: ReleaseRequest, *, tell: Tell) -> Release:
         if task.released:
             task.source.check_truths()
     if request.board is None:
-        _warn_of_seeds(tasks, tell)
+        _warn_of_seeds(tasks)
     return Release(
         regions=regions,
         split=split,
@@ -167,7 +167,7 @@ def _check_region(name: str, split: SplitFile, out: Path) -> None:
         )
 
 
-def _tasks(regions: Sequence[str], request: ReleaseRequest, tell: Tell) -> tuple[ReleaseTask, ...]:
+def _tasks(regions: Sequence[str], request: ReleaseRequest) -> tuple[ReleaseTask, ...]:
     """Return the tasks of the regions and of their older and edited maps, by suite and map."""
     suites = [find_suite(name).card.name for name in dict.fromkeys(request.suites)] or list(SUITES)
     found = []
@@ -254,7 +254,7 @@ def _check_task(task: Task, manifest: Manifest, split: SplitFile) -> None:
         )
 
 
-def _warn_of_seeds(tasks: Sequence[ReleaseTask], tell: Tell) -> None:
+def _warn_of_seeds(tasks: Sequence[ReleaseTask]) -> None:
     """Report withheld truths that could be drawn again by trying a few seeds."""
     hiding = [task for task in tasks if set(task.parts) - task.released]
     seeds = [TruthManifest.read(task.source.truth).seed for task in hiding]

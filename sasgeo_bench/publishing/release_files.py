@@ -3,7 +3,7 @@
 
 import shutil
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -264,13 +264,13 @@ def _sums_of(folder: Path) -> dict[str, str]:
 
 
 @contextmanager
-def open_release(folder: Path, *, tell: Callable[[str], None]) -> Iterator[Path]:
+def open_release(folder: Path) -> Iterator[Path]:
     """Yield an empty folder that becomes the release when the block ends well; an older release is whole until then.
 
     Raise `StoreError` if the folder holds something else, or cannot be written.
     """
     try:
-        with locked(folder, tell=tell):
+        with locked(folder):
             check_target(folder)
             with fresh_folder(folder) as scratch:
                 yield scratch

@@ -252,7 +252,7 @@ class Written:
 
 
 @contextmanager
-def held(folder: Path, target: Path, *, root: Path, tell: Callable[[str], None]) -> Iterator[None]:
+def held(folder: Path, target: Path, *, root: Path) -> Iterator[None]:
     """Lock a board against other writers while its site is made.
 
     Raise `StoreError` if there is no board, naming those in boards/ below `root`, or the target holds something that is
@@ -265,16 +265,16 @@ def held(folder: Path, target: Path, *, root: Path, tell: Callable[[str], None])
         hint = f"did you mean {boards[near[0]]}?" if near else f"name the folder of one, as {some}"
         raise StoreError(f"{folder} holds no board ({BOARD}): {hint}")
     check_target(target)
-    with locked(folder, tell=tell):
+    with locked(folder):
         yield
 
 
-def site_lock(folder: Path, target: Path, *, tell: Callable[[str], None]) -> AbstractContextManager[None]:
+def site_lock(folder: Path, target: Path) -> AbstractContextManager[None]:
     """Return the lock of a site, to be held while it is written: a board that is refused leaves no lock behind.
 
     A site in the board's own folder has none: its file would be foreign there, and the lock of the board suffices.
     """
-    return nullcontext() if target.parent.resolve() == folder.resolve() else locked(target, tell=tell)
+    return nullcontext() if target.parent.resolve() == folder.resolve() else locked(target)
 
 
 def check_target(target: Path) -> None:

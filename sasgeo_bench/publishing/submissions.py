@@ -17,7 +17,7 @@ from sasgeo_bench.leaderboard.stored_board import StoredBoard, why_anew
 from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, AnsweredTask, Card, Submission
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_among
 from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
@@ -50,10 +50,10 @@ class SubmitRequest:
     into: Path | None = None
 
 
-def make_submission(request: SubmitRequest, *, tell: Tell) -> Path:
+def make_submission(request: SubmitRequest) -> Path:
     """Put predictions and a card into a folder that `validate` accepts, and return it.
 
-    `tell` gets a line on misses and on controls that are not answered. Raise `ConfigError` if the card does not fit the
+    A line tells of misses and of controls that are not answered. Raise `ConfigError` if the card does not fit the
     board or the runs, or the predictions hold faults; `StoreError` if something cannot be read or written.
     """
     card = request.card if isinstance(request.card, Card) else read_card_file(request.card)
@@ -255,7 +255,7 @@ def hold_submission(folder: Path, tasks: Sequence[Path]) -> tuple[Submission, tu
         return submission, tuple(submission_faults(folder, submission, [*map(Task.open, folders)], split))
 
 
-def submissions_for(board: str, paths: Sequence[Path], *, tell: Tell) -> tuple[Path, ...]:
+def submissions_for(board: str, paths: Sequence[Path]) -> tuple[Path, ...]:
     """Return the submissions for a board id, in `paths` or folders of them; report how many are for others.
 
     What cannot be read is among them: the board reports and loses it alone. Raise `StoreError` if a path is neither a
@@ -282,7 +282,7 @@ def _board_named(folder: Path, board: str) -> str:
 
 
 def with_submissions(
-    stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell, root: Path = Path("out"), jobs: int = 1
+    stored: Path, submissions: Sequence[Path], board: Path, *, root: Path = Path("out"), jobs: int = 1
 ) -> Board:
     """Score stored results again together with submissions, and write the board of both.
 
@@ -291,32 +291,28 @@ def with_submissions(
     submitted`. A submission that is damaged or does not fit is left out, among the `failures` of the board. Raise
     `StoreError` or `ConfigError` if results are damaged or no folder holds submissions; nothing is written then.
     """
-    return score_all(_request(stored, submissions, board, tell=tell, root=root, jobs=jobs), tell=tell)
+    return score_all(_request(stored, submissions, board, root=root, jobs=jobs))
 
 
-def _request(
-    stored: Path, submissions: Sequence[Path], board: Path, *, tell: Tell, root: Path, jobs: int
-) -> ScoreRequest:
+def _request(stored: Path, submissions: Sequence[Path], board: Path, *, root: Path, jobs: int) -> ScoreRequest:
     if not is_pack(stored):
         raise StoreError(f"{stored} holds no stored results: name a folder that 'leaderboard --results' has written")
-    found = submissions_for(board_of([stored]), submissions, tell=tell)
+    found = submissions_for(board_of([stored]), submissions)
     return replace(request_of([stored], board=board, root=root), submissions=found, jobs=jobs)
 
 
-def beside_stored(
-    stored: Path, submission: Path, board: Path, *, tell: Tell, root: Path = Path("out"), jobs: int = 1
-) -> Board:
+def beside_stored(stored: Path, submission: Path, board: Path, *, root: Path = Path("out"), jobs: int = 1) -> Board:
     """Score one submission beside stored results, whose own rejectors and contrasts stand as they are.
 
     Its figures are those of `with_submissions`, to the last bit; ranks are of all entries together. Figures and
-    pictures are left out. If the stored figures are those of another scorer or rejector, `tell` gets the reason and all
+    pictures are left out. If the stored figures are those of another scorer or rejector, a line says why, and all
     is scored anew. Arguments and errors as of `with_submissions`.
     """
-    request = _request(stored, [submission], board, tell=tell, root=root, jobs=jobs)
+    request = _request(stored, [submission], board, root=root, jobs=jobs)
     reason = why_anew(
         read_board_manifest(stored), [rule.card for rule in rules_of(request.rejectors, request.split).values()]
     )
     if reason is not None:
         tell(f"all entries are scored anew: {reason}")
-        return score_all(request, tell=tell)
-    return score_all(replace(request, stored=StoredBoard.open(stored)), tell=tell)
+        return score_all(request)
+    return score_all(replace(request, stored=StoredBoard.open(stored)))

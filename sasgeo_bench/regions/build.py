@@ -27,7 +27,7 @@ from sasgeo_bench.osm.mapped import lonlat_box
 from sasgeo_bench.osm.read import Reading, read_extract, read_geojson
 from sasgeo_bench.osm.synthetic.town import TownPlan, write_town
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.imagery import ORTHO, Imagery, OrthoRecord
@@ -172,14 +172,14 @@ def _is_current(folder: Path, inputs_sha256: str, *, with_preview: bool) -> bool
     return sizes_hold and is_shown and manifest.inputs_sha256 == inputs_sha256
 
 
-def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
-    """Build the region of a plan unless it is up to date; `tell` receives a line for each step.
+def build_region(plan: BuildPlan) -> Manifest:
+    """Build the region of a plan unless it is up to date, with a line for each step.
 
     A failed build leaves an earlier region as it was. Raise `ExtractError` or `CoverageError` if the extract is damaged
     or does not cover the bounds, `StoreError` if the folder cannot be written.
     """
     name = plan.folder.name
-    manifest = _write_unless_current(plan, tell, lambda scratch: _build_into(scratch, plan, tell))
+    manifest = _write_unless_current(plan, lambda scratch: _build_into(scratch, plan))
     if manifest is None:
         tell(f"{name}: up to date, nothing to do")
         return region_files.read_manifest(plan.folder)
@@ -188,7 +188,7 @@ def build_region(plan: BuildPlan, *, tell: Tell) -> Manifest:
     return manifest
 
 
-def _build_into(scratch: Path, plan: BuildPlan, tell: Tell) -> Manifest:
+def _build_into(scratch: Path, plan: BuildPlan) -> Manifest:
     name = plan.folder.name
     if len(plan.pictures) < len(plan.spec.imagery):
         raise StoreError(f"{plan.folder} was changed after it was found up to date: build it again")
@@ -210,7 +210,7 @@ def _build_into(scratch: Path, plan: BuildPlan, tell: Tell) -> Manifest:
         f"{name}: {len(reading.features)} features into a graph and {counted(len(plan.spec.class_names), 'layer')}"
         f" of {plan.grid.rows} x {plan.grid.cols} cells"
     )
-    imagery = _write_imagery(scratch, plan, reading, tell) if plan.pictures else None
+    imagery = _write_imagery(scratch, plan, reading) if plan.pictures else None
     return _write_into(scratch, plan, extract, reading, imagery=imagery)
 
 
@@ -228,7 +228,7 @@ def _read(plan: BuildPlan, source: Path) -> Reading:
     return read_extract(source, plan.grid, at=plan.extract.date, stated_coverage=stated, classes=plan.spec.classes)
 
 
-def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading, tell: Tell) -> OrthoRecord:
+def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading) -> OrthoRecord:
     """Write `ortho.tif`, and measure its offset against the map."""
     from sasgeo_bench.regions.offset import measure_offset  # noqa: PLC0415 - few regions have imagery
 
@@ -328,11 +328,11 @@ def build_edited(
         | ({} if coverage is None else {CUT_AWAY: base.coverage.area - coverage.area}),
         cuts=record.coverage.cuts,
     )
-    _write_unless_current(edited, lambda _: None, lambda scratch: _write_into(scratch, edited, record.extract, reading))
+    _write_unless_current(edited, lambda scratch: _write_into(scratch, edited, record.extract, reading))
     return edited.folder
 
 
-def build_made(spec: RegionFile, reading: Reading, *, out: Path, tell: Tell) -> Path:
+def build_made(spec: RegionFile, reading: Reading, *, out: Path) -> Path:
     """Write a region of generated features to `out/regions/<id>`, and return its folder.
 
     `spec` gives place, id and title; the file of its one extract is not read. `reading` replaces what would be read
@@ -350,7 +350,7 @@ def build_made(spec: RegionFile, reading: Reading, *, out: Path, tell: Tell) -> 
         is_current=False,
     )
     record = ExtractRecord(file=extract.file, sha256=content, bytes=0, date=extract.date, osm_timestamp=None)
-    _write_unless_current(plan, tell, lambda scratch: _write_into(scratch, plan, record, reading))
+    _write_unless_current(plan, lambda scratch: _write_into(scratch, plan, record, reading))
     return plan.folder
 
 
@@ -360,10 +360,10 @@ def _content_sha256(features: gpd.GeoDataFrame) -> str:
     return hashlib.sha256(fingerprint(features).encode() + shapes).hexdigest()
 
 
-def _write_unless_current(plan: BuildPlan, tell: Tell, write: Callable[[Path], Manifest]) -> Manifest | None:
+def _write_unless_current(plan: BuildPlan, write: Callable[[Path], Manifest]) -> Manifest | None:
     """Let `write` fill the folder of a region; return None if it is up to date, perhaps by a build we waited for."""
     try:
-        with locked(plan.folder, tell=tell):
+        with locked(plan.folder):
             if _is_current(plan.folder, plan.inputs_sha256, with_preview=plan.with_preview):
                 return None
             with fresh_folder(plan.folder) as scratch:

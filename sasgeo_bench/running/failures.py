@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.progress import tell
 from sasgeo_bench.texts import message_of, one_line
 
 LOG: Final = "failures.log"  # in the folder of a run; next to that of a board
@@ -65,20 +66,20 @@ def log_beside(board: Path) -> Path:
 
 
 class Failures:
-    """Failed entries by name, with the cause of each as one line; tracebacks are appended to `log`.
+    """Failed entries by name, with the cause of each as one line, which is told; tracebacks are appended to `log`.
 
-    >>> failures = Failures(Path("failures.log"), tell=print)
-    >>> with failures.of("graph"):
+    >>> failures = Failures(Path("failures.log"))
+    >>> with reporting(print), failures.of("graph"):
     ...     raise SasgeoError("it has no card")
     graph failed: it has no card
     >>> failures.found
     {'graph': 'it has no card'}
     """
 
-    def __init__(self, log: Path, *, tell: Callable[[str], None]) -> None:
+    def __init__(self, log: Path, *, is_told: bool = True) -> None:
         self.found: dict[str, str] = {}
         self.errors: dict[str, Exception] = {}
-        self.log, self._tell = log, tell
+        self.log, self._is_told = log, is_told
 
     @property
     def first(self) -> Exception | None:
@@ -104,8 +105,8 @@ class Failures:
             write_log(self.log, name, error)
         self.errors.setdefault(name, error)
         line = line.removeprefix(f"{name}: ")
-        if self.found.setdefault(name, line) == line:
-            self._tell(f"{name} failed: {line}")
+        if self.found.setdefault(name, line) == line and self._is_told:
+            tell(f"{name} failed: {line}")
 
     def blame(self, items: Mapping[str, Item], work: Callable[[Mapping[str, Item]], object]) -> bool:
         """Record the items with which some work fails alone, after it failed with all; return whether there are any."""

@@ -15,10 +15,11 @@ from typing import Any, Final
 import numpy as np
 import psutil
 
+from sasgeo_bench import progress
 from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.files.plugins import ORACLE
 from sasgeo_bench.matching.matcher import lacks
-from sasgeo_bench.progress import Progress, Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run, reach_of
 from sasgeo_bench.running.runner import map_bytes
@@ -155,7 +156,9 @@ class Profile:
 
 
 def profile(
-    request: ProfileRequest, *, plan: RunPlan | None = None, tell: Tell, progress: Progress | None = None
+    request: ProfileRequest,
+    *,
+    plan: RunPlan | None = None,
 ) -> Profile:
     """Measure a matcher, as planned by `plan_profile`; nothing is stored.
 
@@ -172,7 +175,7 @@ def profile(
     region = plan.parts[0].region
     manifest = read_manifest(region)
     with _pinned(request.cores) as cores:
-        plan = trained(plan, tell=tell)
+        plan = trained(plan)
         result = plan.training_result
         if result is not None and result.text is None:
             raise MatchError(f"{plan.card.name} learned nothing: {result.status}: {result.message}")
@@ -189,7 +192,7 @@ def profile(
                 raise MatchError(f"{plan.card.name} cannot prepare {region.name}: {ready.status}: {ready.message}")
             first = worker.match(asked[0], top_k=request.top_k)
             meter = EnergyMeter()
-            fixes, readings = _sustained(worker, asked, request, meter=meter, progress=progress)
+            fixes, readings = _sustained(worker, asked, request, meter=meter)
             return Profile(
                 matcher=plan.card.name,
                 version=plan.card.version,
@@ -285,7 +288,6 @@ def _sustained(
     request: ProfileRequest,
     *,
     meter: EnergyMeter,
-    progress: Progress | None,
 ) -> tuple[list[Fix], list[Reading]]:
     """Ask for the time requested, and look at the sensors meanwhile."""
     fixes: list[Fix] = []

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from uuid import uuid4
 
+from sasgeo_bench import progress
 from sasgeo_bench.errors import counted
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.follower import card_on_flights
-from sasgeo_bench.progress import Lines, Progress, Tell, connected, done_on
+from sasgeo_bench.progress import connected, done_on, tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -93,8 +94,8 @@ class RunReport:
     folders: tuple[Path, ...]
 
 
-def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunReport:
-    """Ask every pending query of a plan; `tell` gets the progress as lines unless `progress` is given.
+def run(plan: RunPlan) -> RunReport:
+    """Ask every pending query of a plan.
 
     Raises
     ------
@@ -103,27 +104,26 @@ def run(plan: RunPlan, *, tell: Tell, progress: Progress | None = None) -> RunRe
     ConfigError
         If a named cluster is not there.
     """
-    progress = progress or Lines(tell)
     for line in plan.training_lines() if plan.training_set is None else ():
         tell(f"{plan.card.name}: {line}")
-    plan = trained(plan, tell=tell)
-    _tell_state(plan, tell)
+    plan = trained(plan)
+    _tell_state(plan)
     for part in plan.parts:
         if not part.left and part.done and prediction_files.read_key(part.folder) != part.key:
-            with locked(part.folder, tell=tell):
+            with locked(part.folder):
                 _begin(plan, part)  # answers under an earlier training count again: `run.json` says which
     parts = [part for part in plan.parts if part.left]
     if parts:
         progress.begin(plan.card.name, sum(len(part.left) for part in parts))
     if plan.request.dask is not None and parts:
-        costs = _run_on_cluster(plan.request.dask, plan, parts, tell, progress)
+        costs = _run_on_cluster(plan.request.dask, plan, parts)
     else:
-        costs = _run_here(plan, parts, tell, progress)
+        costs = _run_here(plan, parts)
     pooled = pool_costs(costs)
     return RunReport(counts=pooled.counts, messages=pooled.messages, folders=tuple(part.folder for part in plan.parts))
 
 
-def _tell_state(plan: RunPlan, tell: Tell) -> None:
+def _tell_state(plan: RunPlan) -> None:
     """Report the finished tasks, by name if they are few, failures, and how many rows answer other queries."""
     whole = [part for part in plan.parts if not part.left]
     if len(whole) > MOST_LINES:
@@ -141,15 +141,15 @@ def _tell_state(plan: RunPlan, tell: Tell) -> None:
         tell(f"{plan.card.name}: {rows} to queries that these tasks do not hold now{others}, set aside")
 
 
-def _run_here(plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
+def _run_here(plan: RunPlan, parts: list[RunPart]) -> list[Cost]:
     """Ask the queries of all tasks on this machine."""
     costs = []
     for batch in _batches(by_map(plan.request.spec, parts)):
         with ExitStack() as locks:
-            _lock(locks, batch, tell)
+            _lock(locks, batch)
             left = _still_left(plan, batch)
             if left:
-                costs.append(answer(plan, left, jobs=plan.request.jobs, watch=_Notes(plan, progress)))
+                costs.append(answer(plan, left, jobs=plan.request.jobs, watch=_Notes(plan)))
     return costs
 
 
@@ -165,10 +165,10 @@ def _batches(groups: Sequence[Sequence[RunPart]]) -> Iterator[list[RunPart]]:
         yield batch
 
 
-def _lock(locks: ExitStack, parts: Sequence[RunPart], tell: Tell) -> None:
+def _lock(locks: ExitStack, parts: Sequence[RunPart]) -> None:
     """Hold the folders of some tasks; all runs lock them in one order, so that no two wait for each other."""
     for folder in sorted({part.folder for part in parts}):
-        locks.enter_context(locked(folder, tell=tell))
+        locks.enter_context(locked(folder))
 
 
 def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
@@ -185,10 +185,10 @@ def _still_left(plan: RunPlan, parts: Sequence[RunPart]) -> list[RunPart]:
 
 
 class _Notes(Watch):
-    """Keeps `run.json` of each task, and reports each row to `progress`, by one thread at a time."""
+    """Keeps `run.json` of each task, and reports each row, by one thread at a time."""
 
-    def __init__(self, plan: RunPlan, progress: Progress) -> None:
-        self._plan, self._progress = plan, progress
+    def __init__(self, plan: RunPlan) -> None:
+        self._plan = plan
         self._lock = threading.Lock()
         self._before: dict[Path, Cost] = {}
 
@@ -201,19 +201,19 @@ class _Notes(Watch):
         """Report a row of the matcher as a whole: a task may be too short for a pace."""
         del part
         with self._lock:
-            self._progress.advance(self._plan.card.name, 1)
+            progress.advance(self._plan.card.name, 1)
 
     def end(self, part: RunPart, cost: Cost) -> None:
         """Write the cost of the task."""
         _write_run(self._plan, part, cost, self._before[part.folder])
 
 
-def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart], tell: Tell, progress: Progress) -> list[Cost]:
+def _run_on_cluster(address: str, plan: RunPlan, parts: list[RunPart]) -> list[Cost]:
     """Ask the queries of all tasks on a cluster at once."""
     costs: list[list[Cost]] = []
     with ExitStack() as locks:
         client = locks.enter_context(connected(address))
-        _lock(locks, parts, tell)
+        _lock(locks, parts)
         parts = _still_left(plan, parts)
         costs, left = [[] for _ in parts], [len(part.left) for part in parts]
         before = [_begin(plan, part) for part in parts]

@@ -15,7 +15,7 @@ from sasgeo_bench.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.learned_file import write_learned
 from sasgeo_bench.matching.segmenter import check_text
-from sasgeo_bench.progress import Progress, Tell, spread
+from sasgeo_bench.progress import reporting, spread, tell
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.recalibration import Said, recalibrated
@@ -124,7 +124,7 @@ def segmenter_name(segmenter: str, *, is_recalibrated: bool) -> str:
     return f"{segmenter}{RECALIBRATED}" if is_recalibrated else segmenter
 
 
-def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None = None) -> tuple[Path, ...]:
+def segment_tasks(wanted: SegmentTasks) -> tuple[Path, ...]:
     """Segment the pictures of tasks that are not up to date, and return the folders of the tasks that result.
 
     Raises
@@ -149,11 +149,11 @@ def segment_tasks(wanted: SegmentTasks, *, tell: Tell, progress: Progress | None
         sight = _Sight(
             request=request,
             loaded=loaded,
-            learned=_learned(wanted, loaded, group, tell) if loaded.learns else None,
+            learned=_learned(wanted, loaded, group) if loaded.learns else None,
             is_recalibrated=wanted.is_recalibrated,
         )
         work, label = partial(_segmented, sight), f"{sight.name}, {group.name}"
-        for folder, lines in spread(work, group.asked, jobs=wanted.jobs, label=label, progress=progress):
+        for folder, lines in spread(work, group.asked, jobs=wanted.jobs, label=label):
             made.append(folder)
             for line in lines:
                 tell(line)
@@ -200,7 +200,7 @@ def _group_of(region: str, split: Split) -> str | None:
     return _TRAIN if split.part_of(place) == "train" else "held out"
 
 
-def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group, tell: Tell) -> str | None:
+def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group) -> str | None:
     """Return what a segmenter learned for a group, out of its file or by training; None with nothing to learn from."""
     if not group.train:
         if "training" in loaded.card.needs:
@@ -278,7 +278,8 @@ def _segmented(sight: _Sight, task: Task) -> tuple[Path, list[str]]:
     done = _seen_by(sight, task, suite, faults)
     new = {"suite": suite, "segmenter": record, **({"failed_pictures": len(faults)} if faults else {})}
     origin = about.origin.model_copy(update=new)
-    made = put_task(done.pairs, origin, TruthManifest.read(task.truth), out=root, tell=lines.append)
+    with reporting(lines.append):
+        made = put_task(done.pairs, origin, TruthManifest.read(task.truth), out=root)
     write_segmented(segmented_file(root, made.manifest.queries_sha256), done.pictures)
     lines.append(f"{suite} on {about.region}: {counted(made.manifest.queries, 'query', 'queries')} in {made.folder}")
     if faults:

@@ -12,6 +12,7 @@ import numpy as np
 
 from sasgeo_bench.errors import ConfigError, SasgeoError
 from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.progress import reporting, silent
 from sasgeo_bench.running.checks import Check, check_of
 from sasgeo_bench.tasks.build import check_task, make_tasks, plan_draw
 from sasgeo_bench.tasks.query import Query, Truth
@@ -63,15 +64,15 @@ def _lost_role(suite: Suite) -> str | None:
 
 def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
     """Draw the suite, and check what was drawn."""
-    (request,) = plan_requests(
-        Wanted(suites=(spec,), regions=(TOWN,), split=_SPLIT, count=_COUNT, seed=1, out=folder, may_be_fewer=True),
-        tell=_silent,
-    )
+    wanted = Wanted(suites=(spec,), regions=(TOWN,), split=_SPLIT, count=_COUNT, seed=1, out=folder, may_be_fewer=True)
+    with reporting(silent):
+        (request,) = plan_requests(wanted)
     name = f"draws queries on {TOWN}"
     try:
-        made = make_tasks(request, tell=_silent)
+        with reporting(silent):
+            made = make_tasks(request)
         faults = [fault for task in made for fault in check_task(task)]
-        drawer, sites = plan_draw(request, _silent)
+        drawer, sites = plan_draw(request)
     except SasgeoError as error:
         yield Check(name=name, outcome="not applicable", found=f"{error}: try it on a place that can")
         return
@@ -98,10 +99,6 @@ def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
         except Exception as error:  # noqa: BLE001 - as above
             fault = message_of(error)
         yield check_of(rule, fault, f"{len(kit.pairs)} queries")
-
-
-def _silent(line: str) -> None:
-    del line
 
 
 class _AsControl(Shot):

@@ -14,6 +14,7 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.files.plugins import MATCHERS
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match, lacks
+from sasgeo_bench.progress import reporting, silent
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
@@ -73,20 +74,17 @@ def tiny_place(path: str | Path) -> TinyPlace:
     ((1024, 1024), ['localization', 'retrieval'])
     """
     folder = Path(path)
-    build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent)
     queries: list[Query] = []
     truths: list[Truth] = []
     wanted = Wanted(suites=_SUITES, regions=(TOWN,), split="crossfit", count=1, seed=1, out=folder, may_be_fewer=True)
-    for request in plan_requests(wanted, tell=_silent):
-        for made in make_tasks(request, tell=_silent):
-            queries += made.queries()
-            truths += made.truths
+    with reporting(silent):
+        build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder))
+        for request in plan_requests(wanted):
+            for made in make_tasks(request):
+                queries += made.queries()
+                truths += made.truths
     region = read_region(folder / "regions" / TOWN)
     return TinyPlace(folder=folder, region=region, queries=tuple(queries), truths=tuple(truths))
-
-
-def _silent(line: str) -> None:
-    del line
 
 
 def check_matcher(

@@ -15,6 +15,7 @@ from sasgeo_bench.files.plugins import MATCHERS, TRACKERS
 from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import MatcherCard, is_followed, lacks
+from sasgeo_bench.progress import reporting, silent
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region
@@ -72,7 +73,6 @@ def tiny_flights(path: str | Path) -> TinyFlights:
     (3, 1, 'sequence')
     """
     folder = Path(path)
-    build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder), tell=_silent)
     wanted = Wanted(
         suites=(_SUITE,),
         regions=(TOWN,),
@@ -85,19 +85,17 @@ def tiny_flights(path: str | Path) -> TinyFlights:
     )
     queries: list[Query] = []
     truths: dict[str, Truth] = {}
-    for request in plan_requests(wanted, tell=_silent):
-        for made in make_tasks(request, tell=_silent):
-            queries += made.queries()
-            truths |= {truth.query_id: truth for truth in made.truths}
+    with reporting(silent):
+        build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder))
+        for request in plan_requests(wanted):
+            for made in make_tasks(request):
+                queries += made.queries()
+                truths |= {truth.query_id: truth for truth in made.truths}
     flights = [tuple(views) for _, views in groupby(queries, key=lambda query: query.step and query.step.sequence_id)]
     flights.sort(key=lambda views: (truths[views[0].query_id].kind != _KIND, views[0].query_id))
     return TinyFlights(
         folder=folder, region=read_region(folder / "regions" / TOWN), flights=tuple(flights), truths=truths
     )
-
-
-def _silent(line: str) -> None:
-    del line
 
 
 def check_tracker(

@@ -6,7 +6,7 @@ from functools import partial
 
 from sasgeo_bench.files.folders import locked
 from sasgeo_bench.matching.learned_file import read_learned, write_learned
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.running.failures import LOG, guard, our_failure
 from sasgeo_bench.running.plan import RunPlan, TrainingResult, reach_of, with_training_result
 from sasgeo_bench.running.replies import PluginReply, Reply
@@ -15,7 +15,7 @@ from sasgeo_bench.running.worker import Worker
 from sasgeo_bench.texts import one_line
 
 
-def trained(plan: RunPlan, *, tell: Tell) -> RunPlan:
+def trained(plan: RunPlan) -> RunPlan:
     """Train a matcher, if there is a training set, a pending query, and no earlier result. Tell its outcome.
 
     After a failed training, every query gets its cause for an answer.
@@ -29,7 +29,7 @@ def trained(plan: RunPlan, *, tell: Tell) -> RunPlan:
     is_pending = plan.training_result is None and any(part.left for part in plan.parts)
     if given is None or path is None or not is_pending:
         return plan
-    with locked(path, tell=tell):
+    with locked(path):
         text = read_learned(path)
         if text is None:
             reply = _learn(plan, given)

@@ -11,6 +11,7 @@ import pandas as pd
 import pyarrow as pa
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.progress import tell
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
 from sasgeo_bench.running.run_manifest import RunManifest
@@ -52,13 +53,12 @@ def read_entry_answers(
     *,
     root: Path,
     named: Sequence[Path],
-    tell: Callable[[str], None],
     failures: Failures,
 ) -> list[EntryAnswers]:
     """Return the answers of all entries; skip runs of other queries, or refuse them where the user named them.
 
     Without `folders`, the tasks are those that runs were made on and that files answer; `root` is the parent of tasks/.
-    `named` are the paths that the user named, `tell` receives a line about skipped runs. `failures` records entries
+    `named` are the paths that the user named; a line tells of skipped runs. `failures` records entries
     whose answers cannot be read. Raise StoreError if a run that the user named answers none of the queries. Raise
     ConfigError if no entry answers any task.
     """
@@ -260,10 +260,10 @@ def score_entries(
     return Contest(answers=left, tasks=tuple(tasks), scores=scores, views=views)
 
 
-def scored_rows(contest: Contest, split: Split | None, *, tell: Callable[[str], None]) -> dict[str, pd.DataFrame]:
+def scored_rows(contest: Contest, split: Split | None) -> dict[str, pd.DataFrame]:
     """Return by entry the scored rows of the suites of which it was asked every task, without those of controls.
 
-    Train places of a hold-out `split` do not count. Entries without such a suite are missing; `tell` receives a line
+    Train places of a hold-out `split` do not count. Entries without such a suite are missing, with a line
     about the other suites of an entry. Raise ConfigError if no entry is left.
     """
     unused = {"train"} if split is not None and split.spec.kind == "holdout" else set()

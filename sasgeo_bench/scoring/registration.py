@@ -6,13 +6,14 @@ matter. The rest of it, of how many places it will speak and which difference so
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.progress import tell
 from sasgeo_bench.scoring.base import block_codes
 from sasgeo_bench.scoring.compare import design_effect, detectable_difference, detectable_mean
 from sasgeo_bench.scoring.contrasts import Contrast, chosen_rows
@@ -111,10 +112,8 @@ def check_contrasts(
     contrasts: Sequence[Contrast],
     pilots: Mapping[str, Pilot],
     design: pd.DataFrame,
-    *,
-    tell: Callable[[str], None],
 ) -> tuple[Registration, ...]:
-    """Return what each contrast could show, and `tell` it.
+    """Return what each contrast could show, and tell it.
 
     `design` holds a row for each drawn query, as `score.score_task` returns them without predictions. Raise ConfigError
     for the first contrast whose least difference cannot be reached.

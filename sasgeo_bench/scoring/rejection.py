@@ -17,7 +17,7 @@ from sasgeo_bench.errors import ConfigError, MatchError, counted
 from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false, remark_of
 from sasgeo_bench.matching.plugins import rejector_maker
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.progress import Progress, Tell, spread
+from sasgeo_bench.progress import spread, tell
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA, acceptance_frame
 from sasgeo_bench.scoring.base import Bools, Floats
@@ -338,8 +338,6 @@ def evaluate_rejectors(
     jobs: int,
     dask: str | None = None,
     failures: Failures,
-    tell: Tell,
-    progress: Progress,
 ) -> RejectionResult:
     """Evaluate all rejectors on the answers of each entry; the number of processes does not affect the result.
 
@@ -351,7 +349,7 @@ def evaluate_rejectors(
     accepted: list[pd.DataFrame] = []
     errors: dict[str, list[Exception]] = {}
     remarks: list[str] = []
-    found_by_task = spread(_evaluated, tasks, jobs=jobs, dask=dask, label=JUDGED, progress=progress)
+    found_by_task = spread(_evaluated, tasks, jobs=jobs, dask=dask, label=JUDGED)
     for task, results in zip(tasks, found_by_task, strict=True):
         for name, found in results.items():
             if isinstance(found, Exception):

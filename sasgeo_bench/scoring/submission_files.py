@@ -70,7 +70,7 @@ def write_submission(
     ]
     name = predictions_name(submission.card.name)
     try:
-        with locked(folder, tell=lambda _: None), fresh_folder(folder) as scratch:
+        with locked(folder), fresh_folder(folder) as scratch:
             (scratch / PREDICTIONS).mkdir()
             schema = schema_of(predictions).append(pa.field(ASKED, pa.string()))
             table = pa.Table.from_pylist(rows, schema=schema)

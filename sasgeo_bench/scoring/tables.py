@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
+from sasgeo_bench import progress
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.progress import Progress
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, codes_of, weighted_quantile
 from sasgeo_bench.scoring.compare import RankInterval, distinguishable, rank_intervals, sensitivity
 from sasgeo_bench.scoring.cost import Costs
@@ -63,12 +63,10 @@ def leaderboard(
     return FIGURE_SCHEMA.frame(in_threads(rows_of, sorted(places), done))
 
 
-def leaderboards(
-    scored: Mapping[str, pd.DataFrame], *, draws: int, excluded: Collection[str], progress: Progress
-) -> list[pd.DataFrame]:
+def leaderboards(scored: Mapping[str, pd.DataFrame], *, draws: int, excluded: Collection[str]) -> list[pd.DataFrame]:
     """Return the `leaderboard` of each set of suites that the same matchers were asked: in most cases one.
 
-    Arguments as of `leaderboard`, but matchers may lack suites. `progress` counts suites, tracks and prior groups.
+    Arguments as of `leaderboard`, but matchers may lack suites.
     """
     keys = {key for frame in scored.values() for key in frame[[*GROUP]].itertuples(index=False)}
     progress.begin(INTERVALS, len(keys))

@@ -154,7 +154,7 @@ def store_levels(
         raise ShapeError(
             f"windows of {window_cells} cells cut cells of the levels {uneven}: name a multiple of all factors"
         )
-    with locked(folder, tell=lambda _: None):
+    with locked(folder):
         if (folder / _ABOUT).is_file() and (found := StoredField.open(folder)).key == key:
             return found
         if folder.exists() and not folder.is_dir():

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import ConfigError, ImageryError, SasgeoError, StoreError
 from sasgeo_bench.files.folders import file_record, fresh_folder, locked
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, package_version, plan_build, share_shown
 from sasgeo_bench.regions.imagery import ORTHO, Imagery, OrthoRecord, PictureRecord, RenderedRecord
@@ -80,7 +80,7 @@ class Look:
         return f"{_LOOK} {self.seed}"
 
 
-def render_imagery(folder: Path, world: Path, look: Look, *, tell: Tell) -> OrthoRecord:
+def render_imagery(folder: Path, world: Path, look: Look) -> OrthoRecord:
     """Render the map in `world`, a dated state of the place of the region in `folder`, as that region's imagery.
 
     The region's map stays as it is, and so does its hash: tasks and answers of methods that look at no imagery stay
@@ -95,7 +95,7 @@ def render_imagery(folder: Path, world: Path, look: Look, *, tell: Tell) -> Orth
     """
     region_files.read_manifest(folder)  # before a lock is made: what is no region gets no file beside it
     try:
-        with locked(folder, tell=tell):
+        with locked(folder):
             manifest, shown = region_files.read_manifest(folder), region_files.read_manifest(world)
             picture = _picture(manifest, shown, look)
             if _is_current(folder, manifest, picture) and manifest.imagery is not None:
@@ -105,7 +105,7 @@ def render_imagery(folder: Path, world: Path, look: Look, *, tell: Tell) -> Orth
             rendering = _Rendering(folder, manifest, shown, features, look, picture)
             _check_drawable(rendering)
             with fresh_folder(folder) as scratch:
-                return _render_into(scratch, rendering, tell)
+                return _render_into(scratch, rendering)
     except SasgeoError:
         raise
     except OSError as error:
@@ -121,7 +121,6 @@ def render_place(
     out: Path,
     date: dt.date | None = None,
     extract_folders: Sequence[Path] = (),
-    tell: Tell,
 ) -> Path:
     """Render the imagery of a region that is built in `out`; an older state of its place is built if it is missing.
 
@@ -134,8 +133,8 @@ def render_place(
         )
     world = plan if date is None else plan_build(spec, out=out, date=date, extract_folders=extract_folders)
     if not world.is_current:
-        build_region(world, tell=tell)
-    render_imagery(plan.folder, world.folder, look, tell=tell)
+        build_region(world)
+    render_imagery(plan.folder, world.folder, look)
     return plan.folder / ORTHO
 
 
@@ -213,7 +212,7 @@ def _check_drawable(rendering: _Rendering) -> None:
         )
 
 
-def _render_into(scratch: Path, rendering: _Rendering, tell: Tell) -> OrthoRecord:
+def _render_into(scratch: Path, rendering: _Rendering) -> OrthoRecord:
     """Fill the folder that replaces a region's: its other files, the image, and a manifest that says so."""
     folder, manifest = rendering.folder, rendering.manifest
     tell(f"{folder.name}: rendering {rendering.picture.to_text().removeprefix('rendered from ')}")

@@ -17,7 +17,7 @@ import numpy as np
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import fresh_folder, locked
-from sasgeo_bench.progress import Progress, Tell, spread
+from sasgeo_bench.progress import reporting, spread, tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import read_bits
@@ -46,7 +46,7 @@ from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check
 _SKIP: Final = " (--skip passes on to the next suite)"
 
 
-def make_tasks(request: Request, *, tell: Tell) -> tuple[Task, ...]:
+def make_tasks(request: Request) -> tuple[Task, ...]:
     """Draw a suite's queries on a region; write a task for each searched map, for real ageing each older one.
 
     Raises
@@ -55,24 +55,24 @@ def make_tasks(request: Request, *, tell: Tell) -> tuple[Task, ...]:
         If there is no such suite, the count is not positive, or the region cannot carry the suite or so many sites;
         nothing is written.
     """
-    with _locked(request, tell):
-        return _make_tasks(request, tell)
+    with _locked(request):
+        return _make_tasks(request)
 
 
-def _locked(request: Request, tell: Tell) -> AbstractContextManager[None]:
+def _locked(request: Request) -> AbstractContextManager[None]:
     """Lock a request from start to end, since a second run of it would change the map that this one uses."""
     check_count(request.count)
     check_roots(request.out)
     # The lock is where maps are built, so that a refused request leaves nothing among tasks.
-    return locked(request.out / "regions" / f"{request.region.id}+{request.suite}.request", tell=tell)
+    return locked(request.out / "regions" / f"{request.region.id}+{request.suite}.request")
 
 
-def ensure_tasks(request: Request, *, tell: Tell) -> tuple[Path, ...]:
+def ensure_tasks(request: Request) -> tuple[Path, ...]:
     """Return the task folders of a request; draw them unless they are up to date. Raise as `make_tasks` does."""
     made = made_tasks(request)
     if made is None:
-        with _locked(request, tell):
-            made = made_tasks(request) or tuple(task.folder for task in _make_tasks(request, tell))
+        with _locked(request):
+            made = made_tasks(request) or tuple(task.folder for task in _make_tasks(request))
     return made
 
 
@@ -154,12 +154,12 @@ def _foreign_code(request: Request) -> tuple[str, ...]:
     return () if code is None else (code,)
 
 
-def _make_tasks(request: Request, tell: Tell) -> tuple[Task, ...]:
-    drawer, sites = plan_draw(request, tell)
-    return tuple(_write(request, drawer, sites, tell))
+def _make_tasks(request: Request) -> tuple[Task, ...]:
+    drawer, sites = plan_draw(request)
+    return tuple(_write(request, drawer, sites))
 
 
-def plan_draw(request: Request, tell: Tell) -> tuple[Drawer | FlightDrawer, list[Site]]:
+def plan_draw(request: Request) -> tuple[Drawer | FlightDrawer, list[Site]]:
     """Return what draws the queries of a request, and the sites where it does; missing maps are built.
 
     Raise `ConfigError` if the region cannot carry the suite or so many sites.
@@ -169,7 +169,7 @@ def plan_draw(request: Request, tell: Tell) -> tuple[Drawer | FlightDrawer, list
     refusal = None if request.group is None else suite.refusal(request.group)
     if refusal is not None:
         raise ConfigError(f"suite {suite.card.name!r} {refusal}")
-    scene, base = read_scene(request, suite, tell)
+    scene, base = read_scene(request, suite)
     reason = suite.lack(scene)
     if reason is not None:
         raise ConfigError(f"{request.region.id} cannot carry suite {suite.card.name!r}: {reason}{_SKIP}")
@@ -201,9 +201,9 @@ def _view_reach_m(request: Request, suite: Suite) -> float:
     return reach_m
 
 
-def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Region]:
+def read_scene(request: Request, suite: Suite) -> tuple[Scene, Region]:
     """Build missing regions and read what the suite draws from."""
-    folder = _built(request, request.region, None, tell)
+    folder = _built(request, request.region, None)
     base = region_files.read_region(folder, with_layers=False)
     blocks = request.split.blocks_in(request.region.id)
     if not blocks:
@@ -216,11 +216,11 @@ def read_scene(request: Request, suite: Suite, tell: Tell) -> tuple[Scene, Regio
     if "degraded map" in needs and imagery is not None:
         others = (degraded_map(request, suite, base),)
     if "older maps" in needs:
-        folders = [_built(request, request.region, date, tell) for date in aged_dates(request.region)]
+        folders = [_built(request, request.region, date) for date in aged_dates(request.region)]
         others = tuple(map(State.read, folders))
     if "another region" in needs and request.elsewhere is not None:
         # A view that shows more than the region's map knows of would give away that it is of another place.
-        elsewhere = State.read(_built(request, request.elsewhere, None, tell)).of_classes(base.classes)
+        elsewhere = State.read(_built(request, request.elsewhere, None)).of_classes(base.classes)
     scene = Scene(
         map=state,
         world=state,
@@ -252,15 +252,15 @@ def _ageing(spec: RegionFile) -> Ageing:
     return ageing_of(pool_rates(book, exclude=[place] if place else []), place=place or spec.id)
 
 
-def _built(request: Request, spec: RegionFile, date: dt.date | None, tell: Tell) -> Path:
+def _built(request: Request, spec: RegionFile, date: dt.date | None) -> Path:
     """Return the folder of a region, which is built if it is missing or its inputs have changed."""
     plan = plan_build(spec, out=request.out, date=date, extract_folders=request.extract_folders)
     if not plan.is_current:
-        build_region(plan, tell=tell)
+        build_region(plan)
     return plan.folder
 
 
-def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site], tell: Tell) -> Iterator[Task]:
+def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site]) -> Iterator[Task]:
     jobs = drawer.jobs(sites)
     why = {job.query_id: drawer.why_not(job) for job in jobs}
     left = [job for job in jobs if why[job.query_id] is None]
@@ -282,15 +282,13 @@ def _write(request: Request, drawer: Drawer | FlightDrawer, sites: Sequence[Site
         hidden["profile"] = request.choice.profile.model_dump(mode="json", exclude={"classes"})
     for region, own in sorted(by_map.items()):
         origin = _origin(request, drawer, region, sites, own)
-        made = put_task(drawer.drawn(own), origin, TruthManifest(**hidden), out=request.out, tell=tell)
+        made = put_task(drawer.drawn(own), origin, TruthManifest(**hidden), out=request.out)
         drawn = f"{counted(made.manifest.queries, 'query', 'queries')} at {counted(len(sites), 'site')}"
         tell(f"{name} on {region}: {drawn} in {made.folder}")
         yield made
 
 
-def put_task(
-    pairs: Iterable[tuple[Query, Truth]], origin: TaskOrigin, hidden: TruthManifest, *, out: Path, tell: Tell
-) -> Task:
+def put_task(pairs: Iterable[tuple[Query, Truth]], origin: TaskOrigin, hidden: TruthManifest, *, out: Path) -> Task:
     """Write queries below `out/tasks` and their truths below `out/truth`, each folder whole or not at all.
 
     `pairs` are in the order of the query ids. `origin` becomes `task.json`; its `suite` and `region` name the
@@ -313,8 +311,8 @@ def put_task(
     origin = origin.model_copy(update={name: seed for name, seed in seeds.items() if seed is not None})
     try:
         with (
-            locked(task_folder, tell=tell),
-            locked(truth_folder, tell=tell),
+            locked(task_folder),
+            locked(truth_folder),
             fresh_folder(task_folder) as task_scratch,
             fresh_folder(truth_folder) as truth_scratch,
         ):
@@ -386,19 +384,20 @@ class Drawn:
     lack: str | None = None
 
 
-def carry_out(requests: Sequence[Request], *, jobs: int = 1, progress: Progress | None = None) -> Iterator[Drawn]:
+def carry_out(requests: Sequence[Request], *, jobs: int = 1) -> Iterator[Drawn]:
     """Draw the tasks of requests with several processes, whose number changes no query; yield results in order.
 
-    Tasks that are up to date stay. `progress` counts the requests. Raise a StoreError if a folder cannot be written or
+    Tasks that are up to date stay. Raise a StoreError if a folder cannot be written or
     holds foreign files.
     """
-    yield from spread(_carry_out, requests, jobs=jobs, label="tasks drawn", progress=progress)
+    yield from spread(_carry_out, requests, jobs=jobs, label="tasks drawn")
 
 
 def _carry_out(request: Request) -> Drawn:
     lines: list[str] = []
     try:
-        folders = ensure_tasks(request, tell=lines.append)
+        with reporting(lines.append):
+            folders = ensure_tasks(request)
     except ConfigError as error:
         return Drawn(lines=tuple(lines), lack=str(error).removesuffix(_SKIP))
     return Drawn(lines=tuple(lines), folders=folders)

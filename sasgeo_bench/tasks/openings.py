@@ -12,7 +12,7 @@ from sasgeo_bench.config import Record
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import fresh_file, locked
 from sasgeo_bench.files.json import read_json
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.texts import json_text
 
@@ -86,13 +86,13 @@ def joined_openings(first: Openings, second: Openings) -> Openings:
     return {place: tuple(own.values()) for place, own in found.items()}
 
 
-def record_openings(out: Path, split: str, places: Iterable[str], opening: Opening, *, tell: Tell) -> Openings:
+def record_openings(out: Path, split: str, places: Iterable[str], opening: Opening) -> Openings:
     """Record that places are opened, and return all openings of the split; one by a known seed is not a new one.
 
     Raise `StoreError` if the file is damaged or cannot be written.
     """
     path = openings_file(out, split)
-    with locked(path, tell=tell):
+    with locked(path):
         before = read_openings(out, split)
         known = joined_openings(before, dict.fromkeys(places, (opening,)))
         if known != before:

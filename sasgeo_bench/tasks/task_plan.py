@@ -11,7 +11,7 @@ import numpy as np
 
 from sasgeo_bench.errors import ConfigError, ExtractError, ImageryError
 from sasgeo_bench.osm.locate import Extract
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import RegionFile, find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks import task_files
@@ -91,7 +91,7 @@ class Wanted(Settings):
     sealed_seed: PrivateSeed | None = None
 
 
-def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
+def plan_requests(wanted: Wanted) -> tuple[Request, ...]:
     """Plan one request for each region and suite; read nothing but settings.
 
     Raises
@@ -135,7 +135,7 @@ def plan_requests(wanted: Wanted, *, tell: Tell) -> tuple[Request, ...]:
             elsewhere=wrong_place(split, item, known),
             **settings | ({"seed": wanted.sealed_seed} if split.sealed_place(item.id) else {}),
         )
-        for item in _without_sealed({item.id: item for item in named}, split, wanted, tell)
+        for item in _without_sealed({item.id: item for item in named}, split, wanted)
         for spec, suite in suites.items()
     )
 
@@ -148,9 +148,7 @@ def _other_split(region: str) -> str:
     return "add it to a split file of your own" + (f", or use --split {found}" if found else "")
 
 
-def _without_sealed(
-    named: Mapping[str, RegionFile], split: Split, wanted: Wanted, tell: Tell
-) -> tuple[RegionFile, ...]:
+def _without_sealed(named: Mapping[str, RegionFile], split: Split, wanted: Wanted) -> tuple[RegionFile, ...]:
     """Leave out regions of sealed places unless their seed is given, and tell so in one line."""
     closed = [] if wanted.sealed_seed is not None else [name for name in named if split.sealed_place(name)]
     if not closed:

@@ -27,12 +27,12 @@ def town_tasks(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Root with a quarter of town-grid, which is enough for the search of a view, and the suite `clean` at one site."""
     out = tmp_path_factory.mktemp("baselines") / "out"
     wanted = Wanted(suites=("clean",), regions=("town-grid",), split="crossfit", count=1, seed=0, out=out)
-    for request in plan_requests(wanted, tell=lambda _: None):
+    for request in plan_requests(wanted):
         whole = request.region
         town = whole.extract[-1].town.model_copy(update={"size_m": 1280.0})
         extract = whole.extract[-1].model_copy(update={"town": town})
         quarter = whole.model_copy(update={"size_m": (1024.0, 1024.0), "extract": [extract]})
-        make_tasks(replace(request, region=quarter), tell=lambda _: None)
+        make_tasks(replace(request, region=quarter))
     return out
 
 

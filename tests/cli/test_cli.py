@@ -140,7 +140,7 @@ def test_the_towns_of_the_demo_are_a_line_and_your_own_are_listed_whatever_their
 
 def test_inspect_draws_a_map_that_was_built_on_the_way_to_queries(program, tmp_path):
     spec = read_region_file(Path(small_town(tmp_path)))
-    build_region(plan_build(spec, out=tmp_path / "out"), tell=lambda _: None)
+    build_region(plan_build(spec, out=tmp_path / "out"))
     code, out, err = program("inspect", spec.id)
     assert code == 0, err
     (drawn,) = (tmp_path / "out/sheets").glob("*.png")

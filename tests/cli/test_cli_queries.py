@@ -410,7 +410,7 @@ def test_the_towns_of_the_shipped_splits_share_no_ground(name, program, towns):
 
 def test_one_town_under_two_names_in_two_parts_is_caught(program, own_out, tmp_path):
     path = town(tmp_path / "own", "elsewhere", **{"center_lonlat = [12.25, 49.25]": "center_lonlat = [14.05, 51.35]"})
-    build_region(plan_build(read_region_file(path), out=own_out), tell=lambda _: None)
+    build_region(plan_build(read_region_file(path), out=own_out))
     for kind in ("holdout", "crossfit"):
         split = split_file(tmp_path, RIVERSIDE, "elsewhere", "town-grid", "town-suburb", kind=kind)
         code, told, err = program("verify", split, "--regions", path.parent, "--out", own_out)

@@ -42,13 +42,13 @@ def request_(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     spec = parse_toml(TEXT, PipelineFile, source="small.toml")
     with threaded(), pytest.MonkeyPatch.context() as patch:
         patch.setattr("sasgeo_bench.leaderboard.build.make_extras", lambda *_: [])
-        run_pipeline(plan_pipeline(spec, out=out, tell=silent), tell=silent, results=folder / "results")
+        run_pipeline(plan_pipeline(spec, out=out), results=folder / "results")
     return BoardRequest(stored=folder / "results" / "small", out=out, pipeline=folder / "small.toml")
 
 
 @pytest.fixture(scope="module")
 def board(request_):
-    return draw_board(request_, tell=silent)
+    return draw_board(request_)
 
 
 def release(request_, board, into):
@@ -61,7 +61,7 @@ def release(request_, board, into):
         into=into,
         board=board,
     )
-    return make_release(wanted, tell=silent)
+    return make_release(wanted)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_the_program_of_the_page_answers_without_this_package(request_, released
     asked = SubmitRequest(
         predictions=tmp_path / "mine.parquet", card=card, board=request_.stored, into=tmp_path / "mine"
     )
-    submission, faults = hold_submission(make_submission(asked, tell=silent), [request_.stored])
+    submission, faults = hold_submission(make_submission(asked), [request_.stored])
     assert faults == ()
     assert all(task.answered == task.queries for task in submission.tasks)
 
@@ -116,7 +116,7 @@ def test_a_board_of_pictures_is_refused_before_anything_is_drawn(request_, monke
     monkeypatch.setattr(Request, "found", find_suite("aerial"))
     monkeypatch.setattr(board_queries, "draw_all", pytest.fail)
     with pytest.raises(ConfigError, match="'small' asks about pictures, which a release does not hold: its queries"):
-        draw_board(request_, tell=silent)
+        draw_board(request_)
 
 
 @pytest.mark.parametrize("words", [(), ("--board", "x", "--regions", "vaduz"), ("--board", "x", "--truth")])

@@ -24,6 +24,7 @@ from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
 from sasgeo_bench.osm.locate import Extract
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing import submissions
 from sasgeo_bench.publishing.submissions import beside_stored, hold_submission, with_submissions
 from sasgeo_bench.regions.region import DATA_VERSION
@@ -83,7 +84,7 @@ def request_(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     (folder / "small.toml").write_text(TEXT, encoding="utf-8")
     spec = parse_toml(TEXT, PipelineFile, source="small.toml")
     with threaded():
-        run_pipeline(plan_pipeline(spec, out=out, tell=silent), tell=silent, results=folder / "results")
+        run_pipeline(plan_pipeline(spec, out=out), results=folder / "results")
     return EntryRequest(
         stored=folder / "results" / "small",
         matcher=f"{__name__}:Middle",
@@ -102,26 +103,26 @@ def unscored(monkeypatch):
 def entered(request_, tmp_path_factory):
     lines = []
     into = tmp_path_factory.mktemp("submitted") / "middle"
-    with threaded():
-        folder, board = enter(plan_entry(request_, tell=silent), into=into, tell=lines.append)
+    with threaded(), reporting(lines.append):
+        folder, board = enter(plan_entry(request_), into=into)
     return folder, board, lines
 
 
 def test_what_it_costs_is_said_before(request_):
-    first, drawing, asking, scoring, whole = cost_lines(plan_entry(request_, tell=silent))
+    first, drawing, asking, scoring, whole = cost_lines(plan_entry(request_))
     assert first.startswith("small: ")
     assert " queries in 3 tasks" in first  # the suite and the controls
     assert drawing == "  nothing is left to draw"
     assert re.match(r"  asking \d+ queries .+, and what the matcher itself takes: no entry of the board is", asking)
     assert scoring.startswith("  scoring ")
     assert whole.startswith("  in all ")
-    elsewhere = plan_entry(replace(request_, out=request_.out / "elsewhere"), tell=silent)
+    elsewhere = plan_entry(replace(request_, out=request_.out / "elsewhere"))
     assert " 3 tasks and 3 maps are not there yet, about 6 MB on disk" in [*cost_lines(elsewhere)][1]
 
 
 def test_more_than_the_matcher_counts_and_a_busy_machine_takes_longer(request_, monkeypatch):
     """Each map takes a process that starts and prepares; a load of 7 with 2 processors takes four times as long."""
-    entry = plan_entry(replace(request_, out=request_.out / "elsewhere"), tell=silent)
+    entry = plan_entry(replace(request_, out=request_.out / "elsewhere"))
     tasks, run = asked_tasks(entry.stored), check_entry(entry).run
     whole = entry_cost.open_tasks(entry.plan, tasks, run, is_again=False)
     stages = [entry_cost._drawing(entry.plan, whole), entry_cost._asking(entry.stored, whole, run)]
@@ -138,7 +139,7 @@ def test_more_than_the_matcher_counts_and_a_busy_machine_takes_longer(request_, 
 def test_entries_of_the_board_tell_how_long_it_takes(request_, monkeypatch):
     """Those that are like the matcher: none that follows flights alone."""
     monkeypatch.setattr(entry_cost, "is_unranked", lambda _: False)
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     left = {"localization": 100.0, "sequence": 100.0}
     names = [name for _, name in entry_cost._costs(entry.stored, left, 3, check_entry(entry).run)]
     assert {"random", "prior_centre"} <= {*names}
@@ -154,7 +155,7 @@ def test_entries_of_the_board_tell_how_long_it_takes(request_, monkeypatch):
 
 def test_an_entry_that_is_answered_is_said_to_need_scoring_alone(request_, entered):
     del entered
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     _, drawing, asking, scoring, whole, *_ = cost_lines(entry, check_entry(entry).run)
     assert drawing == "  nothing is left to draw"
     assert asking == "  nothing is left to ask: what is drawn here as on the board has answers"
@@ -190,7 +191,8 @@ def test_its_row_stands_beside_the_others_as_submitted(entered):
 @pytest.mark.usefixtures("unscored")
 def test_a_second_time_nothing_is_asked_again(request_, entered, tmp_path):
     lines = []
-    again, _ = enter(plan_entry(request_, tell=silent), into=tmp_path / "middle", tell=lines.append)
+    with reporting(lines.append):
+        again, _ = enter(plan_entry(request_), into=tmp_path / "middle")
     assert any(line.endswith(" answered before") and ": 0 queries to ask, " in line for line in lines)
     files = read_submission(entered[0]).files
     assert read_submission(again).files == files
@@ -201,30 +203,30 @@ def test_a_name_that_is_taken_is_refused_before_anything_is_asked(request_, tmp_
     request = replace(request_, matcher=f"{__name__}:Shipped")
     monkeypatch.setattr(entering, "draw_all", pytest.fail)
     with pytest.raises(MatchError, match="named 'sasgeo', as a matcher that ships: rename it"):
-        enter(plan_entry(request, tell=silent), into=tmp_path / "sasgeo", tell=silent)
+        enter(plan_entry(request), into=tmp_path / "sasgeo")
     assert not (tmp_path / "sasgeo").exists()
 
 
 def test_a_folder_that_holds_other_things_is_refused_before_anything_is_asked(request_, tmp_path, monkeypatch):
     monkeypatch.setattr(entering, "ask", pytest.fail)
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     (tmp_path / "middle").mkdir()
     (tmp_path / "middle" / "thesis.tex").write_text("mine", encoding="utf-8")
     with pytest.raises(StoreError, match="holds something else than a submission, which would be lost"):
-        enter(entry, into=tmp_path / "middle", tell=silent)
+        enter(entry, into=tmp_path / "middle")
     with pytest.raises(StoreError, match="must be named as the card is, 'middle'"):
-        enter(entry, into=tmp_path / "other", tell=silent)
+        enter(entry, into=tmp_path / "other")
 
 
 def test_answers_to_another_board_are_not_replaced(request_, entered, monkeypatch):
     folder, _, _ = entered
     monkeypatch.setattr(entering, "ask", pytest.fail)
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     other = replace(entry, plan=replace(entry.plan, spec=entry.plan.spec.model_copy(update={"id": "other"})))
     with pytest.raises(
         StoreError, match=r"holds answers to the board 'small', .* as in --into submissions/other/middle"
     ):
-        enter(other, into=folder, tell=silent)
+        enter(other, into=folder)
 
 
 def test_a_seed_that_did_not_draw_the_board_is_refused(request_, monkeypatch):
@@ -235,13 +237,13 @@ def test_a_seed_that_did_not_draw_the_board_is_refused(request_, monkeypatch):
     with pytest.raises(
         ConfigError, match=f"not drawn by this seed of sealed places, of commitment {seed.commitment[:12]}"
     ):
-        plan_entry(replace(request_, sealed=seed), tell=silent)
+        plan_entry(replace(request_, sealed=seed))
 
 
 def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_, monkeypatch):
     sealed = {"town-suburb": SealedPlace(drawn_by="ab" * 32, openings=[])}
     about = BoardManifest(scorer_version=6, entries=[], tasks=[], sealed=sealed, task_version=3)
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     assert not any("count as misses" in line for line in cost_lines(entry))
     monkeypatch.setattr(entry_cost, "read_board_manifest", lambda _: about)
     told = "\n".join(cost_lines(entry))
@@ -259,7 +261,7 @@ def test_lines_of_a_matchers_card_are_cut_to_those_of_a_submission():
 
 def test_a_card_that_no_submission_can_have_is_refused_before_anything_is_drawn(request_, monkeypatch):
     monkeypatch.setattr(Middle, "card", replace(Middle.card, licence="long " * 20))
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     with pytest.raises(ConfigError, match=r"the card of .*:Middle: 'licence': String should have at most 60 char"):
         check_entry(entry)
 
@@ -272,7 +274,7 @@ def test_what_a_class_says_of_its_authors_is_in_the_submission():
 
 def test_figures_are_those_of_a_whole_score_to_the_last_bit(request_, entered, tmp_path):
     folder, board, _ = entered
-    whole = with_submissions(request_.stored, [folder], tmp_path / "whole", tell=silent, root=request_.out)
+    whole = with_submissions(request_.stored, [folder], tmp_path / "whole", root=request_.out)
     assert {"", "margin"} <= {*board.table["rejector"]}
     pd.testing.assert_frame_equal(board.table, whole.table, check_exact=True)
     pd.testing.assert_frame_equal(board.acceptance, whole.acceptance, check_exact=True)
@@ -283,14 +285,15 @@ def test_figures_are_those_of_a_whole_score_to_the_last_bit(request_, entered, t
 def test_all_is_scored_anew_where_the_scorer_is_another_one(request_, entered, tmp_path, monkeypatch):
     monkeypatch.setattr(submissions, "why_anew", lambda *_: "the board is of scorer version 5, this program of 6")
     lines = []
-    beside_stored(request_.stored, entered[0], tmp_path / "both", tell=lines.append, root=request_.out)
+    with reporting(lines.append):
+        beside_stored(request_.stored, entered[0], tmp_path / "both", root=request_.out)
     assert "all entries are scored anew: the board is of scorer version 5, this program of 6" in lines
 
 
 def test_queries_of_another_version_are_not_asked(request_):
-    entry = plan_entry(request_, tell=silent)
-    tasks, controls = draw_all(entry.plan, tell=silent, progress=None)
-    same = same_queries(request_.stored, [*tasks, *controls], tell=silent)
+    entry = plan_entry(request_)
+    tasks, controls = draw_all(entry.plan)
+    same = same_queries(request_.stored, [*tasks, *controls])
     lost = sorted(same)[::3]
     only = {name: "drawn otherwise" if name in lost else one for name, one in same.items()}
     runs = plan_runs(replace(entry.plan, only=only, since_ns=sys.maxsize), entry.matcher, [*tasks, *controls])
@@ -302,18 +305,20 @@ def test_queries_of_another_version_are_not_asked(request_):
 def test_all_is_asked_again_on_demand_and_a_changed_matcher_is_told(request_, entered, tmp_path, monkeypatch):
     del entered
     lines = []
-    enter(plan_entry(replace(request_, is_again=True), tell=silent), into=tmp_path / "middle", tell=lines.append)
+    with reporting(lines.append):
+        enter(plan_entry(replace(request_, is_again=True)), into=tmp_path / "middle")
     assert any(" queries to ask, 0 answered before" in line for line in lines)
     assert not any("asked anew" in line for line in lines)
     monkeypatch.setattr(Middle, "card", replace(Middle.card, version="9"))
-    enter(plan_entry(request_, tell=silent), into=tmp_path / "middle", tell=lines.append)
+    with reporting(lines.append):
+        enter(plan_entry(request_), into=tmp_path / "middle")
     assert any(": all is asked anew, as " in line for line in lines)
 
 
 @pytest.mark.usefixtures("unscored")
 def test_a_round_that_was_cut_goes_on_where_it_was(request_, entered, tmp_path, monkeypatch):
     del entered
-    entry, lines = plan_entry(replace(request_, is_again=True), tell=silent), []
+    entry, lines = plan_entry(replace(request_, is_again=True)), []
     asked = []
 
     def cut(spec, runs, **words):
@@ -325,17 +330,18 @@ def test_a_round_that_was_cut_goes_on_where_it_was(request_, entered, tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(entering, "ask", cut)
         with pytest.raises(KeyboardInterrupt):
-            enter(entry, into=tmp_path / "middle", tell=silent)
+            enter(entry, into=tmp_path / "middle")
     whole = sum(len(task.asked) for task in asked_tasks(request_.stored))
     assert 0 < len(asked) < whole
-    enter(entry, into=tmp_path / "middle", tell=lines.append)
+    with reporting(lines.append):
+        enter(entry, into=tmp_path / "middle")
     assert any(f": {whole - len(asked)} queries to ask, {len(asked)} answered before" in line for line in lines)
 
 
 def test_who_fails_on_every_query_has_no_submission_and_an_example_of_it_on_one_line(request_, tmp_path):
     request = replace(request_, matcher=f"{__name__}:Lost")
     with pytest.raises(MatchError) as told:
-        enter(plan_entry(request, tell=silent), into=tmp_path / "lost", tell=silent)
+        enter(plan_entry(request), into=tmp_path / "lost")
     said = (
         r"lost failed on all (\d+) queries \(\1 ended as crash, the first with the message [\"'].*no road.*near \w+.*"
     )
@@ -346,29 +352,29 @@ def test_who_fails_on_every_query_has_no_submission_and_an_example_of_it_on_one_
 def test_a_board_that_is_not_there_is_named_with_one_that_is(request_):
     beside = request_.stored.parent
     with pytest.raises(StoreError, match=f"is no folder here: did you mean {request_.stored}"):
-        plan_entry(replace(request_, stored=beside / f"{request_.stored.name}x"), tell=silent)
+        plan_entry(replace(request_, stored=beside / f"{request_.stored.name}x"))
     with pytest.raises(StoreError, match="holds no stored results: name those of a board"):
-        plan_entry(replace(request_, stored=beside), tell=silent)
+        plan_entry(replace(request_, stored=beside))
 
 
 def test_extracts_that_are_missing_are_listed_at_once(request_, monkeypatch):
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     lost = Extract(file="nowhere.osm.pbf", date=dt.date(2020, 1, 1), sha256=("0" * 64,))
     monkeypatch.setattr(Request, "extracts", (lost, lost.model_copy(update={"file": "gone.osm.pbf"})))
     monkeypatch.setattr(entering, "draw_all", pytest.fail)
     assert "missing extracts: gone.osm.pbf, nowhere.osm.pbf" in "".join(cost_lines(entry))
     with pytest.raises(ConfigError, match=r"missing extracts: gone\.osm\.pbf, nowhere\.osm\.pbf: .* by --without"):
-        enter(entry, tell=silent)
+        enter(entry)
 
 
 @pytest.mark.parametrize("beside", [(), ("town-suburb",)])  # one that is known hides no other
 def test_a_region_that_the_board_has_not_cannot_be_left_out(request_, beside):
     with pytest.raises(ConfigError, match="--without names vaduz, and the board asks about no such region"):
-        plan_entry(replace(request_, without=("vaduz", *beside)), tell=silent)
+        plan_entry(replace(request_, without=("vaduz", *beside)))
 
 
 def test_a_partial_entry_is_said_to_be_one(request_):
-    entry = plan_entry(request_, tell=silent)
+    entry = plan_entry(request_)
     other = entry.plan.requests[0].region.model_copy(update={"id": "elsewhere"})
     entry = replace(
         entry, plan=replace(entry.plan, requests=(replace(entry.plan.requests[0], region=other),), controls=())
@@ -380,34 +386,35 @@ def test_another_text_of_the_pipeline_is_refused(request_, tmp_path):
     (tmp_path / "small.toml").write_text(TEXT.replace("sites = 1", "sites = 2"), encoding="utf-8")
     words = r"made by another text of the pipeline 'small'.* \(sasgeo-bench .*, task version \d+\), or name the file by"
     with pytest.raises(ConfigError, match=words):
-        plan_entry(replace(request_, pipeline=tmp_path / "small.toml"), tell=silent)
+        plan_entry(replace(request_, pipeline=tmp_path / "small.toml"))
 
 
 def test_a_board_on_other_maps_is_refused_at_once_by_the_version_that_made_it(request_, monkeypatch):
     monkeypatch.setattr(board_queries, "DATA_VERSION", DATA_VERSION + 1)
     made_by = rf"made by sasgeo-bench \S+, data version {DATA_VERSION}, task version {TASK_VERSION}, and this is "
     with pytest.raises(ConfigError, match=rf"{made_by}sasgeo-bench \S+, data version {DATA_VERSION + 1}, task version"):
-        plan_entry(request_, tell=silent)
+        plan_entry(request_)
 
 
 def test_a_board_of_tasks_of_another_version_is_told(request_, monkeypatch):
     monkeypatch.setattr(board_queries, "TASK_VERSION", TASK_VERSION + 1)
     lines: list[str] = []
-    plan_entry(request_, tell=lines.append)
+    with reporting(lines.append):
+        plan_entry(request_)
     assert [line for line in lines if f"task version {TASK_VERSION}, this is sasgeo-bench" in line]
 
 
 def test_a_folder_without_results_is_refused(request_, tmp_path):
     with pytest.raises(StoreError, match="holds no stored results: name those of a board"):
-        plan_entry(replace(request_, stored=tmp_path), tell=silent)
+        plan_entry(replace(request_, stored=tmp_path))
 
 
 def test_queries_that_are_drawn_otherwise_are_refused_before_anything_is_asked(request_, tmp_path, monkeypatch):
-    entry = plan_entry(request_, tell=silent)
-    other = plan_pipeline(entry.plan.spec.model_copy(update={"seed": 5}), out=tmp_path / "out", tell=silent)
+    entry = plan_entry(request_)
+    other = plan_pipeline(entry.plan.spec.model_copy(update={"seed": 5}), out=tmp_path / "out")
     monkeypatch.setattr(entering, "ask", pytest.fail)
     with pytest.raises(ConfigError, match=r"none of the \d+ queries of .* is drawn here as it was: .* version that"):
-        enter(replace(entry, plan=other), into=tmp_path / "middle", tell=silent)
+        enter(replace(entry, plan=other), into=tmp_path / "middle")
     assert not (tmp_path / "middle").exists()
 
 
@@ -437,6 +444,6 @@ def test_the_command_says_who_answered_the_same_queries_elsewhere(program, monke
 
 
 def test_a_slip_in_a_training_place_does_not_untrain_a_matcher(request_):
-    entry = plan_entry(replace(request_, matcher=f"{__name__}:Slip"), tell=silent)
+    entry = plan_entry(replace(request_, matcher=f"{__name__}:Slip"))
     with pytest.raises(ConfigError, match=r"names 'munchen', no place of the split: did you mean 'munich'\?"):
         check_entry(entry)

@@ -5,7 +5,6 @@ import hashlib
 import io
 import lzma
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,6 +13,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.experiments import head_start
 from sasgeo_bench.experiments.head_start import unpack_head_start
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, PipelineFile
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.running.run_manifest import RunManifest
 
 RUN = "runs/random/abc/clean/one"
@@ -40,10 +40,10 @@ def whole(folder: Path, files: dict[str, bytes] = PACKED) -> Path:
     return packed(folder, [entry(name, content) for name, content in files.items()])
 
 
-def unpack(file: Path, tell: Callable[[str], None] = lambda _: None) -> None:
+def unpack(file: Path) -> None:
     """Unpack into `out` beside the file what it states rightly."""
     data = file.with_name("mine.tar.xz").read_bytes()
-    unpack_head_start(file, ArchiveSpec(sha256=hashlib.sha256(data).hexdigest()), file.parent / "out", tell=tell)
+    unpack_head_start(file, ArchiveSpec(sha256=hashlib.sha256(data).hexdigest()), file.parent / "out")
 
 
 def found(out: Path) -> dict[str, bytes]:
@@ -52,8 +52,9 @@ def found(out: Path) -> dict[str, bytes]:
 
 def test_all_is_laid_down_whole_marked_for_good_and_told_once(tmp_path):
     lines: list[str] = []
-    for _ in range(2):
-        unpack(whole(tmp_path), lines.append)
+    with reporting(lines.append):
+        unpack(whole(tmp_path))
+        unpack(whole(tmp_path))
     laid = found(tmp_path / "out")
     assert {name: content for name, content in laid.items() if not name.endswith("packed.json")} == PACKED
     assert sum(name.endswith("packed.json") for name in laid) == 2
@@ -76,10 +77,13 @@ def test_what_was_there_stays_unmarked_and_is_not_mixed_with_what_is_packed(tmp_
 
 def test_without_a_stated_hash_nothing_is_unpacked_and_a_line_says_so(tmp_path):
     lines: list[str] = []
-    unpack_head_start(whole(tmp_path), None, tmp_path / "out", tell=lines.append)
+    with reporting(lines.append):
+        unpack_head_start(whole(tmp_path), None, tmp_path / "out")
     (tmp_path / "mine.tar.xz").unlink()
-    unpack_head_start(tmp_path / "mine.toml", None, tmp_path / "out", tell=pytest.fail)
-    unpack_head_start(tmp_path / "mine.toml", ArchiveSpec(sha256="0" * 64), tmp_path / "out", tell=lines.append)
+    with reporting(pytest.fail):
+        unpack_head_start(tmp_path / "mine.toml", None, tmp_path / "out")
+    with reporting(lines.append):
+        unpack_head_start(tmp_path / "mine.toml", ArchiveSpec(sha256="0" * 64), tmp_path / "out")
     assert not (tmp_path / "out").exists()
     assert "mine.tar.xz is left packed, for mine.toml does not state its SHA-256" in lines[0]
     assert "states an archive, and there is none" in lines[1]
@@ -87,7 +91,7 @@ def test_without_a_stated_hash_nothing_is_unpacked_and_a_line_says_so(tmp_path):
 
 def test_another_archive_than_the_stated_one_is_refused(tmp_path):
     with pytest.raises(StoreError, match=r"mine\.tar\.xz is not the archive that mine\.toml states \(its SHA-256 is"):
-        unpack_head_start(whole(tmp_path), ArchiveSpec(sha256="0" * 64), tmp_path / "out", tell=lambda _: None)
+        unpack_head_start(whole(tmp_path), ArchiveSpec(sha256="0" * 64), tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -205,7 +209,7 @@ def test_what_a_killed_run_left_is_removed_and_a_folder_of_that_name_is_named(tm
     (tmp_path / "mine.tar.xz").unlink()
     (tmp_path / "mine.tar.xz").mkdir()
     with pytest.raises(StoreError, match=r"mine\.tar\.xz is no file"):
-        unpack_head_start(tmp_path / "mine.toml", None, tmp_path / "out", tell=lambda _: None)
+        unpack_head_start(tmp_path / "mine.toml", None, tmp_path / "out")
 
 
 def test_the_hash_of_an_archive_is_no_part_of_the_experiment_and_must_be_one():

@@ -12,6 +12,7 @@ from sasgeo_bench.experiments import pipeline_plan
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
+from sasgeo_bench.progress import reporting
 from tests.handmade import split_file
 
 pytestmark = pytest.mark.usefixtures("in_threads", "without_drawings", "few_controls")
@@ -48,13 +49,13 @@ def _importable(monkeypatch):
 def plan_of(tmp_path):
     """Plan the pipeline with changes of its text; the split names the part of each town unless it is given."""
 
-    def made(split=None, tell=lambda _: None, **changes):
+    def made(split=None, **changes):
         split = split or split_file(tmp_path, agricultural="train", grid="calibration", suburb="test")
         text = TEXT.replace("SPLIT", str(split))
         for old, new in changes.items():
             assert old in text
             text = text.replace(old, new)
-        return plan_pipeline(parse_toml(text, PipelineFile, source="held.toml"), out=tmp_path / "out", tell=tell)
+        return plan_pipeline(parse_toml(text, PipelineFile, source="held.toml"), out=tmp_path / "out")
 
     return made
 
@@ -77,7 +78,7 @@ def test_train_places_teach_calibration_places_fit_rejectors_and_test_places_are
         f"    test: 1 place ({TEST})",
         "    learners:Oracle: from calibration and test places themselves, never ranked",
     ]
-    board = run_pipeline(plan, tell=lambda _: None)
+    board = run_pipeline(plan)
     about = json.loads((tmp_path / "out" / "boards" / "held" / "board.json").read_text(encoding="utf-8"))
     learned = {entry["name"]: entry["learned"] for entry in about["entries"]}
     (counts,), (oracle,) = learned["counts"], learned["oracle_counts"]
@@ -112,7 +113,8 @@ def test_on_train_places_only_suites_to_learn_from_are_drawn(plan_of):
 def test_without_learning_train_places_are_left_out_in_one_line(plan_of):
     told = []
     text = TEXT[TEXT.index("[learning]") :]
-    found = requests_of(plan_of(tell=told.append, **{text: "", '"learners:Counts", "learners:Oracle", ': ""}))
+    with reporting(told.append):
+        found = requests_of(plan_of(**{text: "", '"learners:Counts", "learners:Oracle", ': ""}))
     assert {name for _, name in found} == {CALIBRATION, TEST}
     assert told == [f"nothing learns, so train places are left out: {TRAIN}"]
 

@@ -24,6 +24,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import (
     read_pipeline_file,
 )
 from sasgeo_bench.matching.controls.blind import PriorCentre
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.tasks import build as tasks
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, made_tasks
@@ -71,7 +72,7 @@ def small(**changes):
 @pytest.fixture(scope="module")
 def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     out = lay_towns(tmp_path_factory.mktemp("pipeline") / "out", "town-suburb")
-    plan = plan_pipeline(small(), out=out, tell=lambda _: None)
+    plan = plan_pipeline(small(), out=out)
     told = plan.to_text().splitlines()
     assert told[1:3] == [
         "  queries: 0 of 1 task up to date, 1 to be drawn (1 not there yet), at most 28 queries",
@@ -85,8 +86,8 @@ def made(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
         for line in told
     )
     lines = []
-    with threaded():
-        return plan, run_pipeline(plan, tell=lines.append), lines
+    with threaded(), reporting(lines.append):
+        return plan, run_pipeline(plan), lines
 
 
 def test_a_pipeline_ends_with_a_board(made):
@@ -110,7 +111,7 @@ class Middle(PriorCentre):
 def test_a_contrast_may_name_a_matcher_by_module_and_class(made):
     plan, board, _ = made
     spec = small(**{'id = "small"': 'id = "by-class"', "prior_centre": f"{__name__}:Middle"})
-    again = run_pipeline(plan_pipeline(spec, out=plan.out, tell=lambda _: None), tell=lambda _: None)
+    again = run_pipeline(plan_pipeline(spec, out=plan.out))
     (before,), (found,) = board.findings, again.findings
     assert (found.first, found.second) == ("random", "middle")
     assert (found.n, found.difference) == (before.n, before.difference)
@@ -121,7 +122,7 @@ def test_a_kind_that_nobody_draws_is_refused_before_anything_is_drawn(where, tmp
     learning = '[learning]\nsuites = ["clean"]\nkinds = ["nope"]\n\n[[task]]'
     change = {"[[contrast]]": '[[contrast]]\nkinds = ["nope"]'} if where == "contrast" else {"[[task]]": learning}
     with pytest.raises(ConfigError, match=rf"{where}.* names the kind 'nope', which is not drawn: its suites have "):
-        plan_pipeline(small(**change), out=tmp_path, tell=lambda _: None)
+        plan_pipeline(small(**change), out=tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -153,8 +154,8 @@ def test_every_card_is_read_before_the_first_query_is_asked(made, tmp_path, monk
     monkeypatch.setattr(pipeline, "run", stop)
     spec = small().model_copy(update={"matchers": ["random", "taken:Mine"]})
     lines = []
-    with pytest.raises(ConfigError, match="here begins the first run"):
-        run_pipeline(plan_pipeline(spec, out=made[0].out, tell=lambda _: None), tell=lines.append)
+    with pytest.raises(ConfigError, match="here begins the first run"), reporting(lines.append):
+        run_pipeline(plan_pipeline(spec, out=made[0].out))
     assert "taken:Mine failed: its card is named 'fft_vote', as a matcher that ships: rename it" in lines
 
 
@@ -173,7 +174,8 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     queries = plan.out / "tasks" / "clean" / "town-suburb" / "queries.parquet"
     before = queries.stat().st_mtime_ns
     lines = []
-    again = run_pipeline(plan, tell=lines.append)
+    with reporting(lines.append):
+        again = run_pipeline(plan)
     assert queries.stat().st_mtime_ns == before
     assert [line.split(",")[0] for line in lines if "to ask" in line] == [
         f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")
@@ -192,7 +194,7 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
 def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_coming(made):
     plan, board, _ = made
     changes = {'id = "small"': 'id = "other"\nseed = 1', "sites = 1": "sites = 2"}
-    other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
+    other = plan_pipeline(small(**changes), out=plan.out)
     told = other.to_text()
     assert "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with another seed), at most 56 queries\n" in told
     count = len(board.scores["random"]) + len(
@@ -204,10 +206,11 @@ def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_comi
         re.MULTILINE,
     )
     assert "answers where they are: those to the same queries count again, the others are set aside\n" in told
-    run_pipeline(other, tell=lambda _: None)
+    run_pipeline(other)
     assert "1 drawn with sites = 2, now 3" in _more_sites(other).to_text()
     lines = []
-    again = run_pipeline(plan, tell=lines.append)
+    with reporting(lines.append):
+        again = run_pipeline(plan)
     assert [line for line in lines if "queries to ask" in line and ": 0 queries" not in line] == []
     for name, frame in board.scores.items():
         assert again.scores[name].equals(frame)
@@ -216,7 +219,7 @@ def test_two_pipelines_in_one_place_ask_nothing_twice_and_a_dry_run_sees_it_comi
 def _more_sites(plan):
     (task,) = plan.spec.task
     spec = plan.spec.model_copy(update={"task": [task.model_copy(update={"sites": 3})]})
-    return plan_pipeline(spec, out=plan.out, tell=lambda _: None)
+    return plan_pipeline(spec, out=plan.out)
 
 
 def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
@@ -225,7 +228,7 @@ def test_what_another_run_drew_meanwhile_is_not_drawn_again(made, monkeypatch):
     found = iter((None, folders))
     monkeypatch.setattr(tasks, "made_tasks", lambda _: next(found))
     monkeypatch.setattr(tasks, "_make_tasks", None)
-    assert ensure_tasks(request, tell=lambda _: None) == folders
+    assert ensure_tasks(request) == folders
 
 
 @pytest.mark.parametrize(
@@ -237,14 +240,14 @@ def test_what_changes_queries_has_them_drawn_anew(made, changes, tmp_path):
     assert made_tasks(plan.requests[0]) is not None
     split = split_file(tmp_path, suburb="test", grid="train")
     changes = {old: new.replace("SPLIT", str(split)) for old, new in changes.items()}
-    other = plan_pipeline(small(**changes), out=plan.out, tell=lambda _: None)
+    other = plan_pipeline(small(**changes), out=plan.out)
     assert made_tasks(other.requests[0]) is None
 
 
 def test_a_task_of_its_own_regions_is_drawn_on_these_alone(tmp_path):
     own = '[[task]]\nsuites = ["occlusion"]\nsites = 1\nregions = ["town-grid"]\n[[contrast]]'
     both = {'regions = ["town-suburb"]': 'regions = ["town-suburb", "town-grid"]'}
-    plan = plan_pipeline(small(**{"[[contrast]]": own} | both), out=tmp_path, tell=lambda _: None)
+    plan = plan_pipeline(small(**{"[[contrast]]": own} | both), out=tmp_path)
     found = [(item.suite, item.region.id) for item in plan.requests]
     assert found == [("clean", "town-suburb"), ("clean", "town-grid"), ("occlusion", "town-grid")]
 
@@ -399,7 +402,7 @@ def test_a_file_of_the_paper_keeps_the_hash_that_it_had_before_there_were_readin
 def test_a_reading_of_the_crop_is_a_suite_that_all_matchers_are_asked_on_and_contrasts_name(tmp_path):
     text = PAPER.replace("trials = 3", 'trials = 3\ncrop_readings = ["absent"]')
     spec = parse_toml(text.replace('["paper-poc"]', '["paper-poc-crop-absent"]'), PipelineFile, source="few.toml")
-    said = plan_pipeline(spec, out=tmp_path, tell=lambda _: None).to_text()
+    said = plan_pipeline(spec, out=tmp_path).to_text()
     assert "3 trials of each seed: 0 of 4 tasks up to date" in said
     for suite in ("paper-poc", "paper-poc-crop-absent"):
         assert f"to be drawn: {suite} on paper-poc-43" in said
@@ -463,8 +466,8 @@ oracles = ["learners:Oracle"]
 def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_itself(tmp_path, monkeypatch, lay_towns):
     lay_towns(tmp_path, "town-suburb", "town-agricultural")
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "running"))
-    plan = plan_pipeline(parse_toml(LEARNING, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
-    board = run_pipeline(plan, tell=lambda _: None)
+    plan = plan_pipeline(parse_toml(LEARNING, PipelineFile, source="taught.toml"), out=tmp_path)
+    board = run_pipeline(plan)
     assert {item.diagnostics["pairs"] for item in board.predictions["counts"].values()} == {5.0}
     about = json.loads((tmp_path / "boards" / "taught" / "board.json").read_text(encoding="utf-8"))
     learned = {entry["name"]: entry["learned"] for entry in about["entries"]}
@@ -507,7 +510,6 @@ def test_learning_that_makes_no_sense_is_refused_in_one_line(tmp_path, old, new,
         plan_pipeline(
             parse_toml(LEARNING.replace(old, new).replace('"town-suburb", ', ""), PipelineFile, source="taught.toml"),
             out=tmp_path,
-            tell=lambda _: None,
         )
     assert "\n" not in str(error.value)
 
@@ -515,15 +517,15 @@ def test_learning_that_makes_no_sense_is_refused_in_one_line(tmp_path, old, new,
 def test_an_oracle_with_a_contestants_name_is_refused(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "running"))
     text = LEARNING.replace('["learners:Oracle"]', '["learners:Counts"]')
-    plan = plan_pipeline(parse_toml(text, PipelineFile, source="taught.toml"), out=tmp_path, tell=lambda _: None)
+    plan = plan_pipeline(parse_toml(text, PipelineFile, source="taught.toml"), out=tmp_path)
     with pytest.raises(ConfigError, match="the names of oracles begin with oracle_, so that no board ranks them"):
         plan.to_text()
 
 
 def test_a_half_without_a_place_is_told_before_anything_is_asked(tmp_path):
-    both = plan_pipeline(taught_by(""), out=tmp_path, tell=lambda _: None)
+    both = plan_pipeline(taught_by(""), out=tmp_path)
     assert "has no place here" not in "\n".join(both.training_groups.lines(both.requests))
-    one = plan_pipeline(taught_by("", LEARNING.replace('"town-suburb", ', "")), out=tmp_path, tell=lambda _: None)
+    one = plan_pipeline(taught_by("", LEARNING.replace('"town-suburb", ', "")), out=tmp_path)
     told = one.training_groups.lines(one.requests)
     assert [line for line in told if "has no place here" in line] == [
         "    half a has no place here: nobody learns for half b"
@@ -568,7 +570,7 @@ def taught_by(line, text=LEARNING):
 
 def test_the_detectors_of_a_task_reach_its_queries(tmp_path):
     text = LEARNING.replace("[[task]]", '[[task]]\ndetectors = ["published", "measured"]')
-    plan = plan_pipeline(taught_by("", text), out=tmp_path, tell=lambda _: None)
+    plan = plan_pipeline(taught_by("", text), out=tmp_path)
     assert {request.choice.detectors for request in plan.requests} == {("published", "measured")}
 
 
@@ -576,7 +578,7 @@ def test_an_unknown_suite_region_or_split_is_refused_before_anything_is_made(tmp
     for old, new in (("claen", "clean"), ("town-suburbia", "town-suburb"), ("crosfit", "crossfit")):
         spec = parse_toml(TEXT.replace(f'"{new}"', f'"{old}"'), PipelineFile, source="small.toml")
         with pytest.raises(ConfigError, match=f"did you mean '{new}'"):
-            plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+            plan_pipeline(spec, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -585,14 +587,14 @@ def test_a_choice_that_leaves_nothing_names_the_pipeline_and_the_task(tmp_path):
     with pytest.raises(
         ConfigError, match=r"^pipeline 'small', \[\[task\]\] 1 of 1: suite 'clean' has nothing of views_cells 191"
     ):
-        plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+        plan_pipeline(spec, out=tmp_path / "out")
 
 
 @pytest.mark.parametrize(("old", "new"), [("random", "randon"), ("prior_centre", "prior_center")])
 def test_a_matcher_that_nobody_has_is_refused_before_anything_is_made(tmp_path, old, new):
     spec = parse_toml(TEXT.replace(f'"{old}"', f'"{new}"'), PipelineFile, source="small.toml")
     with pytest.raises(MatchError, match=f"there is no matcher '{new}', did you mean '{old}'"):
-        plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+        plan_pipeline(spec, out=tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -602,9 +604,9 @@ class MarginToo(Margin):
 
 def test_two_rejectors_of_one_name_are_refused_before_anything_is_drawn(tmp_path):
     spec = small(**{"[[task]]": f'rejectors = ["margin", "{__name__}:MarginToo"]\n[[task]]'})
-    plan = plan_pipeline(spec, out=tmp_path / "out", tell=lambda _: None)
+    plan = plan_pipeline(spec, out=tmp_path / "out")
     with pytest.raises(ConfigError, match=r"^margin and .*:MarginToo are both named 'margin': rename one"):
-        run_pipeline(plan, tell=lambda _: None)
+        run_pipeline(plan)
     assert not (tmp_path / "out").exists()
 
 
@@ -612,7 +614,7 @@ def test_two_rejectors_of_one_name_are_refused_before_anything_is_drawn(tmp_path
 def test_every_shipped_pipeline_can_be_planned(name, tmp_path):
     spec = read_pipeline_file(find_pipeline_file(name))
     assert spec.id == name
-    plan = plan_pipeline(spec, out=tmp_path, tell=lambda _: None)
+    plan = plan_pipeline(spec, out=tmp_path)
     assert plan.requests or plan.spec.paper is not None
     assert list(tmp_path.iterdir()) == []
 
@@ -684,10 +686,11 @@ def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, mo
             "contrast": [item.model_copy(update={"second": "broken_here:Broken"}) for item in plan.spec.contrast],
         }
     )
-    other = plan_pipeline(spec, out=plan.out, tell=lambda _: None)
+    other = plan_pipeline(spec, out=plan.out)
     assert "    broken_here:Broken: cannot be asked (broken_here:Broken: cannot be made (" in other.to_text()
     lines = []
-    beside = run_pipeline(other, tell=lines.append)
+    with reporting(lines.append):
+        beside = run_pipeline(other)
     figures, before = (item[item["unit"] == "1"].reset_index(drop=True) for item in (beside.table, board.table))
     assert figures.equals(before)  # what the runs took, in seconds and bytes, other tests add to
     assert list(beside.failures.found) == ["broken_here:Broken"]
@@ -707,7 +710,7 @@ def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch
         return work(request)
 
     monkeypatch.setattr(pipeline_plan, "plan_run", broken)
-    beside = run_pipeline(plan, tell=lambda _: None)
+    beside = run_pipeline(plan)
     assert set(beside.scores) == set(board.scores) - {"random"}
     assert [item.verdict for item in beside.findings] == ["not decided: random failed"]
     assert "in broken" in (plan.out / "boards" / "small.failures.log").read_text(encoding="utf-8")
@@ -721,7 +724,7 @@ PICTURED = {
 
 
 def test_reference_imagery_shows_the_map_nearest_in_age_of_each_place(tmp_path, monkeypatch):
-    plan = plan_pipeline(small(**PICTURED), out=tmp_path, tell=lambda _: None)
+    plan = plan_pipeline(small(**PICTURED), out=tmp_path)
     assert "  reference imagery: 1 region, rendered (snow, family calibration, seed 0, 10 years older)" in (
         plan.to_text().splitlines()
     )
@@ -760,7 +763,7 @@ def test_reference_imagery_that_tells_nothing_or_too_much_is_refused(tmp_path, o
     if "clean" in new:
         text = text.replace("aerial+oracle_segmenter", "clean")
     with pytest.raises(ConfigError, match=words) as error:
-        plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+        plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path)
     assert "\n" not in str(error.value)
 
 
@@ -768,10 +771,10 @@ def test_a_contrast_on_flights_names_their_track(tmp_path):
     text = TEXT.replace('suites = ["clean"]', 'suites = ["flight-gap"]')
     assert text != TEXT
     with pytest.raises(ConfigError, match="has track 'localization', and suite 'flight-gap' is of flights, say track"):
-        plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+        plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path)
     other = TEXT.replace("[[contrast]]", '[[contrast]]\ntrack = "sequence"', 1)
     with pytest.raises(ConfigError, match="has track 'sequence', and suite 'clean' has no flights"):
-        plan_pipeline(parse_toml(other, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+        plan_pipeline(parse_toml(other, PipelineFile, source="small.toml"), out=tmp_path)
 
 
 def test_trackers_are_asked_on_flights_alone_and_of_the_controls_the_oracle(tmp_path):
@@ -779,7 +782,7 @@ def test_trackers_are_asked_on_flights_alone_and_of_the_controls_the_oracle(tmp_
         '"prior_centre"', '"prior_only"'
     )
     text = text.replace('suites = ["clean"]', 'suites = ["clean", "flight-gap"]', 1)
-    plan = plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path, tell=lambda _: None)
+    plan = plan_pipeline(parse_toml(text, PipelineFile, source="small.toml"), out=tmp_path)
     asked = {
         name: [suite for suite in ("clean", "flight-gap", CONTROLS) if is_asked(plan, name, suite, "town-suburb")]
         for name in plan.matchers

@@ -19,6 +19,7 @@ from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import LearningSpec, PipelineFile
 from sasgeo_bench.leaderboard.private_board import sealed_lines
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks
 from sasgeo_bench.tasks.openings import (
@@ -59,10 +60,10 @@ def split(tmp_path_factory):
     return split_file(tmp_path_factory.mktemp("split"), agricultural="train", suburb="test", grid="sealed test")
 
 
-def plan_of(split, out, tell=lambda _: None, *, regions=None, **seeds):
+def plan_of(split, out, *, regions=None, **seeds):
     text = TEXT.replace("SPLIT", str(split))
     text = text if regions is None else text.replace('["town-suburb", "town-grid"]', json.dumps(regions))
-    return plan_pipeline(parse_toml(text, PipelineFile, source="closed.toml"), out=out, tell=tell, **seeds)
+    return plan_pipeline(parse_toml(text, PipelineFile, source="closed.toml"), out=out, **seeds)
 
 
 def about_board(out):
@@ -73,12 +74,13 @@ def about_board(out):
 def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_it(split, tmp_path, lay_towns):
     out = lay_towns(tmp_path / "out", OPEN, SEALED)
     told = []
-    plan = plan_of(split, out, told.append)
+    with reporting(told.append):
+        plan = plan_of(split, out)
     assert told == [
         f"sealed places of split 'towns-alone' are left out: {SEALED} (leaderboard --sealed-seed-file opens them)"
     ]
     assert f"  sealed {SEALED}: left out, not opened (--sealed-seed-file opens it)" in plan.to_text().splitlines()
-    board = run_pipeline(plan, tell=lambda _: None)
+    board = run_pipeline(plan)
     assert {place for frame in board.scores.values() for place in frame["place"]} == {OPEN}
     assert [path for path in out.rglob("*") if SEALED in path.name and "regions" not in path.parts] == []
     assert about_board(out).sealed == {SEALED: SealedPlace(drawn_by=None, openings=[])}
@@ -87,7 +89,7 @@ def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_
 
     plan = plan_of(split, out, sealed=SEED)
     assert f"  sealed {SEALED}: to be opened, by seed {SEED.commitment[:12]}" in plan.to_text().splitlines()
-    board = run_pipeline(plan, tell=lambda _: None, opened=FIRST)
+    board = run_pipeline(plan, opened=FIRST)
     assert {place for frame in board.scores.values() for place in frame["place"]} == {OPEN, SEALED}
     opened = SealedPlace(drawn_by=SEED.commitment, openings=[Opening.of(SEED, FIRST)])
     assert about_board(out).sealed == {SEALED: opened}
@@ -102,12 +104,12 @@ def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_
     assert "answered, 0 to ask" in next(line for line in same.splitlines() if line.startswith("    random: "))
     again = plan_of(split, out, sealed=OTHER)
     assert "opened again, after 2026-03-01 by seed" in again.to_text()
-    record = open_seal(again.seal, again.requests, opened=SECOND, stored=None, tell=lambda _: None)
+    record = open_seal(again.seal, again.requests, opened=SECOND, stored=None)
     assert [item.opened for item in record[SEALED].openings] == [FIRST, SECOND]
     (line,) = sealed_lines(record)
     assert line.startswith(f"Sealed place {SEALED}: opened on 2026-04-01")
     assert "this is opening 2, after 2026-03-01" in line
-    assert record == open_seal(again.seal, again.requests, opened=SECOND, stored=None, tell=lambda _: None)
+    assert record == open_seal(again.seal, again.requests, opened=SECOND, stored=None)
 
 
 @pytest.mark.parametrize(
@@ -118,11 +120,11 @@ def test_a_sealed_place_is_left_out_then_opened_by_a_seed_and_the_board_records_
     ],
 )
 def test_no_opening_is_dated_before_an_earlier_one_or_into_the_future(split, tmp_path, day, words):
-    record_openings(tmp_path, "towns-alone", [SEALED], Opening.of(SEED, FIRST), tell=lambda _: None)
+    record_openings(tmp_path, "towns-alone", [SEALED], Opening.of(SEED, FIRST))
     before = openings_file(tmp_path, "towns-alone").read_bytes()
     plan = plan_of(split, tmp_path, sealed=OTHER)
     with pytest.raises(ConfigError, match=words):
-        open_seal(plan.seal, plan.requests, opened=dt.date.fromisoformat(day), stored=None, tell=lambda _: None)
+        open_seal(plan.seal, plan.requests, opened=dt.date.fromisoformat(day), stored=None)
     assert openings_file(tmp_path, "towns-alone").read_bytes() == before
 
 
@@ -131,7 +133,7 @@ def test_the_queries_of_a_sealed_place_depend_on_its_seed_alone(split, tmp_path,
     for name, seed in (("one", SEED), ("same", SEED), ("other", OTHER)):
         out = lay_towns(tmp_path / name, OPEN, SEALED)
         for request in plan_of(split, out, sealed=seed).requests:
-            (folder,) = ensure_tasks(request, tell=lambda _: None)
+            (folder,) = ensure_tasks(request)
             found[name, request.region.id] = task_files.Task.open(folder).asked
     assert found["one", SEALED] == found["same", SEALED]
     assert not found["one", SEALED].keys() & found["other", SEALED].keys()
@@ -193,7 +195,7 @@ def test_a_hold_out_whose_test_places_are_all_sealed_can_be_planned_and_not_run(
     plan = plan_of(split, tmp_path / "out")
     assert "left out, not opened" in plan.to_text()
     with pytest.raises(ConfigError, match="every test place of split 'towns-alone' is sealed"):
-        run_pipeline(plan, tell=lambda _: None)
+        run_pipeline(plan)
     assert not (tmp_path / "out").exists()
 
 
@@ -205,7 +207,7 @@ def test_stored_results_keep_the_openings_of_another_root(split, tmp_path, monke
     (tmp_path / "stored" / "board.json").write_text("{}", encoding="utf-8")
     monkeypatch.setattr(sealed, "read_board_manifest", lambda _: record)
     plan = plan_of(split, tmp_path / "out", sealed=OTHER)
-    found = open_seal(plan.seal, plan.requests, opened=SECOND, stored=tmp_path / "stored", tell=lambda _: None)
+    found = open_seal(plan.seal, plan.requests, opened=SECOND, stored=tmp_path / "stored")
     assert [item.commitment for item in found[SEALED].openings] == [SEED.commitment, OTHER.commitment]
 
 
@@ -216,7 +218,7 @@ def test_the_order_of_openings_is_that_of_their_records():
 
 def test_openings_are_kept_in_order_each_seed_once_and_a_damaged_file_is_refused(tmp_path):
     for seed, day in ((SEED, FIRST), (OTHER, SECOND), (SEED, SECOND)):
-        record_openings(tmp_path, "mine", ["porto"], Opening.of(seed, day), tell=lambda _: None)
+        record_openings(tmp_path, "mine", ["porto"], Opening.of(seed, day))
     assert [item.to_text()[:10] for item in read_openings(tmp_path, "mine")["porto"]] == ["2026-03-01", "2026-04-01"]
     openings_file(tmp_path, "mine").write_text('{"porto": [{"bits": 128}]}', encoding="utf-8")
     with pytest.raises(StoreError, match=r"mine\.json is damaged .*restore it from a copy"):

@@ -11,6 +11,7 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import locked
+from sasgeo_bench.progress import reporting
 
 # Adds 1 to a number in a file, many times: of two at once, which both read the same number, one would be lost.
 COUNTING = """
@@ -20,7 +21,7 @@ from sasgeo_bench.files.folders import locked
 
 folder = Path(sys.argv[1])
 for _ in range(200):
-    with locked(folder, tell=str):
+    with locked(folder):
         count = int((folder / "count").read_text())
         (folder / "count").write_text(str(count + 1))
 """
@@ -31,15 +32,16 @@ def silent(line):
 
 
 def test_nothing_is_left_of_a_lock_whatever_happened_under_it(tmp_path):
-    with locked(tmp_path / "site", tell=silent):
+    with locked(tmp_path / "site"):
         assert [path.name for path in tmp_path.iterdir()] == [".site.lock"]
-    with pytest.raises(KeyError), locked(tmp_path / "site", tell=silent):
+    with pytest.raises(KeyError), locked(tmp_path / "site"):
         raise KeyError
     assert not [*tmp_path.iterdir()]
 
 
 def test_a_lock_that_cannot_be_made_is_a_fault_and_nobody_waits_for_it():
-    with pytest.raises(StoreError, match="/proc/site cannot be written"), locked(Path("/proc/site"), tell=pytest.fail):
+    refused = pytest.raises(StoreError, match="/proc/site cannot be written")
+    with reporting(pytest.fail), refused, locked(Path("/proc/site")):
         pass
 
 
@@ -48,16 +50,17 @@ def test_who_waited_for_a_lock_excludes_who_comes_later(tmp_path):
     waits, holds, ends, late = Event(), Event(), Event(), Event()
 
     def wait():
-        with locked(tmp_path / "site", tell=lambda _: waits.set()):
+        with locked(tmp_path / "site"):
             holds.set()
             assert ends.wait(600)
 
     def come_later():
-        with locked(tmp_path / "site", tell=lambda _: late.set()):
+        with locked(tmp_path / "site"):
             assert ends.is_set()
 
-    with ThreadPoolExecutor(2) as pool:
-        with locked(tmp_path / "site", tell=silent):
+    waiting = iter((waits, late))
+    with reporting(lambda _: next(waiting).set()), ThreadPoolExecutor(2) as pool:
+        with locked(tmp_path / "site"):
             first = pool.submit(wait)
             assert waits.wait(600)
         assert holds.wait(600)

@@ -25,6 +25,7 @@ from sasgeo_bench.leaderboard.plot_tables import (
 )
 from sasgeo_bench.leaderboard.plots import draw_steps
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.sasgeo.conformal import level_name
@@ -82,7 +83,7 @@ def board(tmp_path_factory):
     levels = {level_name("gauss", 1e-2): 10.0}
     return Board(
         entries=(),
-        failures=Failures(tmp_path_factory.mktemp("board") / "failures.log", tell=lambda _: None),
+        failures=Failures(tmp_path_factory.mktemp("board") / "failures.log"),
         scores=tables,
         predictions={
             name: StoredAnswers.of(
@@ -112,7 +113,8 @@ def unanswered(board):
 @pytest.mark.slow
 def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path):
     told = []
-    figures = figures_extra(board, tell=told.append, contrasts=CONTRASTS).figures
+    with reporting(told.append):
+        figures = figures_extra(board, contrasts=CONTRASTS).figures
     assert set(figures) == {
         "age-real-age-localization-r500-weak-s3.svg",
         "stress-localization-r500-weak-s3.svg",
@@ -148,12 +150,13 @@ def test_a_board_without_data_has_no_figures_and_says_so(board):
     bare = replace(
         board, judged={}, measured={}, findings=(), predictions=dict.fromkeys(board.scores, StoredAnswers.of([]))
     )
-    assert set(figures_extra(unanswered(bare), tell=told.append).figures) == {
-        "strength-real-age-localization-r500-weak-s3.svg",
-        "stress-localization-r500-weak-s3.svg",
-        "ablation-localization-r500-weak-s3.svg",
-        "errors-localization-r500-weak-s3.svg",
-    }
+    with reporting(told.append):
+        assert set(figures_extra(unanswered(bare)).figures) == {
+            "strength-real-age-localization-r500-weak-s3.svg",
+            "stress-localization-r500-weak-s3.svg",
+            "ablation-localization-r500-weak-s3.svg",
+            "errors-localization-r500-weak-s3.svg",
+        }
     (line,) = told
     assert line.partition(": ")[2].split(", ") == [
         "success against the age of the map",
@@ -193,7 +196,7 @@ def test_prior_groups_are_never_in_one_figure(board):
     both = {name: pd.concat([board.scores[name], frame], ignore_index=True) for name, frame in other.items()}
     table = leaderboard(both, draws=100)
     apart = replace(board, scores=both, table=table, judged={}, predictions=dict.fromkeys(both, NOTHING), findings=())
-    both_named = [name for name in figures_extra(unanswered(apart), tell=lambda _: None).figures if "stress" in name]
+    both_named = [name for name in figures_extra(unanswered(apart)).figures if "stress" in name]
     assert both_named == ["stress-localization-r500-weak-s3.svg", "stress-localization-rnone-weak-s3.svg"]
     steps = steps_frame(table, queries_of(both), ["graph"])
     assert set(steps.groupby(["suite", "track", "prior_group"]).size().index.get_level_values(2)) == {
@@ -286,7 +289,7 @@ def test_a_stanford_figure_is_of_few_matchers_those_of_contrasts_first(board, mo
     name = "stanford-0.01-r500-weak-s3.svg"
 
     def rows(contrasts=CONTRASTS):
-        drawn = figures_extra(both, tell=lambda _: None, contrasts=contrasts).figures[name]
+        drawn = figures_extra(both, contrasts=contrasts).figures[name]
         return {matcher for matcher, _ in drawn.keywords["levels"]}
 
     assert rows() == {"raster", "graph"}

@@ -57,11 +57,11 @@ def out(tmp_path_factory, lay_towns):
     wanted = Wanted(suites=(SUITE,), regions=(REGION,), split="crossfit", count=2, seed=0, out=root, may_be_fewer=True)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
-        for request in plan_requests(wanted, tell=quiet):
-            make_tasks(request, tell=quiet)
+        for request in plan_requests(wanted):
+            make_tasks(request)
     run(root, "near", off_m=3.0, accepts=lambda _: True)
     run(root, "far", off_m=40.0, accepts=lambda number: number % 2 == 0)
-    score(predictions=root / "runs", out=root, name="mine", draws=100, results=root / "results", tell=quiet)
+    score(predictions=root / "runs", out=root, name="mine", draws=100, results=root / "results")
     return root
 
 
@@ -109,7 +109,7 @@ def test_a_flight_is_shown_with_a_map_for_each_tracker(out):
 
 @pytest.mark.usefixtures("plain_site")
 def test_the_page_of_a_suite_has_its_table_figures_and_flight(out):
-    publish(out / "boards" / "mine", tell=quiet, root=out)
+    publish(out / "boards" / "mine", root=out)
     (page,) = (out / "boards" / "mine" / "site").glob(f"suite*{SUITE}*.html")
     text = page.read_text(encoding="utf-8")
     for shown in ("distance_within_25m", "false_accepted", f"flights/{SUITE}.webp", "distance-"):
@@ -117,7 +117,7 @@ def test_the_page_of_a_suite_has_its_table_figures_and_flight(out):
 
 
 def test_stored_results_give_the_same_board(out):
-    again = score(predictions=out / "results" / "mine", out=out, name="again", draws=100, cases=False, tell=quiet)
+    again = score(predictions=out / "results" / "mine", out=out, name="again", draws=100, cases=False)
     first, second = (
         frame.sort_values(["matcher", "suite", "stratum", "metric"], ignore_index=True)
         for frame in (read_leaderboard(out / "boards" / "mine"), again.table)

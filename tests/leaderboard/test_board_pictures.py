@@ -28,6 +28,7 @@ from sasgeo_bench.leaderboard.case_plot import case_pixels, fitted
 from sasgeo_bench.leaderboard.cases import words_of
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.run_manifest import RunManifest
@@ -88,13 +89,14 @@ def made(root, tmp_path_factory):
 
     def pictures(board):
         kept.append(board)
-        return pictures_extra(board, tell=lines.append, root=root)
+        with reporting(lines.append):
+            return pictures_extra(board, root=root)
 
     folder = tmp_path_factory.mktemp("made") / "board"
     request = ScoreRequest(predictions=[root / "runs"], root=root, board=folder, draws=100, extras=(pictures,))
     with pytest.MonkeyPatch.context() as patch, plain_boards():
         patch.setattr(board_pictures, "MOST_CASES", FEW)
-        make_board(request, tell=lambda _: None)
+        make_board(request)
         yield folder, lines, kept[0]
 
 
@@ -119,7 +121,7 @@ def test_a_board_lists_its_pictures_and_each_of_them_is_small(made):
 @pytest.mark.usefixtures("in_this_process")
 def test_several_processes_draw_the_same_pictures(made, root):
     folder, _, board = made
-    drawn = pictures_extra(board, tell=lambda _: None, root=root, jobs=2).pictures
+    drawn = pictures_extra(board, root=root, jobs=2).pictures
     there = {path.relative_to(folder / "pictures").as_posix() for path in (folder / "pictures").rglob("*.webp")}
     assert there <= set(drawn)
     assert all(drawn[name] == (folder / "pictures" / name).read_bytes() for name in there)
@@ -165,7 +167,7 @@ def test_every_answer_has_its_place_and_every_failure_its_class(made):
 def caseless(made, root):
     """What is drawn of the board without its cases, with the blocks of a split."""
     _, _, board = made
-    return pictures_extra(board, tell=lambda _: None, root=root, split=find_split("crossfit"), has_cases=False)
+    return pictures_extra(board, root=root, split=find_split("crossfit"), has_cases=False)
 
 
 def test_a_map_says_where_it_lies_and_which_blocks_it_has(caseless, root):
@@ -187,7 +189,8 @@ def test_a_board_is_written_without_the_pictures_that_cannot_be_drawn(made, root
     _, _, board = made
     (tmp_path / "tasks").symlink_to(root / "tasks")
     lines = []
-    assert pictures_extra(board, tell=lines.append, root=tmp_path).pictures == {}
+    with reporting(lines.append):
+        assert pictures_extra(board, root=tmp_path).pictures == {}
     assert any("holds no region.json: build the region first" in line for line in lines)
     assert lines[-1] == "pictures: 0 of regions, 0 of suites, 0 of cases, 0.00 MB"
 

@@ -12,6 +12,7 @@ from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_pictures import STRIP_BYTES, pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.run_manifest import RunManifest
@@ -40,7 +41,8 @@ def put_pictures(out, tasks):
     about = task_files.read_task(folder)
     kept = {name: about[name] for name in ("map_fingerprint", "map_inputs_sha256", "title", "split", "sites")}
     origin = task_files.TaskOrigin(**kept, suite=SUITE, region=REGION)
-    made = put_task(pairs, origin, task_files.TruthManifest(seed=0), out=out, tell=print)
+    with reporting(print):
+        made = put_task(pairs, origin, task_files.TruthManifest(seed=0), out=out)
     planes = np.where(DRAWN.labels == 1, 254, 0).astype(np.uint8)
     seen = Segmented.of(Segmentation(classes=DRAWN.classes, probability_bytes=planes))
     sha256 = task_files.read_task(made.folder)["files"][task_files.QUERIES]["sha256"]
@@ -72,8 +74,10 @@ def board(tasks, tmp_path_factory):
     for name, rights in (("worse", 1), ("better", 2)):
         run(out, task, pairs, name, rights)
     folder = out / "boards" / "mine"
-    extras = (lambda found: pictures_extra(found, tell=print, root=out),)
-    make_board(ScoreRequest(predictions=[out / "runs"], root=out, board=folder, draws=100, extras=extras), tell=print)
+    with reporting(print):
+        extras = (lambda found: pictures_extra(found, root=out),)
+    with reporting(print):
+        make_board(ScoreRequest(predictions=[out / "runs"], root=out, board=folder, draws=100, extras=extras))
     return folder
 
 
@@ -88,7 +92,8 @@ def test_a_board_on_pictures_has_a_strip_of_the_matcher_that_finds_most(board):
 
 @pytest.mark.usefixtures("plain_site")
 def test_the_strip_stands_on_the_first_page_with_its_attribution(board):
-    publish(board, tell=print, root=board.parents[1])
+    with reporting(print):
+        publish(board, root=board.parents[1])
     page = (board / "site" / "index.html").read_text(encoding="utf-8")
     shown = page[page.index("From the picture to the pose") : page.index("Which differences are real")]
     assert 'src="pictures/strips/aerial%2Bgood.webp"' in shown

@@ -27,6 +27,7 @@ from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
@@ -80,15 +81,15 @@ def built(tmp_path_factory, lay_towns):
     """Two towns, a task each in which every fourth place is made absent, a run of the control that has the truth."""
     out = lay_towns(tmp_path_factory.mktemp("boards") / "out", *TOWNS)
     wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=2, seed=2, out=out, may_be_fewer=True)
-    for request in plan_requests(wanted, tell=lambda _: None):
-        make_tasks(request, tell=lambda _: None)
+    for request in plan_requests(wanted):
+        make_tasks(request)
     tasks = [out / "tasks" / "clean" / town for town in TOWNS]
     for town in TOWNS:
         folder = out / "truth" / "clean" / town
         truths = [replace(truth, is_present=at % 4 > 0) for at, truth in enumerate(task_files.read_truths(folder))]
         rows = [task_files.truth_row(truth) for truth in truths]
         pq.write_table(pa.Table.from_pylist(rows, schema=task_files.TRUTH_SCHEMA), folder / task_files.TRUTH)
-    run(plan_run(RunRequest(spec="oracle_pose", tasks=tasks, out=out)), tell=lambda _: None)
+    run(plan_run(RunRequest(spec="oracle_pose", tasks=tasks, out=out)))
     return out
 
 
@@ -113,7 +114,7 @@ def board_of(out, *predictions, has_texts=False, **changes):
         predictions=predictions or [out / "runs"], root=out, board=out / "boards" / "mine", draws=200
     )
     with nullcontext() if has_texts else plain_boards():
-        return make_board(replace(request, **changes), tell=lambda _: None)
+        return make_board(replace(request, **changes))
 
 
 def primary(board, matcher):
@@ -147,7 +148,8 @@ def test_progress_counts_every_group_of_queries_and_every_entry(out):
             done[label] += count
 
     request = ScoreRequest(predictions=[out / "runs"], root=out, board=out / "boards" / "mine", draws=200)
-    board = make_board(request, tell=lambda _: None, progress=Counts())
+    with reporting(progress=Counts()):
+        board = make_board(request)
     groups = board.scores["oracle_pose"][["suite", "track", "prior_group"]].drop_duplicates()
     assert begun == done == {tables.INTERVALS: len(groups), JUDGED: 1}
 
@@ -279,12 +281,13 @@ def test_no_figure_hangs_on_how_many_processes_judge(out, tmp_path, split):
 
 def test_a_rejector_that_is_not_applied_says_why(out, split):
     lines = []
-    run(plan_run(RunRequest(spec="random", tasks=[out / "tasks" / "clean" / TOWNS[0]], out=out)), tell=lambda _: None)
+    run(plan_run(RunRequest(spec="random", tasks=[out / "tasks" / "clean" / TOWNS[0]], out=out)))
     request = ScoreRequest(
         predictions=[out / "runs" / "random"], root=out, board=out / "boards" / "mine", draws=200, split=split,
         rejectors=[f"{__name__}:Doubt"],
     )  # fmt: skip
-    board = make_board(request, tell=lines.append)
+    with reporting(lines.append):
+        board = make_board(request)
     why = "doubt on random: not applied, no other place of the board calibrates"
     assert why in lines
     assert why in board.remarks
@@ -540,8 +543,8 @@ def copy_run(out, name, towns, *, asked=None):
 def told_by(out, *predictions, **changes):
     lines = []
     request = ScoreRequest(predictions=predictions, root=out, board=out / "boards" / "mine", draws=200)
-    with plain_boards():
-        return make_board(replace(request, **changes), tell=lines.append), lines
+    with plain_boards(), reporting(lines.append):
+        return make_board(replace(request, **changes)), lines
 
 
 class Once(dict):
@@ -632,7 +635,8 @@ def test_answers_without_their_run_are_named_and_cost_themselves_alone(out, tmp_
     with pytest.raises(StoreError, match=r"holds answers and no run.json: run the matcher again, they are kept"):
         find_entries([out / "runs"])
     told = []
-    failures = Failures(tmp_path / "failures.log", tell=told.append)
+    with reporting(told.append):
+        failures = Failures(tmp_path / "failures.log")
     (entry,) = find_entries([out / "runs"], failures=failures)
     assert (entry.name, len(entry.sources)) == ("oracle_pose", len(TOWNS) - 1)
     assert str(run.parent) in told[0]

@@ -22,6 +22,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, result_of, seed_lines
 from sasgeo_bench.leaderboard.tables import Cell, text_of
 from sasgeo_bench.leaderboard.validity_tables import seed_table
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import pack_board, request_of, score_all
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
@@ -137,10 +138,10 @@ def made(tmp_path_factory):
         patch.syspath_prepend(str(root))
         for out, seed in ((root / "out", 7), (root / "out" / "private", SEED)):
             wanted = Wanted(suites=("clean",), regions=("town-suburb",), split="crossfit", count=4, seed=seed, out=out)
-            for request in plan_requests(replace(wanted, may_be_fewer=True), tell=silent):
-                tasks = ensure_tasks(request, tell=silent)
-                run(plan_run(RunRequest(spec="redrawer:Redrawer", tasks=tasks, out=out)), tell=silent)
-    make_board(request_on(root / "out" / "private"), tell=silent)
+            for request in plan_requests(replace(wanted, may_be_fewer=True)):
+                tasks = ensure_tasks(request)
+                run(plan_run(RunRequest(spec="redrawer:Redrawer", tasks=tasks, out=out)))
+    make_board(request_on(root / "out" / "private"))
     return root
 
 
@@ -160,7 +161,8 @@ def entry_of(folder):
 def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_board_says_so(made, tmp_path):
     lines = []
     private = made / "out" / "private" / "boards" / "little"
-    board = make_board(request_on(made / "out", board=tmp_path / "board", private=private), tell=lines.append)
+    with reporting(lines.append):
+        board = make_board(request_on(made / "out", board=tmp_path / "board", private=private))
     entry = entry_of(tmp_path / "board")
     assert entry.how == "not reproduced"
     (figure,) = [item for item in entry.private.figures if item.suite == "clean"]
@@ -174,7 +176,7 @@ def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_bo
     assert "| redrawer | clean | localization | success_25m | 1.000 | 0.000 | -1.000 [-1.000, -" in text
     assert "| redrawer (not reproduced) | 1.000 [" in text
     assert "Public and private seed" in (tmp_path / "board" / "leaderboard.tex").read_text(encoding="utf-8")
-    publish(tmp_path / "board", tell=silent)
+    publish(tmp_path / "board")
     page = (tmp_path / "board" / "site" / "index.html").read_text(encoding="utf-8")
     assert '<span class="mark warn" title="it was run on a private seed too' in page
     assert "Public and private seed" in page
@@ -182,7 +184,7 @@ def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_bo
 
 @has_landlock
 def test_without_a_private_seed_a_row_says_run_here(made, tmp_path):
-    make_board(request_on(made / "out", board=tmp_path / "board"), tell=silent)
+    make_board(request_on(made / "out", board=tmp_path / "board"))
     about = read_board_manifest(tmp_path / "board")
     assert entry_of(tmp_path / "board").how == "run here"
     assert not {"private", "private_seed"} & about.model_fields_set
@@ -194,12 +196,12 @@ def test_without_a_private_seed_a_row_says_run_here(made, tmp_path):
 def test_stored_results_keep_both_figures_and_nothing_else_of_the_private_seed(made, tmp_path):
     private = made / "out" / "private" / "boards" / "little"
     request = request_on(made / "out", board=tmp_path / "board", private=private)
-    pack_board(make_board(request, tell=silent), request, tmp_path / "pack")
+    pack_board(make_board(request), request, tmp_path / "pack")
     asked = pd.read_parquet(private / "scores.parquet")["query_id"]
     packed = [path.read_bytes() for path in (tmp_path / "pack").rglob("*") if path.is_file()]
     assert not [name for name in asked for data in packed if name.encode() in data]
     again = request_of([tmp_path / "pack"], board=tmp_path / "again", root=tmp_path)
-    score_all(again, tell=silent)
+    score_all(again)
     assert entry_of(tmp_path / "again").private == entry_of(tmp_path / "board").private
     assert entry_of(tmp_path / "again").how == "not reproduced"
 
@@ -208,14 +210,14 @@ def test_stored_results_keep_both_figures_and_nothing_else_of_the_private_seed(m
 def test_nothing_of_a_private_seed_is_published_but_figures(made, tmp_path):
     out = made / "out" / "private"
     request = request_on(out, board=tmp_path / "board")
-    board = make_board(request, tell=silent)
+    board = make_board(request)
     release = ReleaseRequest(
         regions=("town-suburb",), suites=(), split="crossfit", with_truth=False, out=out, into=tmp_path / "release"
     )
     for publishing in (
         lambda: pack_board(board, request, tmp_path / "pack"),
-        lambda: publish(tmp_path / "board", tell=silent),
-        lambda: make_release(release, tell=silent),
+        lambda: publish(tmp_path / "board"),
+        lambda: make_release(release),
     ):
         with pytest.raises(ConfigError, match="is of a private seed, and holds queries, truths and answers"):
             publishing()
@@ -242,7 +244,7 @@ def changed(made, tmp_path, **changes):
 def test_a_private_board_of_something_else_is_refused(made, tmp_path, changes, words):
     private = changed(made, tmp_path, **changes)
     with pytest.raises(ConfigError, match=words):
-        make_board(request_on(made / "out", board=tmp_path / "board", private=private), tell=silent)
+        make_board(request_on(made / "out", board=tmp_path / "board", private=private))
     assert not (tmp_path / "board").exists()
 
 
@@ -264,7 +266,7 @@ def test_only_the_same_code_shut_in_on_128_bits_vouches_for_a_row(made, tmp_path
         )
     ):
         private = changed(made, tmp_path / str(number), **changes)
-        make_board(request_on(made / "out", board=tmp_path / f"board-{number}", private=private), tell=silent)
+        make_board(request_on(made / "out", board=tmp_path / f"board-{number}", private=private))
         assert entry_of(tmp_path / f"board-{number}").private == SeedResult(verdict="run here", why=words, figures=[])
 
 
@@ -273,12 +275,12 @@ def test_a_private_board_is_not_held_against_another_and_seeds_are_not_mixed(mad
     out = made / "out"
     private = out / "private" / "boards" / "little"
     with pytest.raises(ConfigError, match="are of a private seed themselves: name a public board"):
-        make_board(request_on(out / "private", board=tmp_path / "board", private=private), tell=silent)
+        make_board(request_on(out / "private", board=tmp_path / "board", private=private))
 
 
 def test_a_private_pipeline_is_the_same_with_another_seed_in_another_root(tmp_path):
     spec = parse_toml(PIPELINE_TEXT, PipelineFile, source="little.toml")
-    public, private = (plan_pipeline(spec, out=tmp_path, tell=silent, private=seed) for seed in (None, SEED))
+    public, private = (plan_pipeline(spec, out=tmp_path, private=seed) for seed in (None, SEED))
     assert private.out == tmp_path / "private"
     for name in ("requests", "controls"):
         ours, theirs = getattr(public, name), getattr(private, name)

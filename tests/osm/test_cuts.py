@@ -14,6 +14,7 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.coverage import LONGEST_M, ground_within_reach
 from sasgeo_bench.osm.mapped import CUT
 from sasgeo_bench.osm.read import read_extract
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.region_files import read_region
@@ -100,7 +101,8 @@ def test_the_build_says_in_a_line_what_is_unknown_and_the_region_holds_it(tmp_pa
     spec = RegionFile(**text, cell_size_m=1.0, extract=[extract])
     plan = plan_build(spec, out=tmp_path / "out", extract_folders=[tmp_path])
     told = []
-    manifest = build_region(plan, tell=told.append)
+    with reporting(told.append):
+        manifest = build_region(plan)
     (line,) = [line for line in told if "mapped" in line]
     assert "(header box)" in line
     assert "ways that lack some nodes 40, ways that lack all nodes 2" in line

@@ -24,6 +24,7 @@ from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing import archive, archive_file
 from sasgeo_bench.publishing.archive import laid_out, pack_board, score_all, stored_settings
 from sasgeo_bench.publishing.archive_file import read_pack, read_stored_predictions, unpack, unpack_tasks
@@ -67,8 +68,10 @@ def kept(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     lay_towns(out / "out", "town-suburb", "town-agricultural")
     with pytest.MonkeyPatch.context() as patch, threaded():
         patch.syspath_prepend(str(Path(__file__).parents[1] / "running"))
-        plan = plan_pipeline(parse_toml(PIPELINE, PipelineFile, source="kept.toml"), out=out / "out", tell=lines.append)
-        board = run_pipeline(plan, tell=lines.append, results=out / "results")
+        with reporting(lines.append):
+            plan = plan_pipeline(parse_toml(PIPELINE, PipelineFile, source="kept.toml"), out=out / "out")
+        with reporting(lines.append):
+            board = run_pipeline(plan, results=out / "results")
     return board, plan, out / "results" / "kept", lines
 
 
@@ -99,7 +102,8 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
     lines = []
     monkeypatch.setattr(archive, "figures_extra", lambda *_, **__: Extra())
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path / "out")
-    score_all(replace(usual, draws=100, rejectors=()), tell=lines.append)
+    with reporting(lines.append):
+        score_all(replace(usual, draws=100, rejectors=()))
     said = json.loads((tmp_path / "again" / "pictures" / "pictures.json").read_text(encoding="utf-8"))
     assert len(said["regions"]) == 1
     assert {case["region"] for case in said["cases"]} == {"town-suburb"}
@@ -111,7 +115,7 @@ def test_stored_results_keep_the_version_of_the_maps_they_were_asked_on(kept, tm
     _, _, folder, _ = kept
     monkeypatch.setattr(board_module, "DATA_VERSION", 99)
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path)
-    score_all(replace(usual, draws=100, rejectors=()), tell=lambda _: None, has_cases=False)
+    score_all(replace(usual, draws=100, rejectors=()), has_cases=False)
     first = json.loads((folder / "board.json").read_text())
     assert json.loads((tmp_path / "again" / "board.json").read_text())["data_version"] == first["data_version"]
 
@@ -219,7 +223,7 @@ def test_what_is_no_whole_board_of_runs_is_not_stored(kept, tmp_path, flag, word
     )
     asked = ScoreRequest(predictions=[folder], root=tmp_path, board=tmp_path / "board")
     with pytest.raises(ConfigError, match=words):
-        score_all(replace(asked, **more), tell=lambda _: None, results=tmp_path / "results")
+        score_all(replace(asked, **more), results=tmp_path / "results")
     assert not (tmp_path / "results").exists()
 
 
@@ -396,7 +400,8 @@ def test_results_of_the_first_version_are_read_without_hashes_and_may_be_replace
 def test_publishing_stored_results_draws_their_figures_and_leaves_them_as_they_are(kept, tmp_path):
     _, plan, folder, _ = kept
     before, lines = contents_of(folder), []
-    site = publish(folder, tmp_path / "site", tell=lines.append, root=plan.out).folder
+    with reporting(lines.append):
+        site = publish(folder, tmp_path / "site", root=plan.out).folder
     first = plan.out / "boards" / "kept"
     for kind in ("figures", "pictures"):
         drawn = [path for path in (first / kind).rglob("*.*") if path.suffix in {".svg", ".webp"}]
@@ -416,7 +421,8 @@ def test_publishing_stored_results_whose_tables_are_of_another_version_says_so(o
     (own / "paper.md").write_text("as the paper has it", encoding="utf-8")
     hash_again(own)
     lines = []
-    site = publish(own, tmp_path / "site", tell=lines.append, root=tmp_path).folder
+    with reporting(lines.append):
+        site = publish(own, tmp_path / "site", root=tmp_path).folder
     assert f"the site shows the tables of this version, which differ from those in {own}: store them anew" in lines
     assert (site / "files" / "paper.md").read_text(encoding="utf-8") == "as the paper has it"
 
@@ -557,7 +563,7 @@ def test_a_pipeline_looks_where_results_go_before_it_draws(kept, tmp_path):
     plan = replace(kept[1], out=tmp_path / "out")
     (tmp_path / "kept").touch()
     with pytest.raises(StoreError, match="holds something else than stored results"):
-        run_pipeline(plan, tell=lambda _: None, results=tmp_path)
+        run_pipeline(plan, results=tmp_path)
     assert not (tmp_path / "out").exists()
 
 
@@ -585,7 +591,8 @@ def test_a_full_disk_is_a_short_line(kept, tmp_path, monkeypatch):
 def test_a_board_of_absent_places_alone_has_figures_of_what_is_left(kept):
     board, lines = kept[0], []
     absent = {name: frame.assign(is_present=False) for name, frame in board.scores.items()}
-    figures = figures_extra(replace(board, scores=absent, findings=()), tell=lines.append).figures
+    with reporting(lines.append):
+        figures = figures_extra(replace(board, scores=absent, findings=())).figures
     assert "age of the map" in lines[-1]
     assert "strength" not in " ".join(figures)
 

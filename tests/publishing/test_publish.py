@@ -17,6 +17,7 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.board_files import check_board
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing import site_files
 from sasgeo_bench.publishing.build import publish
 from tests.handmade import (
@@ -43,7 +44,7 @@ def put_and_die(path, data):
     put(path, data)
     os.kill(os.getpid(), signal.SIGKILL)
 site_files._put = put_and_die
-publish.publish(Path(sys.argv[1]), tell=print)
+publish.publish(Path(sys.argv[1]))
 """
 VOID = {"meta", "link", "img", "br", "rect", "wbr"}
 
@@ -113,7 +114,7 @@ def board(tmp_path_factory):
 def site(board, tmp_path_factory):
     """Its site, under a sub-path."""
     target = tmp_path_factory.mktemp("host") / "deep" / "under" / "site"
-    publish(board, target, tell=quiet)
+    publish(board, target)
     return target
 
 
@@ -284,24 +285,24 @@ def test_stored_results_make_the_same_pages(board, site, tmp_path):
     for path in (stored / "leaderboard.csv", *stored.glob("figures/*.svg")):
         path.with_name(f"{path.name}.gz").write_bytes(gzip.compress(path.read_bytes()))
         path.unlink()
-    publish(stored, tell=quiet)
+    publish(stored)
     assert contents(stored / "site") == contents(site)
 
 
 @pytest.mark.usefixtures("plain_site")
 def test_a_board_with_its_site_in_it_is_still_a_board_that_can_be_replaced(own):
-    publish(own, tell=quiet)
+    publish(own)
     assert (own / "site" / "index.html").is_file()
     about = json.loads((own / "board.json").read_text(encoding="utf-8"))
     check_board(own, scorer_version=about["scorer_version"])
-    publish(own, tell=quiet)
+    publish(own)
 
 
 @pytest.mark.parametrize("count", [1, 40])
 @pytest.mark.usefixtures("plain_site")
 def test_a_board_of_few_or_many_rows_has_a_page_for_each(tmp_path, count):
     put_board(tmp_path / "mine", table=many_rows(count))
-    written = publish(tmp_path / "mine", tell=quiet)
+    written = publish(tmp_path / "mine")
     assert written.pages == count + 7
     pages = read(written.folder)
     assert len(re.findall(r"\[0\.\d{3}", " ".join(pages["index.html"].said("tbody")))) == count
@@ -311,7 +312,7 @@ def test_a_board_of_few_or_many_rows_has_a_page_for_each(tmp_path, count):
 @pytest.mark.slow
 def test_pages_of_a_board_of_500_rows_stay_small(tmp_path):
     put_board(tmp_path / "mine", table=many_rows(500))
-    written = publish(tmp_path / "mine", tell=quiet)
+    written = publish(tmp_path / "mine")
     assert written.pages == 507
     assert max(path.stat().st_size for path in written.folder.glob("*.html")) < 1_000_000
 
@@ -319,7 +320,7 @@ def test_pages_of_a_board_of_500_rows_stay_small(tmp_path):
 @pytest.mark.usefixtures("plain_site")
 def test_a_board_without_a_row_says_so(tmp_path):
     put_board(tmp_path / "mine", tasks=[], split=None)
-    pages = read(publish(tmp_path / "mine", tell=quiet).folder)
+    pages = read(publish(tmp_path / "mine").folder)
     assert "This board holds no figure." in pages["index.html"].said("p")
     assert "This board has no entry." in pages["matchers.html"].said("li")
     assert pages.keys() & {"rejection.html", "figures.html", "failures.html"} == set()
@@ -334,7 +335,7 @@ def test_a_failed_control_is_told_where_it_cannot_be_overlooked(tmp_path):
             entries=[entry_of("graph")],
             verdicts=[replace(verdict(holds=False), matcher=tested)],
         )
-        page = read(publish(tmp_path / name, tell=quiet).folder)["index.html"]
+        page = read(publish(tmp_path / name).folder)["index.html"]
         parts = zip(page.found, page.texts, strict=True)
         kinds = ((said.get("class"), text) for (_, said), (_, text) in parts)
         return next((kind, text) for kind, text in kinds if kind in {"held", "doubtful", "failed"})
@@ -354,7 +355,8 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
     made_by = {"pipeline": {"id": "x", "sha256": "y"}, "title": "A title of mine"}
     put_board(tmp_path / "mine", table=table, tasks=tasks, entries=[entry_of("unasked")], **made_by)
     told = []
-    pages = read(publish(tmp_path / "mine", tell=told.append).folder)
+    with reporting(told.append):
+        pages = read(publish(tmp_path / "mine").folder)
     assert told == ["not on the map of places, for no region of that name ships: my-town"]
     assert "This version knows no suite of that name" in " ".join(pages["suite-my-suite.html"].said("p"))
     assert "my-suite: localization, my-group" in pages["index.html"].said("h3")
@@ -368,7 +370,7 @@ def test_a_suite_and_a_region_that_nobody_knows_are_named_all_the_same(tmp_path)
 @pytest.mark.slow
 @pytest.mark.usefixtures("plain_site")
 def test_interrupted_the_old_site_stays_whole_and_the_next_takes_its_place(few):
-    publish(few, tell=quiet)
+    publish(few)
     before = contents(few / "site")
     changed = json.loads((few / "board.json").read_text(encoding="utf-8")) | {"draws": 4321}
     (few / "board.json").write_text(json.dumps(changed), encoding="utf-8")
@@ -378,14 +380,14 @@ def test_interrupted_the_old_site_stays_whole_and_the_next_takes_its_place(few):
     assert contents(few / "site") == before
     assert (few / ".site.partial").is_dir()
     check_board(few, scorer_version=changed["scorer_version"])
-    publish(few, tell=quiet)
+    publish(few)
     assert b"4321 draws" in contents(few / "site")["index.html"]
     assert not (few / ".site.partial").exists()
 
 
 @pytest.mark.usefixtures("plain_site")
 def test_a_full_disk_is_one_line_and_the_old_site_stays(few, monkeypatch):
-    publish(few, tell=quiet)
+    publish(few)
     before = contents(few / "site")
 
     def fill(*_):
@@ -393,7 +395,7 @@ def test_a_full_disk_is_one_line_and_the_old_site_stays(few, monkeypatch):
 
     monkeypatch.setattr(site_files, "_put", fill)
     with pytest.raises(StoreError, match=r"site cannot be written \(No space left on device\): check .* as it was"):
-        publish(few, tell=quiet)
+        publish(few)
     assert contents(few / "site") == before
 
 
@@ -402,12 +404,12 @@ def test_what_is_no_site_is_not_replaced(own, tmp_path):
     thesis.mkdir()
     (thesis / "chapter.txt").write_text("years of work", encoding="utf-8")
     with pytest.raises(StoreError, match="holds something else than a site, which would be lost: name another folder"):
-        publish(own, thesis, tell=quiet)
+        publish(own, thesis)
     with pytest.raises(StoreError, match=r"chapter\.txt is a file: move it away"):
-        publish(own, thesis / "chapter.txt", tell=quiet)
+        publish(own, thesis / "chapter.txt")
     for target in (own, own / "figures", own / "public"):
         with pytest.raises(StoreError, match="is the board itself, or would be a strange folder in it: name another"):
-            publish(own, target, tell=quiet)
+            publish(own, target)
     assert contents(thesis) == {"chapter.txt": b"years of work"}
 
 
@@ -559,10 +561,10 @@ def test_a_figure_that_is_no_plain_svg_is_refused(own, mistake, text, fault):
 @pytest.mark.usefixtures("plain_site")
 def test_files_of_ones_own_in_an_older_site_are_never_lost(few, mistake, tmp_path):
     target = tmp_path / "public"
-    publish(few, target, tell=quiet)
+    publish(few, target)
     said = json.loads((target / "site.json").read_text(encoding="utf-8"))
     assert {*said["files"], "site.json"} == contents(target).keys()
-    publish(few, target, tell=quiet)
+    publish(few, target)
     (target / ".git").mkdir()
     (target / ".git" / "HEAD").touch()
     (target / "CNAME").touch()
@@ -573,8 +575,8 @@ def test_files_of_ones_own_in_an_older_site_are_never_lost(few, mistake, tmp_pat
     assert lost in mistake("publish", "--board", few, "--into", target)
     shutil.rmtree(target / ".git")
     (target / "CNAME").unlink()
-    publish(few, target, tell=quiet)
-    publish(few, tell=quiet)
+    publish(few, target)
+    publish(few)
     (few / "site" / "CNAME").touch()
     (few / "figures" / "notes.txt").touch()
     with pytest.raises(StoreError, match=r"1 file \(figures/notes.txt\) that would be lost"):
@@ -593,7 +595,7 @@ def test_files_of_ones_own_in_an_older_site_are_never_lost(few, mistake, tmp_pat
 def test_a_site_is_written_where_a_link_leads(few, mistake, tmp_path):
     (tmp_path / "real").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "real")
-    publish(few, tmp_path / "link", tell=quiet)
+    publish(few, tmp_path / "link")
     assert (tmp_path / "link").is_symlink()
     assert (tmp_path / "real" / "index.html").is_file()
     (tmp_path / "one").symlink_to(tmp_path / "one")

@@ -33,6 +33,7 @@ from rio_cogeo.cogeo import cog_validate
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import file_record, sha256_of
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing import release as release_module
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.publishing.release_files import Release, open_release
@@ -93,7 +94,7 @@ def _request(out: Path, into: Path, **changes: object) -> ReleaseRequest:
 
 
 def _release(out: Path, into: Path, **changes: object) -> Release:
-    return make_release(_request(out, into, **changes), tell=lambda _: None)
+    return make_release(_request(out, into, **changes))
 
 
 @pytest.fixture(scope="module")
@@ -403,7 +404,8 @@ def test_ground_is_counted_once_whatever_the_number_of_its_maps(written: Path) -
 
 def test_in_a_cross_fit_no_truth_is_released_unless_asked_for(source: Path, written: Path, tmp_path: Path) -> None:
     told: list[str] = []
-    make_release(_request(source, tmp_path / FOLDER), tell=told.append)
+    with reporting(told.append):
+        make_release(_request(source, tmp_path / FOLDER))
     assert not (tmp_path / FOLDER / "truth").exists()
     assert (written / "truth/clean" / RIVERSIDE / "truth.parquet").is_file()
     assert any("their seed is so small that anyone can find it" in line for line in told)
@@ -421,7 +423,7 @@ def _rewritten(source: Path, out: Path, part_of: Callable[[int], str]) -> Path:
         (replace(query, part=part_of(at)), truth) for at, (query, truth) in enumerate(zip(queries, truths, strict=True))
     ]
     kept = task_files.Task.open(folder).manifest.origin.model_copy(update={"split": "holdout"})
-    put_task(iter(pairs), kept, task_files.TruthManifest(seed=10**30), out=out, tell=lambda _: None)
+    put_task(iter(pairs), kept, task_files.TruthManifest(seed=10**30), out=out)
     return out
 
 
@@ -620,7 +622,7 @@ def test_a_folder_that_is_a_file_or_a_link_is_refused(tmp_path):
     for name in ("file", "link"):
         with (
             pytest.raises(OSError, match="is a file or a link: move it away"),
-            open_release(tmp_path / name, tell=lambda _: None),
+            open_release(tmp_path / name),
         ):
             pass
 

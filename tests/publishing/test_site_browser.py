@@ -40,7 +40,7 @@ def site(tmp_path_factory):
     cards = {HOSTILE: {"card": card_of(HOSTILE, title=MARKUP, limits=MARKUP)}, "far": {"set_apart": "a reason"}}
     full_board(folder / "mine", shares=shares, changes=cards)
     put_pictures(folder / "mine", failures=("aliased", "aliased", "occluded"))
-    return publish(folder / "mine", folder / "a host" / "site", tell=lambda _: None).folder
+    return publish(folder / "mine", folder / "a host" / "site").folder
 
 
 @pytest.fixture(scope="module")

@@ -22,6 +22,7 @@ from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import Card, example_card
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import laid_tasks, pack_board
 from sasgeo_bench.publishing.archive_file import read_pack
 from sasgeo_bench.publishing.submissions import (
@@ -70,7 +71,7 @@ def stored(tasks, tmp_path_factory):
     shutil.copytree(tasks, out, symlinks=True)
     asked = [out / "tasks" / suite / "town-riverside" for suite in SUITES]
     with threaded():
-        run(plan_run(RunRequest(spec="prior_centre", tasks=asked, out=out)), tell=silent)
+        run(plan_run(RunRequest(spec="prior_centre", tasks=asked, out=out)))
     request = ScoreRequest(
         predictions=[out / "runs"],
         tasks=asked,
@@ -80,7 +81,7 @@ def stored(tasks, tmp_path_factory):
         draws=100,
         pipeline=PipelineRecord(id="kept", sha256="0"),
     )
-    pack_board(make_board(request, tell=silent), request, out.parent / "kept")
+    pack_board(make_board(request), request, out.parent / "kept")
     return out.parent / "kept"
 
 
@@ -127,7 +128,7 @@ def made(stored, right, tmp_path_factory):
     path = write_rows(folder / "mine.parquet", [prediction_row(item) for item in right])
     card = write_card(folder / "card.toml")
     into = folder / "submissions" / "mine"
-    return make_submission(SubmitRequest(predictions=path, card=card, board=stored, into=into), tell=silent)
+    return make_submission(SubmitRequest(predictions=path, card=card, board=stored, into=into))
 
 
 @pytest.fixture
@@ -172,7 +173,7 @@ def test_what_submit_writes_validate_accepts(stored, files, program):
 
 def test_a_submission_says_versions_tasks_and_hashes_and_is_the_same_bytes_again(stored, files, made, tmp_path):
     into = tmp_path / "again" / "mine"
-    make_submission(SubmitRequest(**files, board=stored, into=into), tell=silent)
+    make_submission(SubmitRequest(**files, board=stored, into=into))
     for name in ("submission.json", "predictions/mine.parquet"):
         assert (into / name).read_bytes() == (made / name).read_bytes(), name
     said = json.loads((into / "submission.json").read_text(encoding="utf-8"))
@@ -201,14 +202,14 @@ def test_the_runs_of_a_matcher_can_be_submitted_under_its_own_name_and_version(s
     runs = stored.parent / "out" / "runs" / "prior_centre"
     card = write_card(tmp_path / "card.toml")
     with pytest.raises(ConfigError, match=r"the card is of 'mine' 1, .* holds runs of 'prior_centre' \d+: make them"):
-        make_submission(SubmitRequest(predictions=runs, card=card, board=stored), tell=silent)
+        make_submission(SubmitRequest(predictions=runs, card=card, board=stored))
     mine = shutil.copytree(runs, tmp_path / "runs")
     for path in mine.rglob("run.json"):
         about = json.loads(path.read_text(encoding="utf-8"))
         about["matcher"] |= {"name": "mine", "version": "1"}
         path.write_text(json.dumps(about), encoding="utf-8")
     into = tmp_path / "submissions" / "mine"
-    folder = make_submission(SubmitRequest(predictions=mine, card=card, board=stored, into=into), tell=silent)
+    folder = make_submission(SubmitRequest(predictions=mine, card=card, board=stored, into=into))
     assert all(task.answered == task.queries for task in read_submission(folder).tasks)
 
 
@@ -221,7 +222,7 @@ def test_what_a_runner_has_taught_must_stand_on_the_card(stored, tmp_path):
         path.write_text(json.dumps(about), encoding="utf-8")
     card = write_card(tmp_path / "card.toml", trained_on=["porto"])
     with pytest.raises(ConfigError, match=r"trained on munich, which trained_on of the card does not name for half a"):
-        make_submission(SubmitRequest(predictions=mine, card=card, board=stored), tell=silent)
+        make_submission(SubmitRequest(predictions=mine, card=card, board=stored))
 
 
 @pytest.mark.parametrize(
@@ -435,7 +436,7 @@ def test_a_folder_that_is_not_what_it_says_is_refused(copied, stored, mistake, t
     spoil(copied)
     line = mistake("validate", "--predictions", copied, "--for", stored)
     assert fault in line
-    failures = Failures(tmp_path / "log", tell=lambda _: None)
+    failures = Failures(tmp_path / "log")
     assert find_entries([], [copied], failures=failures) == ()
     assert fault in str(failures.first) or fault.startswith("holds the submission")
 
@@ -522,7 +523,8 @@ def test_a_submission_for_another_board_is_left_out_and_said(copied, stored, pro
     assert (code, out) == (2, "")
     assert f"answers the board 'other', and 'kept' is the board of {stored}: name the results of 'other' by" in err
     lines = []
-    assert submissions_for("kept", [tmp_path / "submissions"], tell=lines.append) == ()
+    with reporting(lines.append):
+        assert submissions_for("kept", [tmp_path / "submissions"]) == ()
     assert lines == ["left out: 1 submission for other boards (other)"]
 
 
@@ -532,7 +534,7 @@ def test_a_matcher_may_answer_several_boards_each_in_a_folder_of_its_own(copied,
         shutil.copytree(copied, root / board / "mine")
     shutil.rmtree(copied)
     change_said(root / "other" / "mine", lambda said: said.update(board="other"))
-    assert submissions_for("kept", [root], tell=silent) == (root / "kept" / "mine",)
+    assert submissions_for("kept", [root]) == (root / "kept" / "mine",)
 
 
 def loop(path):
@@ -554,10 +556,11 @@ def loop(path):
 def test_a_stray_entry_beside_submissions_costs_nobody_else_the_board(copied, tmp_path, lay):
     stray = copied.with_name("random")  # a name of a control, which must not go with it
     lay(stray)
-    found = submissions_for("kept", [copied.parent], tell=silent)
+    found = submissions_for("kept", [copied.parent])
     assert found == (copied, stray)
     lines = []
-    failures = Failures(tmp_path / "log", tell=lines.append)
+    with reporting(lines.append):
+        failures = Failures(tmp_path / "log")
     assert [entry.name for entry in find_entries([], found, failures=failures)] == ["mine"]
     why = f"{stray} is no submission, for it holds no submission.json: remove it, or make it by 'submit'"
     assert failures.found == {str(stray): why}
@@ -566,12 +569,12 @@ def test_a_stray_entry_beside_submissions_costs_nobody_else_the_board(copied, tm
 
 def test_what_is_named_must_be_a_submission_or_a_folder_of_them(copied):
     (copied.parent / "README.md").write_text("how to", encoding="utf-8")
-    assert submissions_for("kept", [copied.parent, copied], tell=silent) == (copied,)
+    assert submissions_for("kept", [copied.parent, copied]) == (copied,)
     for path in (copied / "predictions", copied / "submission.json", copied.with_name("nowhere")):
         with pytest.raises(StoreError, match=f"{path} is no folder of submissions: name one, or a submission itself"):
-            submissions_for("kept", [path], tell=silent)
+            submissions_for("kept", [path])
     with pytest.raises(ConfigError, match="with the stored results of a board: name them with --predictions"):
-        submissions_for("", [copied], tell=silent)
+        submissions_for("", [copied])
 
 
 # --- on a board -------------------------------------------------------------------------------------------------------
@@ -579,7 +582,7 @@ def test_what_is_named_must_be_a_submission_or_a_folder_of_them(copied):
 
 def test_submissions_stand_beside_what_was_run_and_say_so(copied, stored, tmp_path):
     change_said(copied, lambda said: said["card"].update(title="<script>alert(1)</script>"))
-    with_submissions(stored, [copied.parent], tmp_path / "both", tell=silent)
+    with_submissions(stored, [copied.parent], tmp_path / "both")
     about, table = read_board_manifest(tmp_path / "both"), read_leaderboard(tmp_path / "both")
     said = {entry.name: entry for entry in about.entries}
     assert {name: entry.how for name, entry in said.items()} == {
@@ -611,7 +614,8 @@ def test_submissions_stand_beside_what_was_run_and_say_so(copied, stored, tmp_pa
 def test_who_was_taught_by_a_test_place_is_set_apart(copied, stored, tmp_path, trained_on, why):
     change_said(copied, lambda said: said["card"].update(trained_on=trained_on))
     lines = []
-    board = with_submissions(stored, [copied], tmp_path / "both", tell=lines.append)
+    with reporting(lines.append):
+        board = with_submissions(stored, [copied], tmp_path / "both")
     assert board.apart == ({} if why is None else {"mine": why})
     (entry,) = [one for one in read_board_manifest(tmp_path / "both").entries if one.name == "mine"]
     assert entry.set_apart == why
@@ -630,7 +634,8 @@ def test_one_command_publishes_stored_results_and_submissions_and_says_what_it_l
     stray.write_text("notes", encoding="utf-8")
     lost = f"failed, and so not on the board: {stray}: "
     into, lines = tmp_path / "site", []
-    publish(board=stored, submissions=copied.parent, into=into, out=tmp_path, tell=lines.append)
+    with reporting(lines.append):
+        publish(board=stored, submissions=copied.parent, into=into, out=tmp_path)
     assert sum(line.startswith(lost) for line in lines) == 1
     words = ("--submissions", copied.parent, "--into", into, "--out", tmp_path)
     code, said, err = program("publish", "--board", stored, *words)
@@ -657,8 +662,8 @@ def test_of_submissions_that_share_a_name_none_is_scored_and_the_others_are(copi
     twin = shutil.copytree(copied, copied.parent / "kept" / "mine")
     other = shutil.copytree(copied, copied.with_name("other"))
     change_said(other, lambda said: rename_said(other, said))
-    failures = Failures(tmp_path / "log", tell=silent)
-    found = submissions_for("kept", [copied.parent], tell=silent)
+    failures = Failures(tmp_path / "log")
+    found = submissions_for("kept", [copied.parent])
     assert [entry.name for entry in find_entries([], found, failures=failures)] == ["other"]
     assert failures.found == {
         str(one): f"{one} and {another} have one name, 'mine': remove or rename a submission"
@@ -678,7 +683,7 @@ def test_a_name_that_is_not_free_is_refused_by_whoever_validates_and_whoever_sco
     change_said(folder, lambda said: rename_said(folder, said))
     fault = f"{folder}: {name!r} is the name of {whose}: choose another name"
     assert fault in mistake("validate", "--predictions", folder, "--for", stored)
-    failures = Failures(tmp_path / "log", tell=silent)
+    failures = Failures(tmp_path / "log")
     assert find_entries([], [folder], failures=failures) == ()
     assert failures.found == {str(folder): fault.removeprefix(f"{folder}: ")}
 

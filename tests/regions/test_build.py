@@ -20,6 +20,7 @@ from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError, StoreE
 from sasgeo_bench.files.folders import FileRecord
 from sasgeo_bench.osm.features import DTYPES, fingerprint, make_features
 from sasgeo_bench.osm.read import Reading
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions import build, region_files
 from sasgeo_bench.regions.build import build_made, build_region, plan_build
 from sasgeo_bench.regions.evidence import PRESENT, LayerBits
@@ -42,7 +43,7 @@ def small(name: str = "town-suburb", **changes: object):
 
 def built(out: Path, spec, **options: object):
     plan = plan_build(spec, out=out, with_preview=True, **options)
-    return plan, build_region(plan, tell=lambda _: None)
+    return plan, build_region(plan)
 
 
 @pytest.fixture(scope="module")
@@ -117,7 +118,7 @@ def test_layers_may_be_read_when_they_are_first_used_or_never(there):
 
 def test_a_map_on_the_way_to_queries_has_no_preview_until_one_is_wanted(tmp_path):
     plan = plan_build(small(), out=tmp_path)
-    manifest = build_region(plan, tell=lambda _: None)
+    manifest = build_region(plan)
     assert {path.name for path in plan.folder.iterdir()} == FILES - {"preview.png"}
     assert plan_build(small(), out=tmp_path).is_current
     shown, again = built(tmp_path, small())
@@ -151,7 +152,8 @@ def test_a_second_build_is_skipped_and_says_so(there, tmp_path):
     plan, _ = there
     stamp = (plan.folder / "region.json").stat().st_mtime_ns
     told: list[str] = []
-    build_region(plan_build(small(), out=tmp_path), tell=told.append)
+    with reporting(told.append):
+        build_region(plan_build(small(), out=tmp_path))
     assert told == ["town-suburb: up to date, nothing to do"]
     assert (plan.folder / "region.json").stat().st_mtime_ns == stamp
 
@@ -241,7 +243,6 @@ def test_bounds_beyond_the_extract_say_what_it_covers(tmp_path):
         # The town is made around its own centre, the grid lies eleven kilometres east of it.
         build_region(
             type(plan)(**{name: getattr(plan, name) for name in plan.__slots__} | {"grid": shifted.grid}),
-            tell=lambda _: None,
         )
     assert not plan.folder.exists()
 
@@ -311,7 +312,7 @@ def test_verify_names_what_differs(there):
 
 
 def _build_in_process(out: str) -> None:
-    build_region(plan_build(small(), out=Path(out)), tell=lambda _: None)
+    build_region(plan_build(small(), out=Path(out)))
 
 
 @pytest.mark.slow
@@ -346,15 +347,15 @@ def test_what_was_generated_becomes_a_region_that_says_so_and_is_built_once(tmp_
     west_m, south_m, *_ = small().grid().bounds_m
     flat, tall = shapely.box(0, 4, 20, 6), shapely.box(9, 0, 11, 10)  # of one centroid, and so of one fingerprint
     flat, tall = (affinity.translate(house, west_m + 10, south_m + 10) for house in (flat, tall))
-    folder = build_made(small(), generated(flat), out=tmp_path, tell=lambda _: None)
+    folder = build_made(small(), generated(flat), out=tmp_path)
     assert differing_files(folder) == []
     manifest = read_manifest(folder)
     assert (manifest.extract.bytes, manifest.warnings, manifest.counts["building"]) == (0, ("made up",), 1)
     assert (read_region(folder).layer("building") == 1).sum() == 40
     stamp = (folder / "region.json").stat().st_mtime_ns
-    build_made(small(), generated(flat), out=tmp_path, tell=lambda _: None)
+    build_made(small(), generated(flat), out=tmp_path)
     assert (folder / "region.json").stat().st_mtime_ns == stamp
-    build_made(small(), generated(tall), out=tmp_path, tell=lambda _: None)
+    build_made(small(), generated(tall), out=tmp_path)
     assert (read_region(folder).layer("building") == 1).sum() == 20
 
 

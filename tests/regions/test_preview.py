@@ -19,7 +19,7 @@ from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 def manifest(tmp_path_factory):
     spec = read_region_file(find_region_file("town-suburb"))
     plan = plan_build(spec, out=tmp_path_factory.mktemp("out"))
-    return build_region(plan, tell=lambda _: None)
+    return build_region(plan)
 
 
 def drawn(tmp_path, manifest, overview):

@@ -26,8 +26,8 @@ def made(tmp_path_factory, lay_towns):
         out=root / "out",
         may_be_fewer=True,
     )
-    for request in plan_requests(wanted, tell=lambda _: None):
-        make_tasks(request, tell=lambda _: None)
+    for request in plan_requests(wanted):
+        make_tasks(request)
     shutil.copy(Path(__file__).with_name("hostile.py"), root / "hostile.py")
     return root
 

@@ -11,6 +11,7 @@ import pytest
 
 from sasgeo_bench import progress
 from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.running import prediction_files, runner
 from sasgeo_bench.running.answers import pool_costs
 from sasgeo_bench.running.patience import Patience
@@ -47,16 +48,18 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
     alone, spread = (
         plan_run(request_of(task, tmp_path / name, dask=dask)) for name, dask in (("one", None), ("two", "local:2"))
     )
-    run(alone, tell=lambda _: None)
+    run(alone)
     told = []
-    report = run(spread, tell=told.append)
+    with reporting(told.append):
+        report = run(spread)
     assert report.counts == {"ok": len(task_files.Task.open(task).ids())}
     assert rows(spread.parts[0].folder) == rows(alone.parts[0].folder)
     about = RunManifest.open(spread.parts[0].folder)
     assert about.isolation == RunManifest.open(alone.parts[0].folder).isolation
     assert about.prepare_s >= 0
     again = plan_run(request_of(task, tmp_path / "two", dask="local:2"))
-    assert run(again, tell=told.append).counts == {}
+    with reporting(told.append):
+        assert run(again).counts == {}
     assert "nothing left" in told[-1]
 
 
@@ -64,7 +67,7 @@ def test_a_cluster_of_two_processes_gives_what_one_process_does(task, tmp_path):
 def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
     with threaded():
         alone = plan_run(request_of(task, tmp_path / "one"))
-        run(alone, tell=lambda _: None)
+        run(alone)
     plan = plan_run(request_of(task, tmp_path / "two", name="Held", dask="local:2"))
     part = plan.parts[0]
     (place / "hold").write_text(" ".join(next(iter(runner._chunks(part.left, 2, str)))), encoding="utf-8")
@@ -89,7 +92,7 @@ def test_a_dask_worker_that_is_killed_costs_no_row(place, task, tmp_path):
 
 def test_a_chunk_asks_only_what_has_no_row(task, tmp_path):
     first = plan_run(request_of(task, tmp_path, limit=3))
-    run(first, tell=lambda _: None)
+    run(first)
     plan = plan_run(request_of(task, tmp_path))
     asked = task_files.Task.open(task).asked
     chunk = replace(plan.parts[0], left=tuple(asked)[:5], asked=asked)
@@ -129,7 +132,7 @@ def test_a_cluster_that_is_not_there_is_told_in_one_line(task, tmp_path, monkeyp
     monkeypatch.setattr(progress, "_CONNECT_S", 0.5)
     plan = plan_run(request_of(task, tmp_path, dask=address))
     with pytest.raises(ConfigError, match=words):
-        run(plan, tell=lambda _: None)
+        run(plan)
     assert not plan.parts[0].folder.exists()
 
 
@@ -188,8 +191,8 @@ def test_over_500_queries_two_processes_two_shards_and_a_cluster_give_the_same_r
         seed=3,
         out=tmp_path,
     )
-    requests = plan_requests(replace(wanted, may_be_fewer=True), tell=lambda _: None)
-    tasks = [made.folder for request in requests for made in make_tasks(request, tell=lambda _: None)]
+    requests = plan_requests(replace(wanted, may_be_fewer=True))
+    tasks = [made.folder for request in requests for made in make_tasks(request)]
     assert sum(len(task_files.Task.open(task).ids()) for task in tasks) > 500
     ways = {
         "two processes": [{"jobs": 2}],
@@ -202,7 +205,7 @@ def test_over_500_queries_two_processes_two_shards_and_a_cluster_give_the_same_r
         for number, change in enumerate(changes):
             out = tmp_path / name / str(number)
             plan = plan_run(RunRequest(spec="global_descriptor", tasks=tasks, out=out, **change))
-            run(plan, tell=lambda _: None)
+            run(plan)
             folders += [part.folder for part in plan.parts]
         prediction_files.merge_runs(folders, tmp_path / f"{name}.parquet")
         files.append(rows(tmp_path / f"{name}.parquet"))

@@ -6,6 +6,7 @@ import errno
 import pytest
 
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.running.failures import LOG, Failures, log_beside, stops_all
 
 
@@ -18,7 +19,8 @@ class UnspeakableError(RuntimeError):
 
 def test_an_error_without_a_text_is_recorded_as_any_other(tmp_path):
     lines = []
-    failures = Failures(tmp_path / LOG, tell=lines.append)
+    with reporting(lines.append):
+        failures = Failures(tmp_path / LOG)
     with failures.of("mine"):
         raise UnspeakableError
     assert failures.found == {"mine": f"UnspeakableError ({LOG} says where)"}
@@ -28,7 +30,8 @@ def test_an_error_without_a_text_is_recorded_as_any_other(tmp_path):
 
 def test_a_named_fault_stands_in_its_own_words_and_once(tmp_path):
     lines = []
-    failures = Failures(tmp_path / LOG, tell=lines.append)
+    with reporting(lines.append):
+        failures = Failures(tmp_path / LOG)
     for _ in range(2):
         with failures.of("mine"):
             raise StoreError("mine: no answers, run again")
@@ -49,7 +52,7 @@ def test_the_log_of_a_board_lies_next_to_it(tmp_path):
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, MemoryError])
 def test_what_stops_everything_is_not_recorded_but_a_lack_of_memory_is(tmp_path, stop):
-    failures = Failures(tmp_path / LOG, tell=lambda _: None)
+    failures = Failures(tmp_path / LOG)
     if stop is KeyboardInterrupt:
         with pytest.raises(stop), failures.of("mine"):
             raise stop

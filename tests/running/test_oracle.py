@@ -26,7 +26,7 @@ def truths(place, task):
 
 def test_every_answer_is_the_true_pose(task, truths, tmp_path):
     plan = plan_run(RunRequest(spec="oracle_pose", tasks=(task,), out=tmp_path))
-    report = run(plan, tell=lambda _: None)
+    report = run(plan)
     assert report.counts == {"ok": len(truths)}
     answers = list(prediction_files.read_predictions(plan.parts[0].folder))
     assert {item.query_id for item in answers} == set(truths)
@@ -57,7 +57,7 @@ def test_without_truths_the_control_says_what_it_needs(place, task, tmp_path):
     moved = root / "tasks" / task.relative_to(place / "out" / "tasks")
     plan = plan_run(RunRequest(spec="oracle_pose", tasks=(moved,), out=root))
     with pytest.raises(StoreError, match="holds no truths, and oracle_pose answers with them"):
-        run(plan, tell=lambda _: None)
+        run(plan)
 
 
 def test_a_line_of_progress_says_how_many_and_how_long():

@@ -28,7 +28,7 @@ from sasgeo_bench.tasks.private_seed import take_seed
 
 tasks = [Path("out/private/tasks/clean/town-riverside")]
 assert take_seed(Path("my.seed") if sys.argv[1] == "file" else None) is not None
-run(plan_run(RunRequest(spec="seedthief:Thief", tasks=tasks, out=Path("out/private"), limit=1)), tell=print)
+run(plan_run(RunRequest(spec="seedthief:Thief", tasks=tasks, out=Path("out/private"), limit=1)))
 """
 
 
@@ -44,8 +44,8 @@ def made(tmp_path_factory):
         seed=PrivateSeed(SECRET),
         out=root / "out" / "private",
     )
-    for request in plan_requests(wanted, tell=lambda _: None):
-        make_tasks(request, tell=lambda _: None)
+    for request in plan_requests(wanted):
+        make_tasks(request)
     shutil.copy(Path(__file__).with_name("seedthief.py"), root / "seedthief.py")
     source = (root / "seedthief.py").read_text(encoding="utf-8")
     assert SECRET not in source

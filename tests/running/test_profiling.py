@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.profile_page import FIGURE, PAGE, RECORD, facts, write_profile
 from sasgeo_bench.running import profiling, sensors
 from sasgeo_bench.running.profiling import Fix, Profile, ProfileRequest, Reading, profile
@@ -82,7 +83,8 @@ def test_a_matcher_is_asked_again_from_the_first(task, monkeypatch, radius_m):
     )
     count = sum(radius_m is None or query.prior.radius_m is not None for query in read_queries(task))
     before, lines = os.sched_getaffinity(0), []
-    found = profile(replace(request, radius_m=radius_m), tell=lines.append)
+    with reporting(lines.append):
+        found = profile(replace(request, radius_m=radius_m))
     assert os.sched_getaffinity(0) == before
     assert lines[-1] == f"plain: 3 queries, the first of {count}, on town-riverside, again and again for 0.01 s"
     assert len(found.fixes) >= profiling.LEAST_FIXES
@@ -102,7 +104,7 @@ def test_a_matcher_is_asked_again_from_the_first(task, monkeypatch, radius_m):
 
 def test_its_own_process_has_the_cores_and_the_memory_of_the_request(task):
     request = ProfileRequest(spec="hostile:Plain", tasks=(task,), out=task.parents[2], sustain_s=0.01)
-    found = profile(replace(request, memory_bytes=700 * 10**6), tell=lambda _: None)
+    found = profile(replace(request, memory_bytes=700 * 10**6))
     assert found.isolation["memory"].startswith("700 MB at most")
     assert 20e6 < found.peak_bytes < 700e6
     assert len(found.fixes) >= profiling.LEAST_FIXES
@@ -113,9 +115,9 @@ def test_its_own_process_has_the_cores_and_the_memory_of_the_request(task):
 def test_who_answers_nothing_has_no_profile(task):
     request = ProfileRequest(spec="hostile:Raises", tasks=(task,), out=task.parents[2], sustain_s=60.0)
     with pytest.raises(MatchError, match=r"none of the first 20 fixes is an answer \(crash: ValueError: no idea"):
-        profile(request, tell=lambda _: None)
+        profile(request)
     with pytest.raises(MatchError, match="cannot prepare town-riverside: crash: ValueError: no index today"):
-        profile(replace(request, spec="hostile:RaisesInPrepare"), tell=lambda _: None)
+        profile(replace(request, spec="hostile:RaisesInPrepare"))
 
 
 @pytest.mark.usefixtures("in_threads")
@@ -136,12 +138,12 @@ def test_what_cannot_be_asked_is_told_before(task, tasks):
         ),
     ):
         with pytest.raises(ConfigError, match=words):
-            profile(replace(request, **changed), tell=lambda _: None)
+            profile(replace(request, **changed))
 
 
 def test_a_page_is_written_whole_and_replaces_none_but_a_profile(slowing, tmp_path):
     hostile = replace(slowing, matcher="<script>alert(1)</script>")
-    write_profile(hostile, tmp_path / "mine", tell=lambda _: None)
+    write_profile(hostile, tmp_path / "mine")
     assert {path.name for path in (tmp_path / "mine").iterdir()} == {RECORD, PAGE, FIGURE}
     text = (tmp_path / "mine" / PAGE).read_text(encoding="utf-8")
     assert "<script>" not in text
@@ -154,14 +156,14 @@ def test_a_page_is_written_whole_and_replaces_none_but_a_profile(slowing, tmp_pa
     said = json.loads((tmp_path / "mine" / RECORD).read_text(encoding="utf-8"))
     assert len(said["fixes"]) == 41
     assert "OpenStreetMap" in said["attribution"]
-    write_profile(slowing, tmp_path / "mine", tell=lambda _: None)
+    write_profile(slowing, tmp_path / "mine")
     (tmp_path / "mine" / "notes.txt").touch()
     (tmp_path / "file").write_text("mine", encoding="utf-8")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / RECORD).write_text('{"made_by": "another program"}', encoding="utf-8")
     for name in ("mine", "file", "other"):
         with pytest.raises(StoreError, match=r"notes\.txt|is no folder|profile\.json"):
-            write_profile(slowing, tmp_path / name, tell=lambda _: None)
+            write_profile(slowing, tmp_path / name)
     assert (tmp_path / "file").read_text(encoding="utf-8") == "mine"
     assert "mine" in (tmp_path / "mine" / PAGE).read_text(encoding="utf-8")
 

@@ -39,8 +39,8 @@ def draw(own_out):
             out=own_out,
             group=group,
         )
-        (request,) = plan_requests(wanted, tell=quiet)
-        (made,) = make_tasks(request, tell=quiet)
+        (request,) = plan_requests(wanted)
+        (made,) = make_tasks(request)
         return made.folder
 
     return drawn
@@ -53,7 +53,7 @@ def plan_of(task, **changes):
 def ask(task):
     """Ask what is left; the part as it was planned, and how many were asked."""
     plan = plan_of(task)
-    report = run(plan, tell=quiet)
+    report = run(plan)
     return plan.parts[0], sum(report.counts.values())
 
 
@@ -108,7 +108,7 @@ def test_a_task_that_is_drawn_anew_while_it_is_asked_ends_the_run(draw):
     plan = plan_of(task)
     draw(prior="r250-known-s3")
     with pytest.raises(StoreError, match="was made anew while it was asked: run again, answers are kept"):
-        run(plan, tell=quiet)
+        run(plan)
     assert prediction_files.ids_done(plan.parts[0].folder, task_files.Task.open(task).asked) == set()
 
 
@@ -118,7 +118,7 @@ def test_a_map_that_is_damaged_is_no_failure_of_who_prepares_it(draw, own_out):
     layers = own_out / "regions" / TOWN / "layers.tif"
     layers.write_bytes(b"x" * layers.stat().st_size)
     with pytest.raises(StoreError, match=r"layers\.tif is missing, or not what region\.json says: build"):
-        run(plan, tell=quiet)
+        run(plan)
     assert not prediction_files.parts_of(plan.parts[0].folder)
 
 

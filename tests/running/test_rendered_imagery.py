@@ -31,8 +31,8 @@ def draw(own_out):
 
     def drawn(suite, *kinds):
         wanted = Wanted(suites=(suite,), choice=Choice(kinds=kinds), out=own_out, **SETTINGS)
-        (request,) = plan_requests(wanted, tell=quiet)
-        (made,) = make_tasks(request, tell=quiet)
+        (request,) = plan_requests(wanted)
+        (made,) = make_tasks(request)
         return made.folder
 
     return drawn
@@ -44,7 +44,7 @@ def plan_of(task, spec):
 
 def ask(task, spec):
     """Ask what is left; the statuses of what was asked."""
-    return run(plan_of(task, spec), tell=quiet).counts
+    return run(plan_of(task, spec)).counts
 
 
 def about(task, spec):
@@ -63,7 +63,7 @@ def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(dra
     assert about(seen, "orb_vlad").model_fields_set == about(plain, "oracle_pose").model_fields_set
     assert about(seen, "orb_vlad").rendered_imagery is about(plain, "oracle_pose").rendered_imagery is None
 
-    render_imagery(folder, folder, LOOK, tell=quiet)
+    render_imagery(folder, folder, LOOK)
     assert not ask(plain, "oracle_pose")
     assert ask(plain.parents[1] / "clean" / TOWN, "prior_centre")
     assert about(plain, "prior_centre").map_bytes < bare + 5_000  # region.json says a little more
@@ -75,7 +75,7 @@ def test_only_who_looks_at_imagery_is_asked_again_after_it_was_rendered_anew(dra
     assert first.rendered_imagery == plan_of(seen, "orb_vlad").parts[0].imagery
     assert not list(validate(plan_of(seen, "orb_vlad").parts[0].folder, [Task.open(seen)]))
 
-    render_imagery(folder, folder, replace(LOOK, seed=1), tell=quiet)
+    render_imagery(folder, folder, replace(LOOK, seed=1))
     assert plan_of(seen, "orb_vlad").parts[0].aside == 2 * count
     assert ask(seen, "orb_vlad") == {"ok": count}
     assert not ask(plain, "oracle_pose")

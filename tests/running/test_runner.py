@@ -55,7 +55,7 @@ def request_of(task, out, name="Plain", **changes):
 
 def run_all(request):
     plan = plan_run(request)
-    report = run(plan, tell=lambda _: None)
+    report = run(plan)
     return report, plan.parts[0].folder
 
 
@@ -117,7 +117,7 @@ def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
 @pytest.mark.usefixtures("in_threads")
 def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
     plans = [plan_run(request_of(task, tmp_path, limit=count)) for count in (2, 2, 3)]
-    reports = [run(plan, tell=lambda _: None) for plan in plans]
+    reports = [run(plan) for plan in plans]
     assert [report.counts for report in reports] == [{"ok": 2}, {}, {"ok": 1}]
     assert (
         sum(
@@ -316,7 +316,7 @@ def test_hostile_matchers_cost_their_own_rows_from_the_run_to_the_board(task, un
     request = ScoreRequest(
         predictions=[*folders.values()], root=task.parents[2], board=tmp_path / "boards" / "b", draws=100
     )
-    board = make_board(request, tell=lambda _: None)
+    board = make_board(request)
     hashes = {RunManifest.open(folder).hash: name for name, folder in folders.items()}
     assert {entry.hash for entry in board.entries} == set(hashes)
     assert board.failures.found == {}
@@ -353,7 +353,7 @@ def test_where_no_process_can_be_started_for_lack_of_room_the_run_stops_in_one_l
 
     monkeypatch.setattr("tempfile.mkdtemp", full)
     with pytest.raises(StoreError, match=r"no process of a plugin can be started .*No space left"):
-        run(plan, tell=lambda _: None)
+        run(plan)
 
 
 def test_rows_say_what_the_runner_and_what_the_matcher_measured_and_older_rows_are_read(task, tmp_path):

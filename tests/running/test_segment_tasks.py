@@ -12,6 +12,7 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.plugins import ORACLE_SEGMENTER
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running.plan import RunRequest, plan_run
@@ -61,15 +62,15 @@ def drawn_once(tmp_path_factory, lay_towns):
     lay_towns(out, *TOWNS)
     wanted = Wanted(suites=("clean",), regions=TOWNS, split="crossfit", count=1, seed=4, out=out, may_be_fewer=True)
     folders = []
-    for request in plan_requests(wanted, tell=silent):
-        (made,) = make_tasks(request, tell=silent)
+    for request in plan_requests(wanted):
+        (made,) = make_tasks(request)
         about = made.manifest
         truth = out / "truth" / "clean" / request.region.id
         plain = islice(zip(task_files.read_queries(made.folder), task_files.read_truths(truth), strict=True), 4)
         pairs = [with_pictures(*pair, at) for at, pair in enumerate(plain)]
         kept = {name: getattr(about, name) for name in KEPT}
         own = TaskOrigin(**kept, suite="aerial", region=request.region.id)
-        folders.append(put_task(pairs, own, TruthManifest(seed=4), out=out, tell=silent).folder.relative_to(out))
+        folders.append(put_task(pairs, own, TruthManifest(seed=4), out=out).folder.relative_to(out))
     return out, folders
 
 
@@ -89,7 +90,8 @@ def wanted(folders, spec, **changes):
 
 
 def of_oracle(folders, lines=None):
-    return segment_tasks(wanted(folders, ORACLE_SEGMENTER), tell=silent if lines is None else lines.append)
+    with reporting(silent if lines is None else lines.append):
+        return segment_tasks(wanted(folders, ORACLE_SEGMENTER))
 
 
 def test_pictures_to_look_at_are_stored_by_the_queries_that_they_belong_to(pictured):
@@ -138,7 +140,7 @@ def test_views_of_a_flight_stay_in_order_and_a_tracker_follows_them(pictured):
     pairs = [in_flight(*with_pictures(*pair, at), at) for at, pair in enumerate(both)]
     own = TaskOrigin(**{name: about[name] for name in (*KEPT, "region")}, suite="flight-image")
     pairs = sorted(pairs, key=lambda pair: pair[0].query_id)
-    task = put_task(pairs, own, TruthManifest(seed=4), out=Path("out"), tell=silent)
+    task = put_task(pairs, own, TruthManifest(seed=4), out=Path("out"))
     (made,) = of_oracle([task.folder])
     queries = list(task_files.read_queries(made))
     assert [query.step.frame for query in queries] == [0, 1, 0, 1]
@@ -149,7 +151,7 @@ def test_views_of_a_flight_stay_in_order_and_a_tracker_follows_them(pictured):
     assert {query.step.increment for query in queries if query.step.frame} == {(0.0, 50.0, 0.0)}
     assert all((query.evidence.layer("building") == PRESENT).any() for query in queries)
     plan = plan_run(RunRequest(spec="dead_reckoning", tasks=(made,), out=Path("out"), limits=PATIENT))
-    run(plan, tell=silent)
+    run(plan)
     assert [item.status for item in read_predictions(plan.parts[0].folder)] == ["ok"] * 4
 
 
@@ -169,21 +171,24 @@ def test_what_is_up_to_date_stays_and_other_pictures_are_segmented_again(picture
 @pytest.mark.usefixtures("in_threads")
 def test_each_half_is_seen_after_learning_from_the_other_and_nothing_is_learned_twice(pictured):
     lines = []
-    made = segment_tasks(wanted(pictured, "segmenters:Learns"), tell=lines.append)
+    with reporting(lines.append):
+        made = segment_tasks(wanted(pictured, "segmenters:Learns"))
     texts = {path: json.loads(path.read_text()) for path in Path("out", FOLDER).rglob("*.txt")}
     assert sorted(text["places"] for text in texts.values()) == [[name] for name in TOWNS]
     records = {folder.name: task_files.read_task(folder)["segmenter"] for folder in made}
     assert len({record["learned_sha256"] for record in records.values()}) == 2
     assert sum("trained on the pictures" in line for line in lines) == 2
     again = []
-    segment_tasks(wanted(pictured, "segmenters:Learns"), tell=again.append)
+    with reporting(again.append):
+        segment_tasks(wanted(pictured, "segmenters:Learns"))
     assert again == []
 
 
 @pytest.mark.usefixtures("in_threads")
 def test_a_picture_that_a_segmenter_fails_at_has_no_evidence_and_is_told(pictured):
     lines = []
-    made = segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"), tell=lines.append)
+    with reporting(lines.append):
+        made = segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"))
     assert "failed at 4 of 4 pictures, whose evidence is unknown" in lines[-1]
     assert task_files.read_task(made[0])["failed_pictures"] == 4
     for query in task_files.read_queries(made[0]):
@@ -195,20 +200,21 @@ def test_a_picture_that_a_segmenter_fails_at_has_no_evidence_and_is_told(picture
 def test_pictures_that_failed_are_tried_again_and_told_again(pictured):
     for _ in range(2):
         lines = []
-        segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"), tell=lines.append)
+        with reporting(lines.append):
+            segment_tasks(wanted(pictured[:1], "segmenters:WrongShape"))
         assert "failed at 4 of 4 pictures" in lines[-1]
 
 
 @pytest.mark.usefixtures("in_threads")
 @pytest.mark.parametrize("damage", [b"garbage", b"", bytes([255, 254, 0])])
 def test_a_damaged_learned_text_is_refused_and_loses_no_evidence(pictured, damage):
-    made = segment_tasks(wanted(pictured, "segmenters:Learns"), tell=silent)
+    made = segment_tasks(wanted(pictured, "segmenters:Learns"))
     before = (made[1] / "queries.parquet").read_bytes()
     for path in Path("out", FOLDER).rglob("*.txt"):
         path.write_bytes(damage)
     (made[0] / "queries.parquet").unlink()
     with pytest.raises(StoreError, match=r"\.txt is damaged: remove this file and segment again, which learns anew$"):
-        segment_tasks(wanted(pictured, "segmenters:Learns"), tell=silent)
+        segment_tasks(wanted(pictured, "segmenters:Learns"))
     assert (made[1] / "queries.parquet").read_bytes() == before
 
 
@@ -244,7 +250,7 @@ def test_a_matcher_of_evidence_is_not_asked_about_pictures_that_nobody_has_seen(
 
 
 def test_recalibrated_evidence_has_the_shares_of_the_map_within_the_priors(pictured):
-    (made,) = segment_tasks(wanted(pictured[:1], ORACLE_SEGMENTER, is_recalibrated=True), tell=silent)
+    (made,) = segment_tasks(wanted(pictured[:1], ORACLE_SEGMENTER, is_recalibrated=True))
     assert made.parent.name == "aerial+oracle_segmenter+shares"
     assert task_files.read_task(made)["segmenter"]["recalibrated_by"] == "shares of the map"
     plain = of_oracle(pictured[:1])[0]
@@ -278,6 +284,7 @@ def test_train_places_of_a_hold_out_are_learned_from_and_not_asked(pictured):
     parts = {folder: split.part_of(split.places_in(folder.name)[0]) for folder in pictured}
     assert set(parts.values()) == {"train", "test"}
     lines = []
-    made = segment_tasks(wanted(pictured, "segmenters:Learns", split=split), tell=lines.append)
+    with reporting(lines.append):
+        made = segment_tasks(wanted(pictured, "segmenters:Learns", split=split))
     assert [folder.name for folder in made] == [folder.name for folder in pictured if parts[folder] == "test"]
     assert any(line.startswith("left out: 1 train place") for line in lines)

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 import pytest
 
 from sasgeo_bench.files.folders import locked
-from sasgeo_bench.progress import Lines
+from sasgeo_bench.progress import Lines, reporting
 from sasgeo_bench.running import answers, prediction_files, runner, sandbox
 from sasgeo_bench.running.plan import RunRequest, by_map, plan_run
 from sasgeo_bench.running.run_manifest import RunManifest
@@ -66,7 +66,7 @@ def quiet(_):
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_tasks_on_one_map_share_a_process_and_no_process_has_two_maps(pair, elsewhere, tmp_path, jobs):
     plan = plan_of((pair[0], elsewhere, pair[1]), tmp_path, jobs=jobs)
-    assert run(plan, tell=quiet).counts == {"ok": 6}
+    assert run(plan).counts == {"ok": 6}
     for part in plan.parts:
         assert set(rows(part)) == set(part.task.ids()[:2])
         assert told(part, "maps") == {1.0}
@@ -83,17 +83,17 @@ def test_tasks_on_one_map_share_a_process_and_no_process_has_two_maps(pair, else
 
 def test_processor_seconds_are_those_of_a_tasks_own_queries(pair, tmp_path):
     plan = plan_of(pair, tmp_path, name="Works", limit=1)
-    run(plan, tell=quiet)
+    run(plan)
     for part in plan.parts:  # each query takes 0.2 s of a processor; one was asked twice, and counts once
         assert 0.2 <= RunManifest.open(part.folder).cpu_s < 0.39
     before = RunManifest.open(plan.parts[0].folder).cpu_s
-    run(plan_of(pair[:1], tmp_path, name="Works", limit=2), tell=quiet)
+    run(plan_of(pair[:1], tmp_path, name="Works", limit=2))
     assert RunManifest.open(plan.parts[0].folder).cpu_s >= before + 0.2
 
 
 def test_a_crash_costs_one_row_of_one_task(pair, tmp_path):
     plan = plan_of(pair, tmp_path, name="ExitsOnce")
-    report = run(plan, tell=quiet)
+    report = run(plan)
     assert report.counts == {"ok": 3, "crash": 1}
     assert report.messages == {"crash": "ended with exit status 3"}
     crashed, fine = (rows(part) for part in plan.parts)
@@ -115,15 +115,15 @@ def test_a_run_that_breaks_off_in_its_second_task_goes_on_there(pair, tmp_path):
                 raise KeyboardInterrupt
 
     plan = plan_of(pair, tmp_path, name="Plain")
-    with pytest.raises(KeyboardInterrupt):
-        run(plan, tell=quiet, progress=Breaks(quiet))
+    with pytest.raises(KeyboardInterrupt), reporting(progress=Breaks(quiet)):
+        run(plan)
     assert [len(rows(part)) for part in plan.parts] == [2, 1]
     assert all(RunManifest.open(part.folder).prepare_s is not None for part in plan.parts)
     again = plan_of(pair, tmp_path, name="Plain")
     assert [len(part.left) for part in again.parts] == [0, 1]
-    run(again, tell=quiet)
+    run(again)
     whole = plan_of(pair, tmp_path / "undisturbed", name="Plain")
-    run(whole, tell=quiet)
+    run(whole)
     assert [rows(part) for part in again.parts] == [rows(part) for part in whole.parts]
 
 
@@ -157,12 +157,13 @@ def test_a_second_run_waits_for_the_folders_of_the_first(pair, tmp_path):
         lines.append(line)
         is_told.set()
 
-    second = threading.Thread(target=run, args=(plan,), kwargs={"tell": tell})
-    with locked(plan.parts[1].folder, tell=quiet):
-        second.start()
-        is_told.wait()
-        assert not plan.parts[0].folder.exists()
-    second.join()
+    second = threading.Thread(target=run, args=(plan,))
+    with reporting(tell):
+        with locked(plan.parts[1].folder):
+            second.start()
+            assert is_told.wait(600)
+            assert not plan.parts[0].folder.exists()
+        second.join()
     assert lines == [f"{plan.parts[1].folder} is being written by another run, waiting for it"]
     assert [len(rows(part)) for part in plan.parts] == [1, 1]
 

@@ -40,8 +40,8 @@ def flown(tmp_path_factory, lay_towns):
     )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
-        for request in plan_requests(wanted, tell=lambda _: None):
-            make_tasks(request, tell=lambda _: None)
+        for request in plan_requests(wanted):
+            make_tasks(request)
     shutil.copy(Path(__file__).with_name("wayward.py"), root / "wayward.py")
     return root
 
@@ -58,7 +58,7 @@ def run_of(task, out, name, **changes):
     spec = name if name.islower() else f"wayward:{name}"
     request = replace(RunRequest(spec=spec, tasks=(task,), out=out, limits=PATIENT), **changes)
     plan = plan_run(request)
-    run(plan, tell=lambda _: None)
+    run(plan)
     found = defaultdict(list)
     for item in sorted(prediction_files.read_predictions(plan.parts[0].folder), key=lambda item: item.query_id):
         found[flight_id(item.query_id)].append(item)
@@ -166,7 +166,7 @@ def test_a_flight_that_was_cut_off_is_asked_from_its_first_view(task, tmp_path):
     ids = sorted(task_files.Task.open(task).ids())
     whole = [name for name in ids if flight_id(name) == flight_id(ids[0])]
     request = RunRequest(spec="wayward:Counting", tasks=(task,), out=tmp_path, limits=PATIENT, limit=len(whole) + 5)
-    run(plan_run(request), tell=lambda _: None)
+    run(plan_run(request))
     plan = plan_run(replace(request, limit=None))
     assert plan.parts[0].left == tuple(name for name in ids if name not in whole)
     flights = run_of(task, tmp_path, "Counting")

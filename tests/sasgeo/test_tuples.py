@@ -26,7 +26,7 @@ EXACT = VectorNoise(missed_share=0.0, gap_share=0.0, shift_m=0.0)
 def region(tmp_path_factory):
     """A town whose streets are not all alike: in one of blocks every pair of junctions is like many others."""
     plan = plan_build(read_region_file(find_region_file("town-old-town")), out=tmp_path_factory.mktemp("old-town"))
-    build_region(plan, tell=lambda _: None)
+    build_region(plan)
     return read_region(plan.folder)
 
 

@@ -346,12 +346,12 @@ def test_a_registered_contrast_counts_flights_and_nobody_knows_how_many_false_fi
     heads, truths = a_flight(5)
     design = score_flights(heads, truths, {}).flights.assign(role="stress")
     fields = {"first": "a", "second": "b", "suites": ("flight-clean",), "track": "sequence"}
-    (found,) = check_contrasts([Contrast(name="n", metric="false_accepted", **fields)], {}, design, tell=lambda _: None)
+    (found,) = check_contrasts([Contrast(name="n", metric="false_accepted", **fields)], {}, design)
     assert (found.queries, found.best) == (1, 0.0)
     assert math.isnan(found.attainable)
     pilots = {"n": Pilot(second=0.02)}
     with pytest.raises(ConfigError, match=r"at most 0\.020 can be gained"):
-        check_contrasts([Contrast(name="n", metric="false_accepted", **fields)], pilots, design, tell=lambda _: None)
+        check_contrasts([Contrast(name="n", metric="false_accepted", **fields)], pilots, design)
 
 
 def test_what_flights_can_show_follows_from_the_spread_of_their_differences_and_is_not_known_without():
@@ -361,7 +361,7 @@ def test_what_flights_can_show_follows_from_the_spread_of_their_differences_and_
     contrast = Contrast(name="n", first="a", second="b", suites=("flight-clean",), track="sequence")
 
     def detectable(**pilot):
-        return check_contrasts([contrast], {"n": Pilot(**pilot)}, design, tell=lambda _: None)[0].detectable
+        return check_contrasts([contrast], {"n": Pilot(**pilot)}, design)[0].detectable
 
     assert detectable(spread=0.4) == pytest.approx((1.96 + 0.8416) * 0.4 / 4, rel=1e-3)
     assert math.isnan(detectable(discordant=0.5))

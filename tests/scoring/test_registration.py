@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.scoring.compare import detectable_difference
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.registration import Pilot, check_contrasts, registered
@@ -25,18 +26,20 @@ def test_a_least_difference_beyond_what_a_perfect_order_gains_is_refused():
     # 78 % of the answers are false, so a perfect order has 0.447 of the margin's 0.496, and a fifth of that is 0.099.
     told = []
     pilots = {"rejection": Pilot(second=0.496, false_share=0.78)}
-    with pytest.raises(ConfigError, match=r"'rejection' cannot be reached: at most 0\.049 .* and 0\.099 is to matter"):
-        check_contrasts([ABSENT], pilots, design(), tell=told.append)
+    refused = r"'rejection' cannot be reached: at most 0\.049 .* and 0\.099 is to matter"
+    with reporting(told.append), pytest.raises(ConfigError, match=refused):
+        check_contrasts([ABSENT], pilots, design())
     assert len(told) == 1
     excess = replace(ABSENT, metric="e_aurc")
-    (found,) = check_contrasts([excess], {"rejection": Pilot(second=0.05)}, design(), tell=told.append)
+    with reporting(told.append):
+        (found,) = check_contrasts([excess], {"rejection": Pilot(second=0.05)}, design())
     assert (found.best, found.attainable, found.least) == (0.0, 0.05, pytest.approx(0.01))
 
 
 def test_identical_places_lower_what_can_be_gained():
     twins = design(ceiling=0.5)
     with pytest.raises(ConfigError, match=r"at most 0\.020 can be gained"):
-        check_contrasts([GRAPH], {"graph": Pilot(second=0.48)}, twins, tell=str)
+        check_contrasts([GRAPH], {"graph": Pilot(second=0.48)}, twins)
     assert registered(GRAPH, Pilot(second=0.3), twins).attainable == pytest.approx(0.2)
     assert registered(replace(GRAPH, suites=("alias",)), Pilot(), twins).queries == 0
 
@@ -47,7 +50,7 @@ def test_an_interaction_can_gain_what_its_control_leaves_and_no_more():
     pilot = Pilot(second=-0.3, control=0.9)
     assert registered(stability, pilot, design()).attainable == pytest.approx(0.4)
     with pytest.raises(ConfigError, match=r"at most 0\.030 can be gained"):
-        check_contrasts([stability], {"graph": replace(pilot, second=0.07)}, design(), tell=str)
+        check_contrasts([stability], {"graph": replace(pilot, second=0.07)}, design())
     assert registered(stability, replace(pilot, second=0.2), design()).attainable == 0.0
 
 
@@ -59,7 +62,8 @@ def test_power_is_told_for_both_ends_of_the_order_of_holm():
     told = []
     others = [replace(GRAPH, name=f"other-{at}") for at in range(12)]
     pilot = Pilot(discordant=0.25, correlation=0.0)
-    found = check_contrasts([GRAPH, *others], {"graph": pilot}, apart(80), tell=told.append)[0]
+    with reporting(told.append):
+        found = check_contrasts([GRAPH, *others], {"graph": pilot}, apart(80))[0]
     assert found.detectable == pytest.approx(detectable_difference(80, 0.25))
     assert found.detectable < found.detectable_first < np.inf
     both = f"can show is {found.detectable:.3f}, or {found.detectable_first:.3f} if it comes first in Holm's order"

@@ -24,7 +24,7 @@ POSE = Pose(easting_m=299_878.0, northing_m=5_458_887.0, yaw_deg=3.0)  # amid to
 def task(tmp_path_factory):
     out = tmp_path_factory.mktemp("validate")
     wanted = Wanted(suites=("false-unknown",), regions=("town-riverside",), split="crossfit", count=1, seed=3, out=out)
-    return make_tasks(plan_requests(wanted, tell=lambda _: None)[0], tell=lambda _: None)[0].folder
+    return make_tasks(plan_requests(wanted)[0])[0].folder
 
 
 @pytest.fixture

@@ -12,13 +12,14 @@ import shapely
 from rasterio.features import rasterize
 
 from sasgeo_bench.errors import ConfigError, ImageryError, StoreError
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.sensing import reference_imagery
 from sasgeo_bench.sensing.reference_imagery import Look, render_imagery, render_place
 from tests.regions.imagery_place import make_hamlet
-from tests.world import built, quiet
+from tests.world import built
 
 TOWN = "town-suburb"
 COARSE = Look(gsd_m=1.0)
@@ -29,8 +30,8 @@ def spec():
     return read_region_file(find_region_file(TOWN)).model_copy(update={"size_m": (512.0, 512.0)})
 
 
-def render(out, look=COARSE, date=None, tell=quiet):
-    return render_place(spec(), look=look, out=out, date=date, tell=tell)
+def render(out, look=COARSE, date=None):
+    return render_place(spec(), look=look, out=out, date=date)
 
 
 def pixels(path):
@@ -110,7 +111,8 @@ def test_buildings_are_seen_where_the_map_has_them(rendered):
 def test_a_second_time_nothing_is_rendered(rendered):
     path = rendered[0] / "regions" / TOWN / "ortho.tif"
     before, told = path.stat().st_mtime_ns, []
-    assert render(rendered[0], tell=told.append) == path
+    with reporting(told.append):
+        assert render(rendered[0]) == path
     assert path.stat().st_mtime_ns == before
     assert told == [f"{TOWN}: rendered imagery is up to date, nothing to do"]
 
@@ -188,7 +190,7 @@ def test_a_region_that_is_not_built_is_refused_and_no_file_is_made(tmp_path):
         render(tmp_path)
     assert list(tmp_path.iterdir()) == []
     with pytest.raises(StoreError, match=r"holds no region\.json"):
-        render_imagery(tmp_path / "regions" / "nowhere", tmp_path, COARSE, tell=quiet)
+        render_imagery(tmp_path / "regions" / "nowhere", tmp_path, COARSE)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -197,7 +199,7 @@ def test_real_imagery_is_not_replaced(tmp_path):
     folder = built(hamlet.spec(), tmp_path, extract_folders=(hamlet.folder,), imagery_folders=(hamlet.folder,))
     before = state_of(folder)
     with pytest.raises(ImageryError, match="hamlet has imagery of its own"):
-        render_imagery(folder, folder, COARSE, tell=quiet)
+        render_imagery(folder, folder, COARSE)
     assert state_of(folder).items() >= before.items()
 
 

@@ -52,7 +52,7 @@ def asked(tmp_path_factory: pytest.TempPathFactory) -> Path:
             extract_folders=(hamlet.folder,),
             may_be_fewer=True,
         )
-        make_tasks(request, tell=lambda _: None)
+        make_tasks(request)
     return out
 
 

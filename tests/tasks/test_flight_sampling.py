@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import ConfigError, PoseError, StoreError
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.tasks import build, flight_choice, task_files
 from sasgeo_bench.tasks.flight_choice import Airspace
@@ -75,13 +76,9 @@ def quiet(_: str) -> None:
     """Say nothing."""
 
 
-def make(out: Path, suite: str = "flight-overconfident", *, tell=quiet, **changes):
+def make(out: Path, suite: str = "flight-overconfident", **changes):
     base = {"suites": (suite,), "regions": (TOWN,), "split": "crossfit", "count": 1, "seed": 0, "out": out}
-    return [
-        made
-        for request in plan_requests(Wanted(**base | changes), tell=tell)
-        for made in build.make_tasks(request, tell=tell)
-    ]
+    return [made for request in plan_requests(Wanted(**base | changes)) for made in build.make_tasks(request)]
 
 
 def paths(flights):
@@ -298,8 +295,9 @@ def test_where_no_flight_fits_the_request_gets_one_line_and_writes_nothing(own_o
 @pytest.mark.usefixtures("short")
 def test_flights_that_are_left_out_are_counted_and_a_task_without_any_is_refused(own_out):
     lines: list[str] = []
-    with pytest.raises(ConfigError, match="too small or too empty for suite 'flight-gap': a gap is a third"):
-        make(own_out, "flight-gap", tell=lines.append)
+    refused = pytest.raises(ConfigError, match="too small or too empty for suite 'flight-gap': a gap is a third")
+    with reporting(lines.append), refused:
+        make(own_out, "flight-gap")
     assert "flight-gap on town-grid: 4 flights left out, a gap is a third of its flight at most" in lines
     assert not (own_out / "tasks").exists()
 

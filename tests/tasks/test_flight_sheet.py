@@ -35,8 +35,8 @@ def made(towns, tmp_path_factory) -> Path:
     wanted = Wanted(suites=("flight-kidnap",), regions=("town-grid",), split="crossfit", count=2, seed=0, out=out)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
-        for request in plan_requests(wanted, tell=lambda _: None):
-            make_tasks(request, tell=lambda _: None)
+        for request in plan_requests(wanted):
+            make_tasks(request)
     return out
 
 

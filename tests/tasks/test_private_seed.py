@@ -7,6 +7,7 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks, make_tasks, why_to_draw
 from sasgeo_bench.tasks.private_seed import PrivateSeed, seed_record, take_seed
@@ -19,7 +20,7 @@ SEED = PrivateSeed(TEXT)
 
 def request_of(out, seed, suite="clean"):
     wanted = Wanted(suites=(suite,), regions=("town-riverside",), split="crossfit", count=1, seed=seed, out=out)
-    return plan_requests(wanted, tell=lambda _: None)[0]
+    return plan_requests(wanted)[0]
 
 
 def put_seed(folder, text=TEXT, *, name="my.seed", mode=0o600):
@@ -145,27 +146,28 @@ def test_a_public_and_a_private_seed_at_once_are_refused(mistake, monkeypatch):
 
 
 def test_a_private_request_is_drawn_once_and_anew_by_another_seed(own_out):
-    (folder,) = ensure_tasks(request_of(own_out, SEED), tell=lambda _: None)
+    (folder,) = ensure_tasks(request_of(own_out, SEED))
     before = task_files.Task.open(folder).ids()
     lines = []
-    assert ensure_tasks(request_of(own_out, SEED), tell=lines.append) == (folder,)
+    with reporting(lines.append):
+        assert ensure_tasks(request_of(own_out, SEED)) == (folder,)
     assert lines == []
     other = request_of(own_out, PrivateSeed("ab" * 16))
     assert why_to_draw(other) == "drawn with another seed"
-    ensure_tasks(other, tell=lambda _: None)
+    ensure_tasks(other)
     assert set(task_files.Task.open(folder).ids()).isdisjoint(before)
 
 
 def test_public_and_private_queries_never_share_a_folder(own_out):
     for first, second in ((5, SEED), (SEED, 5)):
         suite = "clean" if first == SEED else "occlusion"
-        make_tasks(request_of(own_out, first, suite), tell=lambda _: None)
+        make_tasks(request_of(own_out, first, suite))
         with pytest.raises(StoreError, match=r"was drawn by a .* seed, and this one is .*: choose another --out"):
-            make_tasks(request_of(own_out, second, suite), tell=lambda _: None)
+            make_tasks(request_of(own_out, second, suite))
 
 
 def test_the_papers_experiment_is_drawn_by_a_private_seed_under_its_own_names(tmp_path):
-    folder = make_paper_task(seed=42, trials=2, out=tmp_path, private=SEED, tell=lambda _: None)
+    folder = make_paper_task(seed=42, trials=2, out=tmp_path, private=SEED)
     assert made_paper_task(seed=42, trials=2, out=tmp_path, private=SEED) == folder
     assert made_paper_task(seed=42, trials=2, out=tmp_path) is None
     assert folder.name == "paper-poc-42"

@@ -220,7 +220,7 @@ def wide(tmp_path_factory) -> Drawer:
     (folder / "wide.toml").write_text(text)
     spec = read_region_file(folder / "wide.toml")
     plan = plan_build(spec, out=folder)
-    build_region(plan, tell=lambda _: None)
+    build_region(plan)
     places = [{"name": name, "regions": [name], "half": half} for name, half in zip(PLACES, "abab", strict=True)]
     split_file = SplitFile.model_validate(
         {"id": "x", "title": "X", "kind": "crossfit", "buffer_m": 0.0, "place": places}

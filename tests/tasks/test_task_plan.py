@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import ConfigError
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
@@ -31,9 +32,9 @@ def known():
     return {name: read_region_file(path) for name, path in list_region_files().items()}
 
 
-def plan(tmp_path, tell=lambda _: None, **changes):
+def plan(tmp_path, **changes):
     base = {"suites": ("clean",), "regions": (RIVERSIDE,), "split": "crossfit", "count": 2, "seed": 0}
-    return plan_requests(Wanted(**base | {"out": tmp_path / "out"} | changes), tell=tell)
+    return plan_requests(Wanted(**base | {"out": tmp_path / "out"} | changes))
 
 
 def own_region(folder: Path, *, name: str = "mine", source: str = RIVERSIDE, **changes: str) -> Path:
@@ -82,7 +83,8 @@ def test_planning_writes_nothing(tmp_path):
 
 def test_without_regions_all_that_can_be_built_are_taken_and_the_others_told(tmp_path):
     told = []
-    found = plan(tmp_path, regions=(), tell=told.append)
+    with reporting(told.append):
+        found = plan(tmp_path, regions=())
     assert {item.region.id for item in found} == {name for name in list_region_files() if name.startswith("town-")}
     assert len(told) == 1
     assert "vaduz" in told[0]

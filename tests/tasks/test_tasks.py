@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,7 @@ import pytest
 
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import locked
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.tasks.build import check_task, is_of_region, make_tasks
 from sasgeo_bench.tasks.panels import panels
@@ -56,10 +58,10 @@ def quiet(_: str) -> None:
     """Say nothing."""
 
 
-def make(out: Path, suite: str = "absent", *, tell=quiet, **changes):
+def make(out: Path, suite: str = "absent", **changes):
     base = {"suites": (suite,), "regions": (RIVERSIDE,), "split": "crossfit", "count": 1, "seed": 0, "out": out}
     wanted = Wanted(**base | changes)
-    return [made for request in plan_requests(wanted, tell=tell) for made in make_tasks(request, tell=tell)]
+    return [made for request in plan_requests(wanted) for made in make_tasks(request)]
 
 
 def content(out: Path) -> dict[str, bytes]:
@@ -369,23 +371,21 @@ def test_a_second_run_waits_for_the_first_and_both_leave_a_whole_task(own_out, t
             waiting.set()
 
     folder = own_out / "tasks" / "absent" / RIVERSIDE
-    second = threading.Thread(target=make, args=(own_out,), kwargs={"tell": tell})
-    with locked(folder, tell=quiet):
-        second.start()
-        waiting.wait()
-        assert not (folder / TASK).exists()
-    second.join()
+    second = threading.Thread(target=make, args=(own_out,))
+    with reporting(tell):
+        with locked(folder):
+            second.start()
+            waiting.wait()
+            assert not (folder / TASK).exists()
+        second.join()
     assert content(own_out) == {name: data for name, data in content(tasks).items() if "/absent/" in name}
     assert leftovers(own_out) == []
 
 
 def test_two_runs_at_once_leave_one_whole_task(own_out, tasks):
     told: list[str] = []
-    runs = [threading.Thread(target=make, args=(own_out,), kwargs={"tell": told.append}) for _ in range(2)]
-    for run in runs:
-        run.start()
-    for run in runs:
-        run.join()
+    with reporting(told.append), ThreadPoolExecutor(2) as pool:
+        list(pool.map(make, [own_out] * 2))
     assert sum("5 queries at 1 site in" in line for line in told) == 2
     assert content(own_out) == {name: data for name, data in content(tasks).items() if "/absent/" in name}
     assert leftovers(own_out) == []
@@ -396,23 +396,24 @@ def test_two_runs_of_different_counts_at_once_leave_the_map_of_the_last_and_its_
     told: dict[int, list[str]] = {2: [], 1: []}
     begun, waiting = threading.Event(), threading.Event()
 
+    def tell(line):
+        told[int(threading.current_thread().name)].append(line)
+        if "is being written by another run" in line:
+            waiting.set()
+        else:
+            begun.set()
+            waiting.wait()  # the first says nothing more, and ends not, before the other one has come
+
     def draw(count):
-        def tell(line):
-            told[count].append(line)
-            if "is being written by another run" in line:
-                waiting.set()
-            else:
-                begun.set()
-                waiting.wait()  # the first says nothing more, and ends not, before the other one has come
+        make(own_out, "topology-twins", regions=("town-grid",), count=count, may_be_fewer=count > 1)
 
-        make(own_out, "topology-twins", tell=tell, regions=("town-grid",), count=count, may_be_fewer=count > 1)
-
-    first, last = (threading.Thread(target=draw, args=(count,)) for count in told)
-    first.start()
-    begun.wait()
-    last.start()
-    for run in (first, last):
-        run.join()
+    first, last = (threading.Thread(target=draw, args=(count,), name=str(count)) for count in told)
+    with reporting(tell):
+        first.start()
+        begun.wait()
+        last.start()
+        for run in (first, last):
+            run.join()
     folder = own_out / "tasks/topology-twins/town-grid+topology-twins"
     assert [sum(" queries at " in line for line in lines) for lines in told.values()] == [1, 1]
     assert [sum("is being written by another run" in line for line in lines) for lines in told.values()] == [0, 1]

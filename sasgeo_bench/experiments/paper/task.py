@@ -38,7 +38,7 @@ from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, Crop, paper_suit
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.osm.read import Reading
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import Tell
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.build import build_made
 from sasgeo_bench.regions.evidence import PRESENT
@@ -71,7 +71,6 @@ def make_paper_task(
     trials: int = TRIALS,
     private: PrivateSeed | None = None,
     crop: Crop = "unknown",
-    tell: Tell,
 ) -> Path:
     """Make the paper's 30 regions, draw its retrieval trials on them, and return the folder of the task.
 
@@ -90,12 +89,12 @@ def make_paper_task(
     if private is not None:
         seeds = Seeds(root=private, names=(SUITE, str(VERSION), str(seed)))
     tell(f"{region_name(seed)}: drawing {TILES} tiles")
-    folder = build_made(_spec(seed), _generated(seed, seeds), out=out, tell=tell)
+    folder = build_made(_spec(seed), _generated(seed, seeds), out=out)
     drawer = PaperDrawer.of(region_files.read_region(folder), seeds, crop=crop)
     pairs = sorted((drawer.draw(index) for index in range(trials)), key=lambda pair: pair[0].query_id)
     hidden = TruthManifest(**seed_record(private or seed), request_sha256=_request_sha256(seed, trials, private, crop))
     views_cells = sorted({query.evidence.shape[0] for query, _ in pairs})
-    made = put_task(pairs, _origin(drawer.region, crop, views_cells), hidden, out=out, tell=tell)
+    made = put_task(pairs, _origin(drawer.region, crop, views_cells), hidden, out=out)
     tell(f"{paper_suite(crop)} on {region_name(seed)}: {made.manifest.queries} trials in {made.folder}")
     return made.folder
 

@@ -14,6 +14,7 @@ from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.leaderboard.board_files import check_board
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
+from sasgeo_bench.progress import reporting
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.tasks import task_files
 from tests.threaded import threaded
@@ -42,7 +43,7 @@ FIGURES = ("ablation", "example", "risk-coverage", "robustness")
 
 
 def planned(out, text=TEXT):
-    return plan_pipeline(parse_toml(text, PipelineFile, source="few.toml"), out=out, tell=lambda _: None)
+    return plan_pipeline(parse_toml(text, PipelineFile, source="few.toml"), out=out)
 
 
 @pytest.fixture(scope="module")
@@ -52,14 +53,15 @@ def made(tmp_path_factory, few_controls, without_drawings, lay_towns):  # noqa: 
     with threaded():
         plan = planned(out)
         before = plan.to_text()
-        board = run_pipeline(plan, tell=lambda _: None)
+        board = run_pipeline(plan)
         lines = []
         one = planned(out, TEXT.replace('id = "few"', 'id = "one"').replace("[42, 43]", "[42]"))
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(
                 pipeline, "paper_extra", lambda *about, **more: replace(paper_extra(*about, **more), figures={})
             )
-            run_pipeline(one, tell=lines.append)
+            with reporting(lines.append):
+                run_pipeline(one)
     return plan, board, one, lines, before
 
 

@@ -31,7 +31,7 @@ EXPERIMENT = Decoys(chosen="counts", each_tile=49, around="anchor")
 @pytest.fixture(scope="module")
 def region(tmp_path_factory):
     out = tmp_path_factory.mktemp("decoys") / "out"
-    make_paper_task(seed=42, out=out, trials=1, tell=lambda _: None)
+    make_paper_task(seed=42, out=out, trials=1)
     return region_files.read_region(out / "regions" / "paper-poc-42")
 
 

@@ -56,7 +56,7 @@ DRAWS = 3000
 
 
 def make(out, seed=42, trials=FEW):
-    return make_paper_task(seed=seed, out=out, trials=trials, tell=lambda _: None)
+    return make_paper_task(seed=seed, out=out, trials=trials)
 
 
 def content(out, *kinds):
@@ -254,7 +254,7 @@ def test_decoys_are_far_more_alike_than_windows_are_at_large_and_come_from_all_t
 @pytest.fixture(scope="module", params=["absent", "smaller"])
 def reading(request, out):
     """The first trials under another reading of the crop, each with the same trial of the experiment."""
-    make_paper_task(seed=42, out=out, trials=12, crop=request.param, tell=lambda _: None)
+    make_paper_task(seed=42, out=out, trials=12, crop=request.param)
     first = {truth.pair_id: (query, truth) for query, truth in pairs_of(out)}
     found = pairs_of(out, suite=f"paper-poc-crop-{request.param}")
     return request.param, [(*pair, *first[pair[1].pair_id]) for pair in found]
@@ -429,7 +429,7 @@ def test_a_rectangle_covers_no_more_than_its_share_and_lies_in_the_view_whole():
 @pytest.mark.slow
 def test_another_process_makes_the_same_bytes_and_fewer_trials_are_the_first_of_more(out, tmp_path):
     code = "import sys; from pathlib import Path; from sasgeo_bench.experiments.paper import make_paper_task as make\n"
-    code += f"make(seed=42, out=Path(sys.argv[1]), trials={FEW}, tell=print)"
+    code += f"make(seed=42, out=Path(sys.argv[1]), trials={FEW})"
     environment = os.environ | {"PYTHONHASHSEED": "7", "OMP_NUM_THREADS": "1", "GDAL_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, env=environment)  # noqa: S603 - our own code
     # The map knows nothing of the trials, and what changes in them is the world.

@@ -141,7 +141,7 @@ def town(tmp_path_factory, lay_towns, made_once) -> TownOf:
             spec = spec.model_copy(update={"id": f"{spec.id}-{size}", "size_m": (side_m, side_m), "extract": extracts})
         once = made_once(
             f"{spec.id}-of-{date}",
-            lambda root: build_region(plan_build(spec, out=root, date=date), tell=lambda _: None),
+            lambda root: build_region(plan_build(spec, out=root, date=date)),
         )
         return read_region(plan_build(spec, out=once, date=date).folder)
 

@@ -207,8 +207,8 @@ def test_changed_maps_are_regions_of_their_own_and_their_tasks_hold_together(own
     name = "flight-off-map"
     monkeypatch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
     wanted = Wanted(suites=(name,), regions=(TOWN,), split="crossfit", count=1, seed=0, out=own_town)
-    (request,) = plan_requests(wanted, tell=lambda _: None)
-    made = make_tasks(request, tell=lambda _: None)
+    (request,) = plan_requests(wanted)
+    made = make_tasks(request)
     names = [f"{TOWN}+{name}-1", f"{TOWN}+{name}-2"]
     assert sorted(item.folder.name for item in made) == sorted([TOWN, *names])
     for item in made:
@@ -228,7 +228,7 @@ def test_where_nothing_can_be_changed_the_request_gets_one_line_and_writes_no_ma
     monkeypatch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
     monkeypatch.setattr("sasgeo_bench.tasks.suites.flight_plots.STRETCHES_M", ())
     wanted = Wanted(suites=("flight-off-map",), regions=(TOWN,), split="crossfit", count=1, seed=0, out=own_town)
-    (request,) = plan_requests(wanted, tell=lambda _: None)
+    (request,) = plan_requests(wanted)
     with pytest.raises(ConfigError, match="town-suburb has room for 0 of 1 flights of suite 'flight-off-map'"):
-        make_tasks(request, tell=lambda _: None)
+        make_tasks(request)
     assert not [path.name for path in (own_town / "regions").iterdir() if "+flight" in path.name and path.is_dir()]

@@ -38,7 +38,7 @@ def written(tmp_path, monkeypatch):
 
 def planned(spec, out):
     wanted = Wanted(suites=(spec,), regions=(TOWN,), split="crossfit", count=1, seed=1, out=out, may_be_fewer=True)
-    return plan_requests(wanted, tell=lambda _: None)[0]
+    return plan_requests(wanted)[0]
 
 
 @pytest.fixture
@@ -52,7 +52,7 @@ def test_a_suite_of_somebody_else_is_drawn_under_its_name_and_again_when_its_cod
     lay_towns(tmp_path / "out", TOWN)
     spec = written("rows_drawn")
     request = planned(spec, tmp_path / "out")
-    (made,) = make_tasks(request, tell=lambda _: None)
+    (made,) = make_tasks(request)
     about = read_task(made.folder)
     assert made.folder == tmp_path / "out" / "tasks" / "my-rows" / TOWN
     assert about["suite_sha256"] == suite_code(spec)

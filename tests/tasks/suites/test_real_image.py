@@ -49,8 +49,8 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, out = tmp_path_factory.mktemp("hamlet"), tmp_path_factory.mktemp("out")
     spec = make_hamlet(folder).spec()
     plan = plan_build(spec, out=out, extract_folders=[folder], imagery_folders=[folder])
-    build_region(plan, tell=lambda _: None)
-    make_tasks(request_of(spec, out, folder), tell=lambda _: None)
+    build_region(plan)
+    make_tasks(request_of(spec, out, folder))
     return out
 
 
@@ -104,4 +104,4 @@ def test_the_degraded_map_lacks_houses_and_views_of_two_sites_share_no_ground(dr
 def test_a_region_without_imagery_is_refused_in_one_line(tmp_path):
     town = read_region_file(list_region_files()["town-old-town"])
     with pytest.raises(ConfigError, match=r"town-old-town cannot carry suite 'real-image': no real imagery"):
-        make_tasks(request_of(town, tmp_path), tell=lambda _: None)
+        make_tasks(request_of(town, tmp_path))

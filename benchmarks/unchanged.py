@@ -41,7 +41,7 @@ _HASH: Final = re.compile(r"\b[0-9a-f]{6,64}\b")
 _NUMBER: Final = re.compile(r"\d[\d.,]*")
 _TEXTS: Final = (".csv", ".html", ".json", ".md", ".py", ".svg", ".tex", ".toml")
 _PASSED_OVER: Final = (".lock",)
-_ROOTLESS: Final = ("new-matcher", "submit", "validate")  # commands without --out
+_ROOTLESS: Final = ("new-matcher", "submit")  # commands without --out
 
 Prints = Iterator[tuple[str, str]]
 
@@ -111,7 +111,7 @@ def _demo(program: Program) -> Prints:
     program.run("enter", str(results), "--matcher", "my_matcher.matcher:MyMatcher", "--into", str(entered), at=source)
     words = ("--predictions", str(out / "runs" / MINE), "--card", str(source / "my_matcher" / "card.toml"))
     program.run("submit", *words, "--for", str(results), "--into", str(submitted))
-    program.run("validate", "--predictions", str(submitted), "--for", str(results))
+    program.run("verify", str(submitted), "--for", str(results))
     program.run("score", "--predictions", str(results), "--submissions", str(submitted), "--name", "submitted")
     for folder in (entered, submitted, out / "boards" / "submitted"):
         yield from _board(out, folder, is_measured=True)

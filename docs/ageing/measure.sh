@@ -32,6 +32,6 @@ measure "Andorra, a day apart" andorra-control "andorra-2013-05-28.osm.pbf andor
 measure "Andorra, a day apart, edges kept" andorra-control-edges \
     "andorra-2013-05-28.osm.pbf andorra-2017-02-19.osh.pbf" "2013-05-27" --margin-m 0
 
-"$program" compare-ageing "$here/liechtenstein" "$here/andorra" "$here/monaco" "$here/dreieich" "$here/faroe" \
+"$program" measure-ageing --compare "$here/liechtenstein" "$here/andorra" "$here/monaco" "$here/dreieich" "$here/faroe" \
     --control "$here/andorra-control" --control "$here/andorra-control-edges" \
     --rates "$here/../../sasgeo_bench/ageing/ratebook.toml" --out "$here/summary.md"

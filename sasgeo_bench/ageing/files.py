@@ -234,7 +234,7 @@ def _grid(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 _RATEBOOK_HEAD: Final = f"""\
-# Yearly rates by place and class, written by `sasgeo-bench compare-ageing --rates`; not to be edited.
+# Yearly rates by place and class, written by `sasgeo-bench measure-ageing --compare --rates`; not to be edited.
 # {ATTRIBUTION}
 version = {VERSION}
 attribution = {quoted(ATTRIBUTION)}

@@ -75,7 +75,7 @@ class RateBook(Document):
     def _is_current(cls, version: int) -> int:
         if version != VERSION:
             raise ValueError(
-                f"write the rate book anew with compare-ageing --rates: this program reads version {VERSION}"
+                f"write the rate book anew with measure-ageing --compare --rates: this program reads version {VERSION}"
             )
         return version
 

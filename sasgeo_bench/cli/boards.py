@@ -9,7 +9,7 @@ from typing import Annotated, Final
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, print_table, read_day, say, shown_progress
 from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionFolders, takes
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError, counted
@@ -27,6 +27,7 @@ from sasgeo_bench.leaderboard.rejection_tables import risk_tables
 from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, warnings_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.publishing.submissions import submissions_for

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, NamedTuple
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import EXIT_USER, complain, print_table, say, tell
+from sasgeo_bench.cli.console import EXIT_USER, complain, print_table, say
 from sasgeo_bench.cli.options import RegionFolders
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.files.plugins import (
@@ -28,6 +28,7 @@ from sasgeo_bench.files.plugins import (
     list_entry_points,
     unknown,
 )
+from sasgeo_bench.progress import tell
 from sasgeo_bench.texts import one_line, plain
 
 _OF_DEMO: Final = "demo-"  # too many made-up towns to list

@@ -8,11 +8,12 @@ from typing import Annotated
 import typer
 
 from sasgeo_bench.cli.boards import check_controls, show_board
-from sasgeo_bench.cli.console import say, shown_progress, tell
+from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, failure_lines, plan_entry
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.elsewhere import elsewhere_lines
 
 

@@ -11,7 +11,7 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, say, tell
+from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options
 from sasgeo_bench.errors import FlightError, counted
 from sasgeo_bench.files.folders import fresh_file
@@ -26,6 +26,7 @@ from sasgeo_bench.flights.logs import gaps_of, is_tum, read_flight, read_log, re
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.flights.tum import read_tum, write_tum
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region_files import read_region
 
 AxesFlag = Annotated[

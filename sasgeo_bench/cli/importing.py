@@ -8,12 +8,13 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import print_table, say, tell
+from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out, RegionFolders
 from sasgeo_bench.errors import counted, named
 from sasgeo_bench.importers.items import Box, Dataset, Role
 from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
 from sasgeo_bench.importers.reports import Report
+from sasgeo_bench.progress import tell
 
 Folder = Annotated[Path, typer.Argument(help="folder of the dataset; it is only read")]
 Kind = Annotated[str, typer.Option(help=f"kind of the dataset: {', '.join(IMPORTERS)}")]

@@ -10,7 +10,7 @@ import pandas as pd
 import typer
 from rich.table import Table
 
-from sasgeo_bench.cli.console import EXIT_USER, print_table, say, shown_progress, tell
+from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
 from sasgeo_bench.errors import ConfigError, counted
@@ -21,16 +21,14 @@ from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels
 from sasgeo_bench.leaderboard.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
 from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.progress import spread
+from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.preview import PREVIEW_CELLS, write_preview
 from sasgeo_bench.regions.region import Manifest
-from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_features, read_manifest
+from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, read_manifest
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.strata import STRESS
-from sasgeo_bench.tasks.build import check_task
-from sasgeo_bench.tasks.duplicates import constellations, search_split
 from sasgeo_bench.tasks.flight_sheet import flight_panels, write_flight_sheet
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
@@ -297,49 +295,3 @@ def _reasons(manifest: Manifest) -> Table:
     for warning in manifest.warnings:
         table.add_row(f"warning: {warning}", "")
     return table
-
-
-def verify_command(
-    target: Annotated[str, typer.Argument(help="a built region, a task (SUITE/REGION), a split, or the folder of one")],
-    region_folders: RegionFolders = None,
-    out: Out = Path("out"),
-) -> None:
-    """Check a region or a task against its hashes; search the parts of a split for ground they share."""
-    task_folder, region_folder = find_task(target, out), find_built(target, out)
-    if task_folder is not None:
-        task = Task.open(task_folder, out)
-        with_truths = "every query has its truth" if task.has_truths else "its truths are not here"
-        faults, good = check_task(task), f"all files are as task.json says, and {with_truths}"
-    elif region_folder is not None:
-        faults, good = differing_files(region_folder), "all files are as the manifest says"
-    elif is_split(target):
-        faults, good = _shared_ground(target, out, region_folders or [])
-    else:
-        raise no_target(target, out, region_folders or [])
-    for line in faults:
-        say(line)
-    if faults:
-        raise typer.Exit(EXIT_USER)
-    say(f"{target}: {good}")
-
-
-def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[str], str]:
-    """Ground that parts of a split share, and what was searched."""
-    grids = {name: read_region_file(path).grid() for name, path in list_region_files(folders=folders).items()}
-    split = make_split(read_split_file(find_split_file(target)), grids)
-    built = [region for region in split.spec.region_ids if (out / "regions" / region).is_dir()]
-    missing = [region for region in split.spec.region_ids if region not in built]
-    if missing:
-        tell(f"not searched, for not built: {', '.join(missing)}")
-    if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:  # noqa: PLR2004
-        raise ConfigError(
-            f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
-        )
-    with shown_progress():
-        read = spread(lambda name: read_features(out / "regions" / name), built, label="regions read")
-        maps = dict(zip(built, map(constellations, read), strict=True))
-    faults = [
-        f"{item.first} and {item.second} of different parts hold the same ground: {item.count} buildings lie alike"
-        for item in search_split(split, maps)
-    ]
-    return faults, f"no two parts share ground, {counted(len(built), 'region')} searched"

@@ -15,11 +15,11 @@ from typing import Annotated, Any, Final, TextIO
 import typer
 from typer.core import TyperGroup
 
-from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say, tell
+from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say
 from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, exit_interrupted, is_interrupt
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.progress import QUIET
+from sasgeo_bench.progress import QUIET, tell
 from sasgeo_bench.texts import one_line
 
 HELP: Final = (
@@ -37,13 +37,12 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "build-region": "regions",
         "render-imagery": "regions",
         "measure-ageing": "ageing",
-        "compare-ageing": "ageing",
     },
     "Queries": {
         "make-queries": "queries",
         "segment": "segmenters",
         "inspect": "looking",
-        "verify": "looking",
+        "verify": "verifying",
     },
     "Methods": {
         "list": "doors",
@@ -55,7 +54,6 @@ COMMANDS: Final[dict[str, dict[str, str]]] = {
         "run": "runs",
         "merge": "runs",
         "profile": "profiling",
-        "validate": "submissions",
         "submit": "submissions",
         "enter": "entering",
     },
@@ -87,6 +85,8 @@ ALIASES: Final = {
     },
     **{f"new-{kind}": ("new", kind) for kind in ("matcher", "tracker", "segmenter")},
     **{f"check-{kind}": ("check", "--kind", kind) for kind in ("matcher", "tracker", "segmenter")},
+    "validate": ("verify",),
+    "compare-ageing": ("measure-ageing", "--compare"),
 }
 
 # Command -> what is kept of it when it is interrupted, and how to go on; the others write all or nothing.

@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from sasgeo_bench.cli.boards import check_controls
-from sasgeo_bench.cli.console import say, shown_progress, tell
+from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import Options, Out, takes
 from sasgeo_bench.leaderboard.board import Board
+from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing import build
 from sasgeo_bench.publishing.archive import board_of
 from sasgeo_bench.publishing.site_files import Written

@@ -9,10 +9,11 @@ from typing import Annotated, Final
 
 import typer
 
-from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress, tell
+from sasgeo_bench.cli.console import CONTESTANT_FAILED, complain, say, shown_progress
 from sasgeo_bench.cli.options import Dask, Options, Out, RegionFolders, takes
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.matching.results import SOUND
+from sasgeo_bench.progress import tell
 from sasgeo_bench.running import runner
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import merge_runs

@@ -21,7 +21,7 @@ from sasgeo_bench.tasks.task_files import TASK
 MOST_NAMED: Final = 8
 _ELSEWHERE: Final = {  # what else a folder may be, by a file in it, and the command for it
     BOARD: "a board: publish --board {0} makes a site of it",
-    SUBMISSION: "a submission: validate --predictions {0} checks it",
+    SUBMISSION: "a submission: verify {0} --for BOARD checks it",
 }
 
 
@@ -64,7 +64,7 @@ def _of_folder(folder: Path, out: Path) -> str:
     if other is not None:
         return f"{folder} is {other.format(folder)}"
     if is_run(folder):
-        return f"{folder} holds a run: inspect shows what went wrong in it, validate --predictions {folder} checks it"
+        return f"{folder} holds a run: inspect shows what went wrong in it, verify {folder} --tasks TASK checks it"
     is_root = any((folder / kind).is_dir() for kind in ("regions", "tasks", "runs"))
     inside = [] if is_root else [str(path) for path in _targets_in(folder)]
     if not inside:

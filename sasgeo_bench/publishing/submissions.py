@@ -51,7 +51,7 @@ class SubmitRequest:
 
 
 def make_submission(request: SubmitRequest) -> Path:
-    """Put predictions and a card into a folder that `validate` accepts, and return it.
+    """Put predictions and a card into a folder that `verify` accepts, and return it.
 
     A line tells of misses and of controls that are not answered. Raise `ConfigError` if the card does not fit the
     board or the runs, or the predictions hold faults; `StoreError` if something cannot be read or written.
@@ -185,7 +185,7 @@ def _check_rows(predictions: Path, tasks: Sequence[Task]) -> None:
     faults = [fault for fault in validate(predictions, tasks) if not fault.is_missing_row]
     if faults:
         raise ConfigError(
-            f"{predictions} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all); "
+            f"{predictions} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('verify' lists all); "
             "nothing was written"
         )
 

@@ -487,10 +487,10 @@ def _checked(part: Path, *, is_own: bool) -> pa.Table:
     table = read_part(part, is_own=is_own)
     for name, found, expected in differing_columns(table):
         fault = f"{name}: found {found}, expected {expected}"[:200]
-        raise StoreError(f"{part} holds no predictions ({fault}): 'validate' lists all that is missing")
+        raise StoreError(f"{part} holds no predictions ({fault}): 'verify' lists all that is missing")
     for wrong in row_faults(table):
         fault = one_line(f"{wrong.column}: found {wrong.found}, expected {wrong.expected}")
-        raise StoreError(f"{part}, row {wrong.row}, is no prediction ({fault}): 'validate' says all that is wrong")
+        raise StoreError(f"{part}, row {wrong.row}, is no prediction ({fault}): 'verify' says all that is wrong")
     return table
 
 

@@ -317,7 +317,7 @@ def check_submitted(entry: Entry, tasks: Sequence[Task], split: Split | None) ->
         found = submission_faults(path, entry.submission, tasks, split)
     faults = [fault for fault in found if not fault.is_missing_row]
     if faults:
-        raise ConfigError(f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('validate' lists all)")
+        raise ConfigError(f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('verify' lists all)")
 
 
 def design_rows(task: Task, split: Split | None) -> pd.DataFrame:

@@ -258,7 +258,7 @@ def truths_of(asked: Sequence[Head], truths: Iterable[Truth], answered: Iterable
 def _check_known(answered: Iterable[str], asked: Collection[str]) -> None:
     foreign = next((name for name in answered if name not in asked), None)
     if foreign is not None:
-        raise MetricError(f"prediction {foreign} belongs to no query of the task: 'validate' lists them all")
+        raise MetricError(f"prediction {foreign} belongs to no query of the task: 'verify' lists them all")
 
 
 def ceiling_of(truth: Truth) -> float:

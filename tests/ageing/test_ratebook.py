@@ -106,7 +106,7 @@ def test_a_rate_without_bound_and_one_without_interval_are_read_back():
 @pytest.mark.parametrize(("version", "got"), [("", 1), ("version = 1\n", 1), ("version = 3\n", 3)])
 def test_a_book_of_another_version_is_refused_in_one_line_that_says_how_to_mend_it(version, got):
     text = f'{version}attribution = ""\nlicence = ""\nplace = []\n'
-    mend = "write the rate book anew with compare-ageing --rates"
+    mend = "write the rate book anew with measure-ageing --compare --rates"
     with pytest.raises(ConfigError, match=rf"^book.toml: .*{mend}: this program reads version 2, got {got}$"):
         parse_toml(text, RateBook, source="book.toml")
 

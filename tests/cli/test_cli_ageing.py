@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`measure-ageing` and `compare-ageing` as a user meets them."""
+"""`measure-ageing` as a user meets it."""
 
 import datetime as dt
 from pathlib import Path
@@ -55,11 +55,13 @@ def test_three_files_are_written_and_named(program, towns, tmp_path):
 def test_places_are_put_beside_each_other(program, towns, tmp_path):
     for place in ("north", "south"):
         assert program("measure-ageing", *extracts(towns[::2]), "--place", place, "--out", place)[0] == 0
-    code, out, err = program("compare-ageing", "north", "south", "--out", "both.md")
+    code, out, err = program("measure-ageing", "--compare", "north", "south", "--out", "both.md")
     assert code == 0, err
     assert out.strip() == "both.md"
     assert "| south |" in Path(tmp_path / "both.md").read_text()
-    code, out, err = program("compare-ageing", "north", "--control", "south", "--rates", "r.toml", "--out", "one.md")
+    code, out, err = program(
+        "measure-ageing", "--compare", "north", "--control", "south", "--rates", "r.toml", "--out", "one.md"
+    )
     assert code == 0, err
     assert out.split() == ["one.md", "r.toml"]
     assert parse_toml((tmp_path / "r.toml").read_text(), RateBook, source="r.toml").names == ("north",)
@@ -86,6 +88,6 @@ def test_a_mistake_gets_one_line_and_exit_2(words, told, program, towns, tmp_pat
 
 
 def test_a_folder_that_holds_nothing_measured_is_told(program):
-    code, _, err = program("compare-ageing", "nowhere")
+    code, _, err = program("measure-ageing", "--compare", "nowhere")
     assert code == 2
     assert "run measure-ageing with --out nowhere first" in err

@@ -507,7 +507,7 @@ def test_missing_double_and_foreign_rows_get_a_line_each_and_exit_2(program, min
 
 
 def test_of_many_queries_without_a_row_some_are_named_and_the_rest_counted(program, mine, ids, monkeypatch) -> None:
-    monkeypatch.setattr("sasgeo_bench.cli.submissions.MOST_MISSING", 2)
+    monkeypatch.setattr("sasgeo_bench.cli.verifying.MOST_MISSING", 2)
     path = mine([Prediction(query_id=ids[0])])
     code, told, err = program("validate", "--predictions", path, "--tasks", TASK)
     assert (code, err) == (2, f"mine.parquet: {len(ids) - 1} violations\n")
@@ -565,9 +565,8 @@ def test_what_cannot_be_validated_at_all_gets_one_line(mistake, mine) -> None:
     words = ("validate", "--predictions")
     assert "nowhere holds no task.json: make the queries first" in mistake(*words, path, "--tasks", "nowhere")
     for more in ((), ("--tasks", TASK)):  # what is wrong with the answers is told first
-        assert "there is no file or folder nowhere: name a predictions file" in mistake(*words, "nowhere", *more)
-        told = mistake(*words, TASK, *more)
-        assert f"{TASK} holds neither a run (part-*.parquet) nor a submission (submission.json)" in told
+        assert "there is no region, task, split or run 'nowhere'" in mistake(*words, "nowhere", *more)
+    assert "mine.parquet holds answers: name --tasks, task folders or the stored results" in mistake(*words, path)
     path.write_bytes(path.read_bytes()[:-100])
     assert "mine.parquet cannot be read (" in mistake(*words, path, "--tasks", TASK)
     path.write_text("query_id,candidates\n")

@@ -635,9 +635,9 @@ def test_answers_without_their_run_are_named_and_cost_themselves_alone(out, tmp_
     with pytest.raises(StoreError, match=r"holds answers and no run.json: run the matcher again, they are kept"):
         find_entries([out / "runs"])
     told = []
+    failures = Failures(tmp_path / "failures.log")
     with reporting(told.append):
-        failures = Failures(tmp_path / "failures.log")
-    (entry,) = find_entries([out / "runs"], failures=failures)
+        (entry,) = find_entries([out / "runs"], failures=failures)
     assert (entry.name, len(entry.sources)) == ("oracle_pose", len(TOWNS) - 1)
     assert str(run.parent) in told[0]
 

@@ -163,10 +163,10 @@ def test_what_submit_writes_validate_accepts(stored, files, program):
     code, out, err = program(*flags(files, stored))
     assert (code, out) == (0, "submissions/kept/mine\n"), err
     assert "the suite 'controls' is not answered" in err
-    code, out, err = program("validate", "--predictions", "submissions/kept/mine", "--for", stored)
+    code, out, err = program("verify", "submissions/kept/mine", "--for", stored)
     assert code == 0, err
     assert out == "submissions/kept/mine: a sound submission of mine 1 to kept, 2 tasks\n"
-    code, out, _ = program("validate", "--predictions", "submissions/kept/mine")
+    code, out, _ = program("verify", "submissions/kept/mine")
     assert code == 0
     assert "its rows were held against no queries" in out
 
@@ -193,7 +193,7 @@ def test_queries_without_a_row_are_misses_and_a_suite_without_any_is_not_asked(s
     code, _, err = program(*flags(files, stored))
     assert code == 0, err
     assert "3 have none and count as misses" in err
-    code, out, _ = program("validate", "--predictions", "submissions/kept/mine", "--for", stored)
+    code, out, _ = program("verify", "submissions/kept/mine", "--for", stored)
     assert code == 0
     assert "1 task, 3 queries without a row count as misses" in out
 
@@ -434,7 +434,7 @@ def rename_folder(folder):
 )
 def test_a_folder_that_is_not_what_it_says_is_refused(copied, stored, mistake, tmp_path, spoil, fault):
     spoil(copied)
-    line = mistake("validate", "--predictions", copied, "--for", stored)
+    line = mistake("verify", copied, "--for", stored)
     assert fault in line
     failures = Failures(tmp_path / "log")
     assert find_entries([], [copied], failures=failures) == ()
@@ -488,7 +488,7 @@ def state_task(**fields):
 )
 def test_rows_and_versions_that_do_not_fit_the_board_are_listed_and_never_scored(copied, stored, program, spoil, fault):
     spoil(copied)
-    code, out, _ = program("validate", "--predictions", copied, "--for", stored)
+    code, out, _ = program("verify", copied, "--for", stored)
     assert code == 2
     assert fault in out
     (entry,) = find_entries([], [copied])
@@ -519,7 +519,7 @@ def test_every_submission_of_the_repository_is_sound() -> None:
 
 def test_a_submission_for_another_board_is_left_out_and_said(copied, stored, program, tmp_path):
     change_said(copied, lambda said: said.update(board="other"))
-    code, out, err = program("validate", "--predictions", copied, "--for", stored)
+    code, out, err = program("verify", copied, "--for", stored)
     assert (code, out) == (2, "")
     assert f"answers the board 'other', and 'kept' is the board of {stored}: name the results of 'other' by" in err
     lines = []
@@ -559,9 +559,9 @@ def test_a_stray_entry_beside_submissions_costs_nobody_else_the_board(copied, tm
     found = submissions_for("kept", [copied.parent])
     assert found == (copied, stray)
     lines = []
+    failures = Failures(tmp_path / "log")
     with reporting(lines.append):
-        failures = Failures(tmp_path / "log")
-    assert [entry.name for entry in find_entries([], found, failures=failures)] == ["mine"]
+        assert [entry.name for entry in find_entries([], found, failures=failures)] == ["mine"]
     why = f"{stray} is no submission, for it holds no submission.json: remove it, or make it by 'submit'"
     assert failures.found == {str(stray): why}
     assert lines == [f"{stray} failed: {why}"]
@@ -682,7 +682,7 @@ def test_a_name_that_is_not_free_is_refused_by_whoever_validates_and_whoever_sco
     folder = copied.rename(copied.with_name(name))
     change_said(folder, lambda said: rename_said(folder, said))
     fault = f"{folder}: {name!r} is the name of {whose}: choose another name"
-    assert fault in mistake("validate", "--predictions", folder, "--for", stored)
+    assert fault in mistake("verify", folder, "--for", stored)
     failures = Failures(tmp_path / "log")
     assert find_entries([], [folder], failures=failures) == ()
     assert failures.found == {str(folder): fault.removeprefix(f"{folder}: ")}

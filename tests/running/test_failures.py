@@ -19,9 +19,8 @@ class UnspeakableError(RuntimeError):
 
 def test_an_error_without_a_text_is_recorded_as_any_other(tmp_path):
     lines = []
-    with reporting(lines.append):
-        failures = Failures(tmp_path / LOG)
-    with failures.of("mine"):
+    failures = Failures(tmp_path / LOG)
+    with reporting(lines.append), failures.of("mine"):
         raise UnspeakableError
     assert failures.found == {"mine": f"UnspeakableError ({LOG} says where)"}
     assert lines == [f"mine failed: UnspeakableError ({LOG} says where)"]
@@ -30,10 +29,9 @@ def test_an_error_without_a_text_is_recorded_as_any_other(tmp_path):
 
 def test_a_named_fault_stands_in_its_own_words_and_once(tmp_path):
     lines = []
-    with reporting(lines.append):
-        failures = Failures(tmp_path / LOG)
+    failures = Failures(tmp_path / LOG)
     for _ in range(2):
-        with failures.of("mine"):
+        with reporting(lines.append), failures.of("mine"):
             raise StoreError("mine: no answers, run again")
     assert lines == ["mine failed: no answers, run again"] * 2
     assert not (tmp_path / LOG).exists()

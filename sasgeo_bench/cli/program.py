@@ -113,6 +113,12 @@ class _Group(TyperGroup):
         command = command and load(name or "")
         return name, command, spelled_out(rest, command.params) if command else rest
 
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401, ARG002 - as above
+        """Write the commands in the groups of the work."""
+        for group, names in COMMANDS.items():
+            with formatter.section(group):
+                formatter.write_dl([(name, self.commands[name].help or "") for name in names])
+
 
 def spelled_out(words: Sequence[str], params: Sequence[Any]) -> list[str]:
     """Repeat an option before each of several values that follow it, as a shell leaves them of a pattern.
@@ -197,7 +203,8 @@ def _print_version(*, is_asked: bool) -> None:
         raise typer.Exit
 
 
-app = typer.Typer(cls=_Group, no_args_is_help=True, pretty_exceptions_enable=False, help=HELP)
+# Plain help: what draws boxes around it takes longer to load than all else.
+app = typer.Typer(cls=_Group, no_args_is_help=True, pretty_exceptions_enable=False, help=HELP, rich_markup_mode=None)
 
 
 @app.callback()
@@ -210,9 +217,9 @@ def _program(
     """Options of the program itself; each is carried out by its callback."""
 
 
-for _panel, _commands in COMMANDS.items():
+for _commands in COMMANDS.values():
     for _name, _file in _commands.items():
-        app.command(_name, help=help_of(_file, _name), rich_help_panel=_panel)(lambda: None)
+        app.command(_name, help=help_of(_file, _name))(lambda: None)
 
 
 def _warn(

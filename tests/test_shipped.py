@@ -2,12 +2,17 @@
 """The shipped region files, and finding own ones beside them."""
 
 import shutil
+import tarfile
+from pathlib import Path
 
 import pytest
 
 from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
+from sasgeo_bench.running.plan import RunRequest, plan_run
+from sasgeo_bench.running.run_manifest import RUN, RunManifest
+from sasgeo_bench.running.worker import Limits
 
 
 def test_at_least_24_real_regions_from_at_least_14_places_ship_with_the_package():
@@ -68,3 +73,15 @@ def test_a_region_file_that_is_no_text_is_told(tmp_path):
     (tmp_path / "bad.toml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ConfigError, match="cannot be read"):
         read_region_file(tmp_path / "bad.toml")
+
+
+def test_the_answers_that_come_packed_with_the_demo_are_those_of_the_code_of_today(tmp_path):
+    """Else a first `make demo` asks all again, without a word: `make head-start` packs them anew."""
+    with tarfile.open(shipped_dir("pipelines") / "demo.tar.xz") as packed:
+        names = {Path(name).parts[2]: name for name in packed.getnames() if name.endswith(RUN)}
+        texts = {found: packed.extractfile(name).read() for found, name in names.items()}
+    assert len(texts) > 5
+    for found, text in texts.items():
+        run = RunManifest.model_validate_json(text)
+        request = RunRequest(spec=run.spec, tasks=(), out=tmp_path, top_k=run.top_k, limits=Limits(**run.limits))
+        assert plan_run(request).hash == found, run.spec

@@ -4,7 +4,7 @@
 from collections.abc import Mapping
 from typing import Annotated, Final
 
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, field_validator
 
 from sasgeo_bench.config import Document, Line, Short
 from sasgeo_bench.matching.matcher import Need
@@ -13,6 +13,7 @@ from sasgeo_bench.tasks.split import HALVES, Half
 from sasgeo_bench.texts import FOLDER, NAME, VERSION
 
 SCHEMA_VERSION: Final = 1
+API: Final = 1  # version of the doors: what a plugin of it is given, and answers, stays as it is
 NONE: Final = "none"  # `trained_on` of a method that was not trained on any place of the split
 MOST_PLACES: Final = 1000
 _SHORT: Final = 60  # characters
@@ -50,10 +51,12 @@ class Card(Document):
 
     A class has the same fields as its `MatcherCard`, by `card_file.read_card`, and needs `tracks`. `trained_on` is
     "none", or places of the split; by halves, "a" lists the training places of the answers about half a.
-    `trained_elsewhere` describes other training in a line. `uses` lists inputs besides the query and the map, as in
+    `trained_elsewhere` describes other training in a line. `api` is the version of the doors that it was written for.
+    `uses` lists inputs besides the query and the map, as in
     "imagery"; `authors`, `contact` and `code` name the authors, a way to reach them, and the address of the code.
     """
 
+    api: Annotated[int, Field(exclude=True)] = API  # stands in no submission and no board: it is of the file alone
     name: Name
     version: Version
     title: Line
@@ -69,6 +72,13 @@ class Card(Document):
     authors: Annotated[list[Short], Field(max_length=100)] = []
     contact: Line | None = None
     code: Address | None = None
+
+    @field_validator("api")
+    @classmethod
+    def _known_api(cls, api: int) -> int:
+        if api != API:
+            raise ValueError(f"must be {API}, which this program knows, and not {api}: install one that knows it")
+        return api
 
     @property
     def is_by_half(self) -> bool:
@@ -129,6 +139,7 @@ def example_card(name: str = "my-matcher") -> str:
 
 EXAMPLE: Final = f"""\
 # What the board says of your method, one line each (docs/howto/matcher.md); the class and a submission read it.
+api = {API}                  # version of the doors that it is written for
 name = "{{name}}"
 version = "0.1.0"        # raise it whenever answers change
 title = "{{title}}"

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The package of the tracker kept-tracker."""

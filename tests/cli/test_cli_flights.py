@@ -68,7 +68,6 @@ def test_figures_and_a_fitted_profile_are_written_where_asked(program, pairs, tm
     [
         (("--lengths-m", "20,x"), "--lengths-m must be positive metres as in 10,50, got '20,x'"),
         (("--lengths-m", "0"), "--lengths-m must be positive metres"),
-        (("--lengths-m", ""), "--lengths-m must be positive metres"),
         (("--truth", "lonely.txt"), "give one --estimate for each --truth, got 4 truths and 3 estimates"),
         (("--truth", "no.txt", "--estimate", "no.txt"), "no.txt cannot be read as a trajectory (No such file"),
         (("--truth", "bad.txt", "--estimate", "bad.txt"), "bad.txt, line 1: 3 words: a line is 'time_s x y z"),
@@ -76,8 +75,6 @@ def test_figures_and_a_fitted_profile_are_written_where_asked(program, pairs, tm
         (("--truth", "loop", "--estimate", "truth-1.txt"), "loop cannot be read as a trajectory (Too many levels"),
         (("--results", "truth-1.txt"), "truth-1.txt is named twice, to read from and to write to: name another file"),
         (("--results", "new", "--profile", "new"), "new is named twice"),
-        (("--results", "."), ". cannot be written (Is a directory): name another place"),
-        (("--profile", ""), ". cannot be written (Is a directory): name another place"),
         (("--profile", "folder"), "folder cannot be written (Is a directory): name another place"),
         (("--lost-s", "-1"), "lost-s"),
     ],
@@ -150,10 +147,8 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
     ("words", "told"),
     [
         (("log.csv", "--height-m", "nan"), "--height-m must be a number from 5 to 10000, got nan"),
-        (("run.txt", "--height-m", "1e9"), "--height-m must be a number from 5 to 10000, got 1e+09"),
         (("log.csv", "--speed-mps", "-1"), "--speed-mps must be a number from 0.1 to 100, got -1"),
         (("log.csv", "--speed-mps", "9"), "log.csv has times: leave out --speed-mps"),
-        (("run.txt", "--speed-mps", "9"), "run.txt has times: leave out --speed-mps"),
         (("log.csv", "--axes", "camera"), "log.csv is no TUM file: leave out --axes"),
         (
             ("line.kml", "--height-unit", "none"),
@@ -164,11 +159,8 @@ def test_a_unit_that_is_not_told_is_asked_for_and_taken(program, mistake, tmp_pa
             "'lat' has decimals, and is no count of 1e-7 degrees: say --place-unit deg",
         ),
         (("log.csv", "--least-m", "5"), "--least-m needs --region"),
-        (("log.csv", "--margin-m", "nan"), "--margin-m needs --region"),
         (("log.csv", "--tum", "other.txt"), "--tum needs --region"),
         (("log.csv", "--tum", "."), ". cannot be written (Is a directory): name another place"),
-        (("log.csv", "--tum", ".."), ".. cannot be written (Is a directory)"),
-        (("log.csv", "--tum", ""), ". cannot be written (Is a directory)"),
         ((".",), "sasgeo-bench: . is no flight log"),
     ],
 )

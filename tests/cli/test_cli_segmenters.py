@@ -23,22 +23,6 @@ def test_a_new_segmenter_is_written_and_the_next_step_is_told(program, tmp_path)
     assert (tmp_path / "deep" / "er" / "src" / "my_segmenter" / "segmenter.py").is_file()
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("My Segmenter",), "a segmenter's name has lower-case letters, digits, hyphens and underscores"),
-        (("numpy",), "cannot be a package: it is taken"),
-        (("oracle_segmenter",), "is a segmenter of sasgeo-bench itself"),
-        (("mine", "--into", "full"), "full is there already and not empty"),
-    ],
-)
-def test_a_segmenter_that_cannot_be_made_gets_one_line_and_nothing_is_written(mistake, tmp_path, words, told) -> None:
-    (tmp_path / "full").mkdir()
-    (tmp_path / "full" / "file").write_text("")
-    assert told in mistake("new", "segmenter", *words)
-    assert sorted(path.name for path in tmp_path.rglob("*")) == ["file", "full"]
-
-
 @pytest.mark.usefixtures("in_threads")
 def test_a_check_prints_every_row_and_a_failed_one_is_the_users(program, tmp_path, monkeypatch) -> None:
     files = segmenter_files("my-checked")

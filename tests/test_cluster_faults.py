@@ -14,7 +14,7 @@ from functools import partial
 import pytest
 
 import sasgeo_bench as sgb
-from sasgeo_bench.errors import ConfigError, StoreError
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.progress import reporting, spread
 
 distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
@@ -179,11 +179,6 @@ def test_results_come_in_order_from_a_cluster_and_counts_are_told():
         found = list(spread(square, range(9), dask="local:2", label="squares"))
     assert found == [at * at for at in range(9)]
     assert (counts.label, counts.total, counts.done) == ("squares", 9, 9)
-
-
-def test_jobs_and_a_cluster_are_not_asked_for_together():
-    with pytest.raises(ConfigError, match="--jobs 2 and --dask local:2 both share out the work: leave one of them out"):
-        list(spread(square, range(3), jobs=2, dask="local:2"))
 
 
 def test_workers_that_die_over_and_over_end_the_work_with_one_line(monkeypatch):

@@ -106,10 +106,6 @@ def test_what_a_docstring_says_of_several_parameters_is_said_of_each():
     assert reference.meanings([Both]) == {"lo": interval, "hi": interval, "name": "What it is called."}
 
 
-def test_a_bar_or_a_break_in_a_cell_breaks_no_table():
-    assert reference.table(["a"], [["x | y\nz"]])[-2] == r"| x \| y z |"
-
-
 @pytest.mark.parametrize("path", PROSE, ids=lambda path: path.relative_to(ROOT).as_posix())
 def test_no_line_of_prose_is_too_long(path):
     prose = re.sub(r"^( *)```.*?^\1```$", "", read(path), flags=re.MULTILINE | re.DOTALL)

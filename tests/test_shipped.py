@@ -69,12 +69,6 @@ def test_a_mark_of_the_byte_order_and_other_line_ends_do_no_harm(tmp_path, chang
     assert read_region_file(tmp_path / "mine.toml") == read_region_file(shipped)
 
 
-def test_a_region_file_that_is_no_text_is_told(tmp_path):
-    (tmp_path / "bad.toml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        read_region_file(tmp_path / "bad.toml")
-
-
 def test_the_answers_that_come_packed_with_the_demo_are_those_of_the_code_of_today(tmp_path):
     """Else a first `make demo` asks all again, without a word: `make head-start` packs them anew."""
     with tarfile.open(shipped_dir("pipelines") / "demo.tar.xz") as packed:

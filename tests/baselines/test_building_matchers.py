@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sasgeo_baselines.building_votes import Mixture, Seen, Town, headings, mixture_of
+from sasgeo_baselines.building_votes import Mixture
 from sasgeo_baselines.instance_rays import REACH_M, STEP_M, BuildingMap, cast
-from sasgeo_baselines.ouyang_shape_votes import OuyangShapeVotes, credibility
+from sasgeo_baselines.ouyang_shape_votes import credibility
 from sasgeo_baselines.vojir_instance_rays import (
     LEAST_SPREAD,
     RAYS,
@@ -22,10 +22,8 @@ from sasgeo_baselines.vojir_instance_rays import (
     open_ground,
 )
 
-from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
-from sasgeo_bench.search.plan import Disc
 from tests.baselines.worlds import suburb
 from tests.made_up import error_m
 
@@ -76,24 +74,6 @@ def test_rays_of_a_lattice_are_those_of_its_places(region):
     assert again.is_censored.any()  # beyond the map nothing is known
 
 
-def test_the_waves_of_a_view_are_those_of_the_map_at_its_place(made, region):
-    """Boundaries between rays depend on how many there are: both sides count them between as many."""
-    matcher = VojirInstanceRays(start_m=0.0)
-    matcher.prepare(region, None)
-    places_m, mapped = next(matcher._described(BuildingMap.of(region), 40.0))
-    rows = np.flatnonzero(mapped.any(axis=1))[:30]
-    off = []
-    for at in rows:
-        pose = Pose(easting_m=float(places_m[at, 0]), northing_m=float(places_m[at, 1]), yaw_deg=0.0)
-        sight = matcher.look(made.query_of(made.view_of(region, pose, size_cells=192), PRIOR))
-        if sight is not None:
-            off.append(
-                np.abs(sight.waves - mapped[at])[WAVES : 2 * WAVES].mean() / mapped[rows, WAVES : 2 * WAVES].mean()
-            )
-    assert len(off) > 10
-    assert np.median(off) < 0.35
-
-
 @given(quarter=st.integers(0, 3), censors=st.booleans())
 def test_waves_do_not_turn_with_a_view_and_differences_say_by_how_much(quarter, censors):
     states = yard()
@@ -135,14 +115,6 @@ def test_rays_begin_in_the_open():
     assert np.hypot(*(open_ground(states, cell_m=1.0, within_m=16.0) - 32.0)) <= 16.0
 
 
-def test_a_hidden_half_is_survived_if_its_rays_are_left_out(made, region, seen):
-    cells = seen.cells.copy()
-    cells[:, :, :70] = UNKNOWN
-    found = VojirInstanceRays(censors=True)
-    found.prepare(region, None)
-    assert error_m(found.match(made.query_of(seen.replace(cells), PRIOR), top_k=1), HERE) < 6
-
-
 def test_whitening_is_learned_from_other_maps(made, region, seen):
     query = replace(made.query_of(seen, PRIOR), region="made-up")
     training = Training(regions={"made-up": region}, pairs=((query, SimpleNamespace(pose=HERE)),))
@@ -157,30 +129,6 @@ def test_whitening_is_learned_from_other_maps(made, region, seen):
 
 
 # Votes of shapes
-
-
-def test_components_are_the_answer_and_their_heights_the_scores(made, region, seen):
-    matcher = OuyangShapeVotes()
-    matcher.prepare(region, None)
-    known = replace(PRIOR, yaw_deg=HERE.yaw_deg, yaw_sigma_deg=1.0)
-    answer = matcher.match(made.query_of(seen, known), top_k=5)
-    disc = Disc(center_m=PRIOR.center_m, radius_m=PRIOR.radius_m)
-    votes = Town.of(region).votes(Seen.of(seen), disc, yaws_deg=headings(HERE.yaw_deg, 1.0))
-    bandwidth_m = matcher.numbers["bandwidth_m"]
-    inside = votes[np.hypot(*(votes[:, :2] - PRIOR.center_m).T) <= PRIOR.radius_m + bandwidth_m]
-    mixture = mixture_of(inside, bandwidth_m=bandwidth_m)
-    assert answer.scores[0] == mixture.height[0]
-    assert [answer.poses[0].easting_m, answer.poses[0].northing_m] == mixture.place_m[0].tolist()
-    assert answer.diagnostics["credibility"] == credibility(mixture, PRIOR.radius_m)
-    assert 0 < answer.diagnostics["credibility"] < 1
-
-
-def test_credibility_does_not_depend_on_how_many_poses_are_asked_for(region):
-    matcher, query = OuyangShapeVotes(), suburb().query(192)
-    matcher.prepare(region, None)
-    one, many = (matcher.match(query, top_k=count).diagnostics for count in (1, 8))
-    assert one == many
-    assert "credibility" in one
 
 
 @given(

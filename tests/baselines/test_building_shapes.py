@@ -23,7 +23,6 @@ def houses(made):
 
 def test_a_rectangle_is_measured_as_by_hand(houses):
     found = Buildings.of_map(houses)
-    long = np.argmin(found.middle_m[:, 0] - found.middle_m[:, 1])
     assert len(found) == 3
     by_area = found.shape[np.argsort(found.shape[:, 0])]
     assert np.exp(by_area[:, 0]) == pytest.approx([400.0, 600.0, 1200.0])

@@ -12,7 +12,6 @@ from sasgeo_baselines.image.deep_retrieval import DeepRetrieval
 from sasgeo_baselines.image.sight import Ortho
 from sasgeo_baselines.segmenters.features import ColourBalance, lab_planes
 
-import sasgeo_bench as sgb
 from sasgeo_bench.geometry.grid import Grid
 
 RNG = np.random.default_rng
@@ -27,15 +26,6 @@ def with_weights(path, name="mine") -> DeepRetrieval:
 def test_the_matcher_says_in_one_line_that_torch_is_missing(drawn_file):
     with pytest.raises(RuntimeError, match=r"^mine needs PyTorch.*sasgeo-baselines\[torch\]'$"):
         with_weights(drawn_file).prepare(SimpleNamespace(imagery=None), None)
-
-
-@pytest.mark.usefixtures("without_torch")
-def test_the_matcher_is_listed_and_loaded_without_torch():
-    assert sgb.load_matcher("deep_retrieval").card.needs == ("image", "imagery")
-
-
-def test_the_version_of_its_card_names_the_file_of_weights(drawn_file):
-    assert with_weights(drawn_file).card.version.startswith(f"{DeepRetrieval.card.version}+")
 
 
 def test_the_matcher_says_in_one_line_that_it_has_no_weights():

@@ -50,13 +50,6 @@ def test_a_row_of_houses_is_told_from_a_ring_of_as_many() -> None:
     assert one.distance(other) > 0.1
 
 
-@pytest.mark.parametrize("turns", [1, 2, 3])
-def test_a_quarter_turn_changes_nothing(turns) -> None:
-    found, turned = described(four_houses()), described(np.rot90(four_houses(), turns).copy())
-    np.testing.assert_allclose(turned.spread, found.spread, atol=1e-12)
-    assert turned.counts.tolist() == found.counts.tolist()
-
-
 @given(places=PLACES, yaw_deg=st.floats(0, 360), east_m=st.floats(-500, 500))
 def test_the_histogram_is_that_of_things_turned_and_moved(places, yaw_deg, east_m) -> None:
     moved = Pose(easting_m=east_m, northing_m=7.0, yaw_deg=yaw_deg).to_map(places)

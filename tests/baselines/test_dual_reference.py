@@ -52,14 +52,6 @@ def test_the_sum_finds_what_either_reference_shows(region, window, seen):
         assert off_m(matcher.match(query, top_k=1).poses[0]) < 5.0
 
 
-def test_an_answer_tells_how_many_references_counted(region, window, seen):
-    matcher = prepared(HuDualReference, region)
-    both = query_of(picture(window, TRUTH), evidence=seen(TRUTH))
-    on_map, on_imagery = replace(both, frames=()), query_of(picture(window, TRUTH))
-    told = [matcher.match(query, top_k=1).diagnostics["parts"] for query in (both, on_map, on_imagery)]
-    assert told == [2.0, 1.0, 1.0]
-
-
 def test_a_half_looks_at_its_own_reference_alone(region, window, seen):
     query = query_of(picture(window, TRUTH), evidence=seen(ELSEWHERE))
     on_map, on_imagery = (prepared(kind, region).match(query, top_k=1).poses[0] for kind in (HuMapOnly, HuImageryOnly))
@@ -138,8 +130,3 @@ def test_lessons_are_pairs_with_pictures_taken_evenly():
 def test_a_damaged_share_is_refused_in_one_line(region, text):
     with pytest.raises(ValueError, match="hu_dual_reference: the learned text"):
         prepared(HuDualReference, region, text)
-
-
-def test_no_candidates_have_no_answer(region, seen):
-    query = replace(query_of(NOISE, evidence=seen(TRUTH)), frames=(), track="retrieval", candidates=())
-    assert prepared(HuMapOnly, region).match(query, top_k=1) == sgb.WITHHELD

@@ -172,8 +172,3 @@ def test_each_needs_a_picture_and_imagery_and_withholds_on_a_map_without(name, w
     made = made_of(name, drawn_file)
     made.prepare(SimpleNamespace(imagery=None), None)
     assert made.match(query, top_k=5) == sgb.WITHHELD
-
-
-def test_a_made_up_place_without_imagery_leaves_no_query(tiny: sgb.TinyPlace):
-    checks = sgb.check_matcher("ncc_gradient", place=tiny, is_shut_in=False)
-    assert not [check for check in checks if check.outcome == "fail"]

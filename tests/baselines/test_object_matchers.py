@@ -21,15 +21,6 @@ def scattered(count, *, half_m=90.0, seed=1):
     return np.random.default_rng(seed).uniform(-half_m, half_m, (count, 2))
 
 
-def test_votes_peak_at_the_true_pose():
-    seen = nodes(scattered(12))
-    town = nodes(np.concatenate([HERE.to_map(seen.places_m), np.array(PRIOR.center_m) + scattered(40, half_m=200.0)]))
-    pairs = Pairs.of_kind(Sight(nodes=seen, prior=PRIOR), town, np.arange(len(town)))
-    best = pairs.peaks(DISC, [67.0, 77.0, 87.0], count=1)[0].pose
-    assert best.yaw_deg == 77.0
-    assert np.hypot(best.easting_m - HERE.easting_m, best.northing_m - HERE.northing_m) < 12
-
-
 def test_peaks_lie_apart_so_that_no_place_takes_the_turn_of_another():
     seen = nodes(scattered(12))
     town = nodes(np.concatenate([HERE.to_map(seen.places_m), np.array(PRIOR.center_m) + scattered(40, half_m=200.0)]))

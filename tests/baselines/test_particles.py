@@ -11,7 +11,6 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Prior
 
 GRID = Grid(epsg=32632, west_m=1000.0, north_m=9000.0, cell_size_m=2.0, rows=300, cols=200)
-STILL = (0.0,) * 9
 
 
 def particles_at(places_m, *, yaw_deg=0.0, weight=None):

@@ -6,7 +6,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
-from sasgeo_baselines.raster import RasterUniform
 from sasgeo_baselines.raster_soft import RasterSoft, probabilities, soft_template
 
 from sasgeo_bench.geometry.pose import Pose, Prior
@@ -50,13 +49,6 @@ def test_the_place_is_found_at_any_level_of_the_probabilities(made, region, view
     pose = best(made, RasterSoft(), region, squeezed(view, low, high))
     assert off_m(pose) < 3
     assert abs(pose.yaw_deg - HERE.yaw_deg) < 3
-
-
-def test_a_threshold_loses_what_probabilities_still_tell(made, region, view) -> None:
-    faint = squeezed(view, 0.05, 0.25)
-    assert (faint.cells == ABSENT).all()
-    pose = best(made, RasterUniform(), region, faint)
-    assert pose is None or off_m(pose) > 3
 
 
 def test_the_score_of_a_place_is_the_covariance() -> None:

@@ -7,13 +7,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sasgeo_baselines.raster import FullUnknown, RasterGraph, RasterUniform
 
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.matching.controls.fft_vote import FftVote
 from sasgeo_bench.matching.matcher import check_match
-from sasgeo_bench.search.plan import Disc
-from sasgeo_bench.search.view import Patch, View
 from sasgeo_bench.search.vote_search import VotePlan, VoteSearch, turns
 
 CELL_M, YAW_STEP_DEG = 1.0, 3.0
@@ -63,51 +60,6 @@ def test_a_perfect_view_is_found_within_half_a_cell_and_half_a_yaw_step(made, po
     assert is_found(errors(made, FftVote(), pose))
 
 
-@pytest.mark.parametrize("pose", SOME)
-def test_lines_that_fade_find_it_too(made, pose) -> None:
-    cells, degrees = errors(made, RasterUniform(), pose)
-    assert cells <= 1.0
-    assert degrees <= YAW_STEP_DEG / 2
-
-
-def _yaw_turned_round(monkeypatch) -> None:
-    score, turned = Patch.score, View.turned
-
-    def mirrored(pose: Pose) -> Pose:
-        return replace(pose, yaw_deg=-pose.yaw_deg)
-
-    monkeypatch.setattr(
-        Patch, "score", lambda self, samples, pose, **more: score(self, samples, mirrored(pose), **more)
-    )
-    monkeypatch.setattr(View, "turned", lambda self, blur, pose, **more: turned(self, blur, mirrored(pose), **more))
-
-
-def _half_a_cell_off(monkeypatch) -> None:
-    score = Patch.score
-
-    def moved(pose: Pose) -> Pose:
-        return replace(pose, easting_m=pose.easting_m + CELL_M / 2, northing_m=pose.northing_m - CELL_M / 2)
-
-    monkeypatch.setattr(Patch, "score", lambda self, samples, pose, **more: score(self, samples, moved(pose), **more))
-
-
-def _axes_swapped(monkeypatch) -> None:
-    of = View.of
-    monkeypatch.setattr(View, "of", lambda seen, template, bands: of(seen, template.transpose(0, 2, 1), bands))
-
-
-def _up_is_down(monkeypatch) -> None:
-    of = View.of
-    monkeypatch.setattr(View, "of", lambda seen, template, bands: of(seen, template[:, ::-1], bands))
-
-
-@pytest.mark.parametrize("mutate", [_yaw_turned_round, _half_a_cell_off, _axes_swapped, _up_is_down])
-def test_a_wrong_sign_half_a_cell_or_swapped_axes_are_noticed(made, monkeypatch, mutate) -> None:
-    assert all(is_found(errors(made, FftVote(), pose)) for pose in SOME)
-    mutate(monkeypatch)
-    assert not all(is_found(errors(made, FftVote(), pose)) for pose in SOME)
-
-
 def test_a_view_is_found_without_any_prior_and_on_cells_of_another_size(made) -> None:
     region = made.region_of(made.textured(2, side=240), cell_size_m=2.0)
     pose = Pose(easting_m=1251.0, northing_m=8733.0, yaw_deg=200.0)
@@ -135,34 +87,6 @@ def test_headings_at_right_angles_may_share_a_template(made, monkeypatch, candid
     assert shared.diagnostics == pytest.approx(alone.diagnostics, rel=2e-3)
 
 
-def test_a_view_that_reaches_beyond_the_map_is_found(made) -> None:
-    region = made.region_of(made.textured(1))
-    pose = Pose(easting_m=1030.0, northing_m=8800.0, yaw_deg=15.0)
-    matcher = FftVote()
-    matcher.prepare(region, None)
-    query = made.query_of(made.view_of(region, pose, size_cells=96), prior_near(pose))
-    best = matcher.match(query, top_k=1).poses[0]
-    assert np.hypot(best.easting_m - pose.easting_m, best.northing_m - pose.northing_m) <= 0.5
-
-
-@pytest.mark.parametrize("matcher", [FftVote(), RasterUniform(), RasterGraph(), FullUnknown()])
-def test_the_same_place_twice_scores_the_same_and_keeps_its_order(made, matcher) -> None:
-    one = made.textured(4, side=200)
-    region = made.region_of(np.concatenate((one, one, one), axis=2))  # three copies, 200 m apart
-    matcher.prepare(region, None)
-    pose = Pose(easting_m=1300.25, northing_m=8900.0, yaw_deg=30.0)
-    places = [replace(pose, easting_m=1309.5 + 200 * step, northing_m=8895.5, yaw_deg=33.0) for step in (0, 1, -1)]
-    other = replace(pose, easting_m=1380.0, northing_m=8890.0, yaw_deg=33.0)
-    candidates = (other, *places)
-    prior = Prior(center_m=None, radius_m=None, yaw_deg=33.0, yaw_sigma_deg=5.0, scale_sigma=0.03)
-    query = made.query_of(made.view_of(region, pose, size_cells=64), prior, candidates=candidates)
-    match = check_match(matcher.match(query, top_k=4), query, top_k=4)
-    shown = [round(found.easting_m, 1) for found in match.poses[:3]]
-    assert shown == [1309.5, 1509.5, 1109.5]
-    assert len(set(match.scores[:3])) == 1
-    assert match.scores[3] < match.scores[0]
-
-
 def test_headings_reach_as_far_as_in_all_searches_and_scales_two_standard_deviations() -> None:
     prior = Prior(center_m=None, radius_m=None, yaw_deg=350.0, yaw_sigma_deg=20.0, scale_sigma=0.03)
     tried = turns(prior, VotePlan())
@@ -170,7 +94,3 @@ def test_headings_reach_as_far_as_in_all_searches_and_scales_two_standard_deviat
     assert (min(yaws), max(yaws)) == pytest.approx((-50.0, 50.0))
     assert {round(pose.scale, 2) for pose in tried} == {0.94, 1.0, 1.06}
     assert len(turns(replace(prior, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0), VotePlan())) == 120
-
-
-def test_a_disc_without_a_middle_holds_everything() -> None:
-    assert Disc(center_m=None, radius_m=0.0).holds(np.array([(1e9, -1e9)])).all()

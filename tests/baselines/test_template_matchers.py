@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Templates of height layers, a regressed pose, and local features: worked by hand, properties, what is found."""
 
-import json
 from dataclasses import replace
 from functools import cache
 from types import SimpleNamespace
@@ -17,8 +16,6 @@ from sasgeo_baselines.anyvisloc_pipeline import (
     AnyvislocPipeline,
     Drawing,
     drawn,
-    map_features,
-    view_features,
 )
 from sasgeo_baselines.maplocnet_regress import COARSE_M, MaplocnetRegress, Peak, field_of, lessons, templates_of
 from sasgeo_baselines.ubev_template import HEIGHTS, UbevTemplate, drawn_in, layers_of
@@ -111,11 +108,6 @@ def over_of(present, known, mapped):
     return both / (float(present.sum()) + float((known * mapped).sum()) - both)
 
 
-def test_a_view_of_high_roofs_is_found(made, region, prepared):
-    query = made.query_of(leaning(seen_from(made, region, HERE), HEIGHTS[-1]), PRIOR)
-    assert error_m(prepared(UbevTemplate).match(query, top_k=1)) < 5
-
-
 # Regression
 
 
@@ -176,19 +168,6 @@ def test_a_taught_pose_is_nearer_than_the_highest_cell(made, region, prepared, t
     assert np.median(errors["taught"]) < 0.9 * np.median(errors["coarse"])
 
 
-def test_a_regressed_pose_has_no_rivals_and_no_confidence(made, region, prepared):
-    answer = prepared(MaplocnetRegress).match(made.query_of(seen_from(made, region, HERE), PRIOR), top_k=5)
-    assert len(answer.poses) == 1
-    assert answer.confidence is None
-    assert not answer.diagnostics
-
-
-@pytest.mark.parametrize("text", ["", "{}", "[]", json.dumps({"format": "maplocnet_regress 1", "weights": [[0.0]]})])
-def test_damaged_coefficients_are_refused_in_one_line(region, text):
-    with pytest.raises(ValueError, match=r"^maplocnet_regress: the learned text is damaged, .*: learn again$"):
-        MaplocnetRegress().prepare(region, text)
-
-
 # Local features
 
 
@@ -206,15 +185,6 @@ def test_view_and_map_are_drawn_alike(made, region):
     drawing = Drawing.of_view(view, 1.0)
     np.testing.assert_array_equal(drawing.grey, Drawing.of_map(region).grey[160:240, 160:240])
     assert drawing.is_known.all()
-
-
-def test_features_of_view_and_map_lie_where_the_pose_puts_them(made, region):
-    pose = Pose(easting_m=1200.0, northing_m=8800.0, yaw_deg=0.0)
-    seen = view_features(Drawing.of_view(made.view_of(region, pose, size_cells=200), 1.0), region.grid, per_m2=0.02)
-    mapped = map_features(Drawing.of_map(region), region.grid, per_m2=0.02)
-    away_m = np.linalg.norm(pose.to_map(seen.points)[:, None] - mapped.points[None], axis=2).min(axis=1)
-    assert len(seen) > 100
-    assert (away_m < 1.5).mean() > 0.7
 
 
 def test_inliers_are_told_and_a_heading_that_is_unlikely_is_dropped(made, region, prepared):

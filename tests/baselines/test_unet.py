@@ -53,11 +53,6 @@ def test_the_unet_says_in_one_line_that_torch_is_missing():
             ask()
 
 
-@pytest.mark.usefixtures("without_torch")
-def test_the_unet_is_listed_and_loaded_without_torch():
-    assert sgb.load_segmenter("unet").card.needs == ("training",)
-
-
 # Texts and files of weights, which need no torch
 
 
@@ -70,11 +65,6 @@ def test_a_text_of_weights_is_read_back_as_half_precision():
         np.testing.assert_array_equal(again[name], values.astype(np.float16).astype(np.float32))
 
 
-def test_a_text_of_all_classes_has_less_than_five_megabytes():
-    names = tuple(f"class_{number}" for number in range(16))
-    assert len(network.weights_text(names, network.drawn_weights(16, RNG(0)))) < 5e6
-
-
 def damaged() -> dict[str, str]:
     whole = json.loads(network.weights_text(("water",), network.drawn_weights(1, RNG(0))))
     arrays = whole["arrays"]
@@ -82,14 +72,9 @@ def damaged() -> dict[str, str]:
     return {
         "cut off": json.dumps(whole)[:1000],
         "a list": "[]",
-        "a number": "3",
         "nested": "[" * 100_000,
         "another format": json.dumps(whole | {"format": "unet 0"}),
-        "no arrays": json.dumps({"format": network.FORMAT, "classes": ["water"]}),
-        "arrays as a list": json.dumps(whole | {"arrays": []}),
-        "one array missing": json.dumps(whole | {"arrays": {**arrays, "head.shift": None}}),
         "an array too short": json.dumps(whole | {"arrays": {**arrays, "head.shift": "AAAA"}}),
-        "odd bytes": json.dumps(whole | {"arrays": {**arrays, "head.shift": "AA=="}}),
         "no base64": json.dumps(whole | {"arrays": {**arrays, "head.shift": "!!"}}),
         "infinite": json.dumps(whole | {"arrays": {**arrays, "head.shift": base64.b64encode(wild).decode()}}),
         "more classes": json.dumps(whole | {"classes": ["water", "green"]}),
@@ -111,16 +96,6 @@ def test_an_encoder_is_read_out_of_an_archive_and_out_of_a_learned_text(drawn_fi
     assert exact.keys() == rounded.keys() == network.encoder_shapes().keys()
     for name, values in exact.items():
         np.testing.assert_allclose(rounded[name], values, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no archive", b"\x80\x04K\x01."])
-@pytest.mark.parametrize("suffix", [".npz", ".json"])
-def test_a_file_that_holds_no_weights_is_refused_in_one_line(tmp_path, content, suffix):
-    path = tmp_path / f"encoder{suffix}"
-    path.write_bytes(content)
-    with pytest.raises(ValueError, match="holds no weights") as caught:
-        network.read_encoder(path)
-    assert "\n" not in str(caught.value)
 
 
 def test_pickled_objects_in_an_archive_are_never_loaded(tmp_path):

@@ -54,14 +54,6 @@ def test_a_view_of_two_cells_scores_as_worked_by_hand() -> None:
     assert found == [(-2 - 1) / 2, (4 - 1) / 2, 4.0]
 
 
-@given(seen=arrays(np.uint8, (3, 4, 5), elements=st.integers(0, 2)), gains=GAINS)
-def test_what_is_unknown_is_silent(seen, gains) -> None:
-    mapped = np.random.default_rng(3).integers(0, 2, seen.shape, dtype=np.uint8)
-    hidden = np.where(seen == UNKNOWN, UNKNOWN, mapped).astype(np.uint8)
-    assert score_cells(seen, mapped, gains) == score_cells(seen, hidden, gains)
-    assert score_cells(np.full_like(seen, UNKNOWN), mapped, gains) == 0.0
-
-
 @given(
     east_m=st.floats(-220, 220),
     north_m=st.floats(-220, 220),

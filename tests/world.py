@@ -16,11 +16,6 @@ from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.threaded import threaded
 
 
-def quiet(line: str) -> None:
-    """Take a line that a step says, and leave it."""
-    del line
-
-
 def built(spec: RegionFile | str, out: Path, **options: Any) -> Path:
     """Build a region from its file, or from the shipped one of that name; return its folder."""
     read = read_region_file(find_region_file(spec)) if isinstance(spec, str) else spec
@@ -29,9 +24,10 @@ def built(spec: RegionFile | str, out: Path, **options: Any) -> Path:
     return plan.folder
 
 
-def drawn(out: Path, suite: str, *regions: str, count: int = 1) -> list[Path]:
+def drawn(out: Path, suite: str, *regions: str, **changes: Any) -> list[Path]:
     """Draw a suite in regions, which are built where they are missing; return the folders of the tasks."""
-    wanted = Wanted(suites=(suite,), regions=regions, split="crossfit", count=count, seed=0, out=out)
+    said = {"split": "crossfit", "count": 1, "seed": 0} | changes
+    wanted = Wanted(suites=(suite,), regions=regions, out=out, **said)
     for request in plan_requests(wanted):
         make_tasks(request)
     return [out / "tasks" / suite / region for region in regions]

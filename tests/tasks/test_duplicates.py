@@ -14,7 +14,6 @@ from sasgeo_bench.tasks.duplicates import (
     LEAST_ALIKE,
     LEAST_AREA_M2,
     NEIGHBOURS,
-    Constellations,
     constellations,
     find_duplicate,
     search_split,
@@ -119,12 +118,6 @@ def test_a_house_that_stands_alone_is_no_constellation():
     found = constellations(table(lonely))
     assert len(found.keys) == 20
     assert found.en_m.max() < 1000
-
-
-def test_nothing_shares_nothing():
-    none = Constellations(en_m=np.zeros((0, 2)), keys=np.zeros(0, dtype=np.uint64))
-    assert find_duplicate(none, none) is None
-    assert find_duplicate(none, constellations(table(houses()))) is None
 
 
 def test_a_town_is_found_again_turned_and_shifted_and_two_towns_are_not_taken_for_one(towns):

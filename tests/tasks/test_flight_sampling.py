@@ -72,10 +72,6 @@ def short(monkeypatch) -> None:
     monkeypatch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
 
 
-def quiet(_: str) -> None:
-    """Say nothing."""
-
-
 def make(out: Path, suite: str = "flight-overconfident", **changes):
     base = {"suites": (suite,), "regions": (TOWN,), "split": "crossfit", "count": 1, "seed": 0, "out": out}
     return [made for request in plan_requests(Wanted(**base | changes)) for made in build.make_tasks(request)]
@@ -95,12 +91,6 @@ def test_a_step_comes_back_from_its_row_and_from_the_wire_as_it_was(step):
     assert set(row) <= set(QUERY_SCHEMA.names)
     assert query_of(row).step == step
     assert query_from(query_bytes(query)).step == step
-
-
-def test_a_view_alone_has_no_step_on_disk_nor_on_the_wire():
-    query = one_query()
-    assert query_of(query_row(query)).step is None
-    assert query_from(query_bytes(query)).step is None
 
 
 def test_tables_of_before_there_were_flights_are_read_and_ask_what_they_asked(tmp_path):

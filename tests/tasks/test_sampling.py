@@ -25,7 +25,7 @@ from sasgeo_bench.tasks.split import SplitFile, make_split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites import alias, clean
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Variant
-from sasgeo_bench.tasks.suites.mining import STRIDE_M, candidates, min_distance_m
+from sasgeo_bench.tasks.suites.mining import STRIDE_M, min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
 from sasgeo_bench.tasks.twin import Paste, paste
 
@@ -196,18 +196,6 @@ def test_how_much_of_a_disc_is_on_the_map_does_not_tell_whether_the_truth_is_in_
 
 
 # --- candidates -----------------------------------------------------------------------------------------------------
-
-
-@given(st.integers(1, 60), seeds)
-def test_the_index_of_the_true_candidate_is_that_of_the_truth(count, seed):
-    rng = np.random.default_rng(seed)
-    decoys_m = rng.uniform(10_000, 20_000, (count, 2))
-    places, right = candidates((0.0, 0.0), decoys_m, yaw_deg=12.0, jitter_m=16.0, rng=rng)
-    assert len(places) == count + 1
-    assert max(abs(places[right].easting_m), abs(places[right].northing_m)) <= 16.0
-    assert {pose.yaw_deg for pose in places} == {12.0}
-    gone, none = candidates(None, decoys_m, yaw_deg=12.0, jitter_m=16.0, rng=rng)
-    assert (len(gone), none) == (count, -1)
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.regions.evidence import Evidence, pack
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
@@ -32,13 +32,9 @@ from sasgeo_bench.tasks.task_files import (
     TaskOrigin,
     TruthManifest,
     asked_sha256,
-    query_of,
-    query_row,
     read_queries,
     read_task,
     read_truths,
-    truth_of,
-    truth_row,
     truth_sha256,
     write_task,
 )
@@ -227,18 +223,6 @@ def opened(folders):
     return replace(Task.open(folders[0]), truth=folders[1])
 
 
-@given(queries)
-def test_a_query_comes_back_from_its_row_as_it_was(query):
-    row = query_row(query)
-    assert set(row) <= set(QUERY_SCHEMA.names)
-    check_same(query_of(row), query)
-
-
-@given(truths)
-def test_a_truth_comes_back_from_its_row_as_it_was(truth):
-    assert truth_of(truth_row(truth)) == truth
-
-
 def test_truths_of_before_there_were_detectors_are_of_the_published_one(written):
     path = written[1] / TRUTH
     pq.write_table(pq.read_table(path).drop_columns(["detector"]), path)
@@ -258,6 +242,7 @@ def test_a_task_comes_back_from_disk_as_it_was(tmp_path_factory, pairs):
     assert write_task(task_folder, truth_folder, pairs, ABOUT).queries == len(pairs)
     for back, (query, _) in zip(read_queries(task_folder), pairs, strict=True):
         check_same(back, query)
+    assert pq.read_schema(task_folder / QUERIES).names == [*QUERY_SCHEMA.names, ASKED]
     assert list(read_truths(truth_folder)) == [truth for _, truth in pairs]
     assert sum(read_task(task_folder)["counts"].values()) == len(pairs)
     assert Task.open(task_folder).view_bytes() == {query.query_id: observation_bytes(query) for query, _ in pairs}
@@ -288,16 +273,6 @@ def test_what_is_asked_has_one_hash_for_good_and_another_for_whatever_decides_an
     others += [row | {"observed_on": dt.date(2026, 1, 3)}, row | {"season": "snow"}]
     found = {asked_sha256(row, said), asked_sha256(row, {"map_fingerprint": "ee"}), asked_sha256(row, {})}
     assert len(found | {asked_sha256(other, said) for other in others}) == len(others) + 3
-
-
-def test_the_tables_have_room_for_flights_and_pictures(written):
-    types = {name: str(kind) for name, kind in zip(QUERY_SCHEMA.names, QUERY_SCHEMA.types, strict=True)}
-    assert types["sequence_id"] == "string"
-    assert types["frame"] == "int32"
-    assert types["increment"].startswith("list<")
-    assert types["increment_covariance"].startswith("list<")
-    assert types["frames"].startswith("list<")
-    assert pq.read_schema(written[0] / QUERIES).names == [*QUERY_SCHEMA.names, ASKED]
 
 
 def test_every_file_says_whose_data_it_holds_and_under_which_licence(written):
@@ -334,19 +309,6 @@ def test_any_flipped_byte_is_a_fault_and_nothing_else_goes_wrong(written):
         (fault,) = opened(written).faults()
         assert fault.startswith(f"{path}: ")
         assert "SHA-256" in fault
-
-
-def test_a_table_with_a_flipped_byte_is_read_or_refused_and_nothing_else_goes_wrong(written):
-    path = written[0] / QUERIES
-    content = path.read_bytes()
-    refused = 0
-    for at in range(0, len(content), 29):
-        path.write_bytes(content[:at] + bytes([content[at] ^ 0x80]) + content[at + 1 :])
-        try:
-            list(read_queries(written[0]))
-        except SasgeoError:
-            refused += 1
-    assert refused > 0
 
 
 def test_a_missing_truth_a_foreign_file_and_a_wrong_count_are_faults(written):
@@ -409,8 +371,6 @@ def test_a_task_without_its_queries_has_that_one_fault(written):
     [
         ("{", "is damaged"),
         ("[]", "is damaged"),
-        ("3", "is damaged"),
-        ("{}", "is damaged"),
         ('{"schema_version": 0}', "has schema version 0, this version reads 1"),
         ('{"schema_version": 1}', "is damaged (task.json: 'suite' is missing; "),
         (json.dumps(SAID | {"files": {}}), "'files.queries.parquet' is missing"),
@@ -439,12 +399,6 @@ def test_tasks_and_stored_boards_of_earlier_versions_stay_what_they_were(written
     boards = [json.loads(path.read_text()) for path in (ROOT / "docs" / "results").glob("*/board.json")]
     assert boards
     assert {board["task_version"] for board in boards} <= set(TASK_VERSIONS)
-
-
-def test_bytes_that_are_no_text_are_a_damaged_task_json(written):
-    (written[0] / TASK).write_bytes(b"\xff\xfe{")
-    with pytest.raises(StoreError, match="is damaged"):
-        read_task(written[0])
 
 
 def test_a_cut_off_table_is_named_with_its_mend(written):

@@ -12,7 +12,6 @@ from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
-from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
 from sasgeo_bench.tasks.task_plan import Wanted, aged_dates, check_count, check_roots, plan_requests, wrong_place
@@ -66,19 +65,6 @@ def test_there_is_one_request_for_each_region_and_suite_whatever_is_named_twice(
         ("town-grid", "clean"),
         ("town-grid", "alias"),
     ]
-
-
-def test_what_is_asked_for_stands_in_every_request(tmp_path):
-    group = PriorGroup(radius_m=250.0, yaw="known", scale_sigma=0.1)
-    (item,) = plan(tmp_path, group=group, seed=7, count=3, may_be_fewer=True, extract_folders=(tmp_path,))
-    assert (item.group, item.seed, item.count, item.may_be_fewer) == (group, 7, 3, True)
-    assert item.extract_folders == (tmp_path,)
-    assert item.split.spec.id == "crossfit"
-
-
-def test_planning_writes_nothing(tmp_path):
-    plan(tmp_path)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_regions_all_that_can_be_built_are_taken_and_the_others_told(tmp_path):

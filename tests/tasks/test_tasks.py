@@ -11,7 +11,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -52,10 +51,6 @@ def write_and_die(*words):
 write, task_files.write_task = task_files.write_task, write_and_die
 main()
 """
-
-
-def quiet(_: str) -> None:
-    """Say nothing."""
 
 
 def make(out: Path, suite: str = "absent", **changes):
@@ -147,14 +142,8 @@ def test_ids_are_unique_and_sorted_and_say_nothing(tasks):
 
 def test_task_json_says_where_a_task_comes_from(tasks):
     about = read_task(tasks / "tasks/clean" / RIVERSIDE)
-    said = {name: about[name] for name in ("suite", "region", "split", "sites", "map_date")}
-    assert said == {
-        "suite": "clean",
-        "region": RIVERSIDE,
-        "split": "crossfit",
-        "sites": 2,
-        "map_date": "2025-01-01",
-    }
+    said = [about[name] for name in ("suite", "region", "split", "sites", "map_date")]
+    assert said == ["clean", RIVERSIDE, "crossfit", 2, "2025-01-01"]
     queries = list(read_queries(tasks / "tasks/clean" / RIVERSIDE))
     assert about["prior_groups"] == sorted({query.prior_group for query in queries})
     assert sum(about["counts"].values()) == len(queries)
@@ -166,17 +155,8 @@ def test_no_truth_lies_among_the_tasks(tasks):
         assert sorted(path.name for path in folder.iterdir()) == [QUERIES, TASK]
         assert "truth" not in {part for path in folder.rglob("*") for part in path.relative_to(tasks / "tasks").parts}
         named = set(pq.read_schema(folder / QUERIES).names)
-        assert not named & {
-            "pose",
-            "easting_m",
-            "candidate",
-            "pair_id",
-            "role",
-            "kind",
-            "strength",
-            "block",
-            "measured",
-        }
+        hidden = "pose easting_m candidate pair_id role kind strength block measured"
+        assert not named & set(hidden.split())
 
 
 def leaves(column: pa.ChunkedArray) -> Iterator[pa.Array]:
@@ -264,21 +244,6 @@ def test_the_seed_lies_with_the_truths_and_nowhere_that_a_matcher_sees(own_out):
         flat = [value for name in table.column_names for array in leaves(table[name]) for value in array.to_pylist()]
         assert SEED not in {value for value in flat if isinstance(value, (int, float))}
         assert not [value for value in flat if isinstance(value, str) and str(SEED) in value]
-
-
-def test_candidates_hold_the_truth_only_jittered(tasks):
-    looked = 0
-    for folder in task_folders(tasks):
-        truths = {truth.query_id: truth for truth in read_truths(truth_of(folder))}
-        for query in read_queries(folder):
-            truth = truths[query.query_id]
-            if truth.candidate < 0 or truth.kind.startswith("R2"):  # of neighbours 5 m apart one must be the place
-                continue
-            chosen = query.candidates[truth.candidate]
-            off_m = np.hypot(chosen.easting_m - truth.pose.easting_m, chosen.northing_m - truth.pose.northing_m)
-            assert 0.05 < off_m < 23
-            looked += 1
-    assert looked > 5
 
 
 def test_a_pair_is_one_place_seen_under_all_variants(tasks):
@@ -382,15 +347,6 @@ def test_a_second_run_waits_for_the_first_and_both_leave_a_whole_task(own_out, t
     assert leftovers(own_out) == []
 
 
-def test_two_runs_at_once_leave_one_whole_task(own_out, tasks):
-    told: list[str] = []
-    with reporting(told.append), ThreadPoolExecutor(2) as pool:
-        list(pool.map(make, [own_out] * 2))
-    assert sum("5 queries at 1 site in" in line for line in told) == 2
-    assert content(own_out) == {name: data for name, data in content(tasks).items() if "/absent/" in name}
-    assert leftovers(own_out) == []
-
-
 @pytest.mark.slow
 def test_two_runs_of_different_counts_at_once_leave_the_map_of_the_last_and_its_task(own_out, tasks):
     told: dict[int, list[str]] = {2: [], 1: []}
@@ -438,13 +394,6 @@ def test_the_truths_are_in_place_before_the_task(own_out, monkeypatch):
     assert renamed == ["truth", "tasks"]
 
 
-def test_a_refused_request_leaves_nothing_behind(own_out):
-    before = sorted(path for path in own_out.rglob("*") if not path.name.endswith(".lock"))
-    with pytest.raises(ConfigError, match="holds"):
-        make(own_out, count=900)
-    assert sorted(path for path in own_out.rglob("*") if not path.name.endswith(".lock")) == before
-
-
 @pytest.mark.slow
 def test_a_run_that_is_killed_leaves_the_old_task_and_the_next_one_clears_up(own_out):
     make(own_out)
@@ -489,30 +438,6 @@ def test_every_task_that_is_made_is_good(tasks):
     for folder in task_folders(tasks):
         assert check_task(Task.open(folder)) == []
         assert Task.open(folder).has_truths
-
-
-def test_what_is_wrong_with_a_task_is_named(copied):
-    folder = copied / "tasks/clean" / RIVERSIDE
-    path = truth_of(folder) / TRUTH
-    pq.write_table(pq.read_table(path).slice(1), path)
-    (folder / "notes.txt").write_text("?")
-    manifest = copied / "regions" / RIVERSIDE / "region.json"
-    said = json.loads(manifest.read_text(encoding="utf-8"))
-    manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
-    told = "\n".join(check_task(Task.open(folder)))
-    assert "notes.txt: not part of a task" in told
-    count = sum(read_task(folder)["counts"].values())
-    assert f"{count - 1} truths that are not those of the {count} queries" in told
-    assert "town-riverside was built anew since: make the queries again" in told
-
-
-def test_a_flipped_byte_in_the_middle_of_a_task_is_named(copied):
-    folder = copied / "tasks/clean" / RIVERSIDE
-    data = bytearray((folder / QUERIES).read_bytes())
-    data[len(data) // 2] ^= 4
-    (folder / QUERIES).write_bytes(bytes(data))
-    (told,) = Task.open(folder).faults()
-    assert "SHA-256" in told
 
 
 def test_without_truths_a_task_can_be_checked_but_not_shown(copied):

@@ -315,8 +315,6 @@ def test_an_edited_table_is_a_feature_table():
 
 
 def test_a_square_that_is_a_road_stays_as_it_is_where_bridges_come_down():
-    import geopandas as gpd  # noqa: PLC0415
-
     columns = {"class": "road_minor", "level": [0, 1, 0], "is_bridge": [False, True, False]}
     shapes = [
         shapely.LineString([(0, 0), (40, 0)]),

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
+from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.perturbations.fields import shifted
 from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to
 from sasgeo_bench.tasks.perturbations.season import Season
@@ -103,14 +103,6 @@ def ground(lost=0.0, gained=0.0, names=("building",), vanish=0.0):
     return dict.fromkeys(names, item)
 
 
-def test_what_is_redrawn_stays_near_and_whole():
-    village = houses()
-    for after in aged(village, rates=ground(lost=0.1), years=1, shift_m=2.0, seeds=range(5)):
-        assert (after.cells[0] != village.cells[0]).any()
-        assert count(after) == 64
-        assert (after.cells == PRESENT).sum() == (village.cells == PRESENT).sum()
-
-
 @pytest.mark.parametrize("vanish", [0.0, 0.01, 0.03])
 def test_as_much_ground_is_lost_as_the_rate_says_however_much_of_it_vanishes(vanish):
     village = houses()
@@ -154,10 +146,6 @@ def test_a_place_is_never_aged_by_its_own_rates():
 def test_rates_that_are_none_are_refused():
     with pytest.raises(PerturbError, match="vanish_per_year lies between"):
         rates(vanish=-1.0)
-
-
-def test_the_rates_set_by_hand_are_those_of_the_taxonomy():
-    assert rates_by_hand()["building"] == Rates(vanish_per_year=0.005, appear_per_year=0.02)
 
 
 @given(rows=st.integers(-12, 12), cols=st.integers(-12, 12))

@@ -60,25 +60,6 @@ def test_one_more_class_changes_no_other_one(perturbation, view, monkeypatch):
 
 
 @every
-def test_bare_ground_in_a_view_changes_no_other_class(perturbation, view):
-    cells = view.cells.copy()
-    bare = cells[view.classes.index("bare")]
-    bare[30:90, 60:150] = PRESENT  # over whatever is there, and over ground that shows nothing
-    empty = (view.cells == PRESENT).any(axis=0)[30:90, 60:150]
-    assert not empty.all()
-    names = [name for name in view.classes if name != "bare"]
-    assert_same(seen(perturbation, picked(view, names)), seen(perturbation, view.replace(cells)), names)
-
-
-@every
-def test_a_class_that_is_not_in_view_may_as_well_not_be_asked_for(perturbation, view):
-    empty = [name for name in view.classes if not (view.layer(name) == PRESENT).any()]
-    names = [name for name in view.classes if name not in empty]
-    assert empty
-    assert_same(seen(perturbation, view), seen(perturbation, picked(view, names)), names)
-
-
-@every
 def test_the_order_of_the_classes_does_not_matter(perturbation, views):
     view = views[0]
     names = sorted(view.classes)

@@ -8,7 +8,6 @@ from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.query import BLIND, NOISE_FREE, SHUFFLED, TURNED, TWINS
 from sasgeo_bench.tasks.sampling import Drawer
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.suites.all_suites import SUITES, find_suite
 from sasgeo_bench.tasks.suites.board_controls import shuffled
 
 
@@ -24,11 +23,6 @@ def drafts(made, kind):
 
 def at_site(made, site, variant):
     return made.scene.map.view(site.pose, size_cells=variant.view_cells, cell_size_m=variant.cell_size_m)
-
-
-def test_the_suite_is_found_by_its_name_and_drawn_for_no_experiment():
-    assert find_suite("controls").card.name == "controls"
-    assert "controls" not in SUITES
 
 
 @pytest.mark.parametrize("kind", [NOISE_FREE, TWINS])

@@ -15,7 +15,7 @@ from sasgeo_bench.tasks.build import check_task, make_tasks
 from sasgeo_bench.tasks.query import TWIN_EAST, TWIN_NORTH, PriorGroup
 from sasgeo_bench.tasks.suites.all_suites import FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.flight_off_map import LOST, OFF_MAP, lengths_within
-from sasgeo_bench.tasks.suites.flight_plots import SHARES, Ground, MapChange, Plot
+from sasgeo_bench.tasks.suites.flight_plots import SHARES, Ground
 from sasgeo_bench.tasks.suites.twins import RIVAL_M
 from sasgeo_bench.tasks.task_files import read_truths
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
@@ -195,12 +195,6 @@ def test_the_map_of_a_stress_takes_turns_so_that_its_name_does_not_tell(flown):
     assert set(maps["control"]) == {scene.map.region}
     assert maps["stress"][0] != maps["stress"][1]
     assert maps["stress"][:2] == maps["stress"][2:] == maps["falsifier"][:2][::-1]
-
-
-def test_a_plot_gives_each_role_its_own_change():
-    areas = [shapely.box(at, 0, at + 1, 1) for at in (0, 5)]
-    plot = Plot(strength=250.0, stress=MapChange(area=areas[0]), falsifier=MapChange(area=areas[1]))
-    assert (plot.of("stress").area, plot.of("falsifier").area) == tuple(areas) == plot.areas
 
 
 def test_changed_maps_are_regions_of_their_own_and_their_tasks_hold_together(own_town, monkeypatch):

@@ -116,16 +116,6 @@ def test_a_place_with_copies_has_a_higher_alias_index_than_without_them(carried)
     assert np.mean(gain) > 0.02
 
 
-def test_a_town_of_equal_blocks_has_a_higher_alias_index_than_an_old_one(scene, wide):
-    grid = describe(scene("town-grid large").map, side_m=SIDE_M, clear_m=CLEAR_M)
-    found = {
-        where: [mine(of, at, count=1).alias_index for at in centres(scene, 60, where=where)]
-        for where, of in (("town-grid large", grid), ("town-old-town large", wide))
-    }
-    assert 0 < min(map(min, found.values())) <= max(map(max, found.values())) <= 1
-    assert np.mean(found["town-grid large"]) > np.mean(found["town-old-town large"])
-
-
 def test_the_alias_index_of_an_exact_copy_is_one_and_needs_no_other_places(windows):
     # Its scale is its own: what else is on the map does not change how like two places are.
     twin = replace(

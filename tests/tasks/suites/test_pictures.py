@@ -183,8 +183,3 @@ def test_a_model_of_perception_sees_the_same_view_without_a_picture(place):
     draft = suite_of().draw(shot)
     assert draft.frames == ()
     assert (draft.evidence.cells == shot.perceived().cells).all()
-
-
-def test_a_drone_flies_above_the_tallest_thing(place):
-    tall = suite_of(height_m=20.0, relief=20.0).draw(shot_of(place))
-    assert len(tall.frames) == 1

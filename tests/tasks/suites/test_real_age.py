@@ -67,11 +67,6 @@ def test_controls_search_the_map_of_the_day_and_stresses_an_older_one(carried):
             assert draft.measured["age_years"] == pytest.approx(age_years(searched, made.scene.world))
 
 
-def test_the_town_has_ages_of_about_five_and_ten_years_alone(carried):
-    strengths = {item.strength for item in carried("real-age").suite.variants if item.role == "stress"}
-    assert strengths == {5.0, 10.0}
-
-
 def test_a_site_was_mapped_on_every_older_map_that_is_searched(dated):
     town = dated(2.0, 5.0)
     seeds = Seeds(root=0, names=("town-suburb", "real-age"))

@@ -84,12 +84,6 @@ def test_a_suite_of_twins_refuses_a_disc_too_small_for_any_of_its_pairs(name):
         assert suite.refusal(PriorGroup.parse(narrow)).endswith("use r500 or more, or leave --prior out")
 
 
-def test_suites_whose_disc_need_not_hold_their_twins_refuse_none():
-    for name in ("alias", "controls", "clean", "stable-not-distinctive"):
-        assert not EVERY_SUITE[name].has_rivals
-        assert EVERY_SUITE[name].refusal(PriorGroup.parse("r100-weak-s3")) is None
-
-
 @pytest.mark.parametrize("name", RIVALLED)
 def test_twins_lie_within_reach_of_one_disc(carried, name):
     made = carried(name)
@@ -160,10 +154,6 @@ def test_a_place_that_no_search_would_list_makes_a_stress_another_kind_too():
 def test_a_rival_outside_the_disc_is_counted_as_such():
     told = measure(town(), replace(PRIOR, center_m=(152.0, 444.0), radius_m=60.0))
     assert (told["rivals_in_disc"], told["rivals_listed"], told["truth_listed"]) == (0, 0, 1)
-
-
-def test_a_kind_without_rivals_keeps_its_name():
-    assert kind_of("stress", "U2 wedge", {"unknown_added": 0.3}) == "U2 wedge"
 
 
 def test_the_score_of_a_view_without_error_is_one_at_its_place_and_that_of_its_opposite_negative():

@@ -12,7 +12,6 @@ from sasgeo_bench.tasks.split import blocks_of
 from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import Seeds
 from sasgeo_bench.tasks.suites.sites import choose_sites
-from sasgeo_bench.tasks.suites.twins import OFF_M
 from tests.slow import rest_slow
 
 SEEDS = Seeds(root=3, names=("town", "sites"))
@@ -42,16 +41,6 @@ def test_no_two_sites_are_nearer_than_the_suite_asks(scene, name, where):
     found = places(chosen(town, name))
     apart_m = np.hypot(*(found[:, None] - found[None]).transpose(2, 0, 1))
     assert apart_m[~np.eye(len(found), dtype=bool)].min(initial=np.inf) >= SUITES[name].spacing_m(town)
-
-
-def test_discs_copied_from_twin_sites_do_not_meet(scene):
-    town = scene("town-old-town large", "topology-twins")
-    suite = SUITES["topology-twins"]
-    found = places(chosen(town, "topology-twins"))
-    assert len(found) > 3
-    apart_m = np.hypot(*(found[:, None] - found[None]).transpose(2, 0, 1))
-    # Either disc may lie off its site, towards the other.
-    assert apart_m[~np.eye(len(found), dtype=bool)].min() >= 2 * (suite.radius_m(town) + OFF_M)
 
 
 def test_every_site_lies_in_the_block_it_names_and_blocks_take_turns(quarters):

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from tests.world import drawn
 
 TOWN = "town-riverside"
 
@@ -17,17 +16,8 @@ def made(tmp_path_factory, lay_towns):
     """A folder with out/ and hostile.py in it."""
     root = tmp_path_factory.mktemp("run")
     lay_towns(root / "out", TOWN)
-    wanted = Wanted(
-        suites=("false-unknown", "clean"),
-        regions=(TOWN,),
-        split="crossfit",
-        count=3,
-        seed=4,
-        out=root / "out",
-        may_be_fewer=True,
-    )
-    for request in plan_requests(wanted):
-        make_tasks(request)
+    for suite in ("false-unknown", "clean"):
+        drawn(root / "out", suite, TOWN, count=3, seed=4, may_be_fewer=True)
     shutil.copy(Path(__file__).with_name("hostile.py"), root / "hostile.py")
     return root
 

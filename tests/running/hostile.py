@@ -313,7 +313,7 @@ class LiesOnTheWire(Plain):
     """Writes to the socket of its own process."""
 
     def match(self, query, *, top_k):
-        for number in range(3, 64):
+        for number in range(3, 256):
             try:
                 os.write(number, b"\x7f\xff\xff\xff\x00\x00\x00\x00" + b"x" * 100)
             except OSError:

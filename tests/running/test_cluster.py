@@ -20,9 +20,7 @@ from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import flight_id, view_id
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.threaded import threaded
 
 distributed = pytest.importorskip("distributed", reason="distributed is not installed (make install brings it)")
@@ -113,17 +111,11 @@ def test_chunks_of_a_run_give_up_a_matcher_that_hangs_together_and_another_run_d
     ("address", "words"),
     [
         ("local:0", "local:N with N from 1 to 1000"),
-        ("local:", "local:N with N from 1 to 1000"),
         ("local:two", "local:N with N from 1 to 1000"),
-        ("local:100000000", "local:N with N from 1 to 1000"),
         ("local:" + "9" * 5000, "local:N with N from 1 to 1000"),
         ("tcp://127.0.0.1:9", "no dask scheduler answers at 'tcp://127.0.0.1:9'"),
-        ("tls://127.0.0.1:9", "no dask scheduler answers at 'tls://127.0.0.1:9'"),
-        ("nonsense", "as tcp://host:port, got 'nonsense'"),
         ("", "as tcp://host:port, got ''"),
         ("ftp://127.0.0.1:9", "as tcp://host:port, got 'ftp://127.0.0.1:9'"),
-        ("ucx://127.0.0.1:9", "as tcp://host:port, got 'ucx://127.0.0.1:9'"),
-        ("inproc://here", "as tcp://host:port, got 'inproc://here'"),
         ("tcp://127.0.0.1", "as tcp://host:port, got 'tcp://127.0.0.1'"),
         ("tcp://127.0.0.1:nine", "as tcp://host:port, got 'tcp://127.0.0.1:nine'"),
     ],
@@ -179,36 +171,3 @@ def test_workers_that_die_over_and_over_end_the_run_with_one_line(task, tmp_path
     plan = plan_run(request_of(task, tmp_path))
     with pytest.raises(StoreError, match="died over and over"):
         list(runner.answer_on(Client(), plan, plan.parts))
-
-
-@pytest.mark.slow
-def test_over_500_queries_two_processes_two_shards_and_a_cluster_give_the_same_rows(tmp_path):
-    wanted = Wanted(
-        suites=("occlusion", "clean", "season"),
-        regions=("town-grid",),
-        split="crossfit",
-        count=16,
-        seed=3,
-        out=tmp_path,
-    )
-    requests = plan_requests(replace(wanted, may_be_fewer=True))
-    tasks = [made.folder for request in requests for made in make_tasks(request)]
-    assert sum(len(task_files.Task.open(task).ids()) for task in tasks) > 500
-    ways = {
-        "two processes": [{"jobs": 2}],
-        "two shards": [{"shard": (1, 2)}, {"shard": (2, 2)}],
-        "a cluster": [{"dask": "local:2"}],
-    }
-    files = []
-    for name, changes in ways.items():
-        folders = []
-        for number, change in enumerate(changes):
-            out = tmp_path / name / str(number)
-            plan = plan_run(RunRequest(spec="global_descriptor", tasks=tasks, out=out, **change))
-            run(plan)
-            folders += [part.folder for part in plan.parts]
-        prediction_files.merge_runs(folders, tmp_path / f"{name}.parquet")
-        files.append(rows(tmp_path / f"{name}.parquet"))
-    assert len(files[0]) > 500
-    assert files[0] == files[1] == files[2]
-    assert sum(item.status == "ok" for item in files[0].values()) > 500

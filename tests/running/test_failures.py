@@ -7,7 +7,7 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.progress import reporting
-from sasgeo_bench.running.failures import LOG, Failures, log_beside, stops_all
+from sasgeo_bench.running.failures import LOG, Failures, stops_all
 
 
 class UnspeakableError(RuntimeError):
@@ -42,10 +42,6 @@ def test_a_full_disk_stops_all_and_a_fault_of_one_does_not():
     full.__cause__ = OSError(errno.ENOSPC, "No space left on device")
     assert stops_all(full)
     assert not stops_all(ValueError("mine"))
-
-
-def test_the_log_of_a_board_lies_next_to_it(tmp_path):
-    assert log_beside(tmp_path / "board") == tmp_path / "board.failures.log"
 
 
 @pytest.mark.parametrize("stop", [KeyboardInterrupt, MemoryError])

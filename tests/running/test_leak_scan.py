@@ -116,20 +116,6 @@ def test_the_interpreters_own_folders_are_not_walked(tmp_path):
     assert [item.folder for item in found.found] == [str(tmp_path)]
 
 
-def test_many_processes_of_a_run_share_a_walk(tmp_path, monkeypatch):
-    walks = []
-    monkeypatch.setattr(leak_scan, "walk", lambda roots: walks.append(roots) or leak_scan.Walk(found=()))
-    monkeypatch.setattr(leak_scan.time, "monotonic", lambda: 30.0)
-    leak_scan._walked.cache_clear()
-    for _ in range(3):
-        leak_scan.walk_code([tmp_path])
-    assert len(walks) == 1
-    monkeypatch.setattr(leak_scan.time, "monotonic", lambda: 90.0)
-    leak_scan.walk_code([tmp_path])
-    assert len(walks) == 2
-    leak_scan._walked.cache_clear()
-
-
 def test_answers_packed_beside_a_pipeline_file_are_hidden_and_other_archives_are_not(tmp_path):
     lay(tmp_path, "a/mine.toml", "a/mine.tar.xz", "a/weights.tar.xz", "b/other.toml")
     assert hidden(tmp_path)[0] == ["a/mine.tar.xz"]

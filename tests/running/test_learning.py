@@ -158,13 +158,6 @@ def test_a_matcher_that_does_not_learn_passes_the_training_over(request_of):
     assert RunManifest.open(folder).learned is None
 
 
-@pytest.mark.usefixtures("in_threads")
-def test_time_to_learn_changes_no_run_of_those_that_do_not(request_of):
-    limits = [Limits(learn_s=seconds) for seconds in (100.0, 200.0)]
-    one, other = (plan_run(request_of(spec="hostile:Plain", limits=item)).hash for item in limits)
-    assert one == other
-
-
 @pytest.mark.skipif(not HAS_LANDLOCK, reason="this kernel has no Landlock to refuse files with")
 def test_truths_travel_by_the_wire_and_cannot_be_read(request_of):
     request = request_of("ReadsTruth")

@@ -66,15 +66,6 @@ def test_rows_are_read_as_they_were_written(tmp_path):
     assert {path.suffix for path in folder.iterdir()} == {".parquet"}
 
 
-def test_more_columns_other_orders_and_like_types_are_read_too(rows, write):
-    strings = with_column(rows, "status", rows["status"].cast(pa.large_string()))
-    single = with_column(rows, "confidence", rows["confidence"].cast(pa.float32()))
-    nothing = with_column(rows, "latency_s", pa.nulls(2))
-    for table in (rows.select(rows.column_names[::-1]), rows.append_column("rank", pa.array([1, 2])), strings, single):
-        assert everything(write(table))[::-1] == [FULL, FAILED]
-    assert {item.latency_s for item in everything(write(nothing))} == {None}
-
-
 @pytest.mark.parametrize("name", prediction_files.PREDICTION_SCHEMA.names)
 def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_are_read(tmp_path, rows, write, name):
     for table in (rows.drop_columns([name]), with_column(rows, name, pa.array([[True], [False]]))):
@@ -85,15 +76,6 @@ def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_ar
         assert "holds no predictions" in refusal(prediction_files.merge_runs, [path], tmp_path / "new.parquet")
         assert "move it out of the run's folder" in refusal(prediction_files.ids_done, tmp_path, {})
     assert not (tmp_path / "new.parquet").exists()
-
-
-def test_the_matchers_own_time_of_another_kind_or_twice_is_refused(rows, write):
-    """The column is not part of a submission, but rows of a run have it."""
-    text, number = pa.array(["odd"] * 2), pa.array([1.0] * 2)
-    odd = write(rows.append_column("matcher_s", text))
-    assert "(matcher_s: found string, expected double)" in refusal(everything, odd)
-    twice = rows.append_column("matcher_s", number).append_column("matcher_s", number)
-    assert "(matcher_s: found 2 columns, expected double)" in refusal(everything, write(twice))
 
 
 @pytest.mark.parametrize("name", ["query_id", "confidence"])

@@ -12,11 +12,10 @@ from sasgeo_bench.errors import ConfigError, MatchError
 from sasgeo_bench.running import leak_scan, prediction_files, sandbox
 from sasgeo_bench.running.plan import RunRequest, plan_run, reach_of
 from sasgeo_bench.running.testing import check_matcher
-from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.private_seed import PrivateSeed
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.running.seedthief import SECRET
 from tests.slow import rest_slow
+from tests.world import drawn
 
 pytestmark = pytest.mark.skipif(sandbox.landlock_version() == 0, reason="this kernel has no Landlock")
 RUN = """
@@ -36,16 +35,7 @@ run(plan_run(RunRequest(spec="seedthief:Thief", tasks=tasks, out=Path("out/priva
 def made(tmp_path_factory):
     """A private task, the seed in the working folder, and the thief beside it."""
     root = tmp_path_factory.mktemp("thief")
-    wanted = Wanted(
-        suites=("clean",),
-        regions=("town-riverside",),
-        split="crossfit",
-        count=1,
-        seed=PrivateSeed(SECRET),
-        out=root / "out" / "private",
-    )
-    for request in plan_requests(wanted):
-        make_tasks(request)
+    drawn(root / "out" / "private", "clean", "town-riverside", seed=PrivateSeed(SECRET))
     shutil.copy(Path(__file__).with_name("seedthief.py"), root / "seedthief.py")
     source = (root / "seedthief.py").read_text(encoding="utf-8")
     assert SECRET not in source

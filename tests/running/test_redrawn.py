@@ -13,15 +13,10 @@ from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.scoring.validate import set_aside, validate
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import PriorGroup
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from tests import world
 
 TOWN = "town-riverside"
-
-
-def quiet(_):
-    pass
 
 
 @pytest.fixture
@@ -30,18 +25,8 @@ def draw(own_out):
 
     def drawn(count=1, seed=0, prior=None):
         group = None if prior is None else PriorGroup.parse(prior)
-        wanted = Wanted(
-            suites=("no-priors",) if group is None else ("clean",),
-            regions=(TOWN,),
-            split="crossfit",
-            count=count,
-            seed=seed,
-            out=own_out,
-            group=group,
-        )
-        (request,) = plan_requests(wanted)
-        (made,) = make_tasks(request)
-        return made.folder
+        suite = "no-priors" if group is None else "clean"
+        return world.drawn(own_out, suite, TOWN, count=count, seed=seed, group=group)[0]
 
     return drawn
 

@@ -11,18 +11,12 @@ from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.scoring.validate import validate
 from sasgeo_bench.sensing.reference_imagery import Look, render_imagery
-from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_files import Task
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+from tests import world
 
 TOWN = "town-riverside"
 LOOK = Look(gsd_m=2.0)
-SETTINGS = {"regions": (TOWN,), "split": "crossfit", "count": 1, "seed": 0}
-
-
-def quiet(_):
-    pass
 
 
 @pytest.fixture
@@ -30,10 +24,7 @@ def draw(own_out):
     """Draw a site's queries of a suite, and return the task."""
 
     def drawn(suite, *kinds):
-        wanted = Wanted(suites=(suite,), choice=Choice(kinds=kinds), out=own_out, **SETTINGS)
-        (request,) = plan_requests(wanted)
-        (made,) = make_tasks(request)
-        return made.folder
+        return world.drawn(own_out, suite, TOWN, choice=Choice(kinds=kinds))[0]
 
     return drawn
 

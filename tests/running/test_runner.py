@@ -105,16 +105,6 @@ def test_two_shards_merged_give_what_one_run_does(task, undisturbed, tmp_path):
 
 
 @pytest.mark.usefixtures("in_threads")
-def test_a_second_run_asks_nothing_again_and_a_limit_is_kept(task, tmp_path):
-    first, folder = run_all(request_of(task, tmp_path, limit=3))
-    assert first.counts == {"ok": 3}
-    assert plan_run(request_of(task, tmp_path, limit=3)).parts[0].left == ()
-    second, _ = run_all(request_of(task, tmp_path, limit=5))
-    assert second.counts == {"ok": 2}
-    assert len(table(folder)) == 5
-
-
-@pytest.mark.usefixtures("in_threads")
 def test_what_another_run_answered_meanwhile_is_not_asked_again(task, tmp_path):
     plans = [plan_run(request_of(task, tmp_path, limit=count)) for count in (2, 2, 3)]
     reports = [run(plan) for plan in plans]

@@ -116,7 +116,6 @@ LOST = {
 }
 NO_NET = "none, no socket can be made (seccomp)"
 OWN_PIDS = "a namespace of their own, all end together"
-NO_METADATA = "modes, owners, times and attributes cannot be changed anywhere (seccomp)"
 IN_MEMORY = "4 MB in memory at most"
 ON_DISC = "files of 1 MB at most, as many as the disc holds"
 ALONE = "among others, which cannot be signalled (Landlock), all end together"

@@ -175,12 +175,6 @@ def test_a_segmenter_that_learns_sees_no_labels_but_those_it_learns_from(request
     assert train_segmenter(request_of("CountsLabels", is_shut_in=False), own).text == "12 beside 4"
 
 
-@shut_in
-def test_a_segmenter_has_no_network(request_of) -> None:
-    (reply,) = told(request_of("Connects"), tiny_images()[0])
-    assert reply.status == "refused"
-
-
 @pytest.mark.parametrize(
     ("name", "words"),
     [

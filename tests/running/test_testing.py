@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.errors import StoreError
-from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running import sandbox, testing
 from sasgeo_bench.running.testing import check_matcher, tiny_place
 
@@ -187,16 +185,6 @@ def test_without_a_place_one_is_made_and_nothing_is_left_of_it(table, tmp_path, 
 # --- the place ------------------------------------------------------------------------------------------------------
 
 
-def test_a_tiny_place_holds_what_a_matcher_may_meet(tiny) -> None:
-    queries = tiny.queries
-    assert {query.track for query in queries} == {"localization", "retrieval"}
-    assert any(query.vectors is not None and len(query.vectors) for query in queries)
-    assert any(query.prior.center_m is None and query.prior.yaw_deg is None for query in queries)
-    assert {query.region for query in queries} == {tiny.region.manifest.id}
-    assert all(query.evidence.classes == tiny.region.classes for query in queries)
-    assert read_region(tiny.map_folder).manifest == tiny.region.manifest
-
-
 def test_every_query_of_a_tiny_place_has_its_truth_on_the_map(tiny) -> None:
     assert [truth.query_id for truth in tiny.truths] == [query.query_id for query in tiny.queries]
     west_m, south_m, east_m, north_m = tiny.region.grid.bounds_m
@@ -219,10 +207,3 @@ def test_a_tiny_place_is_the_same_wherever_and_whenever_it_is_made(tiny, tmp_pat
         assert [query.query_id for query in other.queries] == [query.query_id for query in tiny.queries]
         assert other.truths == tiny.truths
         assert other.region.manifest.fingerprint == tiny.region.manifest.fingerprint
-
-
-def test_a_tiny_place_that_cannot_be_written_is_told_in_one_line(tmp_path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="cannot be written") as told:
-        tiny_place(tmp_path / "file")
-    assert "\n" not in str(told.value)

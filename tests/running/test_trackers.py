@@ -15,10 +15,9 @@ from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks import flight_choice, task_files
-from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import flight_id
-from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 from tests.slow import rest_slow
+from tests.world import drawn
 
 TOWN = "town-riverside"
 PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is
@@ -29,19 +28,9 @@ def flown(tmp_path_factory, lay_towns):
     """A task of three short flights, and the trackers beside it."""
     root = tmp_path_factory.mktemp("flights")
     lay_towns(root / "out", TOWN)
-    wanted = Wanted(
-        suites=("flight-overconfident",),
-        regions=(TOWN,),
-        split="crossfit",
-        count=1,
-        seed=4,
-        out=root / "out",
-        may_be_fewer=True,
-    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
-        for request in plan_requests(wanted):
-            make_tasks(request)
+        drawn(root / "out", "flight-overconfident", TOWN, seed=4, may_be_fewer=True)
     shutil.copy(Path(__file__).with_name("wayward.py"), root / "wayward.py")
     return root
 
@@ -97,14 +86,6 @@ def test_what_a_tracker_learnt_reaches_every_step(task, tasks, tmp_path):
     assert 0 < count <= len(task_files.Task.open(train).ids())
     untaught = run_of(task, tmp_path, "Taught")
     assert {item.diagnostics["lessons"] for rows in untaught.values() for item in rows} == {-1.0}
-
-
-@pytest.mark.parametrize("name", ["sasgeo_track", "lsvl_belief"])
-def test_a_tracker_that_learns_is_planned_to_learn(task, tasks, tmp_path, name):
-    (train,) = (tasks / "tasks" / "alias").glob("town-grid*")
-    plan = plan_run(RunRequest(spec=name, tasks=(task,), out=tmp_path, train=(train,)))
-    assert plan.learns
-    assert "to be trained on" in plan.to_text()
 
 
 def test_no_view_to_come_is_in_the_process_of_a_tracker(counted):

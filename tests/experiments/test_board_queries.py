@@ -30,10 +30,6 @@ PAGE = Path(__file__).parents[2] / "docs" / "howto" / "any-language.md"
 TEXT = PIPELINE.replace('"crossfit"', '"places"')  # controls of every board are of crossfit
 
 
-def silent(line):
-    del line
-
-
 @pytest.fixture(scope="module")
 def request_(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     folder = tmp_path_factory.mktemp("board")

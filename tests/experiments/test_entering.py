@@ -72,10 +72,6 @@ class Lost(PriorCentre):
         raise KeyError(f"no road\nnear {query.track}")
 
 
-def silent(line):
-    del line
-
-
 @pytest.fixture(scope="module")
 def request_(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
     """A request to enter a board that is stored, with the file of its pipeline."""
@@ -251,12 +247,14 @@ def test_queries_of_sealed_places_and_of_older_versions_are_told_before(request_
     assert "are of sealed places, and count as misses without --sealed-seed-file" in told
 
 
-def test_lines_of_a_matchers_card_are_cut_to_those_of_a_submission():
-    long = "word " * 100
-    card = replace(Middle.card, source=long, limits=long)
-    made = entering._card_of(card, [], None, source="mine")
+def test_a_card_of_a_submission_has_the_authors_of_the_class_and_lines_that_are_cut():
+    said = {"authors": ("A. Author",), "code": "https://example.org/mine", "uses": ("imagery",)}
+    made = entering._card_of(
+        replace(Middle.card, source="word " * 100, limits="word " * 100, **said), [], None, source="mine"
+    )
     assert made.source.endswith(" ...")
     assert len(made.limits) <= 300
+    assert (made.authors, made.code, made.uses) == (["A. Author"], "https://example.org/mine", ["imagery"])
 
 
 def test_a_card_that_no_submission_can_have_is_refused_before_anything_is_drawn(request_, monkeypatch):
@@ -264,12 +262,6 @@ def test_a_card_that_no_submission_can_have_is_refused_before_anything_is_drawn(
     entry = plan_entry(request_)
     with pytest.raises(ConfigError, match=r"the card of .*:Middle: 'licence': String should have at most 60 char"):
         check_entry(entry)
-
-
-def test_what_a_class_says_of_its_authors_is_in_the_submission():
-    card = replace(Middle.card, authors=("A. Author",), code="https://example.org/mine", uses=("imagery",))
-    made = entering._card_of(card, [], None, source="mine")
-    assert (made.authors, made.code, made.uses) == (["A. Author"], "https://example.org/mine", ["imagery"])
 
 
 def test_figures_are_those_of_a_whole_score_to_the_last_bit(request_, entered, tmp_path):
@@ -402,11 +394,6 @@ def test_a_board_of_tasks_of_another_version_is_told(request_, monkeypatch):
     with reporting(lines.append):
         plan_entry(request_)
     assert [line for line in lines if f"task version {TASK_VERSION}, this is sasgeo-bench" in line]
-
-
-def test_a_folder_without_results_is_refused(request_, tmp_path):
-    with pytest.raises(StoreError, match="holds no stored results: name those of a board"):
-        plan_entry(replace(request_, stored=tmp_path))
 
 
 def test_queries_that_are_drawn_otherwise_are_refused_before_anything_is_asked(request_, tmp_path, monkeypatch):

@@ -210,6 +210,17 @@ def test_what_changes_queries_has_them_drawn_anew(made, changes, tmp_path):
     assert made_tasks(other.requests[0]) is None
 
 
+def test_a_dry_run_tells_why_tasks_are_drawn_anew_and_how_many_answers_that_leaves(made):
+    plan, board, _ = made
+    told = plan_pipeline(small(**{"sites = 1": "sites = 2"}), out=plan.out).to_text()
+    assert (
+        "  queries: 0 of 1 task up to date, 1 to be drawn (1 drawn with sites = 1, now 2), at most 56 queries" in told
+    )
+    count = len(board.scores["random"])
+    assert f"to be drawn; {count} answered there before\n" in told
+    assert "answers where they are: those to the same queries count again, the others are set aside\n" in told
+
+
 def test_a_task_of_its_own_regions_is_drawn_on_these_alone(tmp_path):
     own = '[[task]]\nsuites = ["occlusion"]\nsites = 1\nregions = ["town-grid"]\n[[contrast]]'
     both = {'regions = ["town-suburb"]': 'regions = ["town-suburb", "town-grid"]'}

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's variants: each differs from the one before by its own switch alone."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from hypothesis.extra.numpy import arrays
 from sasgeo_baselines.raster import (
     BETA,
     FullUnknown,
+    GraphCheck,
     RasterGraph,
     RasterGraphStability,
     RasterUniform,
@@ -86,6 +89,24 @@ def scene(houses, *, size=48, tall=10) -> np.ndarray:
     for row, col in houses:
         layers[0, row : row + tall, col : col + 10] = PRESENT
     return layers
+
+
+def test_neither_side_of_the_graph_is_described_where_the_other_is_unknown(made) -> None:
+    chart = RasterUniform().read(made.region_of(scene(HOUSES)))
+    here = Pose(easting_m=1024.0, northing_m=8976.0, yaw_deg=0.0)
+
+    def distance(pose, seen) -> float:
+        bands = np.arange(len(seen))
+        return GraphCheck(check=PoseCheck(chart=chart, bands=bands, seen=seen, cell_size_m=1.0)).distance(pose)
+
+    assert distance(here, scene(HOUSES)) == 0.0
+    assert distance(replace(here, easting_m=9000.0), scene(HOUSES)) == 0.0  # beyond the map
+    half = scene(HOUSES)
+    half[:, :, :24] = UNKNOWN  # hides two houses of four
+    missed, silent = (distance(here, variant().seen(half)[:1]) for variant in (RasterGraphStability, FullUnknown))
+    # 2 against 4 counts 2 / 7, and their distances differ; 2 against the same 2 is nothing.
+    assert missed > (2 / 7) / 2
+    assert silent == 0.0
 
 
 def three_places(made, first: np.ndarray, second: np.ndarray, **region):

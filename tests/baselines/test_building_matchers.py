@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sasgeo_baselines.building_votes import Mixture
+from sasgeo_baselines.building_votes import Mixture, Seen, Town, headings, mixture_of
 from sasgeo_baselines.instance_rays import REACH_M, STEP_M, BuildingMap, cast
-from sasgeo_baselines.ouyang_shape_votes import credibility
+from sasgeo_baselines.ouyang_shape_votes import OuyangShapeVotes, credibility
 from sasgeo_baselines.vojir_instance_rays import (
     LEAST_SPREAD,
     RAYS,
@@ -24,6 +24,7 @@ from sasgeo_baselines.vojir_instance_rays import (
 
 from sasgeo_bench.matching.matcher import Training
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
+from sasgeo_bench.search.plan import Disc
 from tests.baselines.worlds import suburb
 from tests.made_up import error_m
 
@@ -144,3 +145,19 @@ def test_credibility_is_a_share_and_does_not_depend_on_where_all_lie(places, mov
     assert 0 <= found <= rows[0, 2] / rows[:, 2].sum()
     assert credibility(replace(mixture, place_m=mixture.place_m + moved), 500.0) == pytest.approx(found, abs=1e-6)
     assert credibility(mixture, 1000.0) >= found
+
+
+def test_components_are_the_answer_and_their_heights_the_scores(made, region, seen):
+    matcher = OuyangShapeVotes()
+    matcher.prepare(region, None)
+    known = replace(PRIOR, yaw_deg=HERE.yaw_deg, yaw_sigma_deg=1.0)
+    answer = matcher.match(made.query_of(seen, known), top_k=5)
+    disc = Disc(center_m=PRIOR.center_m, radius_m=PRIOR.radius_m)
+    votes = Town.of(region).votes(Seen.of(seen), disc, yaws_deg=headings(HERE.yaw_deg, 1.0))
+    bandwidth_m = matcher.numbers["bandwidth_m"]
+    inside = votes[np.hypot(*(votes[:, :2] - PRIOR.center_m).T) <= PRIOR.radius_m + bandwidth_m]
+    mixture = mixture_of(inside, bandwidth_m=bandwidth_m)
+    assert answer.scores[0] == mixture.height[0]
+    assert [answer.poses[0].easting_m, answer.poses[0].northing_m] == mixture.place_m[0].tolist()
+    assert answer.diagnostics["credibility"] == credibility(mixture, PRIOR.radius_m)
+    assert 0 < answer.diagnostics["credibility"] < 1

@@ -5,12 +5,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sasgeo_baselines.stfm_centroids import Patterns, clear_m
+from sasgeo_baselines.stfm_centroids import Patterns, StfmCentroids, clear_m
 from sasgeo_baselines.triangle_rsim import Triangles, differences, shapes_of
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.nodes import INDEX
+from tests.baselines.worlds import hidden, houses
 
 VIEW = 176
 
@@ -94,3 +95,15 @@ def test_a_class_that_a_view_does_not_read_and_one_of_no_object_hide_nothing():
     hiding = cells.copy()
     hiding[0, :, :50] = UNKNOWN
     assert clear_m(view.replace(hiding), np.array([[20.5, 0.5]])).tolist() == pytest.approx([21.0], abs=1.0)
+
+
+def test_an_object_whose_neighbours_may_be_out_of_sight_says_nothing():
+    """Half of the view is hidden: no object that speaks has its farthest neighbour beyond the edge of what is known."""
+    matcher, query = StfmCentroids(), houses().query(VIEW)
+    matcher.prepare(houses().region, None)
+    whole, half = matcher.look(query), matcher.look(hidden(query, slice(60)))
+    assert len(half.patterns.kind) < len(whole.patterns.kind)
+    right_m = half.patterns.corners_m[:, 0, 0] - half.patterns.reach_m
+    assert right_m.min() > 60 - VIEW / 2
+    clear = clear_m(hidden(query, slice(60)).evidence, np.array([[0.0, 0.0]]))
+    assert clear.tolist() == pytest.approx([28.0], abs=1.0)

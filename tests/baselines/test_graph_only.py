@@ -146,3 +146,9 @@ def test_a_large_prior_is_tried_on_a_wider_lattice(made, prepared, monkeypatch) 
     monkeypatch.setattr(graph_only, "MOST_TRIED", 12)
     best = check_match(prepared.match(query, top_k=3), query, top_k=3).poses[0]
     assert np.hypot(best.easting_m - 1200.0, best.northing_m - 8904.0) <= 32.0
+
+
+def test_a_place_beyond_the_map_is_no_place(made, prepared) -> None:
+    far = replace(PLACES[0], easting_m=90_000.0)
+    query = made.query_of(view_of(made, ROW), NORTH, candidates=(far, PLACES[2]))
+    assert [pose.easting_m for pose in prepared.match(query, top_k=3).poses] == [1200.0]

@@ -18,7 +18,7 @@ from sasgeo_baselines.liu_object_graph import (
 )
 from sasgeo_baselines.patches import Patches, consensus, correlation, matches, mutual, soft_mutual
 from sasgeo_baselines.spatial_graph_clique import SpatialGraphClique
-from sasgeo_baselines.zhang_hier_consensus import similarity
+from sasgeo_baselines.zhang_hier_consensus import ZhangHierConsensus, similarity
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
@@ -176,3 +176,15 @@ def test_how_many_objects_agree_is_told_as_inliers(made, village, liu):
     assert answer.diagnostics["inliers"] == int(answer.scores[0]) >= 12
     candidates = made.query_of(village.drawn, PRIOR, candidates=(HERE,))
     assert matcher.match(candidates, top_k=1).diagnostics["inliers"] >= 12
+
+
+def test_a_view_of_another_place_has_few_inliers(made):
+    zhang = ZhangHierConsensus()
+    zhang.prepare(worlds.things().region, None)
+    other = made.view_of(made.region_of(made.textured(77)), HERE, size_cells=160)
+    wrong, right = (
+        zhang.match(made.query_of(view, PRIOR), top_k=3).diagnostics for view in (other, worlds.things().seen(160))
+    )
+    assert wrong["inlier_ratio"] < right["inlier_ratio"] / 2
+    assert wrong["inliers"] < right["inliers"] / 2
+    assert right["inlier_ratio"] > 0.5

@@ -316,6 +316,8 @@ def test_a_correlation_surface_is_that_of_squares_read_one_by_one(region):
         assert found[down, right] == pytest.approx(expected, abs=1e-4)
     assert found.argmax() == 12
     assert found[2, 2] > 0.9
+    even = Template.of(seen.replace(np.zeros_like(cells)))  # a view without contrast is like nothing
+    assert np.abs(surfaces(even, mosaic, there)).max() < 1e-3
 
 
 def particles_at(pose):

@@ -31,6 +31,16 @@ def small_town(folder: Path, **changes: str) -> Path:
     return path
 
 
+def test_the_version_lists_and_findings_go_to_stdout(program):
+    assert program("--version")[1] == f"sasgeo-bench {metadata.version('sasgeo-bench')}\n"
+    code, listed, err = program("list", "regions")
+    assert code == 0, err
+    assert "2013-08-03 .. 2025-09-19 (9)" in listed
+    code, healthy, err = program("doctor")
+    assert code == 0, err
+    assert "GDAL, GEOS, PROJ" in healthy
+
+
 def test_a_process_ends_with_the_exit_code_and_keeps_results_and_messages_apart(tmp_path):
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     ended = [

@@ -58,6 +58,7 @@ def test_places_are_put_beside_each_other(program, towns, tmp_path):
         (("--at", "2014-13-01"), "--at must be a date"),
         (("--at", "2014-01-01"), "got 1 for 2 extracts"),
         (("--bounds", "11,48,10,49"), "--bounds must be west,south,east,north"),
+        (("--bounds", "here"), "--bounds must be west,south,east,north"),
         (("--bounds", "-7,61,-6,62"), "nothing in common"),
         (("--extract", "none.osm.pbf"), "no extract at none.osm.pbf"),
     ],

@@ -496,3 +496,11 @@ def test_one_query_is_found_by_the_beginning_of_its_id_and_an_unknown_one_is_tol
 )
 def test_dates_and_edits_of_a_map_are_of_its_region_and_no_other_one_is(name, is_of_it):
     assert is_of_region(name, "vaduz") is is_of_it
+
+
+def test_a_task_of_a_map_that_was_built_anew_is_named(copied):
+    manifest = copied / "regions" / RIVERSIDE / "region.json"
+    said = json.loads(manifest.read_text(encoding="utf-8"))
+    manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
+    (told,) = check_task(Task.open(copied / "tasks/clean" / RIVERSIDE))
+    assert "town-riverside was built anew since: make the queries again" in told

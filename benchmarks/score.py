@@ -28,8 +28,8 @@ import numpy as np
 from benchmarks.growth import draw
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive import score_all
 from sasgeo_bench.regions.evidence import Evidence

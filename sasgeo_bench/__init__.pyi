@@ -18,9 +18,9 @@ from .geometry.pose import Prior as Prior
 from .geometry.pose import inverse as inverse
 from .geometry.pose import rotation as rotation
 from .geometry.pose import wrap_deg as wrap_deg
+from .leaderboard.board import StoredBoard as StoredBoard
+from .leaderboard.board import read_board as read_board
 from .leaderboard.query_plot import plot_query as plot_query
-from .leaderboard.stored_board import StoredBoard as StoredBoard
-from .leaderboard.stored_board import read_board as read_board
 from .matching.belief_fix import fix_of as fix_of
 from .matching.belief_fix import followed as followed
 from .matching.card_file import read_card as read_card

@@ -103,9 +103,8 @@ def put_board(folder, *, table=None, entries=(), findings=(), verdicts=(), score
             "contrasts": CONTRAST_SCHEMA.frame(findings),
             "controls": CONTROL_SCHEMA.frame(verdicts),
         },
-        texts={"leaderboard.md": "# Board\n", "leaderboard.tex": "% board\n"},
         about=about_of(list(entries), **about),
-        extras=extras,
+        extras=[Extra(texts={"leaderboard.md": "# Board\n", "leaderboard.tex": "% board\n"}), *extras],
     )
     return folder
 

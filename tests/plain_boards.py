@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from sasgeo_bench.leaderboard import board
+from sasgeo_bench.leaderboard import build
 from sasgeo_bench.scoring import rejection
 from sasgeo_bench.scoring.acceptance import acceptance_frame
 
@@ -16,6 +16,6 @@ def plain_boards() -> Iterator[None]:
     """Boards have empty texts, and no table of what is accepted by cost."""
     with pytest.MonkeyPatch.context() as patch:
         for name in ("board_markdown", "board_latex"):
-            patch.setattr(board, name, lambda *_, **__: "")
+            patch.setattr(build, name, lambda *_, **__: "")
         patch.setattr(rejection, "acceptance_frame", lambda one, other, rows: acceptance_frame(one, other, rows[:0]))
         yield

@@ -98,7 +98,7 @@ def test_a_town_is_driven_from_region_to_site_by_functions_alone(tmp_path, capfd
         assert len(answers) == len(truths)
     assert any("ok" in line for line in notes)
     board = sgb.score(predictions=out / "runs", draws=100, cases=False, out=out)
-    assert set(board.scores) == names
+    assert set(board.scores["matcher"]) == names
     site = sgb.publish(board=out / "boards/board", into=tmp_path / "site")
     assert (site.folder / "index.html").is_file()
     assert capfd.readouterr() == ("", "")

@@ -354,7 +354,7 @@ def test_a_board_of_hostile_names_is_a_table_of_them_in_every_format(tmp_path):
     }
     assert not re.search(r"(?<!\\)\\(?:input|end\{(?!table|tabular))", board_latex(board, about_of([])))
     about = about_of(entries)
-    write_board(tmp_path / "board", tables={"leaderboard": board}, texts={}, about=about)
+    write_board(tmp_path / "board", tables={"leaderboard": board}, about=about)
     back = list(csv.reader((tmp_path / "board" / "leaderboard.csv").open(encoding="utf-8", newline="")))
     assert {row[0].removeprefix("'") for row in back[1:]} == {plain(name) for name in names}
     assert not [cell for row in back for cell in row if cell[:1] in tuple("=+@\t\r")]

@@ -31,6 +31,7 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.publishing.submissions import submissions_for
+from sasgeo_bench.running.failures import log_beside
 from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.tasks.task_files import TRUTH
 
@@ -118,7 +119,7 @@ def score(options: ScoreOptions) -> Board:
     Returns
     -------
     Board
-        `table` is the leaderboard, `scores` the row of each query by matcher, `verdicts` say which controls hold.
+        `leaderboard` holds every figure, `scores` the row of each matcher and query, `controls` which of them hold.
 
     Raises
     ------
@@ -131,7 +132,7 @@ def score(options: ScoreOptions) -> Board:
     --------
     >>> import sasgeo_bench as sgb
     >>> board = sgb.score(predictions="out/runs", name="mine", jobs=2)  # doctest: +SKIP
-    >>> board.table[["matcher", "track", "recall_1"]]  # doctest: +SKIP
+    >>> board.leaderboard[["matcher", "track", "recall_1"]]  # doctest: +SKIP
     """
     _check_names(options.name, options.truth)
     if options.truth is not None and not any(map(is_pack, options.predictions)):  # stored results hold their truths
@@ -157,7 +158,7 @@ def score(options: ScoreOptions) -> Board:
         jobs=options.jobs,
         dask=options.dask,
     )
-    return score_all(request, has_cases=options.cases, results=options.results)
+    return score_all(request, has_cases=options.cases, results=options.results).board
 
 
 def score_command(options: ScoreOptions) -> None:
@@ -245,13 +246,7 @@ def leaderboard_command(options: LeaderboardOptions) -> None:
     if private is not None:
         read_private(private, plan.spec.identity)
     with shown_progress():
-        board = run_pipeline(
-            plan,
-            results=results,
-            has_cases=options.cases,
-            private=private,
-            opened=opened,
-        )
+        board = run_pipeline(plan, results=results, has_cases=options.cases, private=private, opened=opened).board
     show_board(board)
     say(board_folder(plan))
     if plan.private is not None:
@@ -271,17 +266,18 @@ def _how_to_publish(folder: Path) -> str:
 
 def check_controls(board: Board) -> None:
     """End with a status that a script sees where a control or a contestant failed; the board is written though."""
-    for name, why in board.failures.found.items():
+    for name, why in board.about.failed.items():
         complain(f"failed, and so not on the board: {name}: {why}")
     unseen = segmenter_lines(board.about)
     for line in unseen:
         complain(line)
-    if board.failures.found and board.failures.log.is_file():
-        complain(f"where it failed stands in {board.failures.log}")
+    log = log_beside(board.folder)
+    if board.about.failed and log.is_file():
+        complain(f"where it failed stands in {log}")
     failed = [item for item in board.verdicts if not item.holds]
     if any(item.is_of_board for item in failed):
         raise typer.Exit(CONTROL_FAILED)
-    if board.failures.found or failed or unseen:
+    if board.about.failed or failed or unseen:
         raise typer.Exit(CONTESTANT_FAILED)
 
 
@@ -299,8 +295,8 @@ def _begin(file: Path, stated: ArchiveSpec | None, options: LeaderboardOptions) 
 
 def show_board(board: Board) -> None:
     """Print what a board says in short: who is good at what, the contrasts, and what is answered at a given risk."""
-    risks = risk_tables(board.table)
-    tables = (*summary(Book.of(board.table)), contrast_table(board.findings), *risks)
+    risks = risk_tables(board.leaderboard)
+    tables = (*summary(Book.of(board.leaderboard)), contrast_table(board.findings), *risks)
     for table in (one for one in tables if one.rows):
         say(table.title)
         shown = Table(*(column.name for column in table.columns), box=None, pad_edge=False)
@@ -311,5 +307,5 @@ def show_board(board: Board) -> None:
         say(line)
     for line in control_lines(board.verdicts):
         (tell if all(item.holds for item in board.verdicts) else complain)(line)
-    for line in (*map_lines(board.about), *warnings_of(board.table)):
+    for line in (*map_lines(board.about), *warnings_of(board.leaderboard)):
         tell(line)

@@ -12,7 +12,6 @@ from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, failure_lines, plan_entry
-from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.elsewhere import elsewhere_lines
 
@@ -62,15 +61,15 @@ def enter_command(options: EnterOptions) -> None:
     if options.dry_run:
         return
     with shown_progress():
-        folder, board = enter(entry, into=options.into)
-    show_board(board)
+        folder, scored = enter(entry, into=options.into)
+    show_board(scored.board)
     both = options.out / "boards" / f"{entry.board}-{folder.name}"
-    for line in elsewhere_lines(read_board_manifest(both).elsewhere):
+    for line in elsewhere_lines(scored.board.about.elsewhere):
         say(line)
     name = checked.run.card.name
-    for line in failure_lines(board.predictions.get(name, {}).values()):
+    for line in failure_lines(scored.predictions.get(name, {}).values()):
         say(f"{name}: {line}")
     say(folder)
     tell(f"the board of both, without pictures: {both}")
     tell(f"next: look at your row, then open a pull request with {folder}")
-    check_controls(board)
+    check_controls(scored.board)

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from sasgeo_bench import progress
 from sasgeo_bench.cli.boards import check_controls
 from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import Options, Out, takes
@@ -63,8 +64,8 @@ def publish(options: PublishOptions) -> Written:
 name another one with --into
     """
     written, scored = _published(options)
-    for name, why in scored.failures.found.items() if scored else ():
-        tell(f"failed, and so not on the board: {name}: {why}")
+    for name, why in scored.about.failed.items() if scored else ():
+        progress.tell(f"failed, and so not on the board: {name}: {why}")
     return written
 
 
@@ -73,7 +74,7 @@ def _published(options: PublishOptions) -> tuple[Written, Board | None]:
     folder, scored = options.board, None
     if options.submissions:
         folder = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
-        scored = with_submissions(options.board, options.submissions, folder, root=options.out, jobs=options.jobs)
+        scored = with_submissions(options.board, options.submissions, folder, root=options.out, jobs=options.jobs).board
     written = build.publish(
         folder,
         options.into,

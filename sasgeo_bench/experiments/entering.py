@@ -15,7 +15,7 @@ from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, pl
 from sasgeo_bench.experiments.pipeline import ask, draw_all
 from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, Run, plan_runs
 from sasgeo_bench.files.plugins import check_registered
-from sasgeo_bench.leaderboard.board import Board
+from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.results import SOUND, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
@@ -114,7 +114,7 @@ def enter(
     entry: Entry,
     *,
     into: Path | None = None,
-) -> tuple[Path, Board]:
+) -> tuple[Path, Scored]:
     """Draw the queries of a board, ask the matcher, write the submission, and score it beside the stored answers.
 
     What was drawn or answered before is not done again. Return the folder of the submission (`into`, or
@@ -146,10 +146,10 @@ def enter(
     card = _card_of(planned.card, runs, plan.split, source=entry.matcher)
     make_submission(SubmitRequest(predictions=planned.run_folder, card=card, board=entry.stored, into=folder))
     both = plan.out / "boards" / f"{entry.board}-{card.name}"
-    board = beside_stored(entry.stored, folder, both, root=plan.out, jobs=plan.jobs)
+    scored = beside_stored(entry.stored, folder, both, root=plan.out, jobs=plan.jobs)
     if card.trained_elsewhere:
         tell(f"{card.name}: trained elsewhere than in the places of the split, not set apart: {card.trained_elsewhere}")
-    return folder, board
+    return folder, scored
 
 
 def _check_answered(plan: RunPlan, asked: Collection[str], folder: Path) -> None:

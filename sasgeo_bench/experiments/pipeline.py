@@ -25,10 +25,10 @@ from sasgeo_bench.experiments.pipeline_plan import (
     plan_runs,
 )
 from sasgeo_bench.experiments.sealed import open_seal
-from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
 from sasgeo_bench.progress import reporting, silent, tell
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.publishing.archive_file import check_results
@@ -57,7 +57,7 @@ def run_pipeline(
     has_cases: bool = True,
     private: Path | None = None,
     opened: dt.date | None = None,
-) -> Board:
+) -> Scored:
     """Draw what is missing, run queries without a row, score all of it, and write the board to out/boards/<id>/.
 
     `results` is a folder to store the board in, with the answers and truths it was made of, as <id>/. `has_cases` shows
@@ -102,7 +102,6 @@ def run_pipeline(
         draws=plan.spec.draws,
         pipeline=plan.spec.identity,
         title=plan.spec.title,
-        extras=(figures, pictures, *(() if plan.spec.paper is None else (partial(paper_extra, root=plan.out),))),
         by_region=() if plan.spec.paper is None or len(plan.spec.paper.seeds) == 1 else tuple(plan.spec.paper.crops),
         by_block=() if plan.spec.paper is None else tuple(plan.spec.paper.crops),
         jobs=plan.jobs,
@@ -110,10 +109,11 @@ def run_pipeline(
         sealed=sealed,
         failed=failures.found,
     )
-    board = make_board(request)
+    paper = () if plan.spec.paper is None else (partial(paper_extra, root=plan.out),)
+    scored = make_board(request, (figures, pictures, *paper))
     if stored is not None:
-        tell(pack_board(board, request, stored).to_text())
-    return board
+        tell(pack_board(scored, request, stored).to_text())
+    return scored
 
 
 def draw_all(plan: PipelinePlan) -> tuple[list[Path], list[Path]]:

@@ -10,7 +10,6 @@ from typing import Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.flight_plots import (
     distance_frame,
@@ -47,6 +46,7 @@ from sasgeo_bench.leaderboard.pooled_tables import (
     price_frame,
     recall_frame,
 )
+from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.progress import tell
 from sasgeo_bench.scoring.contrasts import Contrast, by_place
 from sasgeo_bench.scoring.protection import ProtectionLevels, protection_levels
@@ -61,66 +61,67 @@ MOST_STANFORD: Final = 5  # matchers
 _PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
 
 
-def figures_extra(board: Board, *, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
+def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
     """Return the figures of a board, as SVG.
 
     Report the kinds of figures that lack data. `contrasts` are the registered ones; `split` assigns the
     places that calibrate conformal protection levels.
     """
-    shown = shown_matchers(board.table, contrasts)
-    queries = queries_of(board.scores)
-    alone = {name: single_views(frame) for name, frame in board.scores.items()}
-    steps = steps_frame(board.table, queries, shown)
+    table, scores = scored.board.leaderboard, scored.scores
+    shown = shown_matchers(table, contrasts)
+    queries = queries_of(scores)
+    alone = {name: single_views(frame) for name, frame in scores.items()}
+    steps = steps_frame(table, queries, shown)
     if steps.empty:  # a table without a row does not know its types, by which it is held against others
         steps = steps.astype({name: queries[name].dtype for name in ("strength", "view_cells")})
-    ages = ages_frame(steps, queries, board.measured)
+    ages = ages_frame(steps, queries, scored.measured)
     # An age is no other strength: where maps have ages, those are the axis.
     others = steps[~steps["suite"].isin(set(ages["suite"]))]
-    calibrated = _calibrated(board.table)
+    calibrated = _calibrated(table)
     kinds: dict[str, Callable[[], Named]] = {
         "success against the age of the map": lambda: _each("age", ages, GROUP, draw_ages, shown),
         "success against strength": lambda: _each("strength", others, GROUP, draw_steps, shown),
-        "success under stress": lambda: _each("stress", stress_frame(board.table, shown), GROUP[1:], draw_bars, shown),
+        "success under stress": lambda: _each("stress", stress_frame(table, shown), GROUP[1:], draw_bars, shown),
         "arms side by side": lambda: _each(
-            "ablation", ablation_frame(board.scores, contrasts, shown), GROUP[1:], draw_ablation, shown
+            "ablation", ablation_frame(scores, contrasts, shown), GROUP[1:], draw_ablation, shown
         ),
-        "differences by place": lambda: _forests(board, contrasts),
+        "differences by place": lambda: _forests(scored, contrasts),
         "recall against K": lambda: _each(
             "recall",
-            recall_frame(alone, board.predictions, board.truths, shown),
+            recall_frame(alone, scored.predictions, scored.truths, shown),
             GROUP[1:],
             draw_recall,
             shown,
         ),
         "the distribution of errors": lambda: _each(
-            "errors", errors_frame(alone, board.table, shown), GROUP[1:], draw_errors, shown
+            "errors", errors_frame(alone, table, shown), GROUP[1:], draw_errors, shown
         ),
-        "success against cost": lambda: _each("price", _priced(board), GROUP[1:], draw_prices, shown),
-        "risk against coverage": lambda: _each("risk", risk_frame(board.judged, shown), GROUP, draw_risk, shown),
+        "success against cost": lambda: _each("price", _priced(scored), GROUP[1:], draw_prices, shown),
+        "risk against coverage": lambda: _each("risk", risk_frame(scored.judged, shown), GROUP, draw_risk, shown),
         "reliability": lambda: _each(
             "reliability",
-            reliability_frame(board.judged, calibrated, shown),
+            reliability_frame(scored.judged, calibrated, shown),
             GROUP[1:],
             draw_reliability,
             shown,
         ),
         "the cost of decisions": lambda: _each(
-            "cost", cost_frame(board.judged, calibrated, shown), GROUP[1:], draw_costs, shown
+            "cost", cost_frame(scored.judged, calibrated, shown), GROUP[1:], draw_costs, shown
         ),
-        "protection levels against errors": lambda: _stanfords(board, shown, split),
+        "protection levels against errors": lambda: _stanfords(scored, shown, split),
         "error along flights": lambda: _each(
-            "distance", distance_frame(board.views, board.scores, shown), GROUP, draw_distance, shown
+            "distance", distance_frame(scored.views, scores, shown), GROUP, draw_distance, shown
         ),
         "how far odometers carry fixes on flights": lambda: _each(
-            "interval", interval_frame(board.table, kinds_of(board.scores), shown), GROUP, draw_intervals, shown
+            "interval", interval_frame(table, kinds_of(scores), shown), GROUP, draw_intervals, shown
         ),
         "success against the drift of odometers": lambda: _each(
-            "drift", drift_frame(board.table, shown), GROUP[1:], draw_drift, shown
+            "drift", drift_frame(table, shown), GROUP[1:], draw_drift, shown
         ),
     }
     drawn: dict[str, dict[str, Draw]] = {}
     for kind, make in kinds.items():
-        with board.failures.of(f"figures of {kind}"):
+        with scored.failures.of(f"figures of {kind}"):
             drawn[kind] = {f"{name}.svg": draw for name, draw in make()}
     empty = [kind for kind, named in drawn.items() if not named]
     if empty:
@@ -146,16 +147,16 @@ def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
     return set(zip(rows["matcher"], rows["rejector"], strict=True))
 
 
-def _priced(board: Board) -> pd.DataFrame:
+def _priced(scored: Scored) -> pd.DataFrame:
     """Return the ranked matchers with some known cost, for who is cheap need not be among the few that are shown."""
-    rows = price_frame(board.table, board.scores, ranked_matchers(board.table))
+    rows = price_frame(scored.board.leaderboard, scored.scores, ranked_matchers(scored.board.leaderboard))
     known: pd.DataFrame = rows[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
     return known
 
 
-def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:
-    for contrast, finding in zip(contrasts, board.findings, strict=True):
-        places = by_place(contrast, board.scores, board.judged) if finding.n else ()
+def _forests(scored: Scored, contrasts: Sequence[Contrast]) -> Named:
+    for contrast, finding in zip(contrasts, scored.board.findings, strict=True):
+        places = by_place(contrast, scored.scores, scored.judged) if finding.n else ()
         if places:
             yield (
                 _file_name("contrast", contrast.name),
@@ -163,11 +164,11 @@ def _forests(board: Board, contrasts: Sequence[Contrast]) -> Named:
             )
 
 
-def _stanfords(board: Board, shown: Sequence[str], split: Split | None) -> Named:
+def _stanfords(scored: Scored, shown: Sequence[str], split: Split | None) -> Named:
     """Yield a panel for each matcher and method, of few matchers, those of contrasts first."""
     found: dict[tuple[str, float], dict[tuple[str, str], ProtectionLevels]] = {}
-    for matcher in (name for name in shown if name in board.scores):
-        for item in protection_levels(board.scores[matcher], board.predictions[matcher], split):
+    for matcher in (name for name in shown if name in scored.scores):
+        for item in protection_levels(scored.scores[matcher], scored.predictions[matcher], split):
             key = item.prior_group, item.risk
             rows = {name for name, _ in found.get(key, ())} | {matcher}
             if len(item.level_m) and len(rows) <= MOST_STANFORD:

@@ -76,15 +76,14 @@ def write_board(
     folder: Path,
     *,
     tables: Mapping[str, pd.DataFrame],
-    texts: Mapping[str, str],
     about: BoardManifest,
     failed: Mapping[str, str] | None = None,
     extras: Sequence[Extra] = (),
 ) -> None:
     """Write a board completely or not at all; an older board of the same scorer version there is replaced.
 
-    Each of `tables` becomes <name>.parquet, "leaderboard" and "protection" also a csv; `texts` are files by name,
-    `about` the manifest; `failed` grows until the last file is made. Raise StoreError if the folder holds a board of
+    Each of `tables` becomes <name>.parquet, "leaderboard" and "protection" also a csv; `about` is the manifest;
+    `failed` grows until the last file is made. Raise StoreError if the folder holds a board of
     another scorer version, or something that is no part of a board, or cannot be written; an older board is then
     unchanged.
     """
@@ -94,7 +93,7 @@ def write_board(
         with locked(folder):
             check_board(folder, scorer_version=about.scorer_version)
             with fresh_folder(folder) as scratch:
-                for part in (Extra(tables=tables, texts=texts), *extras):
+                for part in (Extra(tables=tables), *extras):
                     _write_part(scratch, part, metadata)
                 for name in (one for one in _AS_CSV if one in tables):
                     (scratch / f"{name}.csv").write_text(csv_text(tables[name]), encoding="utf-8", newline="")

@@ -13,7 +13,6 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
-from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_answers import answers_frame
 from sasgeo_bench.leaderboard.board_files import ANSWERS, PICTURES_FILE, Extra
 from sasgeo_bench.leaderboard.case_plot import WEBP, case_pixels, fitted, pixels_of
@@ -29,6 +28,7 @@ from sasgeo_bench.leaderboard.flight_maps import MOST_TRACKERS, flight_map_pixel
 from sasgeo_bench.leaderboard.manifests import FailedCase, MapBlock, Picture, PictureStrip, RegionMap
 from sasgeo_bench.leaderboard.plot_tables import ranked_matchers, shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
+from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
 from sasgeo_bench.progress import spread, tell
 from sasgeo_bench.regions import region_files
@@ -94,7 +94,7 @@ def _file_of(kind: str, name: str) -> str:
 
 
 def pictures_extra(
-    board: Board,
+    scored: Scored,
     *,
     root: Path,
     contrasts: Sequence[Contrast] = (),
@@ -109,22 +109,22 @@ def pictures_extra(
     of a map; `has_cases` adds failed queries, drawn by `jobs` processes, and `answers.parquet` with the place of every
     query.
     """
-    found = _Found(failures=board.failures)
-    tasks = [about for about in board.tasks if about.suite != CONTROLS]
+    found = _Found(failures=scored.failures)
+    tasks = [about for about in scored.tasks if about.suite != CONTROLS]
     asked = {about.name: task for about in tasks if (task := _there(about, root)) is not None}
     if len(asked) < len(tasks):
         tell(f"pictures of {len(asked)} of {counted(len(tasks), 'task')}: {root / 'tasks'} lacks the views of the rest")
     _add_regions(found, list(asked), root, split)
-    _add_suites(found, asked, board)
+    _add_suites(found, asked, scored)
     answers = {}
     if has_cases:
-        failures = _failures(board, contrasts)
-        placed = answers_frame(board, failures, ranked_matchers(board.table))
+        failures = _failures(scored, contrasts)
+        placed = answers_frame(scored, failures, ranked_matchers(scored.board.leaderboard))
         answers = {ANSWERS: placed} if len(placed) else {}
-        _add_strips(found, board, asked)
-        _add_flights(found, board, asked)
-        shown = failures[failures["matcher"].isin(shown_matchers(board.table, contrasts))]
-        _add_cases(found, board, shown, asked, jobs=jobs)
+        _add_strips(found, scored, asked)
+        _add_flights(found, scored, asked)
+        shown = failures[failures["matcher"].isin(shown_matchers(scored.board.leaderboard, contrasts))]
+        _add_cases(found, scored, shown, asked, jobs=jobs)
     for reason, count in found.lacking.items():
         tell(f"left out: {counted(count, 'picture')}, {reason}")
     listed = ", ".join(
@@ -182,10 +182,10 @@ def _map(folder: Path, manifest: Manifest) -> bytes:
     return fitted(np.ascontiguousarray((255 * colours[..., ::-1]).round().astype(np.uint8)), REGION_BYTES)
 
 
-def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], board: Board) -> None:
+def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], scored: Scored) -> None:
     """Add for each suite a control and its strongest stress at one site."""
     drawn: dict[tuple[str, str], set[str]] = {}
-    for frame in board.scores.values():
+    for frame in scored.scores.values():
         for suite, region, role in zip(frame["suite"], frame["region"], frame["role"], strict=True):
             drawn.setdefault((suite, region), set()).add(role)
     best: dict[str, tuple[int, str]] = {}
@@ -222,21 +222,21 @@ def control_and_stress(truths: Sequence[Truth]) -> list[Truth]:
 # --- strips and cases -------------------------------------------------------------------------------------------------
 
 
-def _add_strips(found: _Found, board: Board, asked: Mapping[tuple[str, str], Task]) -> None:
+def _add_strips(found: _Found, scored: Scored, asked: Mapping[tuple[str, str], Task]) -> None:
     """Add for each suite of pictures some queries of the matcher that finds most of them, from picture to pose."""
     pictured = {name: task for name, task in asked.items() if task.manifest.frames}
     for suite in sorted({suite for suite, _ in pictured}):
         own = {name: task for name, task in pictured.items() if name[0] == suite}
-        name = best_on_pictures(board.scores, own)
+        name = best_on_pictures(scored.scores, own)
         if name is None:
             continue
-        strip = Strip.of(board.scores[name], own, STRIP_ROWS)
-        chosen = board.scores[name].set_index("query_id").loc[list(strip.query_ids), ["suite", "region"]]
+        strip = Strip.of(scored.scores[name], own, STRIP_ROWS)
+        chosen = scored.scores[name].set_index("query_id").loc[list(strip.query_ids), ["suite", "region"]]
         drawn = {
             (row["query_id"], name): row | {"matcher": name, "failure": ""}
             for row in chosen.reset_index().to_dict("records")
         }
-        cases = {case.query.query_id: case for case in _cases(drawn, board, {}, asked, found)}
+        cases = {case.query.query_id: case for case in _cases(drawn, scored, {}, asked, found)}
         alt = f"From the picture to the pose: {name} on {suite}. {strip.facts}"
         found.add(
             "strips",
@@ -258,18 +258,18 @@ def _strip(
     return fitted(strip_pixels(strip, rows, title=title), STRIP_BYTES)
 
 
-def _add_flights(found: _Found, board: Board, asked: Mapping[tuple[str, str], Task]) -> None:
+def _add_flights(found: _Found, scored: Scored, asked: Mapping[tuple[str, str], Task]) -> None:
     """Add for each suite of flights the flight on which trackers differ most, a map for each of them."""
     flown = [name for name, task in asked.items() if task.manifest.is_of_flights]
-    names = [name for name in shown_matchers(board.table, ()) if name in board.views]
+    names = [name for name in shown_matchers(scored.board.leaderboard, ()) if name in scored.views]
     for suite in sorted({suite for suite, _ in flown}):
         regions = [region for one, region in flown if one == suite]
-        chosen = shown_flight({name: board.scores[name] for name in names}, suite, regions)
+        chosen = shown_flight({name: scored.scores[name] for name in names}, suite, regions)
         if chosen is None:
             continue
         region, flight = chosen
-        shown = [name for name in names if (board.views[name]["sequence_id"] == flight).any()][:MOST_TRACKERS]
-        views = {name: board.views[name] for name in shown}
+        shown = [name for name in names if (scored.views[name]["sequence_id"] == flight).any()][:MOST_TRACKERS]
+        views = {name: scored.views[name] for name in shown}
         alt = f"A flight of {suite} on {region}, with the estimates of {', '.join(shown)}"
         found.add(
             "flights",
@@ -284,15 +284,15 @@ def _flight_map(task: Task, flight: str, views: Mapping[str, pd.DataFrame]) -> b
 
 
 def _add_cases(
-    found: _Found, board: Board, failures: pd.DataFrame, asked: Mapping[tuple[str, str], Task], *, jobs: int
+    found: _Found, scored: Scored, failures: pd.DataFrame, asked: Mapping[tuple[str, str], Task], *, jobs: int
 ) -> None:
     failures = failures[[key in asked for key in zip(failures["suite"], failures["region"], strict=True)]]
     if not len(failures):
         return
     chosen = sample_cases(failures, each=_EACH, most=MOST_CASES)
-    words = {key: frame.set_index("query_id") for key, frame in board.judged.items() if key[0] in {*chosen["matcher"]}}
+    words = {key: frame.set_index("query_id") for key, frame in scored.judged.items() if key[0] in {*chosen["matcher"]}}
     drawn = {(row["query_id"], row["matcher"]): row for row in chosen.to_dict("records")}
-    cases = list(_cases(drawn, board, words, asked, found))
+    cases = list(_cases(drawn, scored, words, asked, found))
     draws = [partial(_drawn, case, asked[case.query.suite, case.query.region]) for case in cases]
     for case, outcome in zip(cases, spread(_outcome, draws, jobs=jobs), strict=True):
         row = drawn[case.query.query_id, case.matcher]
@@ -309,15 +309,15 @@ def _add_cases(
     found.listed["cases"].sort(key=lambda one: order[one.file])
 
 
-def _failures(board: Board, contrasts: Sequence[Contrast]) -> pd.DataFrame:
+def _failures(scored: Scored, contrasts: Sequence[Contrast]) -> pd.DataFrame:
     """Return every failure of the ranked matchers of a board, with its class."""
     frames = [pd.DataFrame(columns=list(COLUMNS))]
-    for name in ranked_matchers(board.table):
-        with board.failures.of(f"cases of {name}"):
-            if name in board.scores:
-                rejector = operating_rejector(board.judged, name, contrasts)
-                judged = None if rejector is None else board.judged[name, rejector]
-                frames.append(find_cases(single_views(board.scores[name]), name, judged))
+    for name in ranked_matchers(scored.board.leaderboard):
+        with scored.failures.of(f"cases of {name}"):
+            if name in scored.scores:
+                rejector = operating_rejector(scored.judged, name, contrasts)
+                judged = None if rejector is None else scored.judged[name, rejector]
+                frames.append(find_cases(single_views(scored.scores[name]), name, judged))
     return pd.concat(frames, ignore_index=True)
 
 
@@ -341,7 +341,7 @@ def _drawn(case: Case, task: Task) -> bytes:
 
 def _cases(
     drawn: Mapping[tuple[Any, Any], Mapping[Any, Any]],
-    board: Board,
+    scored: Scored,
     words: Mapping[tuple[str, str], pd.DataFrame],
     tasks: Mapping[tuple[str, str], Task],
     found: _Found,
@@ -363,7 +363,7 @@ def _cases(
                 matcher=matcher,
                 failure=row["failure"],
                 query=views[query_id],
-                truth=board.truths[query_id],
-                prediction=board.predictions[matcher].get(query_id),
+                truth=scored.truths[query_id],
+                prediction=scored.predictions[matcher].get(query_id),
                 **words_of(words, matcher, query_id),
             )

@@ -20,6 +20,7 @@ from sasgeo_bench.leaderboard.manifests import (
     SeedResult,
     SeedVerdict,
 )
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.sandbox import keeps_truth
@@ -272,21 +273,23 @@ def check_public(seed: SeedRecord | None, what: str) -> None:
 
 
 def hold_private(
-    folder: Path,
+    request: ScoreRequest,
     *,
     entries: Sequence[Entry],
     scores: Mapping[str, pd.DataFrame],
     tasks: Sequence[TaskManifest],
-    pipeline: PipelineRecord | None,
-    draws: int,
 ) -> OnPrivate:
-    """Compare the rows of a public board with a board of a private seed in `folder`.
+    """Compare the rows of a public board with the board of a private seed that is named, and tell how they fared.
 
-    `entries`, `scores`, `tasks` and `pipeline` are those of the public board. Report which tasks the two
-    boards do not share. Raise ConfigError if the folder holds no board of a private seed, or one of another pipeline or
-    version, or the public one is itself of a private seed. Raise StoreError if it holds no sound board.
+    `entries`, `scores` and `tasks` are those of the public board. Without such a board, stored results keep theirs.
+    Report which tasks the two boards do not share. Raise ConfigError if the folder holds no board of a private seed, or
+    one of another pipeline or version, or the public one is itself of a private seed. Raise StoreError if it holds no
+    sound board.
     """
-    about, seed = read_private(folder, pipeline)
+    if request.private is None:
+        return OnPrivate() if request.without else _kept_private(request.kept, entries, request.root)
+    folder = request.private
+    about, seed = read_private(folder, request.pipeline)
     if seed_of(tasks) is not None:
         raise ConfigError(
             "the rows to be held against a private seed are of a private seed themselves: name a public board"
@@ -310,7 +313,9 @@ def hold_private(
             rows[entry.name] = _result(RUN_HERE, why)
             continue
         mine, frame = scores[entry.name], theirs[theirs["matcher"] == other.name]
-        rows[entry.name] = result_of(compare_seeds(mine[_is_of(mine, named)], frame, draws=draws))
+        rows[entry.name] = result_of(compare_seeds(mine[_is_of(mine, named)], frame, draws=request.draws))
+    for name, row in rows.items():
+        tell(f"{name}: {row.verdict} ({row.why})")
     return OnPrivate(seed=seed, rows=rows)
 
 
@@ -353,12 +358,12 @@ def _lack(entry: BoardEntry | None, seed: SeedRecord) -> str:
     return f"on the private seed its truths were not kept from it ({isolation.get('truth', 'not protected')})"
 
 
-def kept_private(about: BoardManifest | None, entries: Sequence[Entry], root: Path) -> OnPrivate:
+def _kept_private(about: BoardManifest, entries: Sequence[Entry], root: Path) -> OnPrivate:
     """Return the results on a private seed that stored results keep, for entries whose answers all come from them.
 
-    `about` is the manifest of the stored results, if any, `root` the folder that they are unpacked to.
+    `about` is the manifest of the stored results, `root` the folder that they are unpacked to.
     """
-    if about is None or about.private is None:
+    if about.private is None:
         return OnPrivate()
     known = {_whose(entry): entry.private for entry in about.entries}
     rows = {}

@@ -10,13 +10,13 @@ from pathlib import Path
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.plugins import check_registered
 from sasgeo_bench.files.scratch import scratch_folder
-from sasgeo_bench.leaderboard.board import Board, ScoreRequest
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
 from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.manifests import PackManifest
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
+from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive_file import (
     MOST_BYTES,
@@ -57,7 +57,7 @@ class Stored:
 
 
 def pack_board(
-    board: Board, request: ScoreRequest, folder: Path, *, lacks: str = "", most_bytes: int = MOST_BYTES
+    scored: Scored, request: ScoreRequest, folder: Path, *, lacks: str = "", most_bytes: int = MOST_BYTES
 ) -> Stored:
     """Store a board that was just written in a folder, replacing older results there.
 
@@ -66,13 +66,13 @@ def pack_board(
     of a private seed; `StoreError` if it would be too large or cannot be written, and older results then stay as they
     were.
     """
-    submitted = next((entry.name for entry in board.everyone if not entry.runs), None)
+    submitted = next((entry.name for entry in scored.entries if not entry.runs), None)
     if submitted is not None:
         raise ConfigError(f"{submitted} is a file of predictions: only boards of runs are stored")
-    check_public(seed_of(board.tasks), str(request.board))
-    tasks = [Task.of(about, request.root, truth=request.truth) for about in board.tasks]
+    check_public(seed_of(scored.tasks), str(request.board))
+    tasks = [Task.of(about, request.root, truth=request.truth) for about in scored.tasks]
     ids = {task.manifest.name: task.ids() for task in tasks}
-    runs = {entry.name: list(_runs_of(entry, board, ids)) for entry in board.everyone}
+    runs = {entry.name: list(_runs_of(entry, scored, ids)) for entry in scored.entries}
     packed = write_pack(
         folder,
         board=request.board,
@@ -85,8 +85,8 @@ def pack_board(
     return Stored(folder=folder, packed=packed)
 
 
-def _runs_of(entry: Entry, board: Board, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
-    answers = board.predictions[entry.name]
+def _runs_of(entry: Entry, scored: Scored, ids: Mapping[tuple[str, str], Sequence[str]]) -> Iterator[StoredRun]:
+    answers = scored.predictions[entry.name]
     for source, run in zip(entry.sources, entry.runs, strict=True):
         training = run.learned
         asked = ids[run.suite, run.region]
@@ -178,8 +178,8 @@ def score_all(
     *,
     has_cases: bool = True,
     results: Path | None = None,
-) -> Board:
-    """Score a request without extras, stored results laid out, and write the board with its figures and pictures.
+) -> Scored:
+    """Score a request, stored results laid out, and write the board with its figures and pictures.
 
     `has_cases` shows failed queries with their truths. With `results`, store the board under its name in that folder,
     with all it was made of. Raise `ConfigError` or `StoreError` as `laid_out`, `make_board` and `pack_board` do, or if
@@ -199,13 +199,13 @@ def score_all(
             has_cases=has_cases,
             jobs=request.jobs,
         )
-        manifest = None if kept is None else read_board_manifest(kept)
+        asked = laid if kept is None else replace(laid, kept=read_board_manifest(kept))
         extras = (figures, pictures) if request.stored is None else ()  # which need what was fitted for every entry
-        board = make_board(replace(laid, extras=extras, kept=manifest))
+        scored = make_board(asked, extras)
         if results is not None:
             lacks = "" if kept is None else read_pack(kept).dropped
-            tell(pack_board(board, laid, results / laid.board.name, lacks=lacks).to_text())
-        return board
+            tell(pack_board(scored, laid, results / laid.board.name, lacks=lacks).to_text())
+        return scored
 
 
 def _check_whole(request: ScoreRequest) -> None:

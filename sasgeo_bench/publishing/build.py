@@ -16,6 +16,7 @@ from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import SITE, absolute, resolve_link
 from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import (
     BOARD_FILES,
     FIGURES,
@@ -25,7 +26,6 @@ from sasgeo_bench.leaderboard.board_files import (
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public
-from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
@@ -174,7 +174,7 @@ def _source(files: BoardFiles) -> SiteSource:
     )
 
 
-def _scenes(board: StoredBoard) -> pd.DataFrame:
+def _scenes(board: Board) -> pd.DataFrame:
     """Return success by kind of place from the board's own scored rows; empty where these do not tell."""
     scores = board.scores
     if not set(SCORED) <= set(scores):
@@ -191,7 +191,7 @@ def _scenes_file(scenes: pd.DataFrame) -> Iterator[Download]:
         yield Download(file="kinds-of-place.csv", data=csv_text(table).encode(), what=what)
 
 
-def _name_of(board: StoredBoard) -> str:
+def _name_of(board: Board) -> str:
     pipeline = board.about.pipeline
     return pipeline.id if pipeline is not None else board.folder.resolve().name
 

@@ -18,6 +18,7 @@ from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.files.folders import IMAGES, SITE_FOLDERS, check_site, fresh_folder, list_files, locked
 from sasgeo_bench.files.folders import SITE_MANIFEST as MANIFEST
 from sasgeo_bench.files.paths import plain_file
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import (
     ACCEPTANCE,
     ANSWERS,
@@ -28,7 +29,6 @@ from sasgeo_bench.leaderboard.board_files import (
     SCORES,
 )
 from sasgeo_bench.leaderboard.manifests import PackManifest, PicturesManifest, parse_record
-from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.publishing.site_maps import MAPS
 from sasgeo_bench.publishing.site_source import Download, SiteFigure
@@ -118,7 +118,7 @@ class BoardFiles:
     `settings` are those of stored results, None for a board that is not stored.
     """
 
-    board: StoredBoard
+    board: Board
     figures: tuple[SiteFigure, ...]
     downloads: tuple[Download, ...]
     pictures: PicturesManifest
@@ -133,7 +133,7 @@ def read_board_files(folder: Path) -> BoardFiles:
     with _sound(folder):
         list_files(folder, without=SITE_FOLDERS)
         return BoardFiles(
-            board=StoredBoard.open(folder),
+            board=Board.open(folder),
             figures=tuple(_read_figures(folder / FIGURES)),
             downloads=tuple(_read_downloads(folder)),
             pictures=_read_pictures(folder / PICTURES),

@@ -11,8 +11,8 @@ from typing import Final, Self
 import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import RateBook
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.manifests import PicturesManifest
-from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.scoring.contrasts import Contrast
 
 _MOST_POINTS: Final = 100_000.0  # of a figure, either way
@@ -79,7 +79,7 @@ class SiteSource:
 
     name: str
     title: str
-    board: StoredBoard
+    board: Board
     rates: RateBook
     scenes: pd.DataFrame = field(default_factory=pd.DataFrame)
     registered: tuple[Contrast, ...] = ()

@@ -10,11 +10,12 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
-from sasgeo_bench.leaderboard.board import Board, ScoreRequest
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
-from sasgeo_bench.leaderboard.manifests import PackManifest
-from sasgeo_bench.leaderboard.stored_board import StoredBoard, why_anew
+from sasgeo_bench.leaderboard.manifests import BoardManifest, PackManifest
+from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
 from sasgeo_bench.matching.card_file import read_card_file
+from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, AnsweredTask, Card, Submission
 from sasgeo_bench.progress import tell
@@ -283,7 +284,7 @@ def _board_named(folder: Path, board: str) -> str:
 
 def with_submissions(
     stored: Path, submissions: Sequence[Path], board: Path, *, root: Path = Path("out"), jobs: int = 1
-) -> Board:
+) -> Scored:
     """Score stored results again together with submissions, and write the board of both.
 
     `submissions` are submissions and folders of them; those for other boards are left out. `root` holds regions/,
@@ -301,7 +302,23 @@ def _request(stored: Path, submissions: Sequence[Path], board: Path, *, root: Pa
     return replace(request_of([stored], board=board, root=root), submissions=found, jobs=jobs)
 
 
-def beside_stored(stored: Path, submission: Path, board: Path, *, root: Path = Path("out"), jobs: int = 1) -> Board:
+def why_anew(about: BoardManifest, cards: Sequence[RejectorCard]) -> str | None:
+    """Return why the figures of a stored board are no longer those of this program, None if they are.
+
+    `about` is its manifest, `cards` those of the rejectors here. The version of tasks does not matter:
+    answers are scored against the stored queries, whoever draws which others today.
+
+    >>> why_anew(BoardManifest(scorer_version=1, entries=[], tasks=[]), [])
+    'the board is of scorer version 1, this program of 6'
+    """
+    if about.scorer_version != SCORER_VERSION:
+        return f"the board is of scorer version {about.scorer_version}, this program of {SCORER_VERSION}"
+    stored, here = ({(str(one.name), str(one.version)) for one in some} for some in (about.rejectors, cards))
+    changed = sorted({name for name, _ in stored ^ here})  # another version fits otherwise
+    return f"the rejector {changed[0]} has another version here" if changed else None
+
+
+def beside_stored(stored: Path, submission: Path, board: Path, *, root: Path = Path("out"), jobs: int = 1) -> Scored:
     """Score one submission beside stored results, whose own rejectors and contrasts stand as they are.
 
     Its figures are those of `with_submissions`, to the last bit; ranks are of all entries together. Figures and
@@ -315,4 +332,4 @@ def beside_stored(stored: Path, submission: Path, board: Path, *, root: Path = P
     if reason is not None:
         tell(f"all entries are scored anew: {reason}")
         return score_all(request)
-    return score_all(replace(request, stored=StoredBoard.open(stored)))
+    return score_all(replace(request, stored=Board.open(stored)))

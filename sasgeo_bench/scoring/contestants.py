@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Entries of a board with their answers to its tasks: read tasks, read and validate answers, score them."""
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Final, Self
 
 import pandas as pd
-import pyarrow as pa
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.progress import tell
@@ -18,7 +17,6 @@ from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.scoring.controls import hold_controls
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.flights import score_flights
-from sasgeo_bench.scoring.rows import AS_SUBMITTED
 from sasgeo_bench.scoring.score import Questions, settle_not_applicable, some_rows, with_answers
 from sasgeo_bench.scoring.validate import submission_faults, validate
 from sasgeo_bench.tasks.query import CONTROLS
@@ -53,14 +51,15 @@ def read_entry_answers(
     *,
     root: Path,
     named: Sequence[Path],
+    split: Split | None = None,
     failures: Failures,
 ) -> list[EntryAnswers]:
-    """Return the answers of all entries; skip runs of other queries, or refuse them where the user named them.
+    """Return the answers of all entries, which are validated here; skip runs of other queries, with a line.
 
     Without `folders`, the tasks are those that runs were made on and that files answer; `root` is the parent of tasks/.
-    `named` are the paths that the user named; a line tells of skipped runs. `failures` records entries
-    whose answers cannot be read. Raise StoreError if a run that the user named answers none of the queries. Raise
-    ConfigError if no entry answers any task.
+    `named` are the paths that the user named. `failures` records entries whose answers cannot be read, or hold a fault.
+    Raise StoreError if a run that the user named answers none of the queries. Raise ConfigError if no entry answers any
+    task.
     """
     files: dict[str, Answers] = {}
     for entry in entries:
@@ -77,6 +76,8 @@ def read_entry_answers(
         with failures.of(entry.name):
             if entry.name in files:
                 item = _answers_of_file(entry, tasks, files[entry.name], task_of)
+                if item.asked:
+                    check_submitted(entry, tasks, split)
             else:
                 item, others = _read_runs(entry, tasks, task_of, room)
                 stale += others
@@ -128,22 +129,34 @@ def _answers_of_file(
     return EntryAnswers(entry=entry, predictions=stored, held=held, asked=frozenset(task.folder for task in asked))
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Shard:
+    """Answers of a run to a task: in memory, or, where there is no room, read again wherever they are used."""
+
+    source: Path
+    asked: Mapping[str, str]
+    is_tied: bool
+    kept: Answers | None = None
+
+    def open(self) -> Answers:
+        return Answers.open(self.source, self.asked, is_tied=self.is_tied) if self.kept is None else self.kept
+
+
+def _merged(shards: Sequence[_Shard]) -> Answers:
+    return shards[0].open() if len(shards) == 1 else Answers.merged([shard.open() for shard in shards])
+
+
 class _Room:
-    """Memory for rows of answers: what does not fit is read again where it is used."""
+    """Memory for answers."""
 
     def __init__(self, most_bytes: int) -> None:
         self._left = most_bytes
 
-    def keep(self, answers: Answers, read: Callable[[], Answers]) -> Callable[[], Answers]:
-        """Return what returns these answers: from memory, or as `read` does."""
-        if answers.table.nbytes > self._left:
-            return read
-        self._left -= answers.table.nbytes
-        return partial(_same, answers)  # no lambda: it goes to the processes that fit rejectors
-
-
-def _same(answers: Answers) -> Answers:
-    return answers
+    def takes(self, answers: Answers) -> bool:
+        """Return whether there is room, and take it."""
+        is_room = bool(answers.table.nbytes <= self._left)
+        self._left -= answers.table.nbytes if is_room else 0
+        return is_room
 
 
 def _read_runs(
@@ -154,9 +167,8 @@ def _read_runs(
     Every answer is checked here; those that find no room are read again where they are used.
     """
     by_name = {task.manifest.name: task for task in tasks}
-    read: dict[Path, Callable[[], Answers]] = {}
+    shards: dict[Path, list[_Shard]] = {}  # of a task: several as of shards of a run
     runs: list[tuple[Path, RunManifest]] = []
-    asked: set[Path] = set()
     stale: list[Path] = []
     for source, run in zip(entry.sources, entry.runs, strict=True):
         task = by_name.get((run.suite, run.region))
@@ -164,22 +176,17 @@ def _read_runs(
             stale.append(source)
             continue
         is_same = run.queries_sha256 == task.manifest.queries_sha256
-        open_answers = partial(Answers.open, source, task.asked, is_tied=is_same)
-        found = open_answers()
+        shard = _Shard(source=source, asked=task.asked, is_tied=is_same)
+        found = shard.open()
         if not (len(found.table) or is_same):
             stale.append(source)
             continue
-        mine = room.keep(found, open_answers)
-        read[task.folder] = partial(_both, read[task.folder], mine) if task.folder in read else mine  # as of shards
-        asked.add(task.folder)
+        shards.setdefault(task.folder, []).append(replace(shard, kept=found) if room.takes(found) else shard)
         runs.append((source, _share_of(run, found)))
     left = replace(entry, sources=tuple(source for source, _ in runs), runs=tuple(run for _, run in runs))
-    answers = StoredAnswers(read, task_of)
-    return EntryAnswers(entry=left, predictions=answers, held=frozenset(asked), asked=frozenset(asked)), stale
-
-
-def _both(first: Callable[[], Answers], second: Callable[[], Answers]) -> Answers:
-    return Answers.merged([first(), second()])
+    answers = StoredAnswers({task: partial(_merged, some) for task, some in shards.items()}, task_of)
+    asked = frozenset(shards)
+    return EntryAnswers(entry=left, predictions=answers, held=asked, asked=asked), stale
 
 
 def _share_of(run: RunManifest, answers: Answers) -> RunManifest:
@@ -189,7 +196,7 @@ def _share_of(run: RunManifest, answers: Answers) -> RunManifest:
     return run.model_copy(update={"cpu_s": run.cpu_s * len(answers.table) / (len(answers.table) + answers.aside)})
 
 
-def read_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[Task]:
+def open_tasks(answers: Sequence[EntryAnswers], folders: Sequence[Path], truth: Path) -> list[Task]:
     """Open the tasks of a board, whose truths lie in `truth`; without `folders`, those that the entries bring.
 
     Raise StoreError if a task or its truths are missing or damaged, or do not belong together.
@@ -229,19 +236,14 @@ def score_entries(
     `by_block`, whose blocks are drawn independently, each is a place. Raise the first fault, a StoreError or
     ConfigError, if no entry is left.
     """
-    parts: dict[str, list[_Part]] = {}
-    for item in answers:
-        with failures.of(item.entry.name):
-            if item.entry.how == AS_SUBMITTED:
-                check_submitted(item.entry, tasks, split)
-            parts[item.entry.name] = []
+    parts: dict[str, list[_Part]] = {item.entry.name: [] for item in answers}
     for task in tasks:  # the candidates of a task are in memory at once
-        score = _scorer(task, split, by_region, by_block)
+        asked = _Asked.of(task, split, by_region, by_block)
         for item in answers:
             name = item.entry.name
             if name in parts and task.folder in item.asked:
                 with failures.of(name):
-                    parts[name].append(_scored(item, task, score))
+                    parts[name].append(_scored(item, asked))
                     continue
                 del parts[name]
     scores: dict[str, pd.DataFrame] = {}
@@ -320,13 +322,17 @@ def check_submitted(entry: Entry, tasks: Sequence[Task], split: Split | None) ->
         raise ConfigError(f"{path} holds {counted(len(faults), 'fault')}: {faults[0].to_text()} ('verify' lists all)")
 
 
+def _places(split: Split | None) -> dict[str, Mapping[str, str]]:
+    return {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
+
+
 def design_rows(task: Task, split: Split | None) -> pd.DataFrame:
     """Return a row for each query or flight of one task, scored without an answer; raise as `score_task` does."""
-    return _scorer(task, split)(Answers.of([])).whole
+    return _Asked.of(task, split).scored(Answers.of([])).whole
 
 
-def _scored(item: EntryAnswers, task: Task, score: Callable[[pa.Table], "_Part"]) -> "_Part":
-    return score(item.predictions.of_task(task.folder))
+def _scored(item: EntryAnswers, asked: "_Asked") -> "_Part":
+    return asked.scored(item.predictions.of_task(asked.task.folder))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -357,26 +363,41 @@ def _joined(parts: Sequence[_Part], shared: dict[tuple[int, ...], pd.DataFrame])
     return with_answers(shared[key], pd.concat([part.answers for part in parts], ignore_index=True))
 
 
-def _scorer(
-    task: Task, split: Split | None, by_region: Collection[str] = (), by_block: Collection[str] = ()
-) -> Callable[[Answers], _Part]:
-    """Return what scores the rows of one entry's answers to a task, whose queries are read once for all entries."""
-    of_split = {} if split is None else {"place_of": split.place_of, "country_of": split.country_of}
-    questions = Questions.of(tuple(task.heads()), task.truths, **of_split)
+@dataclass(frozen=True, kw_only=True)
+class _Asked:
+    """The queries of a task, read once for all entries, and what their rows are drawn by."""
 
-    def resampled(frame: pd.DataFrame) -> pd.DataFrame:
-        """Return rows with the blocks and places that they are drawn by."""
+    task: Task
+    questions: Questions
+    columns: pd.DataFrame
+    split: Split | None
+    is_by_region: bool
+    is_by_block: bool
+
+    @classmethod
+    def of(
+        cls, task: Task, split: Split | None, by_region: Collection[str] = (), by_block: Collection[str] = ()
+    ) -> Self:
+        questions = Questions.of(tuple(task.heads()), task.truths, **_places(split))
         suite = task.manifest.suite
-        frame = frame.assign(block=frame["region"]) if suite in by_region else frame
-        return frame.assign(place=frame["block"], country=frame["block"]) if suite in by_block else frame
+        found = cls(
+            task=task,
+            questions=questions,
+            columns=questions.frame,
+            split=split,
+            is_by_region=suite in by_region,
+            is_by_block=suite in by_block,
+        )
+        return replace(found, columns=found.resampled(questions.frame))
 
-    asked = resampled(questions.frame)
-
-    def score(answers: Answers) -> _Part:
+    def scored(self, answers: Answers) -> _Part:
         """Score the answers of one entry."""
-        if not task.manifest.is_of_flights:
-            return _Part(questions=asked, answers=questions.answered(answers))
-        found = score_flights(questions.heads, questions.truths, answers.found, **of_split)
-        return _Part(questions=None, answers=resampled(found.flights), views=found.views)
+        if not self.task.manifest.is_of_flights:
+            return _Part(questions=self.columns, answers=self.questions.answered(answers))
+        found = score_flights(self.questions.heads, self.questions.truths, answers.found, **_places(self.split))
+        return _Part(questions=None, answers=self.resampled(found.flights), views=found.views)
 
-    return score
+    def resampled(self, frame: pd.DataFrame) -> pd.DataFrame:
+        """Return rows with the blocks and places that they are drawn by."""
+        frame = frame.assign(block=frame["region"]) if self.is_by_region else frame
+        return frame.assign(place=frame["block"], country=frame["block"]) if self.is_by_block else frame

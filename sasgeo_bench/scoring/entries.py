@@ -16,6 +16,7 @@ from sasgeo_bench.files.plugins import ORACLE, shipped_names
 from sasgeo_bench.matching.learned_file import TrainingRecord
 from sasgeo_bench.matching.matcher import check_identity
 from sasgeo_bench.matching.submission import Submission
+from sasgeo_bench.progress import tell
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.run_manifest import RUN, RunManifest, damaged
 from sasgeo_bench.scoring.controls import Verdict, knows_too_much
@@ -284,7 +285,7 @@ def set_apart(
     split: Split | None,
     verdicts: Sequence[Verdict] = (),
 ) -> dict[str, str]:
-    """Return by entry why its rows are excluded from ranks; other entries are missing.
+    """Return by entry why its rows are excluded from ranks, with a line; other entries are missing.
 
     Rows are excluded if the answers about a place come from training on that place, or if the entry is right more often
     than chance explains where nothing but the truth could help. Controls are unranked anyway. `scores` has the columns
@@ -300,6 +301,7 @@ def set_apart(
         reasons = [reason for reason in (knows_too_much(verdicts, entry.name), trained) if reason]
         if reasons:
             found[entry.name] = "; ".join(reasons)
+            tell(f"{entry.name}: set apart, {found[entry.name]}")
     return found
 
 

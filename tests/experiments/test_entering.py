@@ -178,10 +178,12 @@ def test_the_card_is_that_of_the_matcher_with_places_apart_from_other_training(e
 
 def test_its_row_stands_beside_the_others_as_submitted(entered):
     _, board, _ = entered
-    table = board.table[(board.table["metric"] == "within_25m") & (board.table["suite"] == "clean")]
+    table = board.board.leaderboard[
+        (board.board.leaderboard["metric"] == "within_25m") & (board.board.leaderboard["suite"] == "clean")
+    ]
     rows = table.set_index(["matcher", "stratum"])["value"]
     assert rows["middle"].equals(rows["prior_centre"])  # the same answers
-    assert {entry.name: entry.how for entry in board.entries}["middle"] == "as submitted"
+    assert {entry.name: entry.how for entry in board.board.about.entries}["middle"] == "as submitted"
 
 
 @pytest.mark.usefixtures("unscored")
@@ -267,10 +269,10 @@ def test_a_card_that_no_submission_can_have_is_refused_before_anything_is_drawn(
 def test_figures_are_those_of_a_whole_score_to_the_last_bit(request_, entered, tmp_path):
     folder, board, _ = entered
     whole = with_submissions(request_.stored, [folder], tmp_path / "whole", root=request_.out)
-    assert {"", "margin"} <= {*board.table["rejector"]}
-    pd.testing.assert_frame_equal(board.table, whole.table, check_exact=True)
-    pd.testing.assert_frame_equal(board.acceptance, whole.acceptance, check_exact=True)
-    assert repr(board.findings) == repr(whole.findings)  # NaN is no equal of NaN
+    assert {"", "margin"} <= {*board.board.leaderboard["rejector"]}
+    pd.testing.assert_frame_equal(board.board.leaderboard, whole.board.leaderboard, check_exact=True)
+    pd.testing.assert_frame_equal(board.board.acceptance, whole.board.acceptance, check_exact=True)
+    assert repr(board.board.findings) == repr(whole.board.findings)  # NaN is no equal of NaN
     assert {*board.judged} < {*whole.judged}  # nothing of the others was fitted
 
 
@@ -414,15 +416,15 @@ def test_the_command_says_what_it_costs_and_stops(request_, program):
 
 def test_the_command_says_who_answered_the_same_queries_elsewhere(program, monkeypatch):
     entry = SimpleNamespace(board="small", run=SimpleNamespace(card=SimpleNamespace(name="mine")))
-    board = SimpleNamespace(predictions={}, about=[], controls=[])
+    board = SimpleNamespace(about=SimpleNamespace(elsewhere="small-mine"))
+    scored = SimpleNamespace(predictions={}, board=board)
     for name in ("plan_entry", "check_entry"):
         monkeypatch.setattr(cli_entering, name, lambda *_, **__: entry)
     for name in ("cost_lines", "failure_lines"):
         monkeypatch.setattr(cli_entering, name, lambda *_: ())
     for name in ("show_board", "check_controls"):
         monkeypatch.setattr(cli_entering, name, lambda _: None)
-    monkeypatch.setattr(cli_entering, "enter", lambda *_, **__: (Path("sent/mine"), board))
-    monkeypatch.setattr(cli_entering, "read_board_manifest", lambda folder: SimpleNamespace(elsewhere=folder.name))
+    monkeypatch.setattr(cli_entering, "enter", lambda *_, **__: (Path("sent/mine"), scored))
     monkeypatch.setattr(cli_entering, "elsewhere_lines", lambda found: [f"the same queries, of {found}"])
     assert program("enter", "small", "--matcher", "mine")[1].splitlines() == [
         "the same queries, of small-mine",

@@ -94,8 +94,8 @@ def test_a_pipeline_ends_with_a_board(made):
     controls = len(task_files.Task.open(plan.out / "tasks" / "controls" / "town-suburb+controls").ids())
     assert f"random: {count + controls} queries to ask, 0 answered before" in lines
     assert f"fft_vote: {controls} queries to ask, 0 answered before" in lines
-    assert {entry.name for entry in board.entries} == {"random", "prior_centre", "oracle_pose"}
-    assert [item.name for item in board.findings] == ["nothing"]
+    assert {entry.name for entry in board.board.about.entries} == {"random", "prior_centre", "oracle_pose"}
+    assert [item.name for item in board.board.findings] == ["nothing"]
     assert (plan.out / "boards" / "small" / "leaderboard.parquet").is_file()
     assert "Registered contrasts" in (plan.out / "boards" / "small" / "leaderboard.md").read_text(encoding="utf-8")
 
@@ -110,7 +110,7 @@ def test_a_contrast_may_name_a_matcher_by_module_and_class(made):
     plan, board, _ = made
     spec = small(**{'id = "small"': 'id = "by-class"', "prior_centre": f"{__name__}:Middle"})
     again = run_pipeline(plan_pipeline(spec, out=plan.out))
-    (before,), (found,) = board.findings, again.findings
+    (before,), (found,) = board.board.findings, again.board.findings
     assert (found.first, found.second) == ("random", "middle")
     assert (found.n, found.difference) == (before.n, before.difference)
 
@@ -126,16 +126,16 @@ def test_a_kind_that_nobody_draws_is_refused_before_anything_is_drawn(where, tmp
 
 def test_every_board_has_controls_and_figures_without_them(made):
     plan, board, _ = made
-    assert {item.matcher for item in board.verdicts} == {"random", "prior_centre", "oracle_pose", "fft_vote"}
-    assert all(item.holds for item in board.verdicts)
-    assert set(board.table["suite"]) == {"clean", "all suites"}
-    assert "fft_vote" not in set(board.table["matcher"])
+    assert {item.matcher for item in board.board.verdicts} == {"random", "prior_centre", "oracle_pose", "fft_vote"}
+    assert all(item.holds for item in board.board.verdicts)
+    assert set(board.board.leaderboard["suite"]) == {"clean", "all suites"}
+    assert "fft_vote" not in set(board.board.leaderboard["matcher"])
     folder = plan.out / "boards" / "small"
     about = json.loads((folder / "board.json").read_text(encoding="utf-8"))
     assert about["pipeline"] == {"id": "small", "sha256": plan.spec.sha256}
-    assert len(pd.read_parquet(folder / "controls.parquet")) == len(board.verdicts)
+    assert len(pd.read_parquet(folder / "controls.parquet")) == len(board.board.verdicts)
     text = (folder / "leaderboard.md").read_text(encoding="utf-8")
-    assert f"- Controls: all {len(board.verdicts)} held." in text
+    assert f"- Controls: all {len(board.board.verdicts)} held." in text
     assert "## Controls" in text
 
 
@@ -178,7 +178,7 @@ def test_a_second_time_nothing_is_drawn_and_nothing_is_asked(made):
     assert [line.split(",")[0] for line in lines if "to ask" in line] == [
         f"{name}: 0 queries to ask" for name in (*plan.matchers, "fft_vote")
     ]
-    assert again.table.equals(board.table)
+    assert again.board.leaderboard.equals(board.board.leaderboard)
     told = plan.to_text()
     assert "  queries: 1 of 1 task up to date\n  controls: 1 of 1 task up to date\n" in told
     count = len(board.scores["random"]) + len(
@@ -450,7 +450,7 @@ def test_each_half_is_asked_after_learning_from_the_other_and_an_oracle_from_its
         ("town-suburb",): ["clean/town-suburb", "controls/town-suburb+controls"],
         ("town-agricultural",): ["clean/town-agricultural"],
     }
-    assert board.table.loc[board.table["matcher"] == "oracle_counts", "is_control"].all()
+    assert board.board.leaderboard.loc[board.board.leaderboard["matcher"] == "oracle_counts", "is_control"].all()
     text = (tmp_path / "boards" / "taught" / "leaderboard.md").read_text(encoding="utf-8")
     assert "trained on 5 queries of 1 place (town-suburb)." in text
     told = plan.to_text().splitlines()
@@ -653,11 +653,13 @@ def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, mo
     lines = []
     with reporting(lines.append):
         beside = run_pipeline(other)
-    figures, before = (item[item["unit"] == "1"].reset_index(drop=True) for item in (beside.table, board.table))
+    figures, before = (
+        item[item["unit"] == "1"].reset_index(drop=True) for item in (beside.board.leaderboard, board.board.leaderboard)
+    )
     assert figures.equals(before)  # what the runs took, in seconds and bytes, other tests add to
     assert list(beside.failures.found) == ["broken_here:Broken"]
     assert "no weights here" in beside.failures.found["broken_here:Broken"]
-    assert [item.verdict for item in beside.findings] == ["not decided: broken_here:Broken failed"]
+    assert [item.verdict for item in beside.board.findings] == ["not decided: broken_here:Broken failed"]
     assert any(line.startswith("broken_here:Broken failed: ") for line in lines)
     assert json.loads((plan.out / "boards" / "beside" / "board.json").read_text())["failed"] == beside.failures.found
 
@@ -674,7 +676,7 @@ def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch
     monkeypatch.setattr(pipeline_plan, "plan_run", broken)
     beside = run_pipeline(plan)
     assert set(beside.scores) == set(board.scores) - {"random"}
-    assert [item.verdict for item in beside.findings] == ["not decided: random failed"]
+    assert [item.verdict for item in beside.board.findings] == ["not decided: random failed"]
     assert "in broken" in (plan.out / "boards" / "small.failures.log").read_text(encoding="utf-8")
 
 

@@ -24,6 +24,7 @@ from sasgeo_bench.leaderboard.plot_tables import (
     stanford_cells,
 )
 from sasgeo_bench.leaderboard.plots import draw_steps
+from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.running.failures import Failures
@@ -36,6 +37,8 @@ from sasgeo_bench.scoring.protection import protection_frame, protection_levels
 from sasgeo_bench.scoring.rejection_rows import answers_of
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
 from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
+from tests.handmade import about_of
 from tests.scoring.test_tables import scores
 
 CONTRASTS = (
@@ -81,9 +84,14 @@ def board(tmp_path_factory):
     said = {"rejector": "sure", "metric": "ece", "suite": "all suites", "stratum": "as drawn", "value": 0.1}
     rows = [table.iloc[[0]].assign(matcher=name, **said) for name in ("raster", "graph")]
     levels = {level_name("gauss", 1e-2): 10.0}
-    return Board(
-        entries=(),
-        failures=Failures(tmp_path_factory.mktemp("board") / "failures.log"),
+    return Scored(
+        board=Board(
+            folder=tmp_path_factory.mktemp("board"),
+            about=about_of([]),
+            leaderboard=pd.concat([table, *rows], ignore_index=True),
+            contrasts=CONTRAST_SCHEMA.frame(hold_contrasts(CONTRASTS, tables, judged, draws=100)),
+        ),
+        failures=Failures(tmp_path_factory.mktemp("log") / "failures.log"),
         scores=tables,
         predictions={
             name: StoredAnswers.of(
@@ -91,8 +99,6 @@ def board(tmp_path_factory):
             )
             for name, frame in tables.items()
         },
-        table=pd.concat([table, *rows], ignore_index=True),
-        findings=hold_contrasts(CONTRASTS, tables, judged, draws=100),
         judged=judged,
         measured={
             one: {"age_years": 1.1 * step}
@@ -103,6 +109,11 @@ def board(tmp_path_factory):
 
 def rows_of(frame):
     return frame["query_id"].tolist()
+
+
+def of_table(board, table):
+    """The board with these figures and without contrasts."""
+    return replace(board, board=replace(board.board, leaderboard=table, contrasts=CONTRAST_SCHEMA.empty()))
 
 
 def unanswered(board):
@@ -148,7 +159,10 @@ def test_every_figure_is_drawn_and_has_the_same_bytes_each_time(board, tmp_path)
 def test_a_board_without_data_has_no_figures_and_says_so(board):
     told = []
     bare = replace(
-        board, judged={}, measured={}, findings=(), predictions=dict.fromkeys(board.scores, StoredAnswers.of([]))
+        of_table(board, board.board.leaderboard),
+        judged={},
+        measured={},
+        predictions=dict.fromkeys(board.scores, StoredAnswers.of([])),
     )
     with reporting(told.append):
         assert set(figures_extra(unanswered(bare)).figures) == {
@@ -175,7 +189,7 @@ def test_a_board_without_data_has_no_figures_and_says_so(board):
 
 def test_points_are_those_of_the_board_at_the_ages_that_maps_had(board):
     queries = queries_of(board.scores)
-    steps = steps_frame(board.table, queries, ["graph"])
+    steps = steps_frame(board.board.leaderboard, queries, ["graph"])
     assert sorted(set(zip(steps["strength"], steps["view_cells"], strict=True))) == [
         (step, size) for step in (0.0, 5.0, 10.0) for size in (96, 192)
     ]
@@ -195,7 +209,7 @@ def test_prior_groups_are_never_in_one_figure(board):
     }
     both = {name: pd.concat([board.scores[name], frame], ignore_index=True) for name, frame in other.items()}
     table = leaderboard(both, draws=100)
-    apart = replace(board, scores=both, table=table, judged={}, predictions=dict.fromkeys(both, NOTHING), findings=())
+    apart = replace(of_table(board, table), scores=both, judged={}, predictions=dict.fromkeys(both, NOTHING))
     both_named = [name for name in figures_extra(unanswered(apart)).figures if "stress" in name]
     assert both_named == ["stress-localization-r500-weak-s3.svg", "stress-localization-rnone-weak-s3.svg"]
     steps = steps_frame(table, queries_of(both), ["graph"])

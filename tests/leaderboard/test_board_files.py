@@ -34,9 +34,8 @@ def put(folder, value, *, extras=(), version=1):
     write_board(
         folder,
         tables={"leaderboard": table, "scores": table},
-        texts={"leaderboard.md": f"{value}\n"},
         about=BoardManifest(scorer_version=version, entries=[], tasks=[]),
-        extras=extras,
+        extras=[Extra(texts={"leaderboard.md": f"{value}\n"}), *extras],
     )
 
 

@@ -15,7 +15,6 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard import board_pictures
-from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_pictures import (
     CASE_BYTES,
     MOST_BYTES,
@@ -27,6 +26,7 @@ from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.case_plot import case_pixels, fitted
 from sasgeo_bench.leaderboard.cases import words_of
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_manifest
@@ -93,10 +93,10 @@ def made(root, tmp_path_factory):
             return pictures_extra(board, root=root)
 
     folder = tmp_path_factory.mktemp("made") / "board"
-    request = ScoreRequest(predictions=[root / "runs"], root=root, board=folder, draws=100, extras=(pictures,))
+    request = ScoreRequest(predictions=[root / "runs"], root=root, board=folder, draws=100)
     with pytest.MonkeyPatch.context() as patch, plain_boards():
         patch.setattr(board_pictures, "MOST_CASES", FEW)
-        make_board(request)
+        make_board(request, (pictures,))
         yield folder, lines, kept[0]
 
 

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_pictures import STRIP_BYTES, pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.build import publish
@@ -77,7 +77,7 @@ def board(tasks, tmp_path_factory):
     with reporting(print):
         extras = (lambda found: pictures_extra(found, root=out),)
     with reporting(print):
-        make_board(ScoreRequest(predictions=[out / "runs"], root=out, board=folder, draws=100, extras=extras))
+        make_board(ScoreRequest(predictions=[out / "runs"], root=out, board=folder, draws=100), extras)
     return folder
 
 

@@ -19,12 +19,12 @@ import pytest
 from sasgeo_bench import cli
 from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.leaderboard import build as boards
-from sasgeo_bench.leaderboard.board import ScoreRequest
+from sasgeo_bench.leaderboard import score as boards
 from sasgeo_bench.leaderboard.board_files import Extra, read_board_manifest, read_leaderboard
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.progress import reporting
@@ -109,16 +109,18 @@ def split():
     return make_split(SplitFile.model_validate(said | {"place": places}), grids)
 
 
-def board_of(out, *predictions, has_texts=False, **changes):
+def board_of(out, *predictions, has_texts=False, extras=(), **changes):
     request = ScoreRequest(
         predictions=predictions or [out / "runs"], root=out, board=out / "boards" / "mine", draws=200
     )
     with nullcontext() if has_texts else plain_boards():
-        return make_board(replace(request, **changes))
+        return make_board(replace(request, **changes), extras)
 
 
 def primary(board, matcher):
-    rows = board.table[(board.table["matcher"] == matcher) & (board.table["metric"] == "success_25m")]
+    rows = board.board.leaderboard[
+        (board.board.leaderboard["matcher"] == matcher) & (board.board.leaderboard["metric"] == "success_25m")
+    ]
     return rows[rows["stratum"] == "all"].iloc[0]
 
 
@@ -170,7 +172,9 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
     board = board_of(out, out / "runs", tmp_path / "mine.parquet")
     for name in ("oracle_pose", "mine"):
         assert primary(board, name)["value"] == 1.0
-        absent = board.table[(board.table["matcher"] == name) & (board.table["metric"] == "answered_absent")]
+        absent = board.board.leaderboard[
+            (board.board.leaderboard["matcher"] == name) & (board.board.leaderboard["metric"] == "answered_absent")
+        ]
         assert set(absent["value"]) == {0.0}
     columns = [name for name in board.scores["mine"].columns if name != "latency_s"]
     pd.testing.assert_frame_equal(board.scores["mine"][columns], board.scores["oracle_pose"][columns])
@@ -180,7 +184,7 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
         ("oracle_pose", "run here"),
     ]
     assert about.attribution == "(c) OpenStreetMap contributors, ODbL"
-    assert len(table) == len(board.table)
+    assert len(table) == len(board.board.leaderboard)
     assert about.libraries["numpy"] == np.__version__
     assert about.pipeline is None
     assert about.rejectors == []
@@ -194,7 +198,7 @@ def test_the_truth_scores_as_perfect_and_a_file_scores_as_a_run_does(out, tmp_pa
     assert str(read["rank_best"].dtype) == "Int64"
     assert read["rank_best"].isna().all()  # of two blocks nobody has a rank
     facts = read.drop_duplicates("matcher").set_index("matcher")[["version", "hash", "is_control"]]
-    (entry,) = (entry for entry in board.entries if entry.name == "oracle_pose")
+    (entry,) = (entry for entry in board.board.about.entries if entry.name == "oracle_pose")
     assert facts.loc["oracle_pose"].tolist() == [entry.version, entry.hash, True]
     assert facts.loc["mine", ["version", "hash"]].isna().all()
     assert not facts.loc["mine", "is_control"]
@@ -234,7 +238,9 @@ def test_a_board_of_equal_confidences_or_none_and_of_no_false_fix_or_nothing_els
     rejectors = ["margin", "isotonic_margin", "logistic_all", "entropy"]
     board = board_of(out, tmp_path / "mine.parquet", rejectors=rejectors, split=split)
     assert primary(board, "mine")["value"] == float(is_right)
-    rows = board.table[(board.table["stratum"] == "as drawn") & (board.table["rejector"] != "")]
+    rows = board.board.leaderboard[
+        (board.board.leaderboard["stratum"] == "as drawn") & (board.board.leaderboard["rejector"] != "")
+    ]
     assert set(rows["rejector"]) == {*rejectors} | ({"own"} if confidence else set())
     # What cannot be told apart is accepted together or not at all.
     covered = rows[rows["metric"] == "coverage_at_risk_0.05"]
@@ -244,19 +250,19 @@ def test_a_board_of_equal_confidences_or_none_and_of_no_false_fix_or_nothing_els
     assert set(rows[(rows["rejector"] == "own") & (rows["metric"] == "brier")]["value"]) == (
         {0.25} if confidence else set()
     )
-    assert len(read_leaderboard(out / "boards" / "mine")) == len(board.table)
+    assert len(read_leaderboard(out / "boards" / "mine")) == len(board.board.leaderboard)
 
 
 def test_a_rejector_is_fitted_on_other_places_and_its_rows_stand_apart(out, tmp_path, split):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, tmp_path / "mine.parquet", rejectors=[f"{__name__}:Doubt"], split=split)
     asked = {"pipeline": PipelineRecord(id="mine", sha256="0" * 64), "rejectors": [f"{__name__}:Order"], "split": split}
-    order = board_of(out, tmp_path / "mine.parquet", **asked).table
+    order = board_of(out, tmp_path / "mine.parquet", **asked).board.leaderboard
     about = read_board_manifest(out / "boards" / "mine")
     assert about.pipeline == asked["pipeline"]
     assert [(card.name, card.is_calibrated) for card in about.rejectors] == [("order", False)]
     assert not {"brier", "cost_20"} & set(order[order["rejector"] == "order"]["metric"])
-    rows = board.table[board.table["rejector"] == "doubt"]
+    rows = board.board.leaderboard[board.board.leaderboard["rejector"] == "doubt"]
     by_name = {row["metric"]: row for _, row in rows[rows["stratum"] == "as drawn"].iterrows()}
     assert by_name["brier"]["value"] == 0.0  # all answers were right, and none was doubted
     assert by_name["coverage_at_risk_0.01"]["value"] == pytest.approx(
@@ -274,9 +280,9 @@ def test_no_figure_hangs_on_how_many_processes_judge(out, tmp_path, split):
     submission(out, tmp_path / "yours.parquet", keep=lambda at: at % 2)
     files = [tmp_path / name for name in ("mine.parquet", "yours.parquet")]
     one, two = (board_of(out, *files, rejectors=rejectors, split=split, jobs=jobs) for jobs in (1, 2))
-    pd.testing.assert_frame_equal(one.table, two.table)
+    pd.testing.assert_frame_equal(one.board.leaderboard, two.board.leaderboard)
     assert one.judged.keys() == two.judged.keys()
-    assert one.remarks == two.remarks
+    assert one.board.about.remarks == two.board.about.remarks
 
 
 def test_a_rejector_that_is_not_applied_says_why(out, split):
@@ -290,7 +296,7 @@ def test_a_rejector_that_is_not_applied_says_why(out, split):
         board = make_board(request)
     why = "doubt on random: not applied, no other place of the board calibrates"
     assert why in lines
-    assert why in board.remarks
+    assert why in board.board.about.remarks
     silent = pd.DataFrame({"is_answered": [False] * 2, "place": ["a", "b"]})
     assert why_not(silent) == "it has no answers to judge"
     half = pd.DataFrame({"is_answered": [False, True], "place": ["a", "b"]})
@@ -302,7 +308,7 @@ def test_what_a_rejector_remarks_of_its_fits_is_told_and_kept(out, tmp_path, spl
     rejectors = ["sasgeo_bench.sasgeo.rejectors:SasgeoLogistic", f"{__name__}:Doubt"]
     board, lines = told_by(out, tmp_path / "mine.parquet", rejectors=rejectors, split=split)
     said = [line for line in lines if "ranked by margin" in line]
-    assert said == list(board.remarks)
+    assert said == list(board.board.about.remarks)
     assert said[0].startswith("sasgeo_logistic on mine: 0 of ")  # the answers are right, all of them
     assert said[0].endswith(" judged so)")
     assert read_board_manifest(out / "boards" / "mine").remarks == said
@@ -312,30 +318,32 @@ def test_protection_levels_are_counted_where_answers_tell_them(out, tmp_path, sp
     levels = {"sigma_m": 2.0, "hpl_gauss_0.01_m": 6.0}
     submission(out, tmp_path / "mine.parquet", change=lambda row, _: replace(row, diagnostics=levels))
     board = board_of(out, tmp_path / "mine.parquet", split=split)
-    assert set(board.protection["method"]) == {"gauss", "conformal"}
-    told = board.protection[board.protection["method"] == "gauss"]
+    assert set(board.board.protection["method"]) == {"gauss", "conformal"}
+    told = board.board.protection[board.board.protection["method"] == "gauss"]
     assert (told["n"] > 0).all()
     assert (told["misleading"] == 0.0).all()  # the submission knows the truth
     folder = out / "boards" / "mine"
-    assert pq.read_table(folder / "protection.parquet").num_rows == len(board.protection)
-    assert len(pd.read_csv(folder / "protection.csv")) == len(board.protection)
+    assert pq.read_table(folder / "protection.parquet").num_rows == len(board.board.protection)
+    assert len(pd.read_csv(folder / "protection.csv")) == len(board.board.protection)
     submission(out, tmp_path / "mine.parquet")  # the same without: the tables go
-    assert board_of(out, tmp_path / "mine.parquet", split=split).protection.empty
+    assert board_of(out, tmp_path / "mine.parquet", split=split).board.protection.empty
     assert not list(folder.glob("protection.*"))
 
 
 def test_the_own_word_of_a_matcher_stands_beside_its_rejectors_and_needs_no_split(out, tmp_path, split):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, tmp_path / "mine.parquet")
-    own = board.table[board.table["rejector"] == "own"].set_index("metric")
+    own = board.board.leaderboard[board.board.leaderboard["rejector"] == "own"].set_index("metric")
     assert own.loc["brier", "value"].max() == 0.0  # right, and sure of it
     assert "coverage_at_risk_0.05" not in own.index
     contrast = Contrast(name="own", first="mine x own", second="mine x doubt", suites=("clean",), metric="aurc")
     changes = {"rejectors": [f"{__name__}:Doubt"], "split": split, "contrasts": [contrast]}
     judged = board_of(out, tmp_path / "mine.parquet", **changes)
-    assert {"own", "doubt"} < set(judged.table["rejector"])
-    assert "coverage_at_risk_0.05" in set(judged.table[judged.table["rejector"] == "own"]["metric"])
-    assert judged.findings[0].n > 0
+    assert {"own", "doubt"} < set(judged.board.leaderboard["rejector"])
+    assert "coverage_at_risk_0.05" in set(
+        judged.board.leaderboard[judged.board.leaderboard["rejector"] == "own"]["metric"]
+    )
+    assert judged.board.findings[0].n > 0
     with pytest.raises(ConfigError, match="'own' is what a board calls a matcher's own confidence: rename"):
         board_of(out, rejectors=[f"{__name__}:Own"], split=split)
 
@@ -343,7 +351,7 @@ def test_the_own_word_of_a_matcher_stands_beside_its_rejectors_and_needs_no_spli
 def test_what_was_sent_and_what_maps_take_is_told(out, tmp_path):
     submission(out, tmp_path / "mine.parquet")
     board = board_of(out, out / "runs", tmp_path / "mine.parquet")
-    told = board.table.set_index(["matcher", "metric"])["value"]
+    told = board.board.leaderboard.set_index(["matcher", "metric"])["value"]
     sizes = [
         size for town in TOWNS for size in task_files.Task.open(out / "tasks" / "clean" / town).view_bytes().values()
     ]
@@ -351,7 +359,7 @@ def test_what_was_sent_and_what_maps_take_is_told(out, tmp_path):
     assert told["mine", "observation_per_fix"] == pytest.approx(sum(sizes) / 1e3 / fixes)
     assert told["oracle_pose", "map_per_km2"] > 0
     shutil.rmtree(out / "regions")  # scores need no map
-    again = board_of(out).table.set_index(["matcher", "metric"])["value"]
+    again = board_of(out).board.leaderboard.set_index(["matcher", "metric"])["value"]
     assert math.isnan(again["oracle_pose", "map_per_km2"])
 
 
@@ -512,7 +520,7 @@ def test_two_rejectors_of_one_name_are_refused_and_one_named_twice_is_one(out, s
     first, second = (f"{__name__}:{name}" for name in ("Doubt", "DoubtToo"))
     with pytest.raises(ConfigError, match=r"Doubt and .*DoubtToo are both named 'doubt': rename one"):
         board_of(out, rejectors=[first, second], split=split)
-    assert set(board_of(out, rejectors=[first, first], split=split).table["rejector"]) >= {"doubt"}
+    assert set(board_of(out, rejectors=[first, first], split=split).board.leaderboard["rejector"]) >= {"doubt"}
 
 
 def test_nothing_to_score_is_told(out, tmp_path):
@@ -555,7 +563,7 @@ class Once(dict):
 def test_a_run_of_other_queries_is_left_out_among_many_and_refused_by_itself(out):
     stale = copy_run(out, "stale", TOWNS, asked=Once())
     board, lines = told_by(out, out / "runs")
-    assert [entry.name for entry in board.entries] == ["oracle_pose"]
+    assert [entry.name for entry in board.board.about.entries] == ["oracle_pose"]
     assert lines[0] == f"left out: 2 runs without an answer to these queries ({stale[0]}, {stale[1]})"
     for named in (stale[0], out / "runs" / "stale"):
         with pytest.raises(StoreError, match="holds answers to other queries than its task does now: run again"):
@@ -583,8 +591,8 @@ def test_who_was_asked_nothing_of_a_task_is_not_on_the_board_of_its_suite(out):
     assert "partly: not on the board of clean, for it was not asked all tasks there" in lines
     assert set(board.scores) == {"oracle_pose"}
     board, lines = told_by(out, out / "runs", tasks=[out / "tasks" / "clean" / TOWNS[0]])
-    assert set(board.scores) == set(board.table["matcher"]) == {"oracle_pose", "partly"}
-    assert not board.table["missing"].any()
+    assert set(board.scores) == set(board.board.leaderboard["matcher"]) == {"oracle_pose", "partly"}
+    assert not board.board.leaderboard["missing"].any()
     present = board.scores["partly"]["is_present"].to_numpy(bool)
     count = len(present)
     assert f"partly: {present.sum()} of {count} queries answered, {count - present.sum()} withheld" in lines
@@ -595,7 +603,7 @@ def test_who_was_asked_nothing_of_a_task_is_not_on_the_board_of_its_suite(out):
 def test_a_region_that_is_left_out_is_as_if_it_had_never_been_asked(out):
     alone, _ = told_by(out, out / "runs", tasks=[out / "tasks" / "clean" / TOWNS[0]])
     board, lines = told_by(out, out / "runs", without=[TOWNS[1]])
-    pd.testing.assert_frame_equal(alone.table, board.table)
+    pd.testing.assert_frame_equal(alone.board.leaderboard, board.board.leaderboard)
     assert not any("left out" in line for line in lines)
     said = json.loads((out / "boards" / "mine" / "board.json").read_text())
     assert said["without"] == [TOWNS[1]]
@@ -837,11 +845,11 @@ def test_answers_that_are_none_are_refused_by_themselves(out, both, column, valu
 def test_answers_that_are_none_cost_their_author_alone(out, both, alone, column, value, why):
     rewrite(both[1], column, value)
     board = board_of(out, *both, has_texts=True, contrasts=[CONTRAST])
-    assert [entry.name for entry in board.entries] == ["good"]
+    assert [entry.name for entry in board.board.about.entries] == ["good"]
     pd.testing.assert_frame_equal(board.scores["good"], alone.scores["good"])
-    pd.testing.assert_frame_equal(board.table, alone.table)
+    pd.testing.assert_frame_equal(board.board.leaderboard, alone.board.leaderboard)
     assert why in board.failures.found["bad"]
-    assert [finding.verdict for finding in board.findings] == ["not decided: bad failed"]
+    assert [finding.verdict for finding in board.board.findings] == ["not decided: bad failed"]
     about = read_board_manifest(out / "boards" / "mine")
     assert about.failed == board.failures.found
     text = (out / "boards" / "mine" / "leaderboard.md").read_text(encoding="utf-8")
@@ -878,7 +886,7 @@ def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out,
     whole = board_of(out, out / "runs", *both, **asked)
     monkeypatch.setattr(contestants, "_MOST_KEPT_BYTES", 0)
     board = board_of(out, out / "runs", *both, **asked)
-    pd.testing.assert_frame_equal(board.table, whole.table)
+    pd.testing.assert_frame_equal(board.board.leaderboard, whole.board.leaderboard)
     pd.testing.assert_frame_equal(board.judged["good", "doubt"], whole.judged["good", "doubt"])
     assert dict(board.predictions["oracle_pose"]) == dict(whole.predictions["oracle_pose"])
 
@@ -910,8 +918,8 @@ def test_a_mistake_of_ours_costs_the_contestant_it_is_about_and_the_log_says_whe
     fails_with(monkeypatch, step, is_bad)
     board = board_of(out, *both, contrasts=[CONTRAST])
     assert board.failures.found == {"bad": "KeyError: 'a mistake of ours' (mine.failures.log says where)"}
-    pd.testing.assert_frame_equal(board.table, alone.table)
-    assert [finding.verdict for finding in board.findings] == ["not decided: bad failed"]
+    pd.testing.assert_frame_equal(board.board.leaderboard, alone.board.leaderboard)
+    assert [finding.verdict for finding in board.board.findings] == ["not decided: bad failed"]
     log = (out / "boards" / "mine.failures.log").read_text(encoding="utf-8")
     assert "Traceback" in log
     assert "in broken" in log
@@ -928,7 +936,7 @@ def test_a_figure_that_cannot_be_made_is_left_out_and_said(out, both, monkeypatc
     fails_with(monkeypatch, step, is_bad)
     board = board_of(out, *both)
     assert list(board.failures.found) == [what]
-    assert set(board.table["matcher"]) == {"good", "bad"}
+    assert set(board.board.leaderboard["matcher"]) == {"good", "bad"}
 
 
 def test_a_figure_that_cannot_be_drawn_leaves_the_others(out, both):
@@ -958,7 +966,7 @@ def test_a_rejector_that_fails_with_one_judges_the_others(out, both, split):
         ("bad", "doubt"),
     }
     assert list(board.failures.found) == ["bad x picky"]
-    assert [finding.verdict for finding in board.findings] == ["not decided: bad x picky failed"]
+    assert [finding.verdict for finding in board.board.findings] == ["not decided: bad x picky failed"]
     with pytest.raises(MatchError, match="rejector 'picky' failed"):
         board_of(out, both[1], **asked | {"contrasts": []})
 

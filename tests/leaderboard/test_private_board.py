@@ -13,13 +13,13 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
-from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.manifests import BoardEntry, PipelineRecord, SeedResult
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, result_of, seed_lines
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.leaderboard.tables import Cell, text_of
 from sasgeo_bench.leaderboard.validity_tables import seed_table
 from sasgeo_bench.progress import reporting
@@ -168,7 +168,7 @@ def test_who_draws_the_truths_again_is_right_on_the_public_seed_alone_and_the_bo
     (figure,) = [item for item in entry.private.figures if item.suite == "clean"]
     assert (figure.public, figure.private) == (1.0, 0.0)
     assert figure.hi < 0
-    assert set(board.table["how"]) == {"not reproduced"}
+    assert set(board.board.leaderboard["how"]) == {"not reproduced"}
     assert any(
         line.startswith("redrawer: not reproduced (all suites, localization, success_25m: private") for line in lines
     )

@@ -19,17 +19,18 @@ from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.files import folders
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.leaderboard import board as board_module
-from sasgeo_bench.leaderboard.board import ScoreRequest
+from sasgeo_bench.leaderboard import record
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing import archive, archive_file
 from sasgeo_bench.publishing.archive import laid_out, pack_board, score_all, stored_settings
 from sasgeo_bench.publishing.archive_file import read_pack, read_stored_predictions, unpack, unpack_tasks
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.scoring.contrasts import Contrast
+from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
 from sasgeo_bench.tasks.query import base_of
 from tests.threaded import threaded
 
@@ -113,7 +114,7 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
 @pytest.mark.usefixtures("undrawn")
 def test_stored_results_keep_the_version_of_the_maps_they_were_asked_on(kept, tmp_path, monkeypatch):
     _, _, folder, _ = kept
-    monkeypatch.setattr(board_module, "DATA_VERSION", 99)
+    monkeypatch.setattr(record, "DATA_VERSION", 99)
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path)
     score_all(replace(usual, draws=100, rejectors=()), has_cases=False)
     first = json.loads((folder / "board.json").read_text())
@@ -589,10 +590,11 @@ def test_a_full_disk_is_a_short_line(kept, tmp_path, monkeypatch):
 
 
 def test_a_board_of_absent_places_alone_has_figures_of_what_is_left(kept):
-    board, lines = kept[0], []
-    absent = {name: frame.assign(is_present=False) for name, frame in board.scores.items()}
+    scored, lines = kept[0], []
+    absent = {name: frame.assign(is_present=False) for name, frame in scored.scores.items()}
+    bare = replace(scored.board, contrasts=CONTRAST_SCHEMA.empty())
     with reporting(lines.append):
-        figures = figures_extra(replace(board, scores=absent, findings=())).figures
+        figures = figures_extra(replace(scored, scores=absent, board=bare)).figures
     assert "age of the map" in lines[-1]
     assert "strength" not in " ".join(figures)
 

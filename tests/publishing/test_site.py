@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import StoreError
+from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import TABLES
 from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, cost_table, sections_of, suite_table
 from sasgeo_bench.leaderboard.columns import MEANINGS
@@ -27,7 +28,6 @@ from sasgeo_bench.leaderboard.manifests import (
 )
 from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables, risk_tables_by_suite
-from sasgeo_bench.leaderboard.stored_board import StoredBoard
 from sasgeo_bench.leaderboard.tables import file_stem, page_names, text_of, ties_of
 from sasgeo_bench.publishing import site_maps
 from sasgeo_bench.publishing.site import contrasts_of, site_pages
@@ -69,7 +69,7 @@ def source(table=None, findings=(), entries=(), **changes):
     board = many_rows(6) if table is None else table
     about = about_of([entry_of(name, **said) for name, said in dict(entries).items()])
     tables = {name: changes.pop(name) for name in TABLES if name in changes}
-    made = StoredBoard(
+    made = Board(
         folder=Path("mine"), about=about, leaderboard=board, **{"contrasts": CONTRAST_SCHEMA.frame(findings), **tables}
     )
     return SiteSource(name="mine", title="Mine", board=made, rates=load_ratebook(), **changes)

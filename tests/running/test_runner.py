@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.leaderboard.board import ScoreRequest
 from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
@@ -308,9 +308,10 @@ def test_hostile_matchers_cost_their_own_rows_from_the_run_to_the_board(task, un
     )
     board = make_board(request)
     hashes = {RunManifest.open(folder).hash: name for name, folder in folders.items()}
-    assert {entry.hash for entry in board.entries} == set(hashes)
+    assert {entry.hash for entry in board.board.about.entries} == set(hashes)
     assert board.failures.found == {}
-    answered = {hashes[entry.hash]: board.scores[entry.name]["status"].value_counts() for entry in board.entries}
+    entries = board.board.about.entries
+    answered = {hashes[entry.hash]: board.scores[entry.name]["status"].value_counts() for entry in entries}
     assert answered.pop("Plain").to_dict() == {"ok": len(task_files.Task.open(task).ids())}
     for name, (status, _) in HOSTILE.items():
         assert answered[name][status] == 2

@@ -25,8 +25,8 @@ from sasgeo_bench.experiments.paper.tables import (
 )
 from sasgeo_bench.experiments.paper.task import DATA, SUITE
 from sasgeo_bench.experiments.paper.tiles import CANDIDATES
-from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import Extra
+from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.leaderboard.tables import p_text
 from sasgeo_bench.leaderboard.text import markdown_table
 from sasgeo_bench.scoring.rows import is_unranked
@@ -199,7 +199,7 @@ CAPTIONS: Final = {
 }
 
 
-def paper_extra(board: Board, *, root: Path) -> Extra:
+def paper_extra(board: Scored, *, root: Path) -> Extra:
     """Return the table next to the paper's, all trials, and figures; `root` holds tasks/, truth/ and regions/."""
     tasks = [Task.of(about, root) for about in board.tasks if about.suite == SUITE]
     by_id = {truth.query_id: truth for task in tasks for truth in task.truths}
@@ -211,7 +211,7 @@ def paper_extra(board: Board, *, root: Path) -> Extra:
         tables={"paper": summary, "trials": trials},
         texts={
             "paper.md": paper_markdown(
-                summary, board.findings, about, {f"{name}.svg": caption for name, caption in CAPTIONS.items()}
+                summary, board.board.findings, about, {f"{name}.svg": caption for name, caption in CAPTIONS.items()}
             )
         },
         figures={
@@ -227,12 +227,12 @@ def paper_extra(board: Board, *, root: Path) -> Extra:
     )
 
 
-def _of_suite(board: Board, suite: str) -> dict[str, pd.DataFrame]:
+def _of_suite(board: Scored, suite: str) -> dict[str, pd.DataFrame]:
     """Return the scored rows of a suite by matcher."""
     return {name: frame[frame["suite"] == suite].reset_index(drop=True) for name, frame in board.scores.items()}
 
 
-def _summaries(board: Board, trials: pd.DataFrame) -> pd.DataFrame:
+def _summaries(board: Scored, trials: pd.DataFrame) -> pd.DataFrame:
     """Return the summary of the suite; below it, where there are some, those of other readings of the crop."""
     drawn = {about.suite for about in board.tasks}
     summaries = []
@@ -240,7 +240,7 @@ def _summaries(board: Board, trials: pd.DataFrame) -> pd.DataFrame:
         if suite in drawn:
             rows = _of_suite(board, suite)
             own = trials if suite == SUITE else trials_frame(rows, board.predictions, board.truths)
-            summary = summary_frame(own, board.table[board.table["suite"] == suite])
+            summary = summary_frame(own, board.board.leaderboard[board.board.leaderboard["suite"] == suite])
             summaries.append(with_gaps(summary, crop, rows, _of_suite(board, SUITE)))
     return pd.concat(summaries, ignore_index=True)
 

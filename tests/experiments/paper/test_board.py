@@ -91,7 +91,7 @@ def test_the_board_holds_table_trials_and_figures(made):
     oracle = trials[trials["matcher"] == "oracle_pose"]
     assert (oracle["rank_best"] == 1).all()
     summary = pd.read_parquet(folder / "paper.parquet")
-    assert set(summary["matcher"]) == {entry.name for entry in board.entries}
+    assert set(summary["matcher"]) == {entry.name for entry in board.board.about.entries}
     text = (folder / "paper.md").read_text(encoding="utf-8")
     assert "6 trials of 2 seeds (42, 43)" in text
     assert "no OSM data" in text
@@ -117,9 +117,11 @@ def test_several_seeds_are_resampled_by_seed_one_by_its_tiles(made):
         said = json.loads((board_folder(name) / "board.json").read_text(encoding="utf-8"))
         assert said["by_region"] == (["paper-poc", "paper-poc-crop-smaller"] if cluster == "seed" else [])
     assert set(board.scores["random"]["block"]) == {"paper-poc-42", "paper-poc-43"}
-    rows = board.table[(board.table["stratum"] == "all") & (board.table["suite"] == "paper-poc")]
+    rows = board.board.leaderboard[
+        (board.board.leaderboard["stratum"] == "all") & (board.board.leaderboard["suite"] == "paper-poc")
+    ]
     assert set(rows["blocks"]) == {2}
-    assert board.findings[0].blocks == 2
+    assert board.board.findings[0].blocks == 2
 
 
 def test_figures_are_the_same_bytes_again_and_say_what_they_are_of(made, tmp_path):

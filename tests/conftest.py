@@ -20,11 +20,10 @@ from filelock import FileLock
 from hypothesis import HealthCheck, settings
 
 from sasgeo_bench import cli, progress
-from sasgeo_bench.experiments import pipeline, pipeline_plan
-from sasgeo_bench.leaderboard import board_pictures
+from sasgeo_bench.experiments import pipeline_plan
+from sasgeo_bench.leaderboard import board_pictures, build
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.publishing import archive
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.testing import TinyPlace, tiny_place
@@ -245,9 +244,8 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
 def without_drawings() -> Iterator[None]:
     """Boards of pipelines and of the program have no figures and no pictures: for tests that are about rows."""
     with pytest.MonkeyPatch.context() as patch:
-        for maker in (pipeline, archive):
-            for name in ("figures_extra", "pictures_extra"):
-                patch.setattr(maker, name, lambda *_, **__: Extra())
+        for name in ("figures_extra", "pictures_extra"):
+            patch.setattr(build, name, lambda *_, **__: Extra())
         yield
 
 
@@ -255,8 +253,7 @@ def without_drawings() -> Iterator[None]:
 def without_pictures() -> Iterator[None]:
     """Boards of pipelines and of the program have no pictures: for tests that are about rows and figures."""
     with pytest.MonkeyPatch.context() as patch:
-        for maker in (pipeline, archive):
-            patch.setattr(maker, "pictures_extra", lambda *_, **__: Extra())
+        patch.setattr(build, "pictures_extra", lambda *_, **__: Extra())
         yield
 
 
@@ -272,8 +269,7 @@ def few_figures() -> Iterator[None]:
         return replace(extra, figures=dict(islice(extra.figures.items(), 2)))
 
     with pytest.MonkeyPatch.context() as patch:
-        for maker in (pipeline, archive):
-            patch.setattr(maker, "figures_extra", few)
+        patch.setattr(build, "figures_extra", few)
         patch.setattr(board_pictures, "MOST_CASES", 2)
         yield
 

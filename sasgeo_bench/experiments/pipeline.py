@@ -25,9 +25,7 @@ from sasgeo_bench.experiments.pipeline_plan import (
     plan_runs,
 )
 from sasgeo_bench.experiments.sealed import open_seal
-from sasgeo_bench.leaderboard.board_figures import figures_extra
-from sasgeo_bench.leaderboard.board_pictures import pictures_extra
-from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.build import drawings, make_board
 from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
 from sasgeo_bench.progress import reporting, silent, tell
 from sasgeo_bench.publishing.archive import pack_board
@@ -81,22 +79,12 @@ def run_pipeline(
     failures = Failures(log_beside(board_folder(plan)))
     folders, names = _run_all(plan, tasks, controls, failures)
     contrasts = tuple(named_on_board(item, names) for item in contrasts)
-    split = plan.split
-    figures = partial(figures_extra, contrasts=contrasts, split=split)
-    pictures = partial(
-        pictures_extra,
-        root=plan.out,
-        contrasts=contrasts,
-        split=split,
-        has_cases=has_cases,
-        jobs=plan.jobs,
-    )
     request = ScoreRequest(
         predictions=folders,
         tasks=[*asked, *controls],
         root=plan.out,
         board=board_folder(plan),
-        split=split,
+        split=plan.split,
         rejectors=plan.spec.rejectors,
         contrasts=contrasts,
         draws=plan.spec.draws,
@@ -110,7 +98,7 @@ def run_pipeline(
         failed=failures.found,
     )
     paper = () if plan.spec.paper is None else (partial(paper_extra, root=plan.out),)
-    scored = make_board(request, (figures, pictures, *paper))
+    scored = make_board(request, (*drawings(request, has_cases=has_cases), *paper))
     if stored is not None:
         tell(pack_board(scored, request, stored).to_text())
     return scored

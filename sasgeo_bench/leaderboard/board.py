@@ -116,7 +116,7 @@ class Board:
         ranked, asked = ranked_matchers(self.leaderboard), self.scores[self.scores["track"] == track]
         counts = asked[asked["matcher"].isin(ranked)].groupby("suite")["matcher"].nunique()
         chosen = suite or (str(counts.idxmax()) if len(counts) else "")
-        some = _by_matcher(asked[asked["suite"] == chosen])
+        some = by_entry(asked[asked["suite"] == chosen])
         rows = price_frame(self.leaderboard, some, [*ranked, *filter(is_unranked, some)])
         rows = rows[rows["latency_s"].notna()]
         if rows.empty:
@@ -141,7 +141,7 @@ class Board:
         Raise `ConfigError` if no matcher gives a confidence there, or every place of the suite is present.
         """
         shown = self._shown(self.scores["matcher"])
-        own = {(name, OWN): own_confidence(frame) for name, frame in _by_matcher(self.scores).items() if name in shown}
+        own = {(name, OWN): own_confidence(frame) for name, frame in by_entry(self.scores).items() if name in shown}
         rows = risk_frame(own, shown)
         for column, value in (("suite", suite), ("track", track), ("prior_group", prior_group), ("mixture", AS_DRAWN)):
             rows = rows[rows[column] == value]
@@ -177,8 +177,8 @@ class Board:
 StoredBoard = Board  # its public name
 
 
-def _by_matcher(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the scored rows of each matcher."""
+def by_entry(scores: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the scored rows of each entry."""
     return {str(name): frame for name, frame in scores.groupby("matcher", sort=False)}
 
 

@@ -8,7 +8,9 @@ from pathlib import Path
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.folders import SITE
+from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra, read_board_manifest
+from sasgeo_bench.leaderboard.board_pictures import pictures_extra
 from sasgeo_bench.leaderboard.board_tables import step_tables
 from sasgeo_bench.leaderboard.plot_tables import age_names, ages_frame
 from sasgeo_bench.leaderboard.rejection_tables import acceptance_tables
@@ -31,6 +33,21 @@ def make_board(request: ScoreRequest, extras: Sequence[Callable[[Scored], Extra]
     board = scored.board.with_failures(scored.failures.found)
     texts = board_texts(replace(scored, board=board))
     return replace(scored, board=board.save([texts, *drawn], failed=scored.failures.found))
+
+
+def drawings(request: ScoreRequest, *, has_cases: bool = True) -> tuple[Callable[[Scored], Extra], ...]:
+    """Return what draws the figures and the pictures of a board; `has_cases` shows failed queries with their truths."""
+    return (
+        partial(figures_extra, contrasts=request.contrasts, split=request.split),
+        partial(
+            pictures_extra,
+            root=request.root,
+            contrasts=request.contrasts,
+            split=request.split,
+            has_cases=has_cases,
+            jobs=request.jobs,
+        ),
+    )
 
 
 def _tell_what_goes(folder: Path, scored: Scored) -> None:

@@ -17,7 +17,7 @@ from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
 from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
 from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
-from sasgeo_bench.scoring.controls import ALPHA, CONTROL_SCHEMA, Falsifier, Verdict
+from sasgeo_bench.scoring.controls import ALPHA, Falsifier, Verdict
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.strata import ALL
 from sasgeo_bench.scoring.verdicts import Finding
@@ -191,7 +191,7 @@ def tables_of(
         *rejection_tables(board),
         cost_table(book),
         *others,
-        control_table(CONTROL_SCHEMA.frame(verdicts)),
+        control_table(verdicts),
     )
     yield from (table for table in found if table is not None and table.rows)
 

@@ -5,8 +5,6 @@ import math
 from collections.abc import Sequence
 from typing import Final
 
-import pandas as pd
-
 from sasgeo_bench.errors import counted
 from sasgeo_bench.leaderboard.columns import column, words
 from sasgeo_bench.leaderboard.manifests import BoardEntry
@@ -25,7 +23,7 @@ from sasgeo_bench.leaderboard.tables import (
     text_cells,
 )
 from sasgeo_bench.scoring.contrasts import AREAS
-from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Falsifier, Verdict
+from sasgeo_bench.scoring.controls import Falsifier, Verdict
 from sasgeo_bench.scoring.rows import ALL_SUITES
 from sasgeo_bench.scoring.verdicts import Finding
 
@@ -72,11 +70,10 @@ def seed_table(entries: Sequence[BoardEntry]) -> Table | None:
     return Table(name="seeds", title=title, columns=columns, rows=tuple(rows), notes=(SEEDS_NOTE,))
 
 
-def control_table(controls: pd.DataFrame) -> Table | None:
+def control_table(verdicts: Sequence[Verdict]) -> Table | None:
     """Return every control of every matcher; None where none was drawn."""
-    if not len(controls):
+    if not verdicts:
         return None
-    verdicts = CONTROL_SCHEMA.rows(Verdict, controls)
     rows = tuple(
         Row(
             cells=(

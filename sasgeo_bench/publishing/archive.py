@@ -4,18 +4,15 @@
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.plugins import check_registered
 from sasgeo_bench.files.scratch import scratch_folder
-from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
-from sasgeo_bench.leaderboard.board_pictures import pictures_extra
-from sasgeo_bench.leaderboard.build import make_board
+from sasgeo_bench.leaderboard.build import drawings, make_board
 from sasgeo_bench.leaderboard.manifests import PackManifest
-from sasgeo_bench.leaderboard.private_board import check_public, seed_of
+from sasgeo_bench.leaderboard.private_board import check_public
 from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive_file import (
@@ -69,7 +66,7 @@ def pack_board(
     submitted = next((entry.name for entry in scored.entries if not entry.runs), None)
     if submitted is not None:
         raise ConfigError(f"{submitted} is a file of predictions: only boards of runs are stored")
-    check_public(seed_of(scored.tasks), str(request.board))
+    check_public(scored.board.about.private_seed, str(request.board))
     tasks = [Task.of(about, request.root, truth=request.truth) for about in scored.tasks]
     ids = {task.manifest.name: task.ids() for task in tasks}
     runs = {entry.name: list(_runs_of(entry, scored, ids)) for entry in scored.entries}
@@ -190,18 +187,9 @@ def score_all(
         check_results(results / request.board.name, request.board)
     kept = stored_among(request.predictions)
     with laid_out(request) as laid:
-        figures = partial(figures_extra, contrasts=request.contrasts, split=request.split)
-        pictures = partial(
-            pictures_extra,
-            root=request.root,
-            contrasts=request.contrasts,
-            split=request.split,
-            has_cases=has_cases,
-            jobs=request.jobs,
-        )
-        asked = laid if kept is None else replace(laid, kept=read_board_manifest(kept))
-        extras = (figures, pictures) if request.stored is None else ()  # which need what was fitted for every entry
-        scored = make_board(asked, extras)
+        # they need what was fitted for every entry
+        extras = drawings(request, has_cases=has_cases) if request.stored is None else ()
+        scored = make_board(laid, extras)
         if results is not None:
             lacks = "" if kept is None else read_pack(kept).dropped
             tell(pack_board(scored, laid, results / laid.board.name, lacks=lacks).to_text())
@@ -247,6 +235,7 @@ def laid_out(request: ScoreRequest) -> Iterator[ScoreRequest]:
                 tasks=found.tasks,
                 root=found.root,
                 truth=found.root / "truth",
+                kept=read_board_manifest(stored),
             )
 
 

@@ -16,7 +16,7 @@ from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.folders import SITE, absolute, resolve_link
 from sasgeo_bench.files.scratch import scratch_folder
-from sasgeo_bench.leaderboard.board import Board
+from sasgeo_bench.leaderboard.board import Board, by_entry
 from sasgeo_bench.leaderboard.board_files import (
     BOARD_FILES,
     FIGURES,
@@ -180,8 +180,7 @@ def _scenes(board: Board) -> pd.DataFrame:
     if not set(SCORED) <= set(scores):
         return pd.DataFrame()
     apart = {entry.name for entry in board.about.entries if entry.set_apart}
-    by_matcher = {str(name): rows for name, rows in scores.groupby("matcher", sort=False)}
-    return scene_frame(by_matcher, draws=board.about.draws or DRAWS, excluded=apart)
+    return scene_frame(by_entry(scores), draws=board.about.draws or DRAWS, excluded=apart)
 
 
 def _scenes_file(scenes: pd.DataFrame) -> Iterator[Download]:

@@ -44,7 +44,7 @@ from sasgeo_bench.publishing.site_pages import (
 )
 from sasgeo_bench.publishing.site_source import SiteSource
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
+from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.verdicts import LOWER
 from sasgeo_bench.tasks.query import SEQUENCE, base_of
 from sasgeo_bench.texts import plain
@@ -279,7 +279,7 @@ def site_pages(source: SiteSource) -> dict[str, str]:
         "regions.html": {"table": region_table(source)},
         "ageing.html": {"table": rate_table(source.rates), "kinds": kinds},
         "method.html": {
-            "controls": control_table(source.board.controls),
+            "controls": control_table(source.board.verdicts),
             "learned": [*training_lines(source.board.about), *segmenter_lines(source.board.about)],
             "meanings": MEANINGS | MARKS,
         },
@@ -304,7 +304,7 @@ def _map_files(templates: Environment, scripts: Mapping[str, str]) -> dict[str, 
 
 def _index(source: SiteSource, book: Book, sections: Sequence[Section]) -> dict[str, Any]:
     """Return what the first page shows."""
-    controls = CONTROL_SCHEMA.rows(Verdict, source.board.controls)
+    controls = source.board.verdicts
     overview = tuple(table for table in summary(book) if _has_rivals(table))
     contrasts = contrasts_of(source)
     prices = {table.name.replace("summary", "price", 1) for table in overview}

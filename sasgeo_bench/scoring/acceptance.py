@@ -3,7 +3,7 @@
 
 A threshold that is set for one share of absent places says little where there are more of them, or of another kind. So
 each kind of absence is mixed with all present places in declared shares; the chances are corrected for the share on
-calibration places (`prior_shift`), and Eq. 14 decides.
+calibration places (`decisions.at_share`), and Eq. 14 decides.
 """
 
 from collections.abc import Iterator

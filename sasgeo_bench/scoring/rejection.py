@@ -21,10 +21,9 @@ from sasgeo_bench.progress import spread, tell
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA, acceptance_frame
 from sasgeo_bench.scoring.base import Bools, Floats
-from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Fixes, accept
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Fixes, accept, at_share
 from sasgeo_bench.scoring.integrity_metric import choose_absent_threshold, choose_threshold
 from sasgeo_bench.scoring.metrics import THRESHOLDS
-from sasgeo_bench.scoring.prior_shift import at_share
 from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows, shifted_column
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, some_rows

@@ -120,7 +120,7 @@ def test_stored_results_give_the_same_board(out):
     again = score(predictions=out / "results" / "mine", out=out, name="again", draws=100, cases=False)
     first, second = (
         frame.sort_values(["matcher", "suite", "stratum", "metric"], ignore_index=True)
-        for frame in (read_leaderboard(out / "boards" / "mine"), again.board.leaderboard)
+        for frame in (read_leaderboard(out / "boards" / "mine"), again.leaderboard)
     )
     columns = ["matcher", "suite", "stratum", "metric", "n", "value", "lo", "hi"]
     pd.testing.assert_frame_equal(first[columns], second[columns], check_dtype=False)

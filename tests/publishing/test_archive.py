@@ -19,7 +19,7 @@ from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.files import folders
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.leaderboard import record
+from sasgeo_bench.leaderboard import build, record
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
@@ -80,7 +80,7 @@ def kept(tmp_path_factory, few_controls, lay_towns):  # noqa: ARG001
 def undrawn(monkeypatch):
     """Boards of stored results have no figures and no pictures: for tests that are about their tables."""
     for name in ("figures_extra", "pictures_extra"):
-        monkeypatch.setattr(archive, name, lambda *_, **__: Extra())
+        monkeypatch.setattr(build, name, lambda *_, **__: Extra())
 
 
 def test_scored_again_stored_results_give_the_same_board(kept, program, tmp_path):
@@ -101,7 +101,7 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
     said["files"]["queries.parquet"]["sha256"] = "0" * 64
     (other / "task.json").write_text(json.dumps(said), encoding="utf-8")
     lines = []
-    monkeypatch.setattr(archive, "figures_extra", lambda *_, **__: Extra())
+    monkeypatch.setattr(build, "figures_extra", lambda *_, **__: Extra())
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path / "out")
     with reporting(lines.append):
         score_all(replace(usual, draws=100, rejectors=()))

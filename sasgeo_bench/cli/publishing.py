@@ -63,32 +63,27 @@ def publish(options: PublishOptions) -> Written:
     sasgeo_bench.errors.StoreError: out/boards/demo/figures is the board itself, or would be a strange folder in it: \
 name another one with --into
     """
-    written, scored = _published(options)
-    for name, why in scored.about.failed.items() if scored else ():
+    written, board = _published(options)
+    for name, why in board.about.failed.items() if board else ():
         progress.tell(f"failed, and so not on the board: {name}: {why}")
     return written
 
 
 def _published(options: PublishOptions) -> tuple[Written, Board | None]:
     """Score submissions, if any, with the stored results, and make the site; return it and the board of both."""
-    folder, scored = options.board, None
+    folder, board = options.board, None
     if options.submissions:
         folder = options.out / "boards" / (board_of([options.board]) or options.board.resolve().name)
-        scored = with_submissions(options.board, options.submissions, folder, root=options.out, jobs=options.jobs).board
-    written = build.publish(
-        folder,
-        options.into,
-        root=options.out,
-        jobs=options.jobs,
-    )
-    return written, scored
+        scored = with_submissions(options.board, options.submissions, folder, root=options.out, jobs=options.jobs)
+        board = scored.board
+    return build.publish(folder, options.into, root=options.out, jobs=options.jobs), board
 
 
 def publish_command(options: PublishOptions) -> None:
     """Make the static site of a board: plain files that open without a server, to be put on any host."""
     with shown_progress():
-        written, scored = _published(replace(options, say=say))
+        written, board = _published(replace(options, say=say))
     tell(written.to_text())
     say(written.folder / "index.html")
-    if scored is not None:
-        check_controls(scored)
+    if board is not None:
+        check_controls(board)

@@ -110,11 +110,7 @@ def check_entry(entry: Entry, *, into: Path | None = None) -> CheckedEntry:
     return CheckedEntry(folder, found)
 
 
-def enter(
-    entry: Entry,
-    *,
-    into: Path | None = None,
-) -> tuple[Path, Scored]:
+def enter(entry: Entry, *, into: Path | None = None) -> tuple[Path, Scored]:
     """Draw the queries of a board, ask the matcher, write the submission, and score it beside the stored answers.
 
     What was drawn or answered before is not done again. Return the folder of the submission (`into`, or

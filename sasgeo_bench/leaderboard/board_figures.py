@@ -78,46 +78,37 @@ def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: 
     # An age is no other strength: where maps have ages, those are the axis.
     others = steps[~steps["suite"].isin(set(ages["suite"]))]
     calibrated = _calibrated(table)
+    judged, groups = scored.judged, GROUP[1:]
+
+    def each(name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., object]) -> Named:
+        """Yield a figure for each group of rows; prior groups are never together."""
+        for key, part in rows.groupby(list(columns), sort=True):
+            yield _file_name(name, *map(str, key)), partial(draw, rows=part, shown=shown)
+
     kinds: dict[str, Callable[[], Named]] = {
-        "success against the age of the map": lambda: _each("age", ages, GROUP, draw_ages, shown),
-        "success against strength": lambda: _each("strength", others, GROUP, draw_steps, shown),
-        "success under stress": lambda: _each("stress", stress_frame(table, shown), GROUP[1:], draw_bars, shown),
-        "arms side by side": lambda: _each(
-            "ablation", ablation_frame(scores, contrasts, shown), GROUP[1:], draw_ablation, shown
-        ),
+        "success against the age of the map": lambda: each("age", ages, GROUP, draw_ages),
+        "success against strength": lambda: each("strength", others, GROUP, draw_steps),
+        "success under stress": lambda: each("stress", stress_frame(table, shown), groups, draw_bars),
+        "arms side by side": lambda: each("ablation", ablation_frame(scores, contrasts, shown), groups, draw_ablation),
         "differences by place": lambda: _forests(scored, contrasts),
-        "recall against K": lambda: _each(
-            "recall",
-            recall_frame(alone, scored.predictions, scored.truths, shown),
-            GROUP[1:],
-            draw_recall,
-            shown,
+        "recall against K": lambda: each(
+            "recall", recall_frame(alone, scored.predictions, scored.truths, shown), groups, draw_recall
         ),
-        "the distribution of errors": lambda: _each(
-            "errors", errors_frame(alone, table, shown), GROUP[1:], draw_errors, shown
+        "the distribution of errors": lambda: each("errors", errors_frame(alone, table, shown), groups, draw_errors),
+        "success against cost": lambda: each("price", _priced(scored), groups, draw_prices),
+        "risk against coverage": lambda: each("risk", risk_frame(judged, shown), GROUP, draw_risk),
+        "reliability": lambda: each(
+            "reliability", reliability_frame(judged, calibrated, shown), groups, draw_reliability
         ),
-        "success against cost": lambda: _each("price", _priced(scored), GROUP[1:], draw_prices, shown),
-        "risk against coverage": lambda: _each("risk", risk_frame(scored.judged, shown), GROUP, draw_risk, shown),
-        "reliability": lambda: _each(
-            "reliability",
-            reliability_frame(scored.judged, calibrated, shown),
-            GROUP[1:],
-            draw_reliability,
-            shown,
-        ),
-        "the cost of decisions": lambda: _each(
-            "cost", cost_frame(scored.judged, calibrated, shown), GROUP[1:], draw_costs, shown
-        ),
+        "the cost of decisions": lambda: each("cost", cost_frame(judged, calibrated, shown), groups, draw_costs),
         "protection levels against errors": lambda: _stanfords(scored, shown, split),
-        "error along flights": lambda: _each(
-            "distance", distance_frame(scored.views, scores, shown), GROUP, draw_distance, shown
+        "error along flights": lambda: each(
+            "distance", distance_frame(scored.views, scores, shown), GROUP, draw_distance
         ),
-        "how far odometers carry fixes on flights": lambda: _each(
-            "interval", interval_frame(table, kinds_of(scores), shown), GROUP, draw_intervals, shown
+        "how far odometers carry fixes on flights": lambda: each(
+            "interval", interval_frame(table, kinds_of(scores), shown), GROUP, draw_intervals
         ),
-        "success against the drift of odometers": lambda: _each(
-            "drift", drift_frame(table, shown), GROUP[1:], draw_drift, shown
-        ),
+        "success against the drift of odometers": lambda: each("drift", drift_frame(table, shown), groups, draw_drift),
     }
     drawn: dict[str, dict[str, Draw]] = {}
     for kind, make in kinds.items():
@@ -131,14 +122,6 @@ def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: 
 
 def _file_name(*parts: str) -> str:
     return _PLAIN.sub("-", "-".join(parts)).strip("-").lower()
-
-
-def _each(
-    name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., object], shown: Sequence[str]
-) -> Named:
-    """Yield a figure for each group of rows; prior groups are never together."""
-    for key, part in rows.groupby(list(columns), sort=True):
-        yield _file_name(name, *map(str, key)), partial(draw, rows=part, shown=shown)
 
 
 def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:

@@ -248,13 +248,7 @@ def _add_strips(found: _Found, scored: Scored, asked: Mapping[tuple[str, str], T
         )
 
 
-def _strip(
-    strip: Strip,
-    cases: Mapping[str, Case],
-    tasks: Mapping[tuple[str, str], Task],
-    *,
-    title: str,
-) -> bytes:
+def _strip(strip: Strip, cases: Mapping[str, Case], tasks: Mapping[tuple[str, str], Task], *, title: str) -> bytes:
     own = [cases[query_id] for query_id in strip.query_ids if query_id in cases]
     rows = [read_picture(case, tasks[case.query.suite, case.query.region]) for case in own]
     return fitted(strip_pixels(strip, rows, title=title), STRIP_BYTES)

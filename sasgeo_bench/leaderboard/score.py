@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Runs, files of predictions and truths -> a scored board: the order of the steps."""
 
+import platform
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Final
 
@@ -13,13 +16,24 @@ import pandas as pd
 from sasgeo_bench.errors import StoreError, counted
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import check_board
-from sasgeo_bench.leaderboard.private_board import hold_private, seed_of
-from sasgeo_bench.leaderboard.record import entry_of, record_of
+from sasgeo_bench.leaderboard.manifests import (
+    BoardEntry,
+    BoardManifest,
+    BoardTask,
+    Learned,
+    RejectorRecord,
+    SeedRecord,
+)
+from sasgeo_bench.leaderboard.private_board import OnPrivate, hold_private, seed_of
 from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
+from sasgeo_bench.matching.matcher import RejectorCard
 from sasgeo_bench.progress import tell
+from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
 from sasgeo_bench.running.prediction_files import StoredAnswers
+from sasgeo_bench.running.run_manifest import CardRecord
+from sasgeo_bench.running.sandbox import joined
 from sasgeo_bench.scoring.contestants import (
     Contest,
     open_tasks,
@@ -33,6 +47,8 @@ from sasgeo_bench.scoring.controls import (
     CONTROL_SCHEMA,
     FALSIFIER_SCHEMA,
     Falsifier,
+    Verdict,
+    failed_controls,
     gains_without_stress,
     hold_controls,
     hold_falsifiers,
@@ -46,11 +62,12 @@ from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, name_alone, wit
 from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
 from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding, with_causes
-from sasgeo_bench.tasks.query import SEQUENCE, base_of
+from sasgeo_bench.tasks.query import SEQUENCE, TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Split
-from sasgeo_bench.tasks.task_files import Task
+from sasgeo_bench.tasks.task_files import Task, TaskManifest
 
 _M2_PER_KM2: Final = 1e6
+_LIBRARIES: Final = ("numpy", "scipy", "pandas", "pyarrow", "statsmodels", "scikit-learn")
 
 
 def score_board(request: ScoreRequest) -> Scored:
@@ -70,23 +87,23 @@ def score_board(request: ScoreRequest) -> Scored:
         scored = scored_rows(contest, request.split)
         scores = rows_to_rank(scored, request.split)
         entries = [item.entry for item in contest.answers if item.entry.name in scores]
-        apart = set_apart(entries, scores, request.split, controls)
+        excluded = set_apart(entries, scores, request.split, controls)
         tasks = tuple(task.manifest for task in contest.tasks)
         on_private = hold_private(request, entries=entries, scores=scores, tasks=tasks)
-        ranks = _ranks(scores, apart, request.draws, failures)
+        ranks = _ranks(scores, excluded, request.draws, failures)
     predictions = {item.entry.name: item.predictions for item in contest.answers}
     views = _of_rows(contest.views, scores)
     costs = _costs(entries, scores, views, contest.tasks, failures)
     rejection = _rejection(request, rules, entries, scored, predictions, failures)
     falsifiers, findings = _tested(request, scores, rejection, failures)
     protection = _protection(scored, scores, predictions, request.split, failures)
-    said = [entry_of(entry, apart.get(entry.name), on_private, controls) for entry in entries]
+    records = [_entry_of(entry, excluded.get(entry.name), on_private, controls) for entry in entries]
     board = Board(
         folder=request.board,
-        about=record_of(
+        about=_record_of(
             request,
             tasks,
-            said,
+            records,
             private=on_private.seed,
             cards=[rule.card for rule in rules.values()],
             remarks=rejection.remarks,
@@ -94,7 +111,7 @@ def score_board(request: ScoreRequest) -> Scored:
         ),
         leaderboard=with_entry_labels(
             pd.concat([part for part in (*ranks, *costs, *rejection.rows) if len(part)], ignore_index=True),
-            {one.name: EntryLabel(one.version or "", one.hash or "", one.how or "", one.set_apart) for one in said},
+            {one.name: EntryLabel(one.version or "", one.hash or "", one.how or "", one.set_apart) for one in records},
         ),
         scores=pd.concat([frame.assign(matcher=name) for name, frame in scores.items()], ignore_index=True),
         contrasts=CONTRAST_SCHEMA.frame(findings),
@@ -137,10 +154,10 @@ def _contest(request: ScoreRequest, failures: Failures) -> Contest:
 
 
 def _ranks(
-    scores: Mapping[str, pd.DataFrame], apart: Mapping[str, str], draws: int, failures: Failures
+    scores: Mapping[str, pd.DataFrame], excluded: Mapping[str, str], draws: int, failures: Failures
 ) -> list[pd.DataFrame] | None:
     """Return the figures of all entries together; None if one of them fails, which is noted."""
-    compare = partial(leaderboards, draws=draws, excluded=apart)
+    compare = partial(leaderboards, draws=draws, excluded=excluded)
     try:
         return compare(scores)
     except Exception as error:
@@ -304,3 +321,83 @@ def _of_rows(views: Mapping[str, pd.DataFrame], scores: Mapping[str, pd.DataFram
         for name, frame in views.items()
         if name in scores
     }
+
+
+# --- the manifest ----------------------------------------------------------------------------------------------------
+
+
+def _record_of(
+    request: ScoreRequest,
+    tasks: Sequence[TaskManifest],
+    entries: Sequence[BoardEntry],
+    *,
+    private: SeedRecord | None,
+    cards: Sequence[RejectorCard],
+    remarks: Sequence[str],
+    failed: Mapping[str, str],
+) -> BoardManifest:
+    """Return the manifest of a board; `private` is the seed that its rows were held against, `remarks` are on fits."""
+    return BoardManifest(
+        scorer_version=SCORER_VERSION,
+        task_version=max((item.task_version for item in tasks), default=TASK_VERSION),
+        data_version=request.kept.data_version or DATA_VERSION,
+        made_by=f"sasgeo-bench {version('sasgeo-bench')}",
+        libraries=dict(_libraries()),
+        pipeline=request.pipeline,
+        title=request.title or request.kept.title,
+        private_seed=seed_of(tasks),
+        private=private,
+        sealed=dict(request.sealed or request.kept.sealed),
+        split=None if request.split is None else request.split.spec.id,
+        draws=request.draws,
+        contrasts=list(request.contrasts),
+        by_region=sorted(request.by_region),
+        by_block=sorted(request.by_block),
+        without=sorted(set(request.without)),
+        rejectors=[
+            RejectorRecord(**{name: getattr(card, name) for name in RejectorRecord.model_fields}) for card in cards
+        ],
+        remarks=list(remarks),
+        elsewhere=list(request.elsewhere),
+        failed=dict(failed),
+        entries=list(entries),
+        tasks=[
+            BoardTask(
+                suite=item.suite,
+                suite_version=item.suite_version,
+                region=item.region,
+                map_date=item.map_date,
+                queries_sha256=item.queries_sha256,
+                map_fingerprint=item.map_fingerprint,
+                failed_pictures=item.failed_pictures,
+            )
+            for item in tasks
+        ],
+    )
+
+
+def _entry_of(entry: Entry, set_apart: str | None, on_private: OnPrivate, controls: Sequence[Verdict]) -> BoardEntry:
+    """Return what a board says of an entry: why it is set apart, if it is, and how it fared on a private seed."""
+    return BoardEntry(
+        name=entry.name,
+        version=entry.version,
+        hash=entry.hash,
+        how=on_private.how(entry),
+        card=None if entry.card is None else CardRecord.model_validate(entry.card),
+        trained_on=entry.declared,
+        set_apart=set_apart,
+        isolation=joined(run.isolation or {} for run in entry.runs) if entry.runs else None,
+        learned=[Learned.model_validate(one) for one in entry.learned()],
+        private=on_private.rows.get(entry.name),
+        failed_controls=[item.to_text() for item in failed_controls(controls, entry.name)],
+    )
+
+
+@cache
+def _libraries() -> Mapping[str, str]:
+    """Return the versions of Python and of installed libraries that affect results, looked up once."""
+    found = {"python": platform.python_version()}
+    for name in _LIBRARIES:
+        with suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found

@@ -170,12 +170,7 @@ def request_of(
     )
 
 
-def score_all(
-    request: ScoreRequest,
-    *,
-    has_cases: bool = True,
-    results: Path | None = None,
-) -> Scored:
+def score_all(request: ScoreRequest, *, has_cases: bool = True, results: Path | None = None) -> Scored:
     """Score a request, stored results laid out, and write the board with its figures and pictures.
 
     `has_cases` shows failed queries with their truths. With `results`, store the board under its name in that folder,

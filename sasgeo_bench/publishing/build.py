@@ -65,13 +65,7 @@ _OF_SCENES: Final = (
 )
 
 
-def publish(
-    board: Path,
-    into: Path | None = None,
-    *,
-    root: Path = Path("out"),
-    jobs: int = 1,
-) -> Written:
+def publish(board: Path, into: Path | None = None, *, root: Path = Path("out"), jobs: int = 1) -> Written:
     """Make the site of a board from its folder; stored results are scored again for their figures and pictures.
 
     `into` is the folder to write, by default `site` in the board's own. Pictures of stored results, which hold no

@@ -19,7 +19,7 @@ from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
 from sasgeo_bench.files import folders
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame
-from sasgeo_bench.leaderboard import build, record
+from sasgeo_bench.leaderboard import build, score
 from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
@@ -114,7 +114,7 @@ def test_scored_again_stored_results_have_pictures_where_the_same_views_lie(kept
 @pytest.mark.usefixtures("undrawn")
 def test_stored_results_keep_the_version_of_the_maps_they_were_asked_on(kept, tmp_path, monkeypatch):
     _, _, folder, _ = kept
-    monkeypatch.setattr(record, "DATA_VERSION", 99)
+    monkeypatch.setattr(score, "DATA_VERSION", 99)
     usual = archive.request_of([folder], board=tmp_path / "again", root=tmp_path)
     score_all(replace(usual, draws=100, rejectors=()), has_cases=False)
     first = json.loads((folder / "board.json").read_text())

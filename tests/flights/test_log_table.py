@@ -57,7 +57,6 @@ def _read(folder: Path, head: str, row: Row, *, name: str = "log.csv", count: in
 def _check(log: FlightLog, *, height_m: float | None = None, yaw_deg: float | None = None, count: int = 6) -> None:
     """Every log of this file is the same flight."""
     assert len(log) == count
-    assert log.time_s is not None
     assert log.time_s[-1] == pytest.approx(count - 1, abs=1e-6)
     assert steps_m(log.lon_deg, log.lat_deg) == pytest.approx(5.0, abs=0.02)
     assert log.lat_deg[0] == pytest.approx(49.005, abs=1e-9)
@@ -122,9 +121,7 @@ def _check(log: FlightLog, *, height_m: float | None = None, yaw_deg: float | No
         ("timeUs,latitude,longitude,agl_feet", lambda y, x, s: f"{s}000000,{y},{x},10", 3.048, None),
     ],
 )  # fmt: skip
-def test_a_log_of_any_format_is_the_same_flight(
-    tmp_path: Path, head: str, row: Row, height_m: float | None, yaw_deg: float | None
-) -> None:
+def test_a_log_of_any_format_is_the_same_flight(tmp_path, head, row, height_m, yaw_deg) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         log = _read(tmp_path, head, row, name="log.pos" if head.startswith("%  ") else "log.csv")
@@ -172,9 +169,7 @@ def test_a_log_of_any_format_is_the_same_flight(
          ["no line has a height: read without", "no line has a yaw: read without"]),
     ],
 )  # fmt: skip
-def test_what_is_no_place_or_no_value_is_left_out_with_a_word(
-    tmp_path: Path, head: str, row: Row, expected: dict | None, left_out: list[str]
-) -> None:
+def test_what_is_no_place_or_no_value_is_left_out_with_a_word(tmp_path, head, row, expected, left_out) -> None:
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         if expected is None:
@@ -226,7 +221,7 @@ def test_what_is_no_place_or_no_value_is_left_out_with_a_word(
     ],
 )  # fmt: skip
 def test_what_neither_name_nor_format_tells_is_asked_for_in_one_line(
-    tmp_path: Path, head: str, row: Row, match: str, facts: dict, expected: dict | None
+    tmp_path, head, row, match, facts, expected
 ) -> None:
     with pytest.raises(FlightError, match=match) as fault:
         _read(tmp_path, head, row)
@@ -270,9 +265,7 @@ def test_what_neither_name_nor_format_tells_is_asked_for_in_one_line(
          "no column of latitude and longitude, found 'GPST', 'x-ecef"),
     ],
 )  # fmt: skip
-def test_what_contradicts_or_may_be_two_things_is_refused(
-    tmp_path: Path, head: str, row: Row, facts: dict, match: str
-) -> None:
+def test_what_contradicts_or_may_be_two_things_is_refused(tmp_path, head, row, facts, match) -> None:
     with pytest.raises(FlightError, match=match):
         _read(tmp_path, head, row, **facts)
 
@@ -298,15 +291,12 @@ def test_units_are_not_said_of_files_that_state_them(tmp_path: Path) -> None:
 
 
 @given(st.sampled_from(sorted(UNITS["time"])), st.integers(-3, 3))
-def test_the_unit_of_a_time_is_that_of_its_name_at_any_speed(
-    tmp_path_factory: pytest.TempPathFactory, unit: str, power: int
-) -> None:
+def test_the_unit_of_a_time_is_that_of_its_name_at_any_speed(tmp_path_factory, unit, power) -> None:
     ticks = 10.0**power / UNITS["time"][unit]  # a step may last a millisecond or a quarter of an hour
     path = tmp_path_factory.mktemp("times") / "log.csv"
     rows = [f"{at * ticks!r},47.14,{9 + at * 1e-7}\n" for at in range(4)]
     path.write_text(f"timestamp_{unit},lat,lon\n{''.join(rows)}", encoding="utf-8")
     log = read_log(path)
-    assert log.time_s is not None
     assert log.time_s == pytest.approx([at * 10.0**power for at in range(4)])
 
 

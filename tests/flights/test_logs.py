@@ -82,24 +82,18 @@ def _refused(path: Path) -> str:
 
 
 @pytest.mark.parametrize("tag", ["trk", "rte"])
-def test_a_gpx_track_or_route_has_places_and_times(written: Callable, tag: str) -> None:
-    log = read_log(written("a.gpx", _gpx(_points(), tag=tag)))
-    assert log.lat_deg.tolist() == [lat for _, lat, _ in _points()]
-    assert log.lon_deg.tolist() == [LON] * 5
-    assert log.time_s is not None
-    assert log.time_s.tolist() == [0, 1, 2, 3, 4]
-    assert (log.height_m, log.yaw_deg) == (None, None)
-
-
-def test_segments_of_a_gpx_track_follow_each_other(written: Callable) -> None:
-    text = _gpx(_points(4)).replace("</trkpt><trkpt", "</trkpt></trkseg><trkseg><trkpt", 1)
-    assert len(read_log(written("a.gpx", text))) == 4
+def test_a_gpx_track_or_route_has_places_and_times(written, tag) -> None:
+    text = _gpx(_points(), tag=tag)
+    segments = text.replace("</trkpt><trkpt", "</trkpt></trkseg><trkseg><trkpt", 1)  # of a track follow each other
+    for log in (read_log(written("a.gpx", text)), read_log(written("b.gpx", segments))):
+        assert log.lat_deg.tolist() == [lat for _, lat, _ in _points()]
+        assert log.lon_deg.tolist() == [LON] * 5
+        assert log.time_s.tolist() == [0, 1, 2, 3, 4]
+        assert (log.height_m, log.yaw_deg) == (None, None)
 
 
 @pytest.mark.parametrize(("mode", "heights"), [("relativeToGround", [80, 90]), ("absolute", None), ("", None)])
-def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(
-    written: Callable, mode: str, heights: list | None
-) -> None:
+def test_a_kml_line_has_heights_above_the_ground_alone_and_no_times(written, mode, heights) -> None:
     line = LINE.format("\n 9.52,47.14,80 \t 9.52,47.15,90\n")
     text = line.replace("<coordinates>", f"<altitudeMode>{mode}</altitudeMode><coordinates>")
     log = read_log(written("a.KML", text))
@@ -140,20 +134,13 @@ def test_a_kml_track_has_times_and_times_of_other_elements_are_not_its_own(writt
         f"</altitudeMode>{whens}{coords}{model}</gx:Track>{other}</kml>"
     )
     log = read_log(written("a.kml", text))
-    assert log.time_s is not None
-    assert log.height_m is not None
     assert (log.time_s.tolist(), log.height_m.tolist()) == ([0, 1, 2], [60, 60, 60])
 
 
 @pytest.mark.parametrize(
     "text",
     [
-        _csv("lat,lon,time_s", "47.14,9.52,5", "47.1401,9.52,6"),
-        _csv("Latitude;Longitude;Timestamp", "47.14;9.52;2025-05-01 10:00:00", "47.1401;9.52;2025-05-01 10:00:01.0"),
         _csv("# made by hand", "", "lat_deg\tlon_deg\ttime_ms", "47.14\t9.52\t5000", "47.1401\t9.52\t6000", "\t\t"),
-        _csv("\ufefftimestamp,lat,lon,alt", "1000000,471400000,95200000,480000", "2000000,471401000,95200000,480000"),
-        _csv("TimeUS,GPS.Lat,GPS.Lng,GPS.Alt", "7,47.14,9.52,480.5", "1000007,47.1401,9.52,480.5"),
-        _csv("time(millisecond),datetime(utc),latitude,longitude", "0,x,47.14,9.52", "1000,x,47.1401,9.52"),
         _csv("utc,lat,lon", '"2025-05-01T10:00:00+02:00",47.14,9.52', "2025-05-01T08:00:01Z,47.1401,9.52"),
         _csv("utc,lat,lon", "2025-05-01 10:00:00 UTC,47.14,9.52", "2025-05-01 12:00:01.0 UTC+02:00,47.1401,9.52"),
     ],
@@ -162,7 +149,6 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
     log = read_log(written("a.csv", text))
     assert log.lat_deg.tolist() == [47.14, 47.1401]
     assert log.lon_deg.tolist() == [9.52, 9.52]
-    assert log.time_s is not None
     assert log.time_s == pytest.approx([0, 1])
 
 
@@ -173,27 +159,22 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
     ("text", "match"),
     [
         (_csv("lat,lon", "47.14,9.52"), "two points at least, the log has 1"),
-        (_csv("lat,lon"), "two points at least, the log has 0"),
         ("", "no column of latitude and longitude, found none: name them lat_deg and lon_deg"),
         (_csv("x,y\x1b[31m,lat", "1,2,3"), r"no column of longitude, found 'x', 'y\?\[31m', 'lat'"),
         (_csv("lat,lon,GPS.lat", "1,2,3"), "latitude is ambiguous, columns 'lat', 'GPS.lat': keep one"),
         (_csv("lat,lon,yaw_deg,heading_rad", "1,2,3,4"), "yaw is ambiguous, columns 'yaw_deg', 'heading_rad'"),
         (_csv("lat,lon", "47.14,9.52", "nan,9.52"), "line 3: latitude is no number, 'nan'"),
-        (_csv("lat,lon", "47.14,9.52", "inf,9.52"), "line 3: latitude is no number"),
         (_csv("lat,lon", "47.14,9.52", "4_7,9.52"), "line 3: latitude is no number"),
         (_csv("lat,lon", "47.14,9.52", ",9.52"), "line 3: latitude is missing"),
         (_csv("lat,lon", "47.14,9.52", "47.1,\x1b]0;x\x07"), r"line 3: longitude is no number, '\?\]0;x\?'"),
         (_csv("lat,lon", "47.14,9.52", "97.14,9.52"), "line 3: latitude 97.14, longitude 9.52 are no degrees on Earth"),
         (_csv("lat,lon", "47.14,9.52", "47.14,189.5"), "line 3: latitude 47.14, longitude 189.5 are no degrees"),
-        (_csv("lat_e7,lon_e7", "471400000,95200000", "1900000000,95200000"), "line 3: latitude 190, longitude 9.52"),
         (_csv("lat,lon", "47.14,9.52", "0,0"), "line 3: latitude and longitude are 0, which is no fix"),
         (_csv("lat;lon", "47.14;9.52", "47,14;9,52"), "line 3: latitude is no number, .*decimals with a point"),
         (_csv("lat,lon", "47.14,9.52", "47.14"), "line 3: 1 cells, the head has 2"),
         (_csv("lat,lon", "47.14,9.52", '47.1,"9.5'), "line 3: no sound CSV"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "47.1401,9.52,2"), "line 3: time goes back by 1 s: sort"),
         (_csv("lat,lon,time_s", "47.14,9.52,-1e308", "47.1401,9.52,1e308"), "line 2: time is no number, '-1e308'"),
-        (_csv("lat,lon,time", "47.14,9.52,01/05/2025 10:00", "47.1401,9.52,3"),
-         "line 2: time is no date and time like"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "47.1401,9.52,"), "line 3: time is missing"),
         (_csv("lat,lon,time", "47.14,9.52,2025-05-01T10:00:00", "47.2,9.52,6"), "line 3: time is no date and time"),
         (_csv("lat,lon,time_s", "47.14,9.52,3", "48.14,9.52,4"), "line 3: moves at 111183 m/s since the point before"),
@@ -207,9 +188,7 @@ def test_a_csv_log_is_the_same_flight_by_any_of_its_names_and_units(written: Cal
          "line 2: height, column 'height_m', m, is 20000 m, beyond 10000"),
     ],
 )  # fmt: skip
-def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
-    written: Callable, text: str, match: str
-) -> None:
+def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(written, text, match) -> None:
     with pytest.raises(FlightError, match=match):
         raise FlightError(_refused(written("a.csv", text)))
 
@@ -222,12 +201,9 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
         ("a.gpx", EXTERNAL.format(f"<gpx>{POINT.format(1, 2, '<time>&e;</time>')}</gpx>"), "has a document type or"),
         ("a.kml", EXTERNAL.format(LINE.format("&e;")), "has a document type or entities"),
         ("a.gpx", "<gpx><trk>", "no sound XML"),
-        ("a.gpx", '<?xml version="1.0" encoding="martian"?><gpx/>', "no sound XML"),
-        ("a.gpx", "lat,lon", "no sound XML"),
         ("a.gpx", "<gpx>" + "<a>" * 9000, "more than 3000000 elements, or 64 in each other: keep the track alone"),
         ("a.gpx", _gpx(_points()).replace("<time>", "<time/><time>"), "point 1: time is no date and time"),
         ("a.gpx", "<gpx/>", "two points at least, the log has 0"),
-        ("a.gpx", _gpx(_points(1)), "two points at least, the log has 1"),
         ("a.gpx", _gpx(_points()).replace("</trk>", "</trk><trk></trk>"), "more than one track"),
         ("a.gpx", _gpx(_points(), tag="rte").replace("</rtept><", "</rtept></rte><rte><", 1), "more than one route"),
         ("a.gpx", _gpx(_points()).replace("<time>2025-05-01T10:00:02Z</time>", ""), "4 of 5 points have a time"),
@@ -246,16 +222,12 @@ def test_each_fault_of_a_table_is_one_line_that_names_the_place_and_the_mend(
          r"no flight log that is read: .gpx, .kml, .csv, .pos, .tum, .*\(unzip a .kmz, export a .ulg by ulog2csv"),
     ],
 )  # fmt: skip
-def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(
-    written: Callable, name: str, text: str, match: str
-) -> None:
+def test_each_fault_of_a_track_is_one_line_that_names_the_point_and_the_mend(written, name, text, match) -> None:
     with pytest.raises(FlightError, match=match):
         raise FlightError(_refused(written(name, text)))
 
 
-def test_files_that_are_missing_too_large_or_no_text_are_refused(
-    written: Callable, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_that_are_missing_too_large_or_no_text_are_refused(written, tmp_path, monkeypatch) -> None:
     assert "there is no flight log" in _refused(tmp_path / "none.csv")
     binary = tmp_path / "a.csv"
     binary.write_bytes(b"lat,lon\n\xff\xfe,9\n")
@@ -274,9 +246,7 @@ def test_files_that_are_missing_too_large_or_no_text_are_refused(
 
 
 @given(st.binary(max_size=300), st.sampled_from([".gpx", ".kml", ".csv"]))
-def test_any_bytes_are_read_or_refused_in_one_line(
-    tmp_path_factory: pytest.TempPathFactory, content: bytes, suffix: str
-) -> None:
+def test_any_bytes_are_read_or_refused_in_one_line(tmp_path_factory, content, suffix) -> None:
     path = tmp_path_factory.mktemp("any") / f"a{suffix}"
     path.write_bytes(content)
     assert _refused(path)
@@ -292,7 +262,6 @@ def test_points_before_the_first_fix_and_of_one_time_are_left_out_with_a_word(wr
         "a.csv: left out 4 points at 0, 0 before the first fix",
         "a.csv: left out 8 points with the time of the point before",
     ]
-    assert log.time_s is not None
     assert log.time_s.tolist() == list(range(8))
     assert log.lat_deg[:2] == pytest.approx([LAT + 2e-4, LAT + 3e-4])
 
@@ -382,9 +351,7 @@ def test_a_log_that_leaves_is_refused_in_one_line_with_the_longest_stretch(writt
         (["-47.14,-170.52,0", "-47.15,-170.52,100"], "at latitude -47.1500 to -47.1400, longitude -170.5200"),
     ],
 )
-def test_a_log_beside_a_region_is_refused_by_where_both_lie(
-    written: Callable, region: Region, rows: list[str], where: str
-) -> None:
+def test_a_log_beside_a_region_is_refused_by_where_both_lie(written, region, rows, where) -> None:
     path = written("a.csv", _csv("lat,lon,time_s", *rows))
     with pytest.raises(FlightError, match=rf"a\.csv lies elsewhere, {where} .*, and town-grid at latitude 48\.\d+ to"):
         read_flight(path, region, height_m=100.0)

@@ -233,13 +233,6 @@ def test_every_shipped_profile_says_where_it_comes_from_and_survives_a_round(nam
     assert read_drift_profile(tmp_path / "again.toml") == shipped
 
 
-def test_cards_say_what_was_not_measured() -> None:
-    assert "nothing was measured" in load_profile("wheel-poor").source
-    assert "not fitted" in load_profile("vo-mono-survey").source
-    for name in ("vio-mono", "vio-stereo"):
-        assert "nothing is known beyond 50 m" in load_profile(name).limits
-
-
 @pytest.mark.parametrize(
     ("text", "found"),
     [

@@ -47,7 +47,7 @@ def _turns_deg(path_m: np.ndarray) -> np.ndarray:
     seed=st.integers(0, 2**32 - 1),
 )
 def test_a_plan_is_inside_and_as_long_as_asked_or_is_refused_in_one_line(
-    regions: Callable[[str], Region], town: str, kind: str, along: str, asked_m: float, margin_m: float, seed: int
+    regions, town, kind, along, asked_m, margin_m, seed
 ) -> None:
     region = regions(town)
     refusal = ""
@@ -86,9 +86,7 @@ def test_a_corridor_does_not_depend_on_the_order_of_the_features(regions: Callab
     ("town-grid", "road", ["road_major", "road_minor"]),
     ("town-industrial", "water", ["waterway"]),
 ])  # fmt: skip
-def test_a_corridor_follows_roads_or_a_waterway_without_u_turns(
-    regions: Callable[[str], Region], town: str, along: str, names: list[str]
-) -> None:
+def test_a_corridor_follows_roads_or_a_waterway_without_u_turns(regions, town, along, names) -> None:
     region = regions(town)
     path_m = _drawn(region, "corridor", along=along, length_m=1500.0)
     ways = shapely.union_all(region.features[region.features["class"].isin(names)].geometry.to_numpy())

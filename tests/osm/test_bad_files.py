@@ -74,20 +74,13 @@ def test_a_packed_extract_that_was_cut_short_is_refused_in_one_line(pack, share:
 
 
 @pytest.mark.parametrize("place", ['lat="91"', 'lon="180.1"', 'lon="-200"'])
-def test_a_node_beyond_the_globe_is_taken_out_of_its_way_and_counted(place: str, tmp_path: Path) -> None:
-    path = tmp_path / "town.osm"
-    axis = place[:3]
-    path.write_text(changed(f' {axis}="[^"]*"', f" {place}"), encoding="utf-8")
-    reading = read_extract(path, GRID)
+def test_a_node_beyond_the_globe_is_taken_out_of_its_way_and_counted(place, tmp_path) -> None:
+    path, plain = tmp_path / "town.osm", tmp_path / "plain.osm"
+    path.write_text(changed(f' {place[:3]}="[^"]*"', f" {place}"), encoding="utf-8")
+    plain.write_text(TOYTOWN, encoding="utf-8")
+    reading, missing = read_extract(path, GRID), "way with nodes missing: the rest was kept"
     assert reading.drops["node beyond 180 degrees east or 90 degrees north, taken out of a way"] == 1
-    assert reading.notes["way with nodes missing: the rest was kept"] == _notes(tmp_path) + 1
-
-
-def _notes(folder: Path) -> int:
-    """How many ways of the town itself lack a node."""
-    path = folder / "plain.osm"
-    path.write_text(TOYTOWN, encoding="utf-8")
-    return read_extract(path, GRID).notes["way with nodes missing: the rest was kept"]
+    assert reading.notes[missing] == read_extract(plain, GRID).notes[missing] + 1
 
 
 def test_changesets_in_an_extract_are_passed_over(tmp_path: Path) -> None:

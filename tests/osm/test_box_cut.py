@@ -4,37 +4,19 @@
 import pytest
 
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
-from sasgeo_bench.osm.families import missing_families
 from sasgeo_bench.osm.history import _frame, _grid_around
 from sasgeo_bench.osm.mapped import lonlat_box
 from sasgeo_bench.osm.read import read_extract
+from tests.osm.drawing import bounds, osm
 from tests.slow import rest_slow
 
 GRID = Grid(epsg=32632, west_m=498_500.0, north_m=5_207_200.0, cell_size_m=10.0, rows=360, cols=300)
 BOX_M = (-2000, -2000, 2000, 2000)  # west, south, east, north, metres from 9 E, 47 N
 
 
-def place(x, y):
-    return 9 + x / 76_030, 47 + y / 111_175
-
-
 def written(path, *ways, box=BOX_M):
-    """An extract of ways (tags and corners in metres) with a box in its header; equal corners are one node."""
-    corners = dict.fromkeys(corner for _, line in ways for corner in line)
-    numbers = {corner: number for number, corner in enumerate(corners, start=1)}
-    nodes = [
-        f'<node id="{number}" lat="{place(*corner)[1]:.7f}" lon="{place(*corner)[0]:.7f}"/>'
-        for corner, number in numbers.items()
-    ]
-    texts = []
-    for identifier, (tags, line) in enumerate(ways, start=1):
-        nds = "".join(f'<nd ref="{numbers[corner]}"/>' for corner in line)
-        text = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
-        texts.append(f'<way id="{identifier}">{nds}{text}</way>')
-    (west, south), (east, north) = place(*box[:2]), place(*box[2:])
-    head = f'<bounds minlat="{south}" minlon="{west}" maxlat="{north}" maxlon="{east}"/>'
-    path.write_text(f'<osm version="0.6">{head}{"".join(nodes + texts)}</osm>', encoding="utf-8")
-    return path
+    """An extract of ways with a box in its header."""
+    return osm(path, *ways, head=bounds(*box))
 
 
 def village(x=0, y=0, reach=400, key="highway", value="residential"):
@@ -137,8 +119,11 @@ def warnings_of(path, classes=None):
     return read_extract(path, GRID, classes=classes).warnings
 
 
+INNER = (-1200, -1200, 1200, 1200)
+
+
 def test_a_town_of_streets_alone_names_what_it_lacks(tmp_path):
-    streets = written(tmp_path / "a.osm", *village(reach=1200), box=(-1200, -1200, 1200, 1200))
+    streets = written(tmp_path / "a.osm", *village(reach=1200), box=INNER)
     (warning,) = warnings_of(streets)
     assert "nothing is of building, water, green, farmland, parking" in warning
     assert warnings_of(streets, ["road_minor", "railway"]) == ()
@@ -149,22 +134,16 @@ def house(x, y, side=12):
     return [(x, y), (x + side, y), (x + side, y + side), (x, y + side), (x, y)]
 
 
-def test_a_town_of_houses_alone_lacks_its_streets_and_a_whole_town_nothing(tmp_path):
+def test_a_town_of_houses_or_railways_alone_lacks_its_streets_and_a_whole_town_nothing(tmp_path):
     houses = [({"building": "yes"}, house(x, y)) for x in range(-1190, 1200, 60) for y in range(-1190, 1200, 60)]
-    box = (-1200, -1200, 1200, 1200)
-    (warning,) = warnings_of(written(tmp_path / "a.osm", *houses, box=box))
+    (warning,) = warnings_of(written(tmp_path / "a.osm", *houses, box=INNER))
     assert "road_major, road_minor, path_track, water" in warning
     park = ({"leisure": "park"}, house(0, 0, 200))
-    assert warnings_of(written(tmp_path / "b.osm", *houses, *village(reach=1200), park, box=box)) == ()
-
-
-def test_open_country_lacks_nothing(tmp_path):
-    path = written(tmp_path / "a.osm", *ACROSS, *UP)
-    reading = read_extract(path, GRID)
-    assert missing_families(reading.features, reading.coverage, classes=("green", "building"), built_up=()) == ""
-
-
-INNER = (-1200, -1200, 1200, 1200)
+    assert warnings_of(written(tmp_path / "b.osm", *houses, *village(reach=1200), park, box=INNER)) == ()
+    rails = [({"railway": "rail"}, [(x, y) for x in range(-1300, 1301, 100)]) for y in range(-1100, 1200, 200)]
+    (warning,) = warnings_of(written(tmp_path / "c.osm", *rails, box=INNER))
+    assert "km of railways" in warning
+    assert "nothing is of road_major, road_minor, path_track, building, water" in warning
 
 
 @pytest.mark.parametrize("landuse", ["residential", "commercial", "industrial", "retail"])
@@ -175,13 +154,6 @@ def test_a_town_of_land_use_alone_lacks_its_streets_and_houses(landuse, tmp_path
     park = ({"leisure": "park"}, house(0, 0, 200))
     (warning,) = warnings_of(written(tmp_path / "a.osm", *blocks, park, box=INNER))
     assert "nothing is of road_major, road_minor, path_track, building:" in warning
-
-
-def test_a_town_of_railways_alone_lacks_the_rest(tmp_path):
-    rails = [({"railway": "rail"}, [(x, y) for x in range(-1300, 1301, 100)]) for y in range(-1100, 1200, 200)]
-    (warning,) = warnings_of(written(tmp_path / "a.osm", *rails, box=INNER))
-    assert "km of railways" in warning
-    assert "nothing is of road_major, road_minor, path_track, building, water" in warning
 
 
 def test_fields_woods_and_one_farm_without_a_road_lack_nothing(tmp_path):

@@ -2,7 +2,6 @@
 """The mapped area: estimated from the data, bounded by the header, overruled by the region file."""
 
 import numpy as np
-import pytest
 import shapely
 
 from sasgeo_bench.osm.coverage import choose_coverage, estimate_coverage
@@ -50,15 +49,6 @@ def test_leftovers_of_relations_far_away_are_cut_off():
     assert metres_of(found).bounds[2] < 6000
 
 
-def test_an_extract_cut_by_a_box_has_the_box_of_its_header():
-    square = shapely.box(-4000, -4000, 4000, 4000)
-    west, south = lonlat_of([(-4000, -4000)])[0]
-    east, north = lonlat_of([(4000, 4000)])[0]
-    area, source = choose_coverage(scattered(square), stated=None, header=shapely.box(west, south, east, north))
-    assert source == "header box"
-    assert area.bounds == pytest.approx((west, south, east, north))
-
-
 def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():
     triangle = shapely.Polygon([(-4000, -4000), (4000, -4000), (4000, 4000)])
     west, south = lonlat_of([(-4000, -4000)])[0]
@@ -72,10 +62,7 @@ def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():
 def test_what_the_region_file_states_overrules_all():
     stated = shapely.box(9, 47, 9.01, 47.01)
     header = shapely.box(8, 46, 10, 48)
-    assert choose_coverage(scattered(COUNTRY), stated=stated, header=header) == (
-        stated,
-        "region file",
-    )
+    assert choose_coverage(scattered(COUNTRY), stated=stated, header=header) == (stated, "region file")
 
 
 def test_no_data_covers_nothing():

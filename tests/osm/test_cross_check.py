@@ -8,9 +8,7 @@ from pathlib import Path
 import osmium
 import pytest
 
-from benchmarks import cross_check_osm
-from benchmarks.cross_check_osm import check, main, read_ours
-from benchmarks.other_readings import Tags
+from benchmarks.cross_check_osm import check
 from tests.slow import rest_slow
 
 LON, LAT = 9.0, 47.0  # the middle of a UTM zone
@@ -130,49 +128,6 @@ def test_a_small_map_is_read_as_gdal_and_osmium_read_it_but_for_rules(name, tmp_
     assert ours == pytest.approx(sums, rel=2e-3)  # the sketch is drawn on a sphere
     assert [each for each in found["differences"] if each["rule"] is None] == []
     assert {each["rule"] for each in found["differences"] if each["reader"] == "gdal"} == rules
-
-
-def test_what_no_rule_explains_is_named_and_is_the_exit_status(tmp_path, monkeypatch, capsys):
-    today().write(tmp_path / "today.osm")
-    words = ["--extracts", str(tmp_path), "--out", str(tmp_path / "out")]
-
-    def without_a_house(path, frame, *, at):
-        table = read_ours(path, frame, at=at)
-        return table[table["class"] != "building"]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(cross_check_osm, "read_ours", without_a_house)
-        with pytest.raises(SystemExit, match="1"):
-            main(words)
-    printed = capsys.readouterr().out
-    assert "today.osm: building (area) differs from gdal by 11" in printed
-    assert "r1 (0 for 63" in printed
-    with pytest.raises(SystemExit, match="1"):
-        main(words)  # kept, by hash of file and code
-    (tmp_path / "out" / "today.osm.json").unlink()
-    with pytest.raises(SystemExit, match="0"):
-        main(words)
-    assert "1 files, 0 faults" in capsys.readouterr().out
-
-
-def test_a_file_that_cannot_be_read_is_a_fault_and_the_others_are_read(tmp_path, capsys):
-    today().write(tmp_path / "today.osm")
-    (tmp_path / "bad.osm").write_text('<osm version="0.6"><node')
-    with pytest.raises(SystemExit, match="1"):
-        main(["--extracts", str(tmp_path), "--out", str(tmp_path / "out")])
-    printed = capsys.readouterr().out
-    assert "\nbad.osm: RuntimeError: " in printed
-    assert "2 files, 1 faults" in printed
-
-
-def test_rules_of_tags_are_those_of_the_taxonomy():
-    tags = Tags.load()
-    assert tags.forms({"landuse": "meadow", "barrier": "fence"}, "relation") == [
-        ("green", "area"),
-        ("field_boundary", "line"),
-    ]
-    assert tags.forms({"highway": "pedestrian", "area": "yes"}, "closed") == [("road_minor", "area")]
-    assert tags.forms({"building": "yes", "area": "no"}, "closed") == []
 
 
 # Of the extracts, a place in each and half the side of a box around it, degrees.

@@ -10,6 +10,7 @@ from sasgeo_bench.osm.history import ObjectKey, read_lifecycle
 from sasgeo_bench.osm.multipolygons import area_relation, kind_keys
 from sasgeo_bench.osm.read import read_extract
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from tests.osm.drawing import osm
 
 GRID = Grid(epsg=32632, west_m=499_700.0, north_m=5_205_500.0, cell_size_m=1.0, rows=600, cols=600)
 BARE = {"type": "multipolygon"}
@@ -23,26 +24,10 @@ SOUTH, NORTH = SQUARE[:3], SQUARE[2:]
 WHOLE, HOLED, IN_YARD = 10_000, 8_400, 1_600
 
 
-def write(path, ways, *relations, first=1, meta="version='1'"):
-    """Write ways (points in metres, tags) numbered from `first`, and relations (members by role, tags) from 1."""
-    places, lines = {}, []
-    for number, (points, tags) in enumerate(ways):
-        refs = "".join(f"<nd ref='{places.setdefault(place, len(places) + 1)}'/>" for place in points)
-        lines.append(f"<way id='{first + number}' {meta}>{refs}{said(tags)}</way>")
-    for number, (members, tags) in enumerate(relations):
-        inside = "".join(f"<member type='way' ref='{way}' role='{role}'/>" for way, role in members)
-        lines.append(f"<relation id='{number + 1}' {meta}>{inside}{said(tags)}</relation>")
-    nodes = [
-        f"<node id='{number}' {meta} lat='{47 + y / 111_175:.7f}' lon='{9 + x / 76_030:.7f}'/>"
-        for (x, y), number in places.items()
-    ]
-    bounds = "<bounds minlat='46.995' minlon='8.995' maxlat='47.005' maxlon='9.005'/>"
-    path.write_text(f"<osm version='0.6'>{bounds}" + "\n".join([*nodes, *lines]) + "</osm>", encoding="utf-8")
-    return path
-
-
-def said(tags):
-    return "".join(f"<tag k='{key}' v='{value}'/>" for key, value in tags.items())
+def write(path, ways, *relations, **more):
+    """Write ways (corners, tags) and relations (members, tags)."""
+    head = "<bounds minlat='46.995' minlon='8.995' maxlat='47.005' maxlon='9.005'/>"
+    return osm(path, *((tags, corners) for corners, tags in ways), relations=relations, head=head, **more)
 
 
 def areas(reading):
@@ -95,9 +80,10 @@ def test_an_area_of_the_old_style_has_the_tags_of_its_outer_ways(ways, tags, exp
     assert areas(reading) == expected | {"parking": [400]}
 
 
-def test_it_has_the_id_of_its_relation_and_is_counted(tmp_path):
-    file = write(tmp_path / "a.osm", [(SQUARE, HOUSE), (YARD, {})], (((1, "outer"), (2, "inner")), BARE))
+def test_new_objects_with_negative_ids_are_assembled_have_the_id_of_their_relation_and_are_counted(tmp_path):
+    file = write(tmp_path / "a.osm", [(SQUARE, HOUSE), (YARD, {})], (((-9, "outer"), (-8, "inner")), BARE), first=-9)
     reading = read_extract(file, GRID)
+    assert areas(reading) == {"building": [HOLED]}
     assert reading.features[["osm_type", "osm_id"]].to_numpy().tolist() == [["relation", 1]]
     assert list(reading.notes.values()) == [1]
     assert not reading.drops
@@ -174,26 +160,14 @@ def test_what_lies_under_ground_on_the_outer_way_is_not_seen(tmp_path):
     assert reading.hidden == {"location=underground": 1}
 
 
-def test_a_relation_cut_at_the_edge_keeps_its_closed_rings(tmp_path):
-    members = ((1, "outer"), (2, "inner"), (77, "outer"))
-    reading = read_extract(write(tmp_path / "a.osm", [(SQUARE, HOUSE), (YARD, {})], (members, BARE)), GRID)
-    assert areas(reading) == {"building": [HOLED]}
-    assert "relation broken or cut at the clip edge: its closed rings were kept" in reading.notes
-
-
 def test_an_outer_way_that_lacks_nodes_marks_a_gap_as_in_the_new_style(tmp_path):
     cuts = []
     for style, tags in (({}, FOREST), (FOREST, {})):
         ways = [(SQUARE, tags), (YARD, {}), (BESIDE, HOUSE)]
         file = write(tmp_path / "a.osm", ways, (((1, "outer"), (2, "inner")), BARE | style))
-        file.write_text(file.read_text(encoding="utf-8").replace("<nd ref='3'/>", "<nd ref='999'/>"), encoding="utf-8")
+        file.write_text(file.read_text(encoding="utf-8").replace('<nd ref="3"/>', '<nd ref="999"/>'), encoding="utf-8")
         cuts.append(read_extract(file, GRID).cuts)
     assert cuts == [{"ways that lack some nodes": 1}] * 2
-
-
-def test_new_objects_of_josm_with_negative_ids_are_assembled_too(tmp_path):
-    file = write(tmp_path / "a.osm", [(SQUARE, HOUSE), (YARD, {})], (((-9, "outer"), (-8, "inner")), BARE), first=-9)
-    assert areas(read_extract(file, GRID)) == {"building": [HOLED]}
 
 
 def test_a_place_in_the_old_and_in_the_new_style_is_the_same_map(tmp_path):

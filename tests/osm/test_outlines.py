@@ -11,10 +11,11 @@ import shapely
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.osm.read import read_extract, read_geojson
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.layers import PRESENT, burn_layers, make_paint
+from tests.osm.drawing import osm, place
 
 GRID = Grid(epsg=32632, west_m=499_900.0, north_m=5_205_400.0, cell_size_m=1.0, rows=400, cols=400)
 SIDE_M, HOLE_M = 100.0, 20.0
+BOX = "<bounds minlat='46.99' minlon='8.99' maxlat='47.01' maxlon='9.01'/>"
 
 LINE_VALUES = [
     (rule.key, value, rule.widths[value], item.name, rule.key == "highway")
@@ -26,24 +27,16 @@ LINE_VALUES = [
 ]
 
 
+def ring(low, high, top=None):
+    top = high if top is None else top
+    return [(low, low), (high, low), (high, top), (low, top), (low, low)]
+
+
 def square(tmp_path, tags, *, as_relation):
     """A square of 100 m with a yard of 20 m, as a closed way (the outer ring alone) or as a multipolygon."""
-    rings = [(-SIDE_M / 2, SIDE_M / 2), (-HOLE_M / 2, HOLE_M / 2)]
-    nodes, ways = [], []
-    for ring, (low, high) in enumerate(rings):
-        for corner, (x, y) in enumerate(((low, low), (high, low), (high, high), (low, high))):
-            place = f'lat="{47 + y / 111_175:.7f}" lon="{9.001 + x / 76_030:.7f}"'
-            nodes.append(f'<node id="{4 * ring + corner + 1}" version="1" {place}/>')
-        refs = "".join(f'<nd ref="{4 * ring + corner + 1}"/>' for corner in (0, 1, 2, 3, 0))
-        own = "" if as_relation or ring else "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
-        ways.append(f'<way id="{ring + 1}" version="1">{refs}{own}</way>')
-    said = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in ({"type": "multipolygon"} | tags).items())
-    members = '<member type="way" ref="1" role="outer"/><member type="way" ref="2" role="inner"/>'
-    relation = f'<relation id="1" version="1">{members}{said}</relation>' if as_relation else ""
-    path = tmp_path / "square.osm"
-    box = "<bounds minlat='46.99' minlon='8.99' maxlat='47.01' maxlon='9.01'/>"
-    path.write_text(f"<osm version='0.6'>{box}" + "\n".join([*nodes, *ways, relation]) + "</osm>")
-    return path
+    ways = [({} if as_relation else tags, ring(50, 150)), ({}, ring(90, 110))]
+    relation = (((1, "outer"), (2, "inner")), {"type": "multipolygon"} | tags)
+    return osm(tmp_path / "square.osm", *ways, relations=[relation] * as_relation, head=BOX)
 
 
 def drawn_m2(tmp_path, tags, name, *, as_relation):
@@ -71,17 +64,7 @@ def test_a_line_that_closes_is_filled_where_it_says_so_and_squares_are(
 def strip_of(tmp_path, tags, width_m, length_m=60.0):
     """The one feature of a closed way that is so wide and long."""
     grid = replace(GRID, west_m=499_800.0)
-    corners = ((0, 0), (length_m, 0), (length_m, width_m), (0, width_m))
-    nodes = [
-        f'<node id="{at}" version="1" lat="{47 + y / 111_175:.9f}" lon="{9.0 + x / 76_030:.9f}"/>'
-        for at, (x, y) in enumerate(corners, 1)
-    ]
-    refs = "".join(f'<nd ref="{at}"/>' for at in (1, 2, 3, 4, 1))
-    said = "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
-    path = tmp_path / "strip.osm"
-    box = "<bounds minlat='46.99' minlon='8.99' maxlat='47.01' maxlon='9.01'/>"
-    path.write_text(f"<osm version='0.6'>{box}" + "".join(nodes) + f'<way id="1" version="1">{refs}{said}</way></osm>')
-    features = read_extract(path, grid).features
+    features = read_extract(osm(tmp_path / "strip.osm", (tags, ring(0, length_m, width_m)), head=BOX), grid).features
     (found,) = features[features["class"] == "field_boundary"].itertuples()
     return found
 
@@ -89,9 +72,7 @@ def strip_of(tmp_path, tags, width_m, length_m=60.0):
 @pytest.mark.parametrize(
     ("tags", "width_m", "is_filled"),
     [
-        ({"barrier": "hedge"}, 2.0, True),
         ({"barrier": "hedge"}, 8.5, True),
-        ({"barrier": "hedge", "height": "2", "width": "2"}, 2.0, True),
         ({"barrier": "hedge"}, 10.0, False),
         ({"barrier": "wall"}, 2.5, True),
         ({"barrier": "wall"}, 4.0, False),
@@ -103,7 +84,6 @@ def strip_of(tmp_path, tags, width_m, length_m=60.0):
         ({"barrier": "hedge", "name": "Green lane"}, 2.0, False),
         ({"barrier": "wall", "amenity": "school"}, 2.0, False),
         ({"barrier": "fence", "landuse": "residential"}, 2.0, False),
-        ({"barrier": "hedge", "leisure": "dog_run"}, 2.0, False),
     ],
 )
 def test_a_hedge_drawn_as_an_area_is_filled_and_a_yard_is_an_outline(tags, width_m, is_filled, tmp_path):
@@ -116,29 +96,15 @@ def test_a_hedge_drawn_as_an_area_is_filled_and_a_yard_is_an_outline(tags, width
         assert found.geometry.area == 0
 
 
-@pytest.mark.parametrize("more", [{}, {"landuse": "residential"}, {"amenity": "school"}, {"name": "Yard"}])
-@pytest.mark.parametrize("value", ["wall", "fence", "hedge"])
-def test_a_barrier_that_closes_is_an_outline_whatever_is_within(value, more, tmp_path):
-    for area in ({}, {"area": "yes"}, {"area": "no"}):
-        found = strip_of(tmp_path, {"barrier": value} | more | area, 40.0)
-        assert found.geometry.length == pytest.approx(200.0, rel=0.01)
-
-
 @pytest.mark.parametrize(("side_m", "is_filled"), [(40.0, False), (4.0, True)])
 def test_yards_of_geojson_are_outlines_too(side_m, is_filled, tmp_path):
-    east, north = 9.0 + side_m / 76_030, 47.0 + side_m / 111_175
-    ring = [[9.0, 47.0], [east, 47.0], [east, north], [9.0, north], [9.0, 47.0]]
-    feature = {
-        "type": "Feature",
-        "properties": {"barrier": "hedge", "area": "yes"},
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
-    }
-    path = tmp_path / "yard.geojson"
-    path.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    whole = shapely.box(8.9, 46.9, 9.1, 47.1)
-    (found,) = read_geojson(
-        [path], replace(GRID, west_m=499_800.0), tags={}, stated_coverage=whole
-    ).features.itertuples()
+    corners = [place(*corner) for corner in ring(0, side_m)]
+    tags, shape = {"barrier": "hedge", "area": "yes"}, {"type": "Polygon", "coordinates": [corners]}
+    yard = {"type": "FeatureCollection", "features": [{"type": "Feature", "properties": tags, "geometry": shape}]}
+    (tmp_path / "yard.geojson").write_text(json.dumps(yard))
+    whole, grid = shapely.box(8.9, 46.9, 9.1, 47.1), replace(GRID, west_m=499_800.0)
+    reading = read_geojson([tmp_path / "yard.geojson"], grid, tags={}, stated_coverage=whole)
+    (found,) = reading.features.itertuples()
     assert found.geometry.area == pytest.approx(side_m**2 if is_filled else 0.0, rel=0.01)
 
 
@@ -156,17 +122,3 @@ def test_yards_of_geojson_are_outlines_too(side_m, is_filled, tmp_path):
 def test_walls_of_a_town_and_of_terraces_keep_a_stated_width(tags, width_m, as_relation, tmp_path):
     reading = read_extract(square(tmp_path, tags, as_relation=as_relation), GRID)
     assert reading.features["width_m"].tolist() == [pytest.approx(width_m)]
-
-
-def test_a_fortress_whose_wall_is_a_multipolygon_is_no_solid_block(tmp_path):
-    reading = read_extract(square(tmp_path, {"barrier": "city_wall"}, as_relation=True), GRID)
-    names = load_taxonomy().names
-    cells = burn_layers(make_paint(reading.features, names, reading.coverage), GRID)[names.index("field_boundary")]
-    assert 0 < (cells == PRESENT).sum() < 1200
-
-
-def test_a_fenced_relation_is_an_area_and_a_fence(tmp_path):
-    tags = {"landuse": "meadow", "barrier": "fence"}
-    found = read_extract(square(tmp_path, tags, as_relation=True), GRID).features
-    assert sorted(found["class"]) == ["field_boundary", "green"]
-    assert found.set_index("class").loc["field_boundary", "width_m"] == np.float32(0.5)

@@ -22,6 +22,7 @@ from sasgeo_bench.regions.build import plan_build
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT, burn, burn_layers, make_paint
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
+from tests.osm.drawing import osm
 
 FRAME = shapely.box(0, 0, 1000, 1000)
 
@@ -150,32 +151,12 @@ GRID = Grid(epsg=32632, west_m=499_900.0, north_m=5_205_400.0, cell_size_m=2.0, 
 
 
 def coast_file(tmp_path, *ways, towns=True, bounds="minlat='46.995' minlon='8.99' maxlat='47.005' maxlon='9.01'"):
-    """An OSM file: coastlines, a road, and hamlets in its corners; places are metres from 47 N, 9 E."""
-    hamlets = [
-        [(x, y), (x + 20, y), (x + 20, y + 20), (x, y)] for x in range(-740, 740, 60) for y in range(-540, 540, 60)
-    ]
-    drawn = [
-        *((way, {"natural": "coastline"}) for way in ways),
-        ([(-700, 300), (700, 310)], {"highway": "residential"}),
-    ]
-    drawn += [(hamlet, {"building": "yes"}) for hamlet in hamlets if towns]
-    places = {
-        place: number for number, place in enumerate(dict.fromkeys(at for way, _ in drawn for at in way), start=1)
-    }
-    nodes = [
-        f'<node id="{number}" lat="{47 + y / 111_175:.7f}" lon="{9 + x / 76_030:.7f}"/>'
-        for (x, y), number in places.items()
-    ]
-    text = [
-        f'<way id="{number}">'
-        + "".join(f'<nd ref="{places[at]}"/>' for at in way)
-        + "".join(f'<tag k="{key}" v="{value}"/>' for key, value in tags.items())
-        + "</way>"
-        for number, (way, tags) in enumerate(drawn, start=1)
-    ]
-    path = tmp_path / "coast.osm"
-    path.write_text(f"<osm version='0.6'><bounds {bounds}/>" + "\n".join([*nodes, *text]) + "</osm>")
-    return path
+    """An OSM file: coastlines, a road, and hamlets in its corners."""
+    corners = [(x, y) for x in range(-740, 740, 60) for y in range(-540, 540, 60) if towns]
+    hamlets = [({"building": "yes"}, [(x, y), (x + 20, y), (x + 20, y + 20), (x, y)]) for x, y in corners]
+    road = ({"highway": "residential"}, [(-700, 300), (700, 310)])
+    coast = [({"natural": "coastline"}, way) for way in ways]
+    return osm(tmp_path / "coast.osm", *coast, road, *hamlets, head=f"<bounds {bounds}/>")
 
 
 def water_of(reading, grid=GRID):

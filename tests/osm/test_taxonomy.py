@@ -9,10 +9,6 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import Rule, SemanticClass, Taxonomy, classify, load_taxonomy
 
-WANTED = {
-    *("road_major", "road_minor", "path_track", "railway", "building", "water", "waterway", "coastline"),
-    *("green", "farmland", "field_boundary", "bridge", "parking", "bare"),
-}
 ONE_CLASS = """
 [[class]]
 id = {id}
@@ -46,21 +42,11 @@ def area_classes(**tags):
     return [label.class_name for label in classify(tags, load_taxonomy()).area]
 
 
-def test_every_class_that_the_benchmark_promises_is_there():
-    assert set(load_taxonomy().names) >= WANTED
-
-
 @pytest.mark.parametrize("key", [name for name, field in SemanticClass.model_fields.items() if field.is_required()])
 def test_a_class_that_leaves_anything_open_is_refused(key):
     text = re.sub(rf"^{key} = .*$", "", ONE_CLASS.format(id=0, name="a"), flags=re.MULTILINE)
     with pytest.raises(ConfigError, match=f"'class.0.{key}' is missing"):
         parse_toml(text, Taxonomy, source="taxonomy.toml")
-
-
-def test_only_rules_and_what_hides_cells_may_be_left_out():
-    assert {name for name, field in SemanticClass.model_fields.items() if not field.is_required()} == {
-        *("outline_of", "covered_by"),
-    }
 
 
 def test_no_tag_makes_two_classes_of_one_geometry():
@@ -78,13 +64,8 @@ def test_no_tag_makes_two_classes_of_one_geometry():
     ("tags", "wanted"),
     [
         ({"highway": "motorway_link"}, ["road_major"]),
-        ({"highway": "residential"}, ["road_minor"]),
         ({"highway": "footway"}, ["path_track"]),
         ({"highway": "primary", "bridge": "viaduct"}, ["road_major", "bridge"]),
-        ({"railway": "rail"}, ["railway"]),
-        ({"waterway": "stream"}, ["waterway"]),
-        ({"natural": "coastline"}, ["coastline"]),
-        ({"barrier": "hedge"}, ["field_boundary"]),
     ],
 )
 def test_lines_get_the_class_their_tags_say(tags, wanted):
@@ -105,10 +86,8 @@ def test_ground_on_which_nothing_grows_is_bare(tags):
 
 def test_ids_of_older_classes_stay():
     older = ("road_major", "road_minor", "path_track", "railway", "building", "water", "waterway", "coastline")
-    assert load_taxonomy().names[:14] == (
-        *older,
-        *("green", "farmland", "field_boundary", "bridge", "parking", "bare"),
-    )
+    older += ("green", "farmland", "field_boundary", "bridge", "parking", "bare")
+    assert load_taxonomy().names[:14] == older
 
 
 @pytest.mark.parametrize(
@@ -120,18 +99,16 @@ def test_ids_of_older_classes_stay():
         ("measured = { ", "measured = { called = { sky = 0.1 }, ", "called names a class"),
         ("traits = []", 'traits = ["shiny"]', "traits"),
         ("volatile = 0", "volatile = 7", "volatile"),
+        ("id = 0", "id = 1", "count up from 0"),
+        ('name = "a"', 'name = "Big"', "name"),
+        ("", ONE_CLASS.format(id=1, name="a"), "unique"),
+        ("", ONE_CLASS.format(id=1, name="b").replace("paint = 11", "paint = 10"), "paint is a rank of each class"),
     ],
 )
-def test_a_property_that_the_program_does_not_know_is_refused(old, new, fault):
-    text = ONE_CLASS.format(id=0, name="a").replace(old, new)
+def test_a_taxonomy_with_a_fault_is_refused(old, new, fault):
+    text = ONE_CLASS.format(id=0, name="a")
     with pytest.raises(ConfigError, match=fault):
-        parse_toml(text, Taxonomy, source="taxonomy.toml")
-
-
-def test_two_classes_of_one_rank_are_refused():
-    text = ONE_CLASS.format(id=0, name="a") + ONE_CLASS.format(id=1, name="b").replace("paint = 11", "paint = 10")
-    with pytest.raises(ConfigError, match="paint is a rank of each class"):
-        parse_toml(text, Taxonomy, source="taxonomy.toml")
+        parse_toml(text.replace(old, new) if old else text + new, Taxonomy, source="taxonomy.toml")
 
 
 def test_a_value_is_matched_whole():
@@ -149,17 +126,3 @@ def test_what_no_rule_knows_is_named():
 def test_a_rule_needs_values_or_widths():
     with pytest.raises(ValueError, match="either values or widths"):
         Rule(key="highway", geometry="line")
-
-
-@pytest.mark.parametrize(
-    ("text", "fault"),
-    [
-        (ONE_CLASS.format(id=1, name="a"), "count up from 0"),
-        (ONE_CLASS.format(id=0, name="a") + ONE_CLASS.format(id=1, name="a"), "unique"),
-        (ONE_CLASS.format(id=0, name="Big"), "name"),
-        (ONE_CLASS.format(id=0, name="a").replace("kind", 'covered_by = "sky"\nkind'), "covered_by names a class"),
-    ],
-)
-def test_a_taxonomy_with_a_fault_is_refused(text, fault):
-    with pytest.raises(ConfigError, match=fault):
-        parse_toml(text, Taxonomy, source="taxonomy.toml")

@@ -11,7 +11,6 @@ from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import (
-    ABSENT,
     PRESENT,
     UNKNOWN,
     Evidence,
@@ -126,10 +125,6 @@ def test_evidence_cannot_be_changed_and_says_what_is_wrong_with_it():
         seen.__class__(
             classes=("a",), cells=seen.cells, cell_size_m=1.0, confidence=np.zeros((1, 2, 3), dtype=np.uint8)
         )
-
-
-def test_the_states_are_those_of_the_layers():
-    assert (ABSENT, PRESENT) == (0, 1)
 
 
 def test_a_cell_unknown_in_one_class_is_unknown_in_all_whatever_the_others_say():

@@ -11,28 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.regions.layers import OUTSIDE, burn, burn_layers, cog_faults, make_paint, write_layers
+from tests.drawn_features import features_of
 
 GRID = Grid(epsg=32632, west_m=0.0, north_m=40.0, cell_size_m=1.0, rows=40, cols=50)
 EVERYWHERE = shapely.box(-1e6, -1e6, 1e6, 1e6)
 
 
-def table(*rows: tuple[str, shapely.Geometry, float], **columns: object) -> gpd.GeoDataFrame:
-    given_rows: dict[str, object] = {
-        "osm_type": ["way"] * len(rows),
-        "osm_id": list(range(len(rows))),
-        "version": [1] * len(rows),
-        "timestamp": [None] * len(rows),
-        "class": [name for name, *_ in rows],
-        "level": [0] * len(rows),
-        "is_bridge": [False] * len(rows),
-        "is_tunnel": [False] * len(rows),
-        "is_visible": [True] * len(rows),
-        "width_m": [width_m for *_, width_m in rows],
-        "geometry": [shape for _, shape, _ in rows],
-    }
-    return make_features({name: (given_rows | columns)[name] for name in (*DTYPES, "geometry")}, epsg=32632)
+def table(*rows: tuple[str, shapely.Geometry, float], **columns) -> gpd.GeoDataFrame:
+    """Features by class, shape and width; columns hold a value for each."""
+    more = [dict(zip(columns, values, strict=True)) for values in zip(*columns.values(), strict=True)] or [{}] * len(
+        rows
+    )
+    named = ({"class": name, "geometry": shape, "width_m": width} for name, shape, width in rows)
+    return features_of(*(row | own for row, own in zip(named, more, strict=True)))
 
 
 @st.composite
@@ -53,37 +45,6 @@ def test_burning_marks_exactly_the_cells_that_gdal_marks(shapes):
     ours = burn(np.array(shapes, dtype=object), GRID)
     theirs = rasterio.features.rasterize(shapes, out_shape=GRID.shape, transform=Affine(*GRID.transform)) == 1
     assert (ours == theirs).all()
-
-
-@given(shapes=st.lists(stars(), min_size=1, max_size=4), row=st.integers(0, 30), col=st.integers(0, 40))
-def test_a_window_holds_the_same_cells_as_the_whole(shapes, row, col):
-    whole = burn(np.array(shapes, dtype=object), GRID)
-    part = burn(np.array(shapes, dtype=object), GRID.window(row, col, 10, 10))
-    assert (part == whole[row : row + 10, col : col + 10]).all()
-
-
-@given(stars())
-def test_the_burnt_area_is_within_the_cells_along_the_edge(shape):
-    grid = GRID.window(-60, -60, 160, 170)
-    area_m2 = burn(np.array([shape], dtype=object), grid).sum()
-    edge_m = shape.length
-    assert abs(area_m2 - shape.area) <= edge_m * np.sqrt(2) + 1
-
-
-@given(st.lists(stars(), min_size=1, max_size=3))
-def test_burning_and_vectorizing_and_burning_again_changes_no_cell(shapes):
-    cells = burn(np.array(shapes, dtype=object), GRID)
-    found = [
-        shapely.orient_polygons(shapely.geometry.shape(shape))
-        for shape, _ in rasterio.features.shapes(cells.astype(np.uint8), mask=cells, transform=Affine(*GRID.transform))
-    ]
-    assert sum(shape.area for shape in found) == cells.sum()
-    again = burn(np.array(found, dtype=object), GRID) if found else np.zeros(GRID.shape, dtype=bool)
-    assert (again == cells).all()
-
-
-def test_no_polygon_marks_no_cell():
-    assert not burn(np.array([], dtype=object), GRID).any()
 
 
 @pytest.mark.parametrize("cell_size_m", [2.0, 1.0, 0.5, 0.25])
@@ -129,6 +90,7 @@ def river_cols(*rows, classes=("water", "waterway"), **columns):
 def test_the_middle_of_a_river_is_no_line_in_its_own_water(columns, cols):
     assert river_cols(RIVER, LAKE, **columns) == cols
     assert river_cols(LAKE, RIVER, **{name: values[::-1] for name, values in columns.items()}) == cols
+    assert river_cols(RIVER, LAKE, classes=("waterway",)) == river_cols(RIVER, POND) == [*range(50)]
 
 
 def test_nothing_but_a_river_is_covered_and_what_covers_it_stays():
@@ -138,11 +100,6 @@ def test_nothing_but_a_river_is_covered_and_what_covers_it_stays():
     alone = [burn_layers(make_paint(table(*rows), (name,), EVERYWHERE), GRID)[0] for name in names]
     np.testing.assert_array_equal(np.delete(layers, 2, axis=0), np.delete(alone, 2, axis=0))
     np.testing.assert_array_equal(layers[2], np.where(alone[1] == 1, 0, alone[2]))
-
-
-def test_a_map_without_water_shows_the_whole_river():
-    assert river_cols(RIVER, LAKE, classes=("waterway",)) == [*range(50)]
-    assert river_cols(RIVER, POND) == [*range(50)]
 
 
 def test_beyond_the_mapped_area_a_covered_river_is_unknown_too():
@@ -161,11 +118,6 @@ def test_a_window_of_a_covered_river_is_that_of_the_whole(shapes, row, col):
     part = burn_layers(paint, GRID.window(row, col, 10, 10))
     assert (part == np.stack((river, water))[:, row : row + 10, col : col + 10]).all()
     assert not (river & water).any()
-
-
-def test_what_is_not_visible_is_not_burnt():
-    tunnel = table(("road_major", shapely.LineString([(0, 20), (50, 20)]), 6.0), is_visible=[False])
-    assert not burn_layers(make_paint(tunnel, ("road_major",), EVERYWHERE), GRID).any()
 
 
 def test_beyond_the_mapped_area_every_class_is_unknown():

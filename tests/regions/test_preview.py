@@ -11,7 +11,6 @@ from sasgeo_bench.regions import preview
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.layers import OUTSIDE, PRESENT
 from sasgeo_bench.regions.preview import write_preview
-from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 
 
@@ -67,10 +66,6 @@ def test_the_axes_are_those_of_the_crs(manifest):
     ticks = {label.get_text(): at for label, at in zip(chart.get_xticklabels(), chart.get_xticks(), strict=True)}
     assert all(float(text) == at for text, at in ticks.items())  # whole coordinates, no offset
     assert sum(west <= at <= east for at in ticks.values()) >= 2
-
-
-def test_the_manifest_carries_the_attribution_that_is_drawn(manifest):
-    assert manifest.attribution == ATTRIBUTION
 
 
 def test_the_edge_of_what_is_mapped_is_drawn_and_nothing_covers_the_map(tmp_path, manifest):

@@ -70,14 +70,11 @@ def test_a_turned_photo_stands_upright(orientation: int) -> None:
     np.testing.assert_array_equal(decode_image(encoded(Image.fromarray(stored), exif=exif)), upright)
 
 
-def test_sixteen_bits_of_grey_are_rounded_to_eight() -> None:
+def test_sixteen_bits_of_grey_are_rounded_to_eight_and_those_of_colour_read() -> None:
     values = np.array([[0, 128, 129, 257, 32768, 65535]], dtype=np.uint16)
     found = decode_image(encoded(Image.fromarray(values)))
     assert found[0, :, 0].tolist() == [0, 0, 1, 1, 128, 255]
     assert (found == found[:, :, :1]).all()
-
-
-def test_sixteen_bits_of_colour_are_read() -> None:
     pixels = b"\0" + struct.pack("!6H", 65535, 0, 0, 0, 0, 65535)
     assert decode_image(png(2, 1, bits=16, kind=2, pixels=pixels)).tolist() == [[[255, 0, 0], [0, 0, 255]]]
 
@@ -108,8 +105,6 @@ BAD: dict[str, tuple[bytes, str]] = {
     "head only": (BIG[:20], "damaged"),
     "half a png": (BIG[: len(BIG) // 2], "truncated or damaged"),
     "half a jpeg": (PHOTO[: len(PHOTO) - 60], "truncated or damaged"),
-    "half a webp": (encoded(Image.new("RGB", (64, 64)), "WEBP")[:-10], "damaged"),
-    "half a tiff": (encoded(Image.new("RGB", (64, 64)), "TIFF")[:200], "damaged"),
     "bits flipped": (BIG[:60] + bytes(40) + BIG[100:], "damaged"),
     "no pixels": (png(0, 5, bits=8, kind=2, pixels=b""), "no JPEG, PNG, WebP or TIFF"),
     "bomb": (png(40_000, 40_000, bits=8, kind=2, pixels=bytes(1000)), "than twice the pixels"),
@@ -119,7 +114,6 @@ BAD: dict[str, tuple[bytes, str]] = {
         "Decompressed data too large",
     ),
     "floats": (encoded(Image.new("F", (2, 2)), "TIFF"), "kind 'F', not colours"),
-    "integers": (encoded(Image.new("I", (2, 2)), "TIFF"), "kind 'I', not colours"),
 }
 
 
@@ -139,9 +133,7 @@ MEDLEY = [BIG, PHOTO, encoded(Image.fromarray(np.eye(40, dtype=np.uint8) * 255),
 @given(
     st.sampled_from(MEDLEY), st.lists(st.tuples(st.integers(0, 500), st.integers(0, 255)), max_size=5), st.integers(1)
 )
-def test_bytes_that_were_changed_or_cut_are_a_picture_or_one_line(
-    data: bytes, changes: list[tuple[int, int]], kept: int
-) -> None:
+def test_bytes_that_were_changed_or_cut_are_a_picture_or_one_line(data, changes, kept) -> None:
     broken = bytearray(data[:kept])
     for at, value in changes:
         broken[at % len(broken)] = value
@@ -206,14 +198,10 @@ def test_labels_fit_their_picture(classes: tuple[str, ...], labels: np.ndarray, 
         LabelledImage(image=aerial(), classes=classes, labels=labels, place="oslo")
 
 
-def tiff_of(alpha):
-    image = Image.fromarray(np.dstack([np.full((20, 20, 3), 90, np.uint8), alpha]), "RGBA")
-    encoded = BytesIO()
-    image.save(encoded, "TIFF")
-    return encoded.getvalue()
-
-
 def test_infrared_in_a_tiff_that_calls_itself_alpha_does_not_darken_the_picture():
+    def tiff_of(alpha):
+        return encoded(Image.fromarray(np.dstack([np.full((20, 20, 3), 90, np.uint8), alpha]), "RGBA"), "TIFF")
+
     infrared = np.random.default_rng(1).integers(1, 200, (20, 20), dtype=np.uint8)
     with pytest.raises(ImageError, match=r"chip.tif has a band that calls itself alpha .* -b 1 -b 2 -b 3"):
         decode_image(tiff_of(infrared), name="chip.tif")

@@ -39,24 +39,17 @@ def test_a_pixel_and_its_ray_belong_together(k1, k2, p1, at):
     np.testing.assert_allclose(lens.to_pixels(lens.to_slopes(point)), point, atol=1e-3)
 
 
-def test_what_the_lens_would_fold_into_the_picture_gets_no_pixel():
+def test_what_the_lens_would_fold_into_the_picture_gets_no_pixel_and_what_lies_beyond_no_ray():
     barrel = lens_of((-0.3, 0.0, 0.0, 0.0, 0.0))  # grows up to a slope of 1 / sqrt(0.9)
     folded = barrel.to_pixels(np.array([[1.0, 0.0], [1.2, 0.0], [1.8, 0.0]]))
     assert np.isnan(folded).all(axis=1).tolist() == [False, True, True]
-
-
-def test_a_pixel_beyond_the_fold_has_no_ray():
-    barrel = lens_of((-0.3, 0.0, 0.0, 0.0, 0.0))
     assert np.isnan(barrel.to_slopes(np.array([[2000.0, 300.0]]))).all()
+    assert barrel.to_pixels(np.empty((0, 2))).shape == barrel.to_slopes(np.empty((0, 2))).shape == (0, 2)
 
 
-def test_a_matrix_of_opencv_comes_back():
+def test_a_matrix_of_opencv_and_a_field_of_view_come_back():
     lens = lens_of()
-    again = Intrinsics.from_matrix(lens.matrix, width_px=800, height_px=600, distortion=LENS)
-    assert again == lens
-
-
-def test_the_middle_of_a_picture_is_half_its_size():
+    assert Intrinsics.from_matrix(lens.matrix, width_px=800, height_px=600, distortion=LENS) == lens
     lens = Intrinsics.from_field_of_view(horizontal_deg=70.0, width_px=801, height_px=600)
     assert lens.centre_px == (400.5, 300.0)
     assert lens.horizontal_deg == pytest.approx(70.0)
@@ -65,11 +58,6 @@ def test_the_middle_of_a_picture_is_half_its_size():
 def test_the_border_runs_once_around_the_picture():
     border = lens_of().border_px(4)
     assert border[[0, 4, 8, 12]].tolist() == [[0, 0], [800, 0], [800, 600], [0, 600]]
-
-
-def test_no_points_are_no_pixels():
-    assert lens_of().to_pixels(np.empty((0, 2))).shape == (0, 2)
-    assert lens_of().to_slopes(np.empty((0, 2))).shape == (0, 2)
 
 
 @pytest.mark.parametrize(

@@ -117,11 +117,9 @@ AHEAD_30, SIDE_10 = HEIGHT_M * math.tan(math.radians(30)), HEIGHT_M * math.tan(m
 # Maker, XMP, heading of the picture's up, and what its middle shows: east and north, metres.
 POINTED = [
     ("DJI", part_of(DJI, gimbal(90, -60)), 90, (AHEAD_30, 0)),
-    ("DJI", part_of(DJI, gimbal(-90, -90)), 270, (0, 0)),
     ("DJI", part_of(DJI, gimbal(30, -90, 60)), 90, (0, 0)),  # straight down a roll is a turn
     ("Autel Robotics", part_of(AUTEL, gimbal(90, 90)), 90, (0, 0)),
     ("Autel Robotics", part_of(AUTEL, gimbal(90, 60)), 90, (AHEAD_30, 0)),
-    ("Autel Robotics", part_of(AUTEL, gimbal(90, -60)), 90, (AHEAD_30, 0)),
     ("Autel Robotics", part_of(DJI, gimbal(0, 60)), 0, (0, AHEAD_30)),  # newer firmware
     ("Autel Robotics", pix4d(90, 30, 0), 90, (AHEAD_30, 0)),  # older firmware
     ("Parrot", part_of(PARROT, gimbal(180, -60, names="Camera{}Degree")) + pix4d(0, 0, 0), 180, (0, -AHEAD_30)),
@@ -131,7 +129,6 @@ POINTED = [
     ("Sentera", pix4d(0, 0, 0), 0, (0, 0)),
     ("Sentera", pix4d(0, -5, 0), 0, (0, -HEIGHT_M * math.tan(math.radians(5)))),
     ("Sentera", pix4d(0, 0, 10), 0, (-SIDE_10, 0)),  # right wing down: the camera looks to the left
-    ("Sentera", pix4d(90, 0, 10), 90, (0, SIDE_10)),
     ("senseFly", pix4d(0, 0, 10), 0, (SIDE_10, 0)),
     ("senseFly", pix4d(0, 0, 10).replace(PIX4D, "http://ns.sensefly.com/Camera/1.0/"), 0, (SIDE_10, 0)),
     ("", pix4d(0, 0, 10) + part_of("http://ns.adobe.com/tiff/1.0/", {"Make": "senseFly"}), 0, (SIDE_10, 0)),
@@ -150,9 +147,7 @@ def test_each_maker_looks_where_its_own_signs_say(make, xmp, yaw_deg, expected_m
     [
         ("Autel Robotics", part_of(AUTEL, gimbal(0, 20)), r"\+20 degrees, which Autel counts .* upwards or downwards"),
         ("Camera", pix4d(0, -90, 0), "seems to count from the horizon"),
-        ("Camera", pix4d(0, -45, 0), "seems to count from the horizon"),
         ("Sentera", pix4d(0, 90, 0), "looks at the horizon or the sky"),
-        ("Skydio", skydio(0, 10, 0), "looks at the horizon or the sky"),
         ("DJI", part_of(DJI, gimbal(0, -135, 0, height=-5)), "-5 m above the ground"),
         ("X", part_of("http://example.com/other/", gimbal()), "height above take-off, gimbal angles missing"),
         ("DJI", part_of("http://ns.adobe.com/camera-raw-settings/1.0/", gimbal(), prefix="drone-dji"), "missing"),
@@ -195,15 +190,11 @@ EXTENTS = [
     ("film, scaled down", {"size": HALF, "inner": dict(zip(PIXELS, FULL, strict=True))}, gimbal(), FILM_M),
     ("film, 16 : 9", {"size": (400, 225)}, gimbal(), (144.2, 81.1)),
     ("calibrated", {}, CALIBRATED, (109.1, 81.8)),
-    ("calibrated, whatever the film says", {"film": 30}, CALIBRATED, (109.1, 81.8)),
     ("calibrated, scaled down", {"size": HALF}, CALIBRATED, (109.1, 81.8)),
     ("its EXIF kept", {"size": HALF, "inner": dict(zip(PIXELS, FULL, strict=True))}, CALIBRATED, (109.1, 81.8)),
-    ("its EXIF renewed", {"size": HALF, "inner": dict(zip(PIXELS, HALF, strict=True))}, CALIBRATED, (109.1, 81.8)),
     ("16 : 9 by the camera", {"size": (400, 225)}, CALIBRATED, (109.1, 61.4)),
-    ("16 : 9, scaled down", {"size": (200, 112)}, CALIBRATED, (109.1, 61.1)),
     ("centre beside the middle", {}, CALIBRATED | {"CalibratedOpticalCenterX": "196.1"}, (109.1, 81.8)),
     ("zoom", {"make": "DJI", "inner": {ZOOM: 2.0}}, gimbal(), (72.1, 54.1)),
-    ("no zoom", {"make": "X", "inner": {ZOOM: 0.0}}, gimbal(), FILM_M),
     ("zoom of 0/0", {"make": "X", "inner": {ZOOM: IFDRational(0, 0)}}, gimbal(), FILM_M),
     ("sensor", {"film": None, "inner": sensor(40.0)}, gimbal(), (113.6, 85.2)),
     ("sensor in inches", {"film": None, "inner": sensor(40.0, unit=2, units_mm=25.4)}, gimbal(), (113.6, 85.2)),
@@ -234,13 +225,10 @@ def test_skydio_calibrates_across_and_down_from_the_middle_of_the_first_pixel(tm
 
 UNFIT = [
     ("cut", {"size": (400, 200)}, CALIBRATED, "400 x 200 pixels is cut out of a picture of 400 x 300, or turned"),
-    ("cut at the sides", {"size": (250, 300)}, CALIBRATED, "cut out of"),
     ("turned by a program", {"size": (300, 400)}, CALIBRATED, "or turned"),
     ("cut, by EXIF", {"size": (300, 300), "inner": dict(zip(PIXELS, FULL, strict=True))}, gimbal(), "cut out of"),
     ("three sizes", {"size": (200, 150), "inner": dict(zip(PIXELS, (800, 600), strict=True))}, CALIBRATED, "of 800 x"),
     ("zoom of others", {"make": "X", "inner": {ZOOM: 2.0}}, gimbal(), "digital zoom of 2"),
-    ("zoom out", {"make": "DJI", "inner": {ZOOM: 0.5}}, gimbal(), "digital zoom of 0.5"),
-    ("zoom of a calibrated one", {"make": "DJI", "inner": {ZOOM: 2.0}}, CALIBRATED, "digital zoom of 2"),
     ("film against sensor", {"inner": sensor(80.0)}, gimbal(), "two focal lengths, 277 px by 35 mm film and 704 px"),
     ("calibrated, of no size", {"size": HALF}, gimbal(CalibratedFocalLength="277"),
      "139 px by 35 mm film and 277 px by calibration"),

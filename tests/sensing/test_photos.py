@@ -67,6 +67,9 @@ def test_place_height_angles_and_focal_length_are_read(photo_path, as_elements):
     assert (photo.height_m, photo.lens.film_mm) == (50.0, 20.0)
     assert (photo.gimbal.yaw_deg, photo.gimbal.pitch_deg, photo.flight.roll_deg) == (90.0, -60.0, -1.0)
     assert photo.taken_at == dt.datetime(2024, 5, 1, 10, 20, 30)  # noqa: DTZ001 - the drone names no zone
+    gps = ZURICH | {ExifTags.GPS.GPSLatitudeRef: "S", ExifTags.GPS.GPSLongitudeRef: "W"}
+    photo = read_photo(write_photo(photo_path, gps=gps))
+    assert (photo.lon_deg, photo.lat_deg) == (pytest.approx(-8.5), pytest.approx(-47.375))
 
 
 def test_the_camera_of_a_photo_heads_by_the_grid(photo_path):
@@ -77,12 +80,6 @@ def test_the_camera_of_a_photo_heads_by_the_grid(photo_path):
     assert camera.yaw_deg == pytest.approx(90.368, abs=0.002)
     to_grid = pyproj.Transformer.from_crs("EPSG:4326", "EPSG:32632", always_xy=True)
     assert camera.position_m[:2] == pytest.approx(to_grid.transform(8.5, 47.375), abs=1e-3)
-
-
-def test_south_and_west_are_negative(photo_path):
-    gps = ZURICH | {ExifTags.GPS.GPSLatitudeRef: "S", ExifTags.GPS.GPSLongitudeRef: "W"}
-    photo = read_photo(write_photo(photo_path, gps=gps))
-    assert (photo.lon_deg, photo.lat_deg) == (pytest.approx(-8.5), pytest.approx(-47.375))
 
 
 @pytest.mark.parametrize(
@@ -116,19 +113,15 @@ def without(*names):
             {"gps": ZURICH | {ExifTags.GPS.GPSLatitude: (0.0, 0.0, 0.0), ExifTags.GPS.GPSLongitude: (0.0, 0.0, 0.0)}},
             "GPS",
         ),
-        ({"gps": ZURICH | {ExifTags.GPS.GPSLatitude: (97.0, 0.0, 0.0)}}, "GPS"),
         ({"gps": ZURICH | {ExifTags.GPS.GPSLatitude: (IFDRational(0, 0), 0.0, 0.0)}}, "GPS"),
         ({"xmp": xmp_of(without("RelativeAltitude"))}, "height above take-off missing; give height_m"),
         ({"xmp": xmp_of(without("GimbalPitchDegree"))}, "gimbal angles missing"),
         ({"xmp": xmp_of(POSE | {"GimbalYawDegree": "nan"})}, "gimbal angles missing"),
-        ({"xmp": xmp_of({})}, "gimbal angles missing"),
         ({"xmp": ""}, "height above take-off, gimbal angles missing"),
         ({"focal": None}, "focal length"),
         ({"xmp": xmp_of(POSE | {"RelativeAltitude": "-12.30"})}, r"-12\.3 m above the ground .*give its own height"),
         ({"xmp": xmp_of(POSE | {"RelativeAltitude": "0.00"})}, r"\+0 m above the ground"),
-        ({"xmp": xmp_of(POSE | {"GimbalPitchDegree": "+0.00"})}, "looks at the horizon or the sky"),
         ({"xmp": xmp_of(POSE | {"GimbalPitchDegree": "+90.00"})}, r"gimbal pitch \+90\.0"),
-        ({"xmp": xmp_of(POSE | {"GimbalPitchDegree": "-170", "GimbalRollDegree": "180"}), "focal": None}, "focal"),
     ],
 )
 def test_a_photo_without_pose_is_refused_on_one_line_where_its_pose_is_asked_for(photo_path, how, hint):

@@ -180,11 +180,6 @@ def test_a_look_that_there_is_not_is_refused(changes, words):
         Look(**changes)
 
 
-def test_an_unknown_date_names_those_that_there_are(rendered):
-    with pytest.raises(ConfigError, match="has no extract of 2001-01-01; there are 2014-01-01, 2019-01-01, 2025-01-01"):
-        render(rendered[0], date=dt.date(2001, 1, 1))
-
-
 def test_a_region_that_is_not_built_is_refused_and_no_file_is_made(tmp_path):
     with pytest.raises(StoreError, match="is not built, or not by this region file: run sasgeo-bench build-region"):
         render(tmp_path)
@@ -211,38 +206,32 @@ def test_a_map_without_anything_to_draw_is_refused(rendered, tmp_path, monkeypat
         render(tmp_path / "out", replace(COARSE, seed=4))
 
 
+FULL = rasterio.errors.RasterioIOError("No space left on device")
+
+
 @pytest.mark.parametrize(
-    "fault", [OSError(28, "No space left on device"), ImageryError("the disk is full"), KeyboardInterrupt()]
+    ("place", "fault"),
+    [
+        ((reference_imagery, "write_tiles"), OSError(28, "No space left on device")),
+        ((reference_imagery, "write_tiles"), ImageryError("the disk is full")),
+        ((reference_imagery, "write_tiles"), KeyboardInterrupt()),
+        ((rasterio.shutil, "copy"), FULL),
+    ],
 )
-def test_a_rendering_that_ends_early_leaves_the_region_as_it_was(rendered, tmp_path, monkeypatch, fault):
-    out = tmp_path / "out"
-    shutil.copytree(rendered[0], out)
-    folder = out / "regions" / TOWN
+def test_a_rendering_that_ends_early_leaves_the_region_as_it_was(rendered, tmp_path, monkeypatch, place, fault):
+    folder = shutil.copytree(rendered[0], tmp_path / "out") / "regions" / TOWN
     before = state_of(folder)
 
     def fail(path, *_, **__):
-        path.write_bytes(b"half of it")
+        path.write_bytes(b"half of it") if fault is not FULL else None
         raise fault
 
-    monkeypatch.setattr(reference_imagery, "write_tiles", fail)
+    monkeypatch.setattr(*place, fail)
     with pytest.raises((StoreError, ImageryError, KeyboardInterrupt)) as told:
-        render(out, replace(COARSE, seed=9))
+        render(tmp_path / "out", replace(COARSE, seed=9))
     assert "\n" not in str(told.value)
+    assert fault is not FULL or "ortho.tif cannot be written (No space left on device)" in str(told.value)
     assert state_of(folder) == before
-
-
-def test_a_full_disk_while_tiles_are_written_is_one_line(rendered, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    shutil.copytree(rendered[0], out)
-    before = state_of(out / "regions" / TOWN)
-
-    def full(*_, **__):
-        raise rasterio.errors.RasterioIOError("No space left on device")
-
-    monkeypatch.setattr(rasterio.shutil, "copy", full)
-    with pytest.raises(ImageryError, match=r"ortho.tif cannot be written \(No space left on device\)"):
-        render(out, replace(COARSE, seed=9))
-    assert state_of(out / "regions" / TOWN) == before
 
 
 @pytest.mark.slow

@@ -63,6 +63,8 @@ def test_beyond_the_mapped_area_labels_are_unknown_and_views_of_nothing_are_left
     found = views(region, (WEST, SOUTH, WEST + 64.0, SOUTH + 64.0))  # mapped from 20 m on
     assert (found[0].labels == UNKNOWN).mean() == pytest.approx(1 - (44 / 64) ** 2, abs=0.05)
     assert views(region, (WEST - 200.0, SOUTH, WEST - 136.0, SOUTH + 64.0)) == []
+    with pytest.raises(ImageryError, match="has no imagery"):
+        views(replace(region, imagery=None), (WEST, SOUTH, WEST + 64.0, SOUTH + 64.0))
 
 
 def test_where_the_imagery_has_no_data_labels_are_unknown(hamlet, tmp_path):
@@ -91,8 +93,3 @@ def test_parts_of_a_region_file_are_where_its_rings_are(hamlet):
     assert part == pytest.approx((WEST + 20, SOUTH + 20, WEST + SIDE_M - 20, SOUTH + SIDE_M - 20), abs=0.01)
     west, east = split_bounds(part, 2)
     assert west[2] == east[0] == pytest.approx(WEST + SIDE_M / 2, abs=0.01)
-
-
-def test_a_region_without_imagery_is_refused(region):
-    with pytest.raises(ImageryError, match="has no imagery"):
-        views(replace(region, imagery=None), (WEST, SOUTH, WEST + 64.0, SOUTH + 64.0))

@@ -7,6 +7,7 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
+import pandas as pd
 import pytest
 import shapely
 from hypothesis import given
@@ -14,21 +15,21 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import CameraError, ConfigError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.osm.features import make_features
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.camera import Camera
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.intrinsics import Intrinsics
-from sasgeo_bench.sensing.rendering.buildings import estimate_storeys, style_buildings
+from sasgeo_bench.sensing.rendering.buildings import estimate_storeys
 from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, draw_conditions, sun_at
 from sasgeo_bench.sensing.rendering.ground import WOOD, green_kinds
 from sasgeo_bench.sensing.rendering.light import cast_shadows, expose
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
-from sasgeo_bench.sensing.rendering.scene import MARGIN_M, Scene, make_scene, paint
+from sasgeo_bench.sensing.rendering.scene import Scene, make_scene, paint
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
-from sasgeo_bench.sensing.rendering.texture import draw, fractal, grain, noise
+from sasgeo_bench.sensing.rendering.texture import fractal, grain, noise
 from sasgeo_bench.sensing.rendering.trace import HeightPyramid, trace
 from sasgeo_bench.sensing.rendering.view import labels, render, render_labelled, render_ortho
+from tests.drawn_features import features_of
 
 EPSG = 32632
 EAST, NORTH = 500_000.0, 5_200_000.0
@@ -40,24 +41,8 @@ CLEAR = Conditions(noise=0.0, blur_px=0.0, jpeg_quality=0)
 
 def features(*rows):
     """Features from (class, geometry, width or NaN)."""
-    names, shapes, widths = zip(*rows, strict=True)
-    count = len(rows)
-    return make_features(
-        {
-            "osm_type": ["way"] * count,
-            "osm_id": np.arange(1, count + 1),
-            "version": np.ones(count),
-            "timestamp": [np.datetime64("2020-01-01")] * count,
-            "class": names,
-            "level": np.zeros(count),
-            "is_bridge": [False] * count,
-            "is_tunnel": [False] * count,
-            "is_visible": [True] * count,
-            "width_m": widths,
-            "geometry": list(shapes),
-        },
-        epsg=EPSG,
-    )
+    named = ({"class": name, "geometry": shape, "width_m": width} for name, shape, width in rows)
+    return features_of(*named, timestamp=pd.Timestamp("2020-01-01"))
 
 
 VILLAGE = (
@@ -136,14 +121,6 @@ def test_a_window_of_noise_is_that_window_of_the_whole(row, col, wavelength_m):
     part = whole.window(row, col, 16, 20)
     for make in (lambda grid: noise(grid, wavelength_m, 3), lambda grid: fractal(grid, wavelength_m, 3), grain):
         np.testing.assert_allclose(make(part), make(whole)[row : row + 16, col : col + 20], atol=1e-4)
-
-
-def test_noise_fills_its_range_and_has_no_bias():
-    grid = Grid(epsg=EPSG, west_m=EAST, north_m=NORTH, cell_size_m=0.5, rows=256, cols=256)
-    values = noise(grid, 2.0, 9)
-    assert np.abs(values).max() <= 1
-    assert abs(values.mean()) < 0.05
-    assert draw(5, np.arange(20_000)).mean() == pytest.approx(0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("azimuth_deg", "step"), [(180.0, (-1, 0)), (270.0, (0, 1)), (0.0, (1, 0)), (90.0, (0, -1))])
@@ -324,17 +301,6 @@ def test_snow_is_bright_night_is_dark_and_haze_is_flat():
     assert haze.std() < 0.7 * summer.std()
 
 
-def test_windows_that_overlap_are_painted_alike():
-    """Apart from crowns and yards that reach in from beyond a margin."""
-    first, second = scene_of(size_m=96.0), scene_of(size_m=96.0, shift_m=16.0)
-    cells = round(16 / 0.5)
-    left = first.painting("summer").colours[0][:, cells:].astype(int)
-    right = second.painting("summer").colours[0][:, :-cells].astype(int)
-    inner = np.s_[60:-60, 60:-60]
-    difference = np.abs(left - right)[inner].max(axis=2)
-    assert (difference > 6).mean() < 0.02
-
-
 def test_a_house_keeps_its_style_when_others_come_and_go():
     shed = ("building", shapely.box(EAST - 30, NORTH + 35, EAST - 26, NORTH + 39), np.nan)
     alone, joined = scene_of(VILLAGE), scene_of((*VILLAGE, shed))
@@ -342,13 +308,6 @@ def test_a_house_keeps_its_style_when_others_come_and_go():
         np.testing.assert_array_equal(getattr(alone.buildings, name)[0], getattr(joined.buildings, name)[0])
     other = scene_of(VILLAGE, place="elsewhere")
     assert not np.array_equal(alone.buildings.roof[0], other.buildings.roof[0])
-
-
-def test_relief_multiplies_heights_alone():
-    plan = village().plan
-    low, high = (style_buildings(plan, relief) for relief in (1.0, 2.0))
-    np.testing.assert_allclose(2 * low.eave_m, high.eave_m)
-    np.testing.assert_array_equal(low.roof, high.roof)
 
 
 def test_larger_and_more_crowded_buildings_are_higher_on_average():
@@ -364,17 +323,10 @@ def test_larger_and_more_crowded_buildings_are_higher_on_average():
 
 def test_large_green_areas_are_woods_more_often():
     def share(side_m: float) -> float:
-        shapes = village().plan.of("green")
-        many = replace(
-            shapes,
-            geometry=np.array([shapely.box(0, 0, side_m, side_m)] * 2000),
-            key=np.arange(2000),
-            width_m=np.full(2000, np.nan),
-            level=np.zeros(2000, dtype=int),
-            is_bridge=np.zeros(2000, dtype=bool),
-            is_sea=np.zeros(2000, dtype=bool),
-        )
-        return float((green_kinds(many, 3) == WOOD).mean())
+        square, flat = shapely.box(0, 0, side_m, side_m), np.zeros(2000, dtype=bool)
+        many = {"geometry": np.array([square] * 2000), "key": np.arange(2000), "width_m": np.full(2000, np.nan)}
+        many |= {"level": np.zeros(2000, dtype=int), "is_bridge": flat, "is_sea": flat}
+        return float((green_kinds(replace(village().plan.of("green"), **many), 3) == WOOD).mean())
 
     assert share(20) < share(100) < share(500)
 
@@ -395,19 +347,6 @@ def test_what_cannot_be_rendered_is_refused_in_one_line():
     window = Grid.around(EAST, NORTH, size_m=(50, 50), cell_size_m=0.5, epsg=32633)
     with pytest.raises(ShapeError, match="EPSG:32633"):
         make_scene(features(*VILLAGE), CLASSES, HOUSE, place="a", window=window)
-
-
-def test_a_scene_covers_its_window_and_a_margin():
-    scene = village()
-    west, south, east, north = scene.grid.bounds_m
-    assert west <= EAST - 48 - MARGIN_M + 0.5
-    assert north >= NORTH + 48 + MARGIN_M - 0.5
-    assert (east - west, north - south) == (96 + 2 * MARGIN_M, 96 + 2 * MARGIN_M)
-
-
-def test_empty_ground_is_a_picture_too():
-    scene = scene_of((VILLAGE[3],), size_m=48.0)
-    assert render(scene, camera(height_m=60.0), CLEAR, np.random.default_rng(0)).std() > 3
 
 
 def test_another_look_of_a_place_shares_no_draw_with_it():

@@ -78,9 +78,11 @@ def test_classes_without_a_new_share_stay_and_nobody_is_changed_in_place() -> No
 @pytest.mark.parametrize(
     ("shares", "fault"), [({"roof": 0.1}, "no class 'roof'"), ({"c0": 1.5}, "0..1, got 1.5"), ({"c0": np.nan}, "nan")]
 )
-def test_unknown_classes_and_impossible_shares_are_refused(shares: dict[str, float], fault: str) -> None:
+def test_unknown_classes_and_impossible_shares_and_probabilities_are_refused(shares, fault) -> None:
     with pytest.raises(ImageError, match=fault):
         seen(np.zeros((1, 2, 2), np.uint8)).with_shares(shares)
+    with pytest.raises(ImageError, match=r"0..1, got 0\.\.1\.2"):
+        Segmentation.of_probabilities(("a",), np.array([[[0.0, 1.2]]]))
 
 
 @pytest.mark.parametrize(
@@ -97,11 +99,6 @@ def test_a_segmentation_has_planes_of_bytes(classes: tuple[str, ...], planes: np
         Segmentation(classes=classes, probability_bytes=planes)
 
 
-def test_a_probability_beyond_one_is_refused() -> None:
-    with pytest.raises(ImageError, match=r"0..1, got 0\.\.1\.2"):
-        Segmentation.of_probabilities(("a",), np.array([[[0.0, 1.2]]]))
-
-
 def packed(head: object, planes: bytes) -> bytes:
     text = json.dumps(head).encode()
     return b"SGSEG\x01" + struct.pack("!I", len(text)) + text + zlib.compress(planes)
@@ -114,17 +111,14 @@ SOUND = {"classes": ["a"], "shape": [2, 2]}
     ("data", "fault"),
     [
         (b"", "not a segmentation"),
-        (b"garbage that is long enough", "not a segmentation"),
         (b"SGSEG\x01" + struct.pack("!I", 2**31) + b"{}", "not a segmentation"),
         (packed({"classes": ["a"]}, bytes(4)), "head of a segmentation is damaged"),
-        (packed({"classes": [1], "shape": [2, 2]}, bytes(4)), "head of a segmentation is damaged"),
         (packed({"classes": ["a"], "shape": [2, -2]}, bytes(4)), "head of a segmentation is damaged"),
         (packed({"classes": ["a"], "shape": [2, True]}, bytes(4)), "head of a segmentation is damaged"),
         (packed({"classes": ["a"], "shape": [10**9, 10**9]}, bytes(4)), "too large"),
         (packed({"classes": ["a", "a"], "shape": [2, 2]}, bytes(8)), "each once"),
         (packed(SOUND, bytes(3)), "does not hold the 4 bytes"),
         (packed(SOUND, bytes(10**6)), "does not hold the 4 bytes"),
-        (packed(SOUND, bytes(4)) + b"more", "does not hold the 4 bytes"),
         (packed(SOUND, bytes(4))[:-3], "does not hold the 4 bytes"),
         (packed(SOUND, bytes(4)).replace(b"\x78\x9c", b"\xff\xff"), "bytes of a segmentation are damaged"),
         (packed({"classes": ["a"], "shape": [4, 1]}, bytes(4)), r"shape \(4, 1\), expected \(2, 2\)"),

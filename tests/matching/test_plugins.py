@@ -268,15 +268,6 @@ def test_the_name_of_an_oracle_is_kept_for_those_that_a_pipeline_names() -> None
         check_card_name("mine:Matcher", "oracle_pose", is_oracle=True)
 
 
-def test_every_one_of_three_that_loses_is_told(install) -> None:
-    for name in ("a-first", "b-second", "c-third"):
-        install(name, {"mine": f"{name[0]}:Sound"})
-    with pytest.warns(UserWarning, match="two plugins") as told:
-        assert list_entry_points()["mine"].value == "a:Sound"
-    assert ["b-second" in str(item.message) for item in told] == [True, False]
-    assert ["c-third" in str(item.message) for item in told] == [False, True]
-
-
 def test_one_matcher_that_two_packages_name_alike_is_no_clash(install) -> None:
     install("a-first", {"mine": "shared:Sound"}, shared=SOUND)
     install("b-second", {"mine": "shared:Sound"})
@@ -328,21 +319,17 @@ def test_what_is_wrong_with_a_plugin_is_told_in_one_line(own, install, value, wo
     assert "wrong" in list_entry_points()
 
 
-@pytest.mark.parametrize("name", ["rastr_uniform", "raster-uniform", "raster_uniforms"])
-def test_a_misspelt_name_gets_a_proposal(own, name) -> None:
+def test_a_misspelt_name_gets_a_proposal_and_one_like_no_other_none(own) -> None:
     own()
-    told = refusal(name)
-    assert f"there is no matcher {name!r}, did you mean 'raster_uniform'?" in told
-    assert "list matchers" in told
-
-
-@pytest.mark.parametrize("name", ["", "something-else-altogether", "../x", "two\nlines"])
-def test_a_name_like_no_other_gets_none(own, name) -> None:
-    own()
-    told = refusal(name)
-    assert f"there is no matcher {name!r}" in told
-    assert "did you mean" not in told
-    assert "module:Class" in told
+    for name in ("rastr_uniform", "raster-uniform", "raster_uniforms"):
+        told = refusal(name)
+        assert f"there is no matcher {name!r}, did you mean 'raster_uniform'?" in told
+        assert "list matchers" in told
+    for name in ("", "something-else-altogether", "../x", "two\nlines"):
+        told = refusal(name)
+        assert f"there is no matcher {name!r}" in told
+        assert "did you mean" not in told
+        assert "module:Class" in told
 
 
 # --- module:Class ---------------------------------------------------------------------------------------------------
@@ -356,10 +343,8 @@ def test_a_class_of_a_module_needs_no_entry_point(own) -> None:
 @pytest.mark.parametrize(
     ("spec", "words"),
     [
-        ("no_such_module:Sound", "No module named 'no_such_module'"),
         ("mine.inner:Sound", "No module named 'mine.inner'"),
         ("mine:NoSuchClass", "module 'mine' has no attribute 'NoSuchClass'"),
-        ("mine:sound", "module 'mine' has no attribute 'sound'"),
         (":", "cannot be imported"),
         ("mine:", "module 'mine' has no attribute ''"),
         (":Sound", "cannot be imported"),
@@ -368,10 +353,6 @@ def test_a_class_of_a_module_needs_no_entry_point(own) -> None:
         (".mine:Sound", "cannot be imported"),
         ("../mine:Sound", "cannot be imported"),
         ("mine.py:Sound", "cannot be imported"),
-        ("mine:Raises", "cannot be made (RuntimeError: no weights here: fetch them first)"),
-        ("mine:Leaves", "cannot be made (SystemExit: 0)"),
-        ("mine:NoCard", "card is a NoneType"),
-        ("mine:NoVerbs", "it has no prepare and no match"),
         ("json:dumps", "cannot be made"),
     ],
 )

@@ -8,9 +8,9 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false
 from sasgeo_bench.matching.plugins import load_rejector
 from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.texts import one_line
 
 SAID = {"name": "half", "version": "1", "title": "Half", "source": "original", "ours": "all", "licence": "MIT"}
+BAD_LINES = ("two\nlines", "\x1b[31mred", "x" * 4001)
 
 
 class Half:
@@ -68,8 +68,11 @@ def test_an_unknown_name_says_where_the_names_are():
         load_rejector("halv")
 
 
-@pytest.mark.parametrize(("field", "value"), [("licence", " "), ("source", ""), ("name", "Half"), ("name", "a b")])
-def test_a_card_that_does_not_say_enough_is_refused(field, value):
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("licence", " "), ("source", ""), ("name", "Half"), ("name", "a b"), *(("title", one) for one in BAD_LINES)],
+)
+def test_a_card_that_does_not_say_enough_in_printable_lines_is_refused(field, value):
     with pytest.raises(MatchError, match=f"card: {field}"):
         RejectorCard(**(SAID | {field: value}))
 
@@ -89,13 +92,3 @@ def test_a_card_that_does_not_say_enough_is_refused(field, value):
 def test_what_is_no_probability_is_refused_with_found_and_expected(found, words):
     with pytest.raises(MatchError, match=words):
         check_p_false(found, 2)
-
-
-@pytest.mark.parametrize("said", ["two\nlines", "\x1b[31mred", "x" * 4001])
-def test_a_card_is_one_printable_line(said):
-    with pytest.raises(MatchError, match="card: title must be one line of at most 4000 printable characters"):
-        RejectorCard(**(SAID | {"title": said}))
-
-
-def test_a_message_cannot_steer_a_terminal():
-    assert one_line("\x1b[2Jgone\a\nnext") == "?[2Jgone? next"

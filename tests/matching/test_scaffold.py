@@ -9,26 +9,36 @@ import zipfile
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import sasgeo_bench
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.plugin_files import SHIPPED
-from sasgeo_bench.files.plugins import MATCHERS, list_entry_points
+from sasgeo_bench.files.plugins import MATCHERS, SEGMENTERS, TRACKERS, list_entry_points
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.card_file import read_card_file
 from sasgeo_bench.matching.matcher import Match
 from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
+from sasgeo_bench.matching.segmenter import ImageTraining
+from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
+from sasgeo_bench.matching.tracker_scaffold import tracker_files
 from sasgeo_bench.regions.region import Region
+from sasgeo_bench.running.segmenter_testing import check_segmenter
 from sasgeo_bench.running.testing import check_matcher
+from sasgeo_bench.sensing.segmentation import Segmentation
+from sasgeo_bench.sensing.tiny_images import tiny_images
 from sasgeo_bench.tasks.query import Query
 
 LONGEST = "a" * 60
 # Some of these would break what is generated if their class were called what the name says.
-ACCEPTED = (
-    *("my-matcher", "my_matcher", "a-b_c-d", "m", "m2", LONGEST, "resnet-50", "v2"),
-    *("match", "query", "pose", "region", "layer-bits", "matcher-card", "withheld", "none", "true", "false"),
-)
+ACCEPTED = {
+    "matcher": (
+        *("my-matcher", "my_matcher", "a-b_c-d", "m", "m2", LONGEST, "resnet-50", "v2"),
+        *("match", "query", "pose", "region", "layer-bits", "matcher-card", "withheld", "none", "true", "false"),
+    ),
+    "tracker": ("my-tracker", "a-b_c", "m2", "pose", "matcher-card", "fix", "region", "none"),
+    "segmenter": ("my-segmenter", "a-b_c", "segmentation", "segmenter-card", "aerial-image", "image-training", "none"),
+}
 REFUSED = (
     *("", " ", "My-Matcher", "my matcher", "my.matcher", "my--matcher", "-matcher", "matcher-", "_m", "2m", "mätcher"),
     *("../x", "/etc/x", "a/b", "a\\b", "..", ".", "~", "$HOME", "a\nb", "a\n", 'a"', "a]", "{name}", "a" * 61),
@@ -38,50 +48,73 @@ REFUSED = (
 )
 
 
+# Names that ship, by the kinds for which they are taken.
+TAKEN = dict.fromkeys(("fft_vote", "raster_uniform", "oracle_pose"), ("matcher", "tracker"))
+TAKEN |= {"dead_reckoning": ("tracker",), "oracle_segmenter": ("segmenter",)}
+MAKERS = {"matcher": plugin_files, "tracker": tracker_files, "segmenter": segmenter_files}
+GROUPS = {"matcher": MATCHERS, "tracker": TRACKERS, "segmenter": SEGMENTERS}
+# What a class needs, which a name like its own must not hide.
+NEEDED = {
+    "matcher": {"Match": Match, "Query": Query, "Pose": Pose, "Region": Region},
+    "tracker": {"Pose": Pose},
+    "segmenter": {"Segmentation": Segmentation},
+}
+
+
 def write_under(folder: Path, name: str) -> Path:
     write_plugin(folder / "plugin", plugin_files(name))
     return folder / "plugin"
 
 
-@pytest.mark.parametrize("name", ACCEPTED)
-def test_a_package_is_complete_and_names_its_class_everywhere_alike(tmp_path, name) -> None:
-    folder = write_under(tmp_path, name)
-    module = name.replace("-", "_")
-    files = {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
-    package = {f"src/{module}/{file}" for file in ("__init__.py", "matcher.py", "card.toml")}
-    assert files == {"pyproject.toml", "README.md", "tests/test_conforms.py", *package}
-    assert read_card_file(folder / "src" / module / "card.toml").name == name
-    project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
+@pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, names in ACCEPTED.items() for name in names])
+def test_a_package_is_complete_and_its_class_can_be_made_and_hides_nothing_that_it_needs(tmp_path, kind, name) -> None:
+    files, module = MAKERS[kind](name), name.replace("-", "_")
+    card = {f"src/{module}/card.toml"} if kind != "segmenter" else set()
+    package = {f"src/{module}/__init__.py", f"src/{module}/{kind}.py", *card}
+    assert set(files) == {"pyproject.toml", "README.md", "tests/test_conforms.py", *package}
+    project = tomllib.loads(files["pyproject.toml"])["project"]
     assert project["name"] == name.replace("_", "-")
-    ((point, value),) = project["entry-points"][MATCHERS].items()
+    ((point, value),) = project["entry-points"][GROUPS[kind]].items()
     assert point == name
-    tree = ast.parse((folder / "src" / module / "matcher.py").read_text())
+    tree = ast.parse(files[f"src/{module}/{kind}.py"])
     (own,) = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    assert value == f"{module}.matcher:{own}"
-    assert f'check_matcher("{value}")' in (folder / "tests" / "test_conforms.py").read_text()
-    assert f"check {name}" in (folder / "README.md").read_text()
+    assert value == f"{module}.{kind}:{own}"
+    assert f'check_{kind}("{value}")' in files["tests/test_conforms.py"]
+    assert f"check {name}" in files["README.md"]
+    assert not any(re.search(r"\{(name|module|cls|title|distribution)\}", text) for text in files.values())
+    write_plugin(tmp_path / "plugin", files)
+    path = tmp_path / "plugin" / "src" / module / f"{kind}.py"
+    assert {
+        each.relative_to(tmp_path / "plugin").as_posix() for each in path.parents[2].rglob("*") if each.is_file()
+    } == {*files}
+    found: dict[str, object] = {"__file__": str(path)}
+    exec(path.read_text(), found)  # noqa: S102 - our own text
+    assert found[own]().card.name == name
+    assert {each: found[each] for each in NEEDED[kind]} == NEEDED[kind]
 
 
-@pytest.mark.parametrize("name", ACCEPTED)
-def test_the_class_of_a_package_can_be_made_and_hides_nothing_that_it_needs(tmp_path, name) -> None:
-    for path, text in plugin_files(name).items():
-        if path.endswith(".py"):
-            compile(text, path, "exec")
-        assert not re.search(r"\{(name|module|cls|title|distribution)\}", text)
-    module = write_under(tmp_path, name) / "src" / name.replace("-", "_") / "matcher.py"
-    found: dict[str, object] = {"__file__": str(module)}
-    exec(module.read_text(), found)  # noqa: S102 - our own text
-    (own,) = [value for value in found.values() if getattr(value, "__module__", None) == "builtins"]
-    assert own().card.name == name
-    assert (found["Match"], found["Query"], found["Pose"], found["Region"]) == (Match, Query, Pose, Region)
-
-
-@pytest.mark.parametrize("name", REFUSED)
-def test_what_is_no_name_for_a_package_is_refused_in_one_line(name) -> None:
+@pytest.mark.parametrize("name", [*REFUSED, "dead_reckoning", "oracle_segmenter"])
+@pytest.mark.parametrize("kind", MAKERS)
+def test_what_is_no_name_for_a_package_or_taken_is_refused_in_one_line(kind, name) -> None:
+    if name in TAKEN and kind not in TAKEN[name]:
+        assert MAKERS[kind](name)
+        return
     with pytest.raises(ConfigError) as refused:
-        plugin_files(name)
+        MAKERS[kind](name)
     assert "\n" not in str(refused.value)
     assert repr(name) in str(refused.value)
+
+
+def test_a_segmenter_that_is_written_learns_to_tell_roofs_from_the_rest() -> None:
+    found: dict[str, object] = {}
+    exec(segmenter_files("my-segmenter")["src/my_segmenter/segmenter.py"], found)  # noqa: S102 - our own text
+    *train, test = tiny_images()
+    segmenter = found["MySegmenter"]()
+    said = segmenter.segment(test.image, learned=segmenter.learn(ImageTraining(images=train)))
+    roof, at = said.probabilities()[said.classes.index("building")], test.classes.index("building")
+    assert roof[test.labels[at] == 1].mean() > 0.8
+    assert roof[test.labels[at] == 0].mean() < 0.3
+    assert np.isnan(segmenter.segment(test.image, learned=None).probabilities()).all()
 
 
 def test_no_package_hides_a_module_that_ours_imports() -> None:
@@ -170,12 +203,15 @@ def test_a_folder_that_cannot_be_looked_into_is_told_in_one_line(tmp_path, monke
 # --- what is written works ------------------------------------------------------------------------------------------
 
 
-def test_what_is_written_passes_the_kit_at_once(tiny, tmp_path, monkeypatch) -> None:
-    monkeypatch.syspath_prepend(str(write_under(tmp_path, "my-matcher") / "src"))
-    checks = list(check_matcher("my_matcher.matcher:MyMatcher", place=tiny))
+@pytest.mark.usefixtures("in_threads")
+@pytest.mark.parametrize("kind", ["matcher", "segmenter"])  # test_tracker_testing flies a tracker
+def test_what_is_written_passes_the_kit_at_once(tiny, tmp_path, monkeypatch, kind) -> None:
+    write_plugin(tmp_path / "plugin", MAKERS[kind](f"my-new-{kind}"))
+    monkeypatch.syspath_prepend(str(tmp_path / "plugin" / "src"))
+    spec = f"my_new_{kind}.{kind}:MyNew{kind.title()}"
+    checks = list(check_matcher(spec, place=tiny) if kind == "matcher" else check_segmenter(spec))
     assert [check.name for check in checks if check.outcome != "pass"] == []
-    assert checks[0].found == "my-matcher 0.1.0"
-    assert len(checks) > 10
+    assert checks[0].found == f"my-new-{kind} 0.1.0"
 
 
 @pytest.mark.parametrize("name", ["my-matcher", "none"])

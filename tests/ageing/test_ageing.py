@@ -26,9 +26,9 @@ from sasgeo_bench.ageing.pairing import (
     polygons_of,
 )
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.osm.history import History, Lifecycle, ObjectKey, Span, State
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from tests.drawn_features import features_of
 
 OLD, NEW = dt.date(2015, 1, 1), dt.date(2020, 1, 1)
 AREA = shapely.box(-1000, -1000, 3000, 3000)
@@ -43,13 +43,13 @@ def line(*points):
     return shapely.LineString(points)
 
 
-def state(on, things, lifecycle=None, *, hidden=()):
+def state(on, things, lifecycle=None, *, hidden=(), **usual):
     """A state of (id, class, geometry) rows; ids in `hidden` lie under ground."""
-    columns = {name: [0] * len(things) for name in DTYPES}
-    ids, classes, shapes = ([thing[k] for thing in things] for k in range(3))
-    columns |= {"osm_type": ["way"] * len(things), "osm_id": ids, "class": classes, "geometry": shapes}
-    columns["is_visible"] = [identifier not in hidden for identifier in ids]
-    return State(source="", on=on, features=make_features(columns, epsg=32632), lifecycle=lifecycle or NO_HINTS)
+    rows = [
+        {"osm_id": each[0], "class": each[1], "geometry": each[2], "is_visible": each[0] not in hidden}
+        for each in things
+    ]
+    return State(source="", on=on, features=features_of(*rows, **usual), lifecycle=lifecycle or NO_HINTS)
 
 
 def measured(*states, area=AREA):
@@ -117,43 +117,23 @@ def test_a_road_redrawn_beside_its_place_keeps_its_length_and_loses_ground():
     """Two of 100 m: one moves by 1 m of its 4 m, one by more than a road can move."""
     old = [(1, "road_minor", line((0, 0), (100, 0))), (2, "road_minor", line((0, 100), (100, 100)))]
     new = [(1, "road_minor", line((0, 1), (100, 1))), (2, "road_minor", line((0, 120), (100, 120)))]
-    states = [state(on, things) for on, things in ((OLD, old), (NEW, new))]
-    for item in states:
-        item.features["width_m"] = 4.0
-    found = row(measured(*states), "road_minor")
+    found = row(measured(state(OLD, old, width_m=4.0), state(NEW, new, width_m=4.0)), "road_minor")
     assert (found["vanished_share"], found["ground_lost_share"]) == (0.5, 0.625)
-    years = (NEW - OLD).days / 365.25
-    assert found["ground_lost_per_year"] == pytest.approx(-np.log(1 - 0.625) / years, abs=1e-6)
-    assert found["ground_gained_per_year"] == pytest.approx(-np.log(1 - 0.625) / years, abs=1e-6)
+    rate = -np.log(1 - 0.625) / ((NEW - OLD).days / 365.25)
+    assert [found[f"ground_{what}_per_year"] for what in ("lost", "gained")] == pytest.approx([rate] * 2, abs=1e-6)
 
 
-def test_a_merge_is_a_split_seen_from_the_other_side():
-    split, whole = NEW_HOUSES[6:10], OLD_HOUSES[6:]
-    found = row(changes(split, whole), "building")
-    assert (found["vanished_share"], found["appeared_share"]) == (0.0, 0.0)
-
-
-def test_the_same_state_twice_has_neither_loss_nor_gain_nor_shift():
-    table = changes(OLD_HOUSES, OLD_HOUSES)
-    for column in ("vanished_share", "appeared_share", "redrawn_share", "ground_lost_share", "id_vanished_share"):
-        assert row(table, "building")[column] == 0.0
-    assert row(table, "building")["vanish_per_year"] == 0.0
-
-
-def test_a_ring_that_starts_elsewhere_or_runs_the_other_way_is_the_same_house():
+def test_a_ring_that_starts_elsewhere_or_runs_the_other_way_is_the_same_house_and_ground_is_covered_once():
     turned = shapely.Polygon([(10, 10), (10, 0), (0, 0), (0, 10)])
     found = compare_areas(make_areas(np.array([house(0)])), make_areas(np.array([turned])))
     assert found.lost.tolist() == found.shift_m.tolist() == [0.0]
-
-
-def test_a_house_that_another_covers_by_a_sixth_has_lost_the_rest():
     found = compare_areas(make_areas(np.array([house(0, width=60)])), make_areas(np.array([house(0)])))
-    assert found.lost.tolist() == [500.0]
-
-
-def test_overlapping_areas_cover_the_ground_once():
+    assert found.lost.tolist() == [500.0]  # a sixth is covered
     covers = np.array([house(0, width=4), house(2, width=4)])
     assert covered_share(np.array([house(0)]), covers).tolist() == [0.6]
+    split, whole = NEW_HOUSES[6:10], OLD_HOUSES[6:]  # a merge is a split seen from the other side
+    merged = row(changes(split, whole), "building")
+    assert (merged["vanished_share"], merged["appeared_share"]) == (0.0, 0.0)
 
 
 def test_a_forest_that_swallows_a_house_does_not_take_its_place_but_fields_take_that_of_a_meadow():
@@ -276,11 +256,7 @@ def test_one_interval_has_the_closed_form():
     assert rate == pytest.approx(-np.log(0.75) / 4)
 
 
-@given(
-    st.floats(0.001, 2.0),
-    st.lists(st.floats(0.1, 9.0), min_size=1, max_size=6),
-    st.floats(1.0, 1e6),
-)
+@given(st.floats(0.001, 2.0), st.lists(st.floats(0.1, 9.0), min_size=1, max_size=6), st.floats(1.0, 1e6))
 def test_the_pooled_rate_is_the_one_that_all_intervals_share(rate, years, amount):
     years = np.array(years)
     total = np.full(len(years), amount)
@@ -368,18 +344,14 @@ def test_a_table_is_read_back_as_it_was_written(ageing, tmp_path):
     assert list(back.table.columns) == list(COLUMNS)
 
 
-def test_the_summary_has_a_row_for_each_place_under_each_class(ageing):
-    text = summary_text([ageing, replace(ageing, place="Elsewhere")])
-    assert text.count("| Toytown |") == text.count("| Elsewhere |") == 1 + 2
-    assert "## building" in text
-    assert "(c) OpenStreetMap contributors, ODbL" in text
-
-
-def test_the_summary_tells_of_the_hand_set_rates_and_of_controls_apart(ageing):
-    text = summary_text([ageing], [replace(ageing, place="Elsewhere")])
+def test_the_summary_has_a_row_for_each_place_under_each_class_and_controls_apart(ageing):
+    text = summary_text([ageing, replace(ageing, place="Here")], [replace(ageing, place="Elsewhere")])
     building = load_taxonomy()["building"].persistence
     assert f"set by hand: vanishes {100 * building.vanish_per_year:.2f}, appears" in text
+    assert "(c) OpenStreetMap contributors, ODbL" in text
     places, controls = text.split("## Controls")
+    assert places.count("| Toytown |") == places.count("| Here |") == 1 + 2
+    assert "## building" in places
     assert places.count("| Elsewhere |") == 1
     assert "| class | Elsewhere |" in controls
     vanished, appeared = (100 * row(ageing.table, "building")[f"{what}_share"] for what in ("vanished", "appeared"))

@@ -31,9 +31,6 @@ def test_the_centre_of_a_cell_lies_in_that_cell(rows, cols, cell_size_m):
     cells = np.array([[rows, cols]])
     grid = grid_of(cell_size_m)
     assert (grid.to_cells(grid.to_centres_m(cells)) == cells).all()
-
-
-def test_the_centre_of_the_first_cell_is_half_a_cell_from_the_corner():
     assert grid_of(2.0).to_centres_m(np.array([[0, 0]])).tolist() == [[500001.0, 5299999.0]]
 
 

@@ -13,7 +13,7 @@ from sklearn.metrics import average_precision_score
 
 from sasgeo_bench.errors import DatasetError, StoreError
 from sasgeo_bench.importers import retrieval
-from sasgeo_bench.importers.items import Dataset, DatasetCard, Item, Position
+from sasgeo_bench.importers.items import Dataset, Item, Position
 from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
 from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
@@ -92,19 +92,18 @@ def test_recall_at_one_percent_is_released_one_rank_too_far(scores):
     dataset = dataset_of("university-1652", {"q": "right"}, gallery)
     found = scores(dataset, {"q": sorted(gallery)})
     assert both(found["recall_1pct"]) == (1.0, 0.0)  # the third answer, and 1 % of 200 are two
-
-
-def test_one_percent_of_a_small_gallery_is_one_rank(scores):
-    gallery = {"a": "wrong", "b": "right"}
-    found = scores(dataset_of("university-1652", {"q": "right"}, gallery), {"q": ["a", "b"]})
+    found = scores(dataset_of("university-1652", {"q": "right"}, {"a": "wrong", "b": "right"}), {"q": ["a", "b"]})
     assert both(found["recall_1pct"]) == (0.0, 0.0)  # round(0.02) is index 0: here the two agree
+    assert both(found["recall_5"]) == (None, 1.0)  # beyond the gallery
 
 
 def test_queries_without_a_positive_are_released_as_misses(scores):
     queries, gallery = {"q1": "a", "q2": "nowhere"}, {"g1": "a", "g2": "b"}
     found = scores(dataset_of("university-1652", queries, gallery), {"q1": ["g1", "g2"], "q2": ["g1", "g2"]})
-    assert both(found["recall_1"]) == (0.5, 1.0)
-    assert both(found["ap"]) == (0.5, 1.0)
+    assert both(found["recall_1"]) == both(found["ap"]) == (0.5, 1.0)
+    found = scores(dataset_of("university-1652", {"q": "a"}, {"g": "b"}), {"q": ["g"]})
+    assert both(found["recall_1"]) == (0.0, None)
+    assert both(found["ap"]) == (None, None)
 
 
 def test_average_precision_is_released_by_trapezoids(scores):
@@ -227,17 +226,6 @@ def test_a_short_list_leaves_open_what_it_cannot_say(scores):
     assert both(found["ap"]) == (None, None)  # a positive is not ranked
 
 
-def test_recall_beyond_the_gallery_is_released_as_an_error_and_corrected_to_all_of_it(scores):
-    found = scores(dataset_of("university-1652", {"q": "a"}, {"g1": "b", "g2": "a"}), {"q": ["g1", "g2"]})
-    assert both(found["recall_5"]) == (None, 1.0)
-
-
-def test_no_query_has_a_positive(scores):
-    found = scores(dataset_of("university-1652", {"q": "a"}, {"g": "b"}), {"q": ["g"]})
-    assert both(found["recall_1"]) == (0.0, None)
-    assert both(found["ap"]) == (None, None)
-
-
 def test_each_height_of_sues_is_reported_by_itself(tmp_path):
     dataset = read_dataset(writers.write_sues(tmp_path / "set"), "sues-200")
     answers = {}
@@ -252,10 +240,6 @@ def test_each_height_of_sues_is_reported_by_itself(tmp_path):
         ("drone to satellite, 300 m", 2, 2),
     ]
     assert [report.scores[0].corrected for report in reports] == [1.0, 0.0]
-
-
-def test_a_height_of_sues_is_not_answered_from_another(tmp_path):
-    dataset = read_dataset(writers.write_sues(tmp_path / "set"), "sues-200")
     answers = [f"Testing/{height}/gallery_satellite/0001/0.jpg" for height in ("150", "300")]
     path = writers.write_ranking(tmp_path / "r.parquet", {"Testing/150/query_drone/0001/0.jpg": answers})
     with pytest.raises(DatasetError, match="several views and heights"):
@@ -303,9 +287,7 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
     ("columns", "told"),
     [
         ({"query_id": ["q"], "gallery_id": ["g1"]}, "has no column 'rank'"),
-        ({"gallery_id": ["g1"], "rank": [1]}, "has no column 'query_id'"),
         (pa.table([["q"], ["q"], ["g1"], [1]], ["query_id", "query_id", "gallery_id", "rank"]), "or more than one"),
-        ({"query_id": ["q"], "gallery_id": ["g1"], "rank": [1.5]}, "expected whole numbers"),
         ({"query_id": ["q"], "gallery_id": ["g1"], "rank": pa.array([None], pa.int64())}, "expected whole numbers"),
         ({"query_id": [7], "gallery_id": ["g1"], "rank": [1]}, "query_id: expected text, got int64"),
         ({"query_id": ["x\x1b[31m\n"], "gallery_id": ["g1"], "rank": [1]}, "is no query of the dataset"),
@@ -314,7 +296,6 @@ def test_the_order_of_rows_changes_nothing(tmp_path_factory, order, queries):
         ({"query_id": ["q", "q"], "gallery_id": ["g1", None], "rank": [1, 2]}, "a missing value is no gallery"),
         ({"query_id": ["q"], "gallery_id": ["g1"], "rank": [0]}, "do not run from 1"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 2**62]}, "do not run from 1"),
-        ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [-1, 1]}, "do not run from 1"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 1]}, "without a gap or a tie"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g2"], "rank": [1, 3]}, "without a gap or a tie"),
         ({"query_id": ["q", "q"], "gallery_id": ["g1", "g1"], "rank": [1, 2]}, "ranks 'g1' twice for query 'q'"),
@@ -353,13 +334,6 @@ def test_names_may_be_stored_as_a_dictionary(tmp_path):
     table = table.set_column(0, "query_id", table["query_id"].dictionary_encode())
     pq.write_table(table, tmp_path / "r.parquet")
     assert read_ranking([tmp_path / "r.parquet"], dataset.items).queries.tolist() == [0]
-
-
-def test_a_card_says_its_terms():
-    for importer in IMPORTERS.values():
-        card: DatasetCard = importer.card
-        assert card.source.startswith("https://github.com/")
-        assert all(text.isprintable() and text for text in (card.title, card.licence, card.attribution))
 
 
 def test_a_ranking_may_lie_in_several_files(tmp_path):

@@ -1,11 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Levels on disk are those made in memory, whatever the windows; a search on either finds the same."""
 
-import json
 import os
 import re
 import shutil
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -67,11 +65,7 @@ def test_a_level_on_disk_is_the_one_made_in_memory(stored, whole, factor):
     np.testing.assert_array_equal(found.thinner, expected.thinner)
     assert (found.grid, found.factor) == (expected.grid, expected.factor)
     assert isinstance(found.cells.base, np.memmap)
-
-
-def test_a_thin_class_is_spread_and_a_wide_one_is_not(stored):
-    assert stored.level(8).thinner[0] < 0.5
-    assert stored.level(8).thinner[[1, 3]].tolist() == [1.0, 1.0]
+    assert factor < 8 or (found.thinner[0] < 0.5 and found.thinner[[1, 3]].tolist() == [1.0, 1.0])  # thin and wide
 
 
 @pytest.fixture(scope="module")
@@ -134,40 +128,31 @@ def test_what_is_cut_off_leaves_the_levels_as_they_were(tmp_path, whole):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("levels.json", "{", "levels.json"),
-        ("levels.json", "[]", "is damaged"),
-        ("levels.json", '{"grid": {}, "key": "", "thinner": {"1": []}}', "is damaged"),
-        ("level-4.npy", "", "is damaged"),
-        ("level-4.npy", None, "is damaged"),
-    ],
-)
-def test_damaged_levels_are_told_in_one_line(tmp_path, stored, name, content, words):
-    folder = shutil.copytree(stored.folder, tmp_path / "map")
-    (folder / name).unlink() if content is None else (folder / name).write_text(content, encoding="utf-8")
-    with pytest.raises(StoreError, match=words) as told:
-        StoredField.open(folder)
-    assert "store the levels of the map again" in str(told.value)
-
-
-@pytest.mark.parametrize(
     ("name", "spoil", "words"),
     [
+        ("levels.json", lambda _: b"{", "damaged"),
+        ("levels.json", lambda _: b"[]", "damaged"),
+        ("levels.json", lambda _: b'{"grid": {}, "key": "", "thinner": {"1": []}}', "damaged"),
+        ("levels.json", lambda data: data.replace(b"1.0]", b"1e308]"), "are no shares"),
+        ("levels.json", lambda data: data.replace(b"1.0]", b'"nan"]'), "are no shares"),
+        ("levels.json", lambda data: re.sub(rb'"thinner": {.*?}', b'"thinner": {}', data), "lists no level 1"),
+        ("levels.json", lambda data: data.replace(b'"rows": 150', b'"rows": 151'),
+         r"level-1.npy has uint8 of shape \(150, 203, 4\), expected uint8 of \(151, "),
+        ("level-4.npy", lambda _: b"", "damaged"),
+        ("level-4.npy", None, "damaged"),
         ("level-2.npy", lambda _: b"\x93NUMPY\x01\x00v\x00" + b"(" * 118, "TokenError"),
         ("level-2.npy", lambda _: b"PK\x03\x04 no archive", "magic string"),
         ("level-2.npy", lambda data: data + b"x", "longer than its cells"),
         ("level-2.npy", lambda data: data.replace(b"order': False", b"order': True "), "expected uint8"),
-        ("levels.json", lambda data: data.replace(b"1.0]", b"1e308]"), "are no shares"),
-        ("levels.json", lambda data: data.replace(b"1.0]", b'"nan"]'), "are no shares"),
-        ("levels.json", lambda data: re.sub(rb'"thinner": {.*?}', b'"thinner": {}', data), "lists no level 1"),
     ],
-)
+)  # fmt: skip
 def test_levels_whose_bytes_are_damaged_are_told_in_one_line(tmp_path, stored, name, spoil, words):
-    folder = shutil.copytree(stored.folder, tmp_path / "map")
-    (folder / name).write_bytes(spoil((folder / name).read_bytes()))
-    with pytest.raises(StoreError, match=f"is damaged .*{words}.*store the levels of the map again"):
-        StoredField.open(folder)
+    path = shutil.copytree(stored.folder, tmp_path / "map") / name
+    path.write_bytes(spoil(path.read_bytes())) if spoil else path.unlink()
+    with pytest.raises(StoreError, match=words) as told:
+        StoredField.open(tmp_path / "map")
+    assert "store the levels of the map again" in str(told.value)
+    assert len(str(told.value).splitlines()) == 1
 
 
 def test_a_pipe_in_place_of_a_level_is_refused_not_waited_for(tmp_path, stored):
@@ -178,13 +163,3 @@ def test_a_pipe_in_place_of_a_level_is_refused_not_waited_for(tmp_path, stored):
     for read in (lambda: StoredField.open(folder), lambda: opened.level(2)):
         with pytest.raises(StoreError, match="it is a pipe"):
             read()
-
-
-def test_levels_of_another_shape_are_damaged(tmp_path, stored):
-    folder = shutil.copytree(stored.folder, tmp_path / "map")
-    about = json.loads((folder / "levels.json").read_text(encoding="utf-8"))
-    about["grid"]["rows"] += 1
-    (folder / "levels.json").write_text(json.dumps(about), encoding="utf-8")
-    with pytest.raises(StoreError, match=r"level-1.npy has uint8 of shape \(150, 203, 4\), expected uint8 of \(151, "):
-        StoredField.open(folder)
-    assert replace(stored, key="x") != stored

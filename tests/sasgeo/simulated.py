@@ -24,6 +24,11 @@ class Simulated:
     error_m: np.ndarray
 
 
+def modes_of(positions_m, by_class, **changes):
+    said = {"positions_m": np.array(positions_m, float), "by_class": np.array(by_class, float), "sigma_m": 2.0}
+    return Modes(**(said | changes))
+
+
 def simulate(count, *, seed=0, hardness=0.5):
     """Answers with a known chance of being false.
 

@@ -18,18 +18,12 @@ from sasgeo_bench.sasgeo.class_weights import (
     side_by_side,
     weight_map,
 )
-from sasgeo_bench.sasgeo.rates import ClassRates, hand_rates
+from sasgeo_bench.sasgeo.rates import ClassRates
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
-from sasgeo_bench.sasgeo.weights import by_hand, information, likelihood_gains
+from sasgeo_bench.sasgeo.weights import information
 
 NAMES = load_taxonomy().names
 HOUSE = ClassRates(hit=0.9, false_alarm=0.02, missing=0.01, vanish_per_year=0.01, appear_per_year=0.005, mapped=0.1)
-
-
-def test_by_hand_one_cell_in_a_hundred_counts():
-    gains = likelihood_gains([hand_rates(name) for name in NAMES], age_years=7.0, persists=by_hand("snow", NAMES))
-    weights = class_weights_of(ScorerModel.by_hand(NAMES), age_years=7.0, season="snow")
-    assert weights == pytest.approx(gains.agree)
 
 
 def test_gains_and_information_shrink_as_the_map_ages():
@@ -42,19 +36,15 @@ def test_gains_and_information_shrink_as_the_map_ages():
 
 def test_a_fitted_table_holds_the_gains_of_the_arm_and_its_exponents():
     model = replace(
-        ScorerModel.by_hand(NAMES),
-        scaling=np.linspace(0.001, 0.02, len(NAMES)),
-        missed_share=np.full(len(NAMES), 0.4),
+        ScorerModel.by_hand(NAMES), scaling=np.linspace(0.001, 0.02, len(NAMES)), missed_share=np.full(len(NAMES), 0.4)
     )
     table = class_weight_table(model, ages_years=[3.0], season="leaf_on")
     gains = Switches().gains(model, age_years=3.0, season="leaf_on")
     assert table["class"].tolist() == list(NAMES)
     assert table["missed"].to_numpy() == pytest.approx(gains.missed)
     assert table["weight"].to_numpy() == pytest.approx(100 * model.scaling * gains.agree)
-
-
-def test_information_out_of_season_is_less():
-    assert 0 < information(HOUSE, age_years=1.0, persists=0.5) < information(HOUSE, age_years=1.0)
+    assert class_weights_of(model, age_years=3.0, season="leaf_on") == pytest.approx(table["weight"].to_numpy())
+    assert 0 < information(HOUSE, age_years=1.0, persists=0.5) < information(HOUSE, age_years=1.0)  # out of season
 
 
 def test_tables_stand_side_by_side_in_the_order_of_the_classes():
@@ -72,13 +62,10 @@ def test_a_cell_weighs_the_sum_of_its_classes_times_its_rarity():
     assert np.isnan(weights[0, 3])
 
 
-@pytest.mark.parametrize("age", [-1.0, float("nan"), float("inf")])
-def test_what_is_no_age_is_refused(age):
-    with pytest.raises(ConfigError, match="at least 0 years"):
-        check_age(age)
-
-
-def test_what_is_no_season_or_no_class_is_refused():
+def test_what_is_no_age_no_season_or_no_class_is_refused():
+    for age in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(ConfigError, match="at least 0 years"):
+            check_age(age)
     with pytest.raises(ConfigError, match=r"no season 'spring' \(leaf_on"):
         check_season("spring")
     with pytest.raises(ConfigError, match="no class 'lamp'"):

@@ -21,18 +21,15 @@ def streets():
     return layers
 
 
-def test_a_crossroads_weighs_more_than_a_street(streets):
-    rarity = Rarity.of(streets, CLASSES, cell_size_m=1.0)
+def test_a_crossroads_weighs_more_than_a_street_and_the_mean_over_what_is_drawn_is_one(streets):
+    rarity, again = (Rarity.of(streets, CLASSES, cell_size_m=1.0) for _ in range(2))
     nu = rarity.weights(streets, CLASSES, cell_size_m=1.0)
     assert nu.shape == streets.shape[1:]
     assert nu[200, 240] > nu[200, 100]
     assert ((nu >= LEAST) & (nu <= MOST)).all()
-
-
-def test_the_mean_over_what_is_drawn_is_one(streets):
-    rarity = Rarity.of(streets, CLASSES, cell_size_m=1.0)
-    nu = rarity.weights(streets, CLASSES, cell_size_m=1.0)
     assert nu[streets.any(axis=0)].mean() == pytest.approx(1.0, abs=0.15)
+    assert (rarity.words == again.words).all()
+    assert (rarity.weight == again.weight).all()
 
 
 def test_turning_a_view_by_right_angles_turns_its_weights(streets):
@@ -41,12 +38,6 @@ def test_turning_a_view_by_right_angles_turns_its_weights(streets):
     nu = rarity.weights(view, CLASSES, cell_size_m=1.0)
     turned = rarity.weights(np.ascontiguousarray(np.rot90(view, 1, (1, 2))), CLASSES, cell_size_m=1.0)
     assert (np.rot90(nu) == turned).mean() > 0.98
-
-
-def test_the_same_map_gives_the_same_weights(streets):
-    one, other = (Rarity.of(streets, CLASSES, cell_size_m=1.0) for _ in range(2))
-    assert (one.words == other.words).all()
-    assert (one.weight == other.weight).all()
 
 
 @pytest.mark.parametrize("value", [0, 255])

@@ -83,19 +83,11 @@ def test_a_score_turns_with_map_and_view(seen, yaw_deg):
     one, other = score(seen, mapped_from(drawn()), off), score(seen, turned_map, turned)
     assert other.score == pytest.approx(one.score, abs=0.2)  # vectors are rounded to a decimetre
     assert (other.matched, other.contradicting) == (one.matched, one.contradicting)
-
-
-def test_the_heading_of_the_view_does_not_matter_where_the_pose_has_it(mapped):
-    pose = Pose(easting_m=5.0, northing_m=-5.0, yaw_deg=30.0)
-    seen = ObservedGraph.make(BLANK, drawn(pose))
-    assert score(seen, mapped, pose).score > 20
-    assert score(seen, mapped, replace(pose, yaw_deg=300.0)).score < 0
-
-
-def test_scale_is_that_of_the_pose(mapped):
-    pose = replace(HERE, scale=1.15)
-    seen = ObservedGraph.make(BLANK, drawn(pose))
-    assert score(seen, mapped, pose).score > score(seen, mapped, HERE).score + 5
+    pose = Pose(easting_m=5.0, northing_m=-5.0, yaw_deg=yaw_deg, scale=1.15)
+    found = ObservedGraph.make(BLANK, drawn(pose))
+    assert score(found, mapped_from(drawn()), pose).score > 20
+    for wrong in (replace(pose, yaw_deg=yaw_deg - 90.0), replace(pose, scale=1.0)):
+        assert score(found, mapped_from(drawn()), wrong).score < score(found, mapped_from(drawn()), pose).score - 5
 
 
 def test_what_is_not_mapped_and_what_is_not_seen_cost(seen, mapped):
@@ -127,10 +119,7 @@ def test_unknown_cells_change_nothing_where_nothing_is(seen, mapped):
 
 def test_nothing_is_made_up_where_the_map_ends(seen):
     vectors = drawn(houses=HOUSES[:4])
-    features, grid = (
-        as_features(vectors),
-        Grid(epsg=32632, west_m=-400.0, north_m=400.0, cell_size_m=1.0, rows=800, cols=800),
-    )
+    features, grid = as_features(vectors), Grid.around(0.0, 0.0, size_m=(800.0, 800.0), cell_size_m=1.0, epsg=32632)
     known = np.ones(grid.shape, dtype=bool)
     known[445:] = False
     half = MappedGraph.make(build_graph(features), features, known=known, grid=grid)
@@ -146,13 +135,10 @@ def test_a_way_that_is_cut_on_the_map_is_a_contradiction(seen):
 
 
 @pytest.mark.parametrize("vectors", [None, vector_table([])])
-def test_an_empty_view_says_nothing(mapped, vectors):
+def test_an_empty_view_or_map_says_nothing(seen, mapped, vectors):
     assert score(ObservedGraph.make(BLANK, vectors), mapped) == GraphScore()
     blind = BLANK.replace(np.full_like(BLANK.cells, UNKNOWN))
     assert score(ObservedGraph.make(blind, vectors), mapped) == GraphScore()
-
-
-def test_an_empty_map_says_nothing(seen):
     assert score(seen, mapped_from(vector_table([]))) == GraphScore()
 
 

@@ -10,16 +10,12 @@ from hypothesis import strategies as st
 
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.sasgeo.conformal import PROTECTION, levels_of
-from sasgeo_bench.sasgeo.integrity import EVIDENCE, EVIDENCE_NAMES, Modes, evidence_of
+from sasgeo_bench.sasgeo.integrity import EVIDENCE, EVIDENCE_NAMES, evidence_of
 from sasgeo_bench.search.plan import Null
 from sasgeo_bench.texts import MOST_DIAGNOSTICS
+from tests.sasgeo.simulated import modes_of
 
 OF_MODES = ("margin_nats", "posterior_entropy_nats", "modes_above", "spread_m", "class_agreement")
-
-
-def modes_of(positions_m, by_class, **changes):
-    said = {"positions_m": np.array(positions_m, float), "by_class": np.array(by_class, float), "sigma_m": 2.0}
-    return Modes(**(said | changes))
 
 
 def drawn(seed, count=5):

@@ -20,16 +20,9 @@ def test_by_hand():
     )
     share = 2 / (2 + HALF_NODES)
     assert terms == pytest.approx(np.array([[4.0, -8.0, 1.5 * share, -1.0], [2.0, 1.0, -0.5 * share, 0.0]]))
-
-
-def test_a_graph_without_nodes_says_nothing():
-    terms = columns(np.ones((3, 2)), np.array([5.0, -5.0, 0.0]), Blend(), nodes=0)
-    assert not terms[:, 2].any()
-
-
-def test_without_a_graph_the_raster_decides_alone():
+    assert not columns(np.ones((3, 2)), np.array([5.0, -5.0, 0.0]), Blend(), nodes=0)[:, 2].any()
     by_class = np.array([[2.0, -4.0], [1.0, 0.5]])
-    assert (columns(by_class, None, Blend(), nodes=9) == by_class).all()
+    assert (columns(by_class, None, Blend(), nodes=9) == by_class).all()  # without a graph
 
 
 def test_contradiction_is_never_covered_up():

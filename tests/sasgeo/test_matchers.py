@@ -83,14 +83,11 @@ def whole(tiny):
     return prepared(Sasgeo, tiny.region)
 
 
-@pytest.mark.parametrize("arm", ALL)
-def test_cards_are_full_and_say_who_learns(arm):
-    assert isinstance(arm(), Matcher)
-    assert isinstance(arm(), Learner) == (arm in LEARNERS)
-    assert arm.card.limits
-
-
-def test_switches_tell_the_arms_apart():
+def test_cards_are_full_and_say_who_learns_and_switches_tell_the_arms_apart():
+    for arm in ALL:
+        assert isinstance(arm(), Matcher)
+        assert isinstance(arm(), Learner) == (arm in LEARNERS)
+        assert arm.card.limits
     assert len({arm.switches for arm in ALL}) == len(ALL) - 1
     assert SasgeoPrior.switches == Sasgeo.switches  # it is told apart by what it learns: nothing
     assert len({arm.card.name for arm in ALL}) == len(ALL)

@@ -152,24 +152,11 @@ def test_no_comment_of_the_scorer_speaks_of_what_the_generator_does(scorer):
     assert quotes(scorer) == []
 
 
-@pytest.mark.parametrize(
-    ("theirs", "ours"),
-    [
-        ("_WAVELENGTH_M: Final = 90.0", "REACH_M: Final = 90"),
-        ("@dataclass\nclass Noise:\n    shift_m: float = 1.5", "@dataclass\nclass Rules:\n    gate_m: float = 1.5"),
-        ("SPANS_M = (60.0, 150.0)", "FAR_M = 150.0"),
-        ("MISSED_SHARE: Final = 0.1", "HIT_SHARE: Final = 0.1"),
-    ],
-)
-def test_a_made_up_shared_parameter_is_found(theirs, ours):
-    assert len(shared({"sasgeo/a.py": ours}, {"tasks/suites/b.py": theirs})) == 1
-
-
-def test_other_units_other_values_and_zero_are_not_shared():
+def test_a_made_up_shared_parameter_or_quote_is_found_and_others_are_not():
+    theirs = "_WAVELENGTH_M: Final = 90.0\n@dataclass\nclass Noise:\n    shift_m: float = 1.5\nSPANS_M = (60.0, 150.0)"
+    ours = "REACH_M: Final = 90\n@dataclass\nclass Rules:\n    gate_m: float = 1.5\nFAR_M = 150.0"
+    assert len(shared({"sasgeo/a.py": ours}, {"tasks/suites/b.py": theirs})) == 3
     ours = "A_M: Final = 5.0\nB_DEG: Final = 7.0\nC_M: Final = 0.0\ncount: int = 7"
     assert shared({"a.py": ours}, {"b.py": "A_DEG: Final = 5.0\nB_M: Final = 7.0\nC_M: Final = 0.0"}) == {}
-
-
-def test_a_made_up_quote_is_found_and_code_is_not_read():
     files = {"a.py": 'x = warped  # 15 m of a warp\n\n\ndef f():\n    """Close gaps."""\n    return gap\n'}
-    assert len(quotes(files)) == 2
+    assert len(quotes(files)) == 2  # code is not read

@@ -95,10 +95,11 @@ def test_short_gaps_of_a_detector_are_closed_and_longer_ones_are_not():
     assert [name for name, *_ in found(ObservedGraph.make(view(), halves(9.0)))] == ["dead_end", "dead_end"]
 
 
-def test_an_empty_or_unknown_view_has_no_nodes():
+def test_an_empty_or_unknown_view_has_no_nodes_and_no_lines():
     assert len(ObservedGraph.make(view()).nodes) == 0
     blind = view(**FORK)
     assert len(ObservedGraph.make(blind.replace(np.full_like(blind.cells, UNKNOWN))).nodes) == 0
+    assert len(middle_lines(np.zeros((9, 9), dtype=bool), 1.0)) == len(lines_of_mask(view())) == 0
 
 
 # Thinned masks
@@ -115,8 +116,3 @@ def test_a_crossroads_of_masks_has_four_lines_and_no_spur():
     lines = lines_of_mask(cross)
     assert sorted(shapely.length(lines.geometry.to_numpy()).round(-1).tolist())[-4:] == [60.0] * 4
     assert len(lines) <= 5  # where the middle lines meet in two forks there is a short piece between
-
-
-def test_nothing_is_thinned_to_nothing():
-    assert len(middle_lines(np.zeros((9, 9), dtype=bool), 1.0)) == 0
-    assert len(lines_of_mask(view())) == 0

@@ -17,14 +17,9 @@ from sasgeo_bench.sasgeo.conformal import (
     separation_level,
     sigmas,
 )
-from sasgeo_bench.sasgeo.integrity import Modes
+from tests.sasgeo.simulated import modes_of
 
 SIGMA_M = 2.0
-
-
-def modes_of(positions_m, by_class, **changes):
-    said = {"positions_m": np.array(positions_m, float), "by_class": np.array(by_class, float), "sigma_m": SIGMA_M}
-    return Modes(**(said | changes))
 
 
 AGREED = modes_of([[0, 0], [0, 80], [60, 0]], [[9, 8, 7], [1, 2, 1], [2, 1, 0]])

@@ -55,19 +55,12 @@ def test_a_map_is_read_in_larger_cells_and_lines_fade(tiny, field):
     assert (field.layers[road] >= plain.layers[road]).all()
 
 
-def test_the_parts_by_class_make_up_the_score(tiny, field, asked):
+def test_the_parts_by_class_make_up_the_score_levelled_or_not(tiny, field, asked):
     for query, pose in asked[:4]:
-        view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
-        whole = score_at(field, view.template(), pose)
-        assert view.by_class(field, [pose]).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
-
-
-def test_the_true_place_scores_high_in_every_class_it_shows(tiny, field, asked):
-    for query, pose in asked[:4]:
-        view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
-        away = replace(pose, easting_m=pose.easting_m + 60.0, northing_m=pose.northing_m - 45.0)
-        here, there = view.by_class(field, [pose, away])
-        assert here.sum() > there.sum()
+        plain = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
+        for view in (plain, plain.levelled()):
+            whole = score_at(field, view.template(), pose)
+            assert view.by_class(field, [pose]).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
 
 
 def test_noise_free_views_are_found_on_a_town(tiny, field):
@@ -103,13 +96,6 @@ def test_classes_that_one_side_lacks_are_left_out(tiny, asked):
     assert not RasterView.of(strange, tiny.region.classes, gains).weights[0].any()
 
 
-def test_a_blind_view_says_nothing(tiny, asked):
-    seen = asked[0][0].evidence
-    blind = seen.replace(np.full_like(seen.cells, UNKNOWN))
-    view = RasterView.of(blind, tiny.region.classes, gains_of(tiny.region))
-    assert not len(view.template().active)
-
-
 def test_exponents_scale_each_class(tiny, field, asked):
     query, pose = asked[0]
     view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region))
@@ -143,26 +129,15 @@ def test_levelled_where_a_class_lies_still_counts_and_unknown_cells_say_nothing(
     assert np.abs(wide.weights[0] - level.weights[0][:, :100]).max() < 0.1
 
 
-def test_levelled_parts_make_up_the_score(tiny, field, asked):
-    query, pose = asked[0]
-    view = RasterView.of(query.evidence, tiny.region.classes, gains_of(tiny.region)).levelled()
-    whole = score_at(field, view.template(), pose)
-    assert view.by_class(field, [pose]).sum() == pytest.approx(whole, rel=1e-3, abs=1.0)
-
-
-def test_damped_much_of_a_class_says_little_more_than_some():
+def test_damped_much_of_a_class_says_little_more_than_some_whatever_the_size_of_the_cells():
     few, many = (raster_view(np.full((side, side), 1.0), np.full((side, side), -0.5)) for side in (10, 1000))
     few, many = (view.damped() for view in (few, many))
     share = few.known.sum() / few.weights.sum(), many.known.sum() / many.weights.sum()
     assert share == pytest.approx((-0.5, -0.5))
     assert few.weights.sum() == pytest.approx(100, rel=0.04)
     assert many.weights.sum() == pytest.approx(REPEATED, rel=0.04)
-
-
-def test_damped_the_size_of_the_cells_does_not_matter():
-    fine = raster_view(np.full((400, 400), 1.0), np.zeros((400, 400)))
-    coarse = replace(raster_view(np.full((200, 200), 4.0), np.zeros((200, 200))), cell_size_m=2.0)
-    assert coarse.damped().weights.sum() == pytest.approx(fine.damped().weights.sum(), rel=1e-4)
+    coarse = replace(raster_view(np.full((500, 500), 4.0), np.zeros((500, 500))), cell_size_m=2.0)
+    assert coarse.damped().weights.sum() == pytest.approx(many.weights.sum(), rel=1e-4)
 
 
 # Vectors burnt as a view

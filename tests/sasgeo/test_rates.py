@@ -77,16 +77,12 @@ def test_a_map_of_one_age_tells_the_detector_and_leaves_ageing_to_the_hand():
     assert fitted.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-2)
 
 
-def test_an_empty_train_part_is_refused():
-    with pytest.raises(ConfigError, match="train part is empty"):
-        fit_rates([])
-
-
-def test_classes_that_differ_are_refused():
+def test_an_empty_train_part_and_classes_that_differ_are_refused():
     one = np.ones((1, 2, 2), dtype=np.uint8)
     tallies = [tally((name,), one, 0 * one, age_years=0.0, block="a") for name in ("building", "railway")]
-    with pytest.raises(ConfigError, match="different classes"):
-        fit_rates(tallies)
+    for given, words in (([], "train part is empty"), (tallies, "different classes")):
+        with pytest.raises(ConfigError, match=words):
+            fit_rates(given)
 
 
 @pytest.mark.parametrize(

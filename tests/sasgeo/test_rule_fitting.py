@@ -6,7 +6,7 @@ import pytest
 
 from sasgeo_bench.sasgeo.graph import START, Matching
 from sasgeo_bench.sasgeo.nodes import INDEX, NODE_KINDS
-from sasgeo_bench.sasgeo.rule_fitting import BLANK, fit_rules
+from sasgeo_bench.sasgeo.rule_fitting import fit_rules
 
 MANY = 20_000
 
@@ -43,8 +43,3 @@ def test_an_outcome_that_was_never_seen_keeps_its_starting_value_however_many_ot
     rules = fit_rules([matching(9, degrees=(80, 0, 0))], [matching(9, degrees=(9000, 0, 0))])
     assert rules.degrees[0] == pytest.approx(0.0, abs=0.01)
     assert rules.degrees[1:] == pytest.approx(START.degrees[1:], rel=0.1)
-
-
-def test_degrees_say_nothing_while_rules_are_estimated():
-    assert BLANK.degrees == (0.0, 0.0, 0.0)
-    assert BLANK.gate_m == START.gate_m

@@ -6,7 +6,7 @@ import pytest
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally
-from sasgeo_bench.sasgeo.weights import SEASON_SHARES, SEASONS, by_hand, fit_season, likelihood_gains
+from sasgeo_bench.sasgeo.weights import SEASON_SHARES, by_hand, fit_season
 
 RATES = ClassRates(hit=0.9, false_alarm=0.01, missing=0.01, vanish_per_year=0.03, appear_per_year=0.01, mapped=0.1)
 
@@ -39,16 +39,3 @@ def test_a_season_that_nobody_tells_changes_nothing():
     classes = load_taxonomy().names
     assert (by_hand("", classes) == 1.0).all()
     assert (by_hand("monsoon", classes) == 1.0).all()
-
-
-def test_hands_name_classes_that_exist_and_shares():
-    names = set(load_taxonomy().names)
-    assert set(SEASONS) == {"leaf_on", "snow", "low_water", "harvest"}
-    for factors in SEASON_SHARES.values():
-        assert set(factors) <= names
-        assert all(0 < factor < 1 for factor in factors.values())
-
-
-def test_what_a_season_hides_is_missed_less():
-    plain, white = (likelihood_gains([RATES], age_years=0.0, persists=[factor]) for factor in (1.0, 0.3))
-    assert plain.missed[0] < white.missed[0] < 0

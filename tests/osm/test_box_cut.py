@@ -36,28 +36,24 @@ def source_of(path):
     return read_extract(path, GRID).coverage_source
 
 
-def test_a_village_amid_bare_ground_whose_roads_leave_on_all_sides_fills_its_box(tmp_path):
+def test_a_village_whose_roads_leave_on_all_sides_fills_its_box_and_one_of_which_a_side_is_crossed_by_none_may_not(
+    tmp_path,
+):
     reading = read_extract(written(tmp_path / "a.osm", *village(), *ACROSS, *UP), GRID)
     assert reading.coverage_source == "header box"
     assert reading.coverage.area == pytest.approx(GRID.rows * GRID.cols * 100, rel=0.02)
+    assert source_of(written(tmp_path / "a.osm", *village(), *ACROSS)) == "estimated"
 
 
-def test_where_roads_end_inside_the_extract_was_cut_along_a_border(tmp_path):
+def test_where_roads_end_inside_the_extract_was_cut_along_a_border_but_not_where_one_does_by_mistake(tmp_path):
     ended = [(MAJOR, [(-1500, 0), (-400, 0), (0, 0), (400, 0), (1500, 0)]),
              (MAJOR, [(0, -1500), (0, -400), (0, 0), (0, 400), (0, 1500)])]  # fmt: skip
     crossing = [({"landuse": "forest"}, [(x, y), (x + 50, y), (x + 50, y + 50), (x, y + 50), (x, y)])
                 for x, y in ((-2025, 0), (1975, 0), (0, -2025), (0, 1975))]  # fmt: skip
     assert source_of(written(tmp_path / "a.osm", *village(), *ended, *crossing)) == "estimated"
-
-
-def test_one_road_that_ends_by_mistake_does_not_make_a_border(tmp_path):
     ended = (MAJOR, [(400, 400), (1200, 1300)])
     more = [(MAJOR, [(-400, 200), (-2300, 900)]), (MAJOR, [(400, -300), (2400, -1200)])]
     assert source_of(written(tmp_path / "a.osm", *village(), *ACROSS, *UP, *more, ended)) == "header box"
-
-
-def test_a_side_that_nothing_crosses_leaves_the_box_in_doubt(tmp_path):
-    assert source_of(written(tmp_path / "a.osm", *village(), *ACROSS)) == "estimated"
 
 
 def test_a_stream_may_begin_anywhere_and_must_not_end(tmp_path):

@@ -35,18 +35,16 @@ def test_the_estimate_follows_an_outline_within_two_cells():
     assert shapely.contains(shapely.buffer(COUNTRY, 300), found)
 
 
-def test_a_lake_within_is_covered_and_a_road_kept_whole_beyond_the_edge_is_not():
+def test_a_lake_within_is_covered_and_a_road_kept_whole_beyond_the_edge_and_leftovers_far_away_are_not():
     lake = shapely.Point(0, 0).buffer(1200)
     road = lonlat_of([(4000 + step, 500) for step in range(0, 4000, 40)])
     found = metres_of(estimate_coverage(np.concatenate((scattered(COUNTRY - lake), road))))
     assert shapely.contains_xy(found, 0, 0)
     assert not shapely.contains_xy(found, 7000, 500)
-
-
-def test_leftovers_of_relations_far_away_are_cut_off():
     island = lonlat_of([(20_000 + 40 * step, 40 * step) for step in range(5)])
     found = estimate_coverage(np.concatenate((scattered(COUNTRY), island)))
     assert metres_of(found).bounds[2] < 6000
+    assert estimate_coverage(np.zeros((0, 2))).is_empty
 
 
 def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():
@@ -57,16 +55,6 @@ def test_of_an_extract_cut_along_a_border_the_header_is_only_the_frame():
     assert source == "estimated"
     assert not shapely.contains_xy(metres_of(area), -2500, 2500)
     assert shapely.contains(shapely.box(west, south, east, north), area)
-
-
-def test_what_the_region_file_states_overrules_all():
-    stated = shapely.box(9, 47, 9.01, 47.01)
-    header = shapely.box(8, 46, 10, 48)
-    assert choose_coverage(scattered(COUNTRY), stated=stated, header=header) == (stated, "region file")
-
-
-def test_no_data_covers_nothing():
-    assert estimate_coverage(np.zeros((0, 2))).is_empty
 
 
 def test_a_place_on_both_sides_of_the_antimeridian_is_estimated_side_by_side():

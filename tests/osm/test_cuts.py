@@ -36,18 +36,15 @@ def test_a_way_that_leaves_straight_to_the_nearest_edge_runs_over_unknown_ground
     assert known.length == pytest.approx(max(way_out.length - LONGEST_M - 0.5, 0), abs=0.5)
 
 
-def test_a_node_on_the_edge_makes_nothing_unknown():
-    assert reach(shapely.Point(0, 500)).is_empty
-    assert reach(shapely.Point(-30, 500)).is_empty
-
-
-def test_between_the_gap_of_a_closed_way_and_the_edge_all_is_unknown():
+def test_between_the_gap_of_a_closed_way_and_the_edge_all_is_unknown_and_a_node_on_it_makes_nothing_so():
     along = reach(shapely.LineString([(10, 500), (10, 900)]))
     assert along.contains(shapely.box(1, 510, 9, 890))
     assert not shapely.contains_xy(along, 30, 700)
     corner = reach(shapely.LineString([(5, 1700), (400, 1995)]))
     assert shapely.contains_xy(corner, 5, 1995)
     assert not shapely.contains_xy(corner, 300, 1700)
+    assert reach(shapely.Point(0, 500)).is_empty
+    assert reach(shapely.Point(-30, 500)).is_empty
 
 
 def cut_file(tmp_path, *, nodes_kept=True):
@@ -74,7 +71,7 @@ def cut_file(tmp_path, *, nodes_kept=True):
     return path
 
 
-def test_a_town_cut_out_of_a_larger_extract_is_unknown_where_its_streets_were_cut(tmp_path):
+def test_a_town_cut_out_of_a_larger_extract_is_unknown_where_its_streets_were_cut_and_a_whole_one_nowhere(tmp_path):
     reading = read_extract(cut_file(tmp_path, nodes_kept=False), GRID)
     assert reading.coverage_source == "header box"
     assert reading.cuts == {"ways that lack some nodes": 40, "ways that lack all nodes": 2}
@@ -82,9 +79,6 @@ def test_a_town_cut_out_of_a_larger_extract_is_unknown_where_its_streets_were_cu
     assert reading.unknown_m2[CUT] == pytest.approx(80 * 40 * 14, rel=0.2)
     assert not shapely.contains_xy(reading.coverage, 500_240, 5_205_164)
     assert shapely.contains_xy(reading.coverage, 500_100, 5_205_164)
-
-
-def test_where_no_way_is_cut_the_box_stays_whole(tmp_path):
     reading = read_extract(cut_file(tmp_path), GRID)
     assert CUT not in reading.unknown_m2
     assert "ways that lack some nodes" not in reading.cuts

@@ -130,13 +130,10 @@ def test_the_boxes_of_several_downloads_are_one_mapped_area_and_one_in_a_comment
     assert len(read_header(path).boxes_lonlat) == 2
 
 
-def test_a_box_that_holds_none_of_the_data_is_named(tmp_path):
+def test_a_box_that_holds_none_of_the_data_is_named_and_one_in_the_older_form_is_a_box(tmp_path):
     far = '<bounds minlat="9" minlon="47" maxlat="9.01" maxlon="47.01"/>'
     with pytest.raises(CoverageError, match=r"nothing within its own bounds, \[47.0000, 9.0000, .* remove them"):
         read_extract(Town().write(tmp_path / "a.osm", far), GRID)
-
-
-def test_a_box_in_the_older_form_is_a_box(tmp_path):
     (west, south), (east, north) = place(-320, -320), place(320, 320)
     old = f'<bound box="{south},{west},{north},{east}" origin="Osmosis"/>'
     assert read_header(Town().write(tmp_path / "a.osm", old)).boxes_lonlat == (

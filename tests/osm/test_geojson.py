@@ -155,13 +155,16 @@ def test_an_area_of_ogr2ogr_has_the_id_of_a_relation_or_of_a_way(kind, propertie
     assert identity_of({"properties": properties, "geometry": geometry}, is_ogr=True) == identity
 
 
-def test_a_relation_and_a_way_of_one_number_are_two_objects(tmp_path):
+def test_objects_of_one_number_or_two_classes_are_kept_apart(tmp_path):
     inside = shapely.box(WEST + 12, SOUTH + 12, WEST + 20, SOUTH + 18)
     relation = feature(HOUSE, osm_id="7", osm_way_id=None, building="yes")
     way = feature(inside, osm_id=None, osm_way_id="7", building="yes")
     found = read(written(tmp_path / "a.geojson", relation, way), tags={}).features
     assert found["osm_type"].tolist() == ["way", "relation"]
     assert found.geometry.area.tolist() == pytest.approx([inside.area, HOUSE.area], rel=1e-2)
+    both = [feature(HOUSE, osm_id=7, building="yes"), feature(HOUSE, osm_id=7, landuse="grass")]
+    reading = read(written(tmp_path / "a.geojson", *both), tags={}, classes=("building", "green"))
+    assert reading.features["class"].tolist() == ["building", "green"]
 
 
 def closed(shape):
@@ -230,23 +233,18 @@ def test_a_closed_way_that_comes_as_a_line_and_as_an_area_is_one_object(tags, cl
     assert reading.drops == {"Polygon without a class": 1}
 
 
-def test_an_object_of_two_classes_in_two_features_keeps_both(tmp_path):
-    both = [feature(HOUSE, osm_id=7, building="yes"), feature(HOUSE, osm_id=7, landuse="grass")]
-    reading = read(written(tmp_path / "a.geojson", *both), tags={}, classes=("building", "green"))
-    assert reading.features["class"].tolist() == ["building", "green"]
-
-
-def test_a_byte_order_mark_is_passed_over(tmp_path):
+def test_a_byte_order_mark_is_passed_over_and_a_file_with_hardly_a_tag_or_of_elsewhere_says_so(tmp_path):
     path = written(tmp_path / "a.geojson", feature(HOUSE))
     path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
     assert len(read(path).features) == 1
-
-
-def test_a_file_with_hardly_a_tag_says_so(tmp_path):
     few = [feature(HOUSE, building="yes"), *(feature(SHED, kind="building") for _ in range(20))]
     reading = read(written(tmp_path / "a.geojson", *few), tags={})
     assert reading.warnings[0].startswith("1 of 21 features became objects of a class (20 x Polygon without a class)")
     assert read(written(tmp_path / "b.geojson", *few[:20]), tags={}).warnings == ()
+    turned = feature(HOUSE)
+    turned["geometry"] = shapely.geometry.mapping(shapely.transform(to_lonlat(HOUSE), lambda points: points[:, ::-1]))
+    with pytest.raises(CoverageError, match=r"move or enlarge the bounds \(what it holds lies within \[47"):
+        read(written(tmp_path / "a.geojson", turned))
 
 
 BAD = {
@@ -285,13 +283,6 @@ def test_longitude_and_latitude_have_many_names(crs, is_lonlat, tmp_path):
         read(path)
 
 
-def test_a_map_that_lies_elsewhere_says_where(tmp_path):
-    turned = feature(HOUSE)
-    turned["geometry"] = shapely.geometry.mapping(shapely.transform(to_lonlat(HOUSE), lambda points: points[:, ::-1]))
-    with pytest.raises(CoverageError, match=r"move or enlarge the bounds \(what it holds lies within \[47"):
-        read(written(tmp_path / "a.geojson", turned))
-
-
 @pytest.mark.parametrize("text", BAD)
 def test_a_broken_file_is_refused_in_one_line(text, tmp_path):
     (tmp_path / "bad.geojson").write_text(text)
@@ -300,15 +291,12 @@ def test_a_broken_file_is_refused_in_one_line(text, tmp_path):
     assert "bad.geojson" in str(found.value)
 
 
-def test_a_region_of_geojson_must_say_its_classes_and_where_it_is_complete(tmp_path):
+def test_a_region_of_geojson_must_say_its_classes_which_are_some_and_where_it_is_complete(tmp_path):
     hamlet = make_hamlet(tmp_path)
     content = hamlet.spec().model_dump()
     for lacking in ("classes", "coverage_parts_lonlat"):
         with pytest.raises(ValueError, match="say which by classes and by coverage_lonlat or coverage_parts"):
             type(hamlet.spec())(**{name: value for name, value in content.items() if name != lacking})
-
-
-def test_a_class_that_is_none_is_refused(tmp_path):
     content = make_hamlet(tmp_path).spec().model_dump() | {"classes": ["buildings"]}
     with pytest.raises(ConfigError, match="'buildings', which is no class: there are road_major"):
         check_document(content, RegionFile, source="hamlet.toml")

@@ -63,12 +63,9 @@ def found(history, name="building", span="whole"):
 # Dates and order
 
 
-def test_states_come_in_the_order_of_their_dates_whatever_that_of_the_files(towns):
+def test_states_come_in_the_order_of_their_dates_or_have_the_dates_given_in_the_order_of_the_files(towns):
     paths = [item.path for item in towns]
     assert date_extracts(paths) == date_extracts(paths[::-1]) == tuple(towns)
-
-
-def test_dates_given_are_those_of_the_files_in_their_order(towns):
     days = [dt.date(2021, 1, 1), dt.date(2020, 1, 1), dt.date(2019, 1, 1)]
     dated = date_extracts([item.path for item in towns], at=days)
     assert [item.path for item in dated] == [item.path for item in towns[::-1]]

@@ -65,15 +65,12 @@ def test_a_file_of_the_right_name_and_another_hash_is_passed_over(tmp_path):
     assert found.parent.name == "right"
 
 
-def test_a_wrong_hash_alone_is_told_with_both(tmp_path):
+def test_what_is_not_found_is_told_in_one_line_with_hashes_and_folders(tmp_path, cache):
     put(tmp_path / "wrong", b"other")
     with pytest.raises(ExtractError) as caught:
         find_extract(wanted(), folders=[tmp_path / "wrong"])
     assert SHA256 in str(caught.value)
     assert hashlib.sha256(b"other").hexdigest() in str(caught.value)
-
-
-def test_offline_one_line_names_the_file_its_hash_and_where_to_put_it(tmp_path, cache):
     with pytest.raises(ExtractError) as caught:
         find_extract(wanted(), folders=[tmp_path / "mine"])
     message = str(caught.value)

@@ -120,13 +120,10 @@ def test_a_group_of_houses_stays_a_group_of_houses(tmp_path):
     assert areas(reading) == {"building": [WHOLE]}
 
 
-def test_two_relations_with_one_outer_way_are_one_house_with_two_yards(tmp_path):
+def test_two_relations_with_one_outer_way_are_one_house_with_two_yards_and_with_an_open_one_two_woods(tmp_path):
     ways = [(SQUARE, HOUSE), (YARD, {}), (BAY, {})]
     relations = [(((1, "outer"), (hole, "inner")), BARE) for hole in (2, 3)]
     assert areas(read_extract(write(tmp_path / "a.osm", ways, *relations), GRID)) == {"building": [HOLED - 100]}
-
-
-def test_neighbours_that_share_an_open_outer_way_are_both_woods(tmp_path):
     east = [(100, 0), (200, 0), (200, 100), (100, 100)]
     west = [(100, 100), (0, 100), (0, 0), (100, 0)]
     ways = [(east, FOREST), (west, FOREST), ([(100, 0), (100, 100)], FOREST)]
@@ -153,11 +150,15 @@ def test_a_wall_on_a_relation_and_its_outer_ways_is_drawn_once(tmp_path):
     assert reading.features.geometry.length.tolist() == pytest.approx([200], rel=0.01)
 
 
-def test_what_lies_under_ground_on_the_outer_way_is_not_seen(tmp_path):
+def test_what_lies_under_ground_on_the_outer_way_is_not_seen_and_its_start_date_is_that_of_the_area(tmp_path):
     ways = [(SQUARE, HOUSE | {"location": "underground"}), (YARD, {}), (BESIDE, HOUSE)]
     reading = read_extract(write(tmp_path / "a.osm", ways, (((1, "outer"), (2, "inner")), BARE)), GRID)
     assert reading.features.sort_values("osm_type")["is_visible"].tolist() == [False, True]
     assert reading.hidden == {"location=underground": 1}
+    ways = [(SQUARE, HOUSE | {"start_date": "2015"}), (YARD, {})]
+    file = write(tmp_path / "a.osm", ways, (((1, "outer"), (2, "inner")), BARE))
+    started = read_lifecycle(file, epsg=32632).started
+    assert started[ObjectKey("relation", 1)] == started[ObjectKey("way", 1)]
 
 
 def test_an_outer_way_that_lacks_nodes_marks_a_gap_as_in_the_new_style(tmp_path):
@@ -185,13 +186,6 @@ def test_a_place_in_the_old_and_in_the_new_style_is_the_same_map(tmp_path):
     for table in tables[1:]:
         assert table.drop(columns="geometry").equals(tables[0].drop(columns="geometry"))
         assert table.geometry.geom_equals(tables[0].geometry).all()
-
-
-def test_the_start_date_of_an_outer_way_is_that_of_its_area(tmp_path):
-    ways = [(SQUARE, HOUSE | {"start_date": "2015"}), (YARD, {})]
-    file = write(tmp_path / "a.osm", ways, (((1, "outer"), (2, "inner")), BARE))
-    started = read_lifecycle(file, epsg=32632).started
-    assert started[ObjectKey("relation", 1)] == started[ObjectKey("way", 1)]
 
 
 @pytest.mark.parametrize("key", ["highway", "tourism", "place", "boundary", "building:part", "landcover"])

@@ -107,12 +107,6 @@ def test_an_inlet_is_sea_and_the_spit_in_it_land():
     assert not is_in(shore.land, 150, 300)
 
 
-def test_no_coast_is_no_sea_and_a_coast_outside_says_nothing():
-    assert len(find_shore([], FRAME).sea) == 0
-    beyond = find_shore(lines([(2000, 0), (2000, 900)]), FRAME)
-    assert (len(beyond.sea), len(beyond.land), beyond.unknown) == (0, 0, {})
-
-
 def test_around_a_small_gap_the_ground_is_unknown_and_the_rest_is_decided():
     shore = find_shore(lines([(-10, 500), (400, 500)], [(420, 500), (1010, 500)]), FRAME)
     assert set(shore.unknown) == {OPEN}
@@ -123,11 +117,18 @@ def test_around_a_small_gap_the_ground_is_unknown_and_the_rest_is_decided():
     assert not is_in([*shore.sea, *shore.land], 410, 505)
 
 
-def test_a_coast_that_ends_near_the_edge_goes_on_to_it():
+def test_a_coast_that_ends_near_the_edge_goes_on_to_it_and_a_loop_does_not_flood_the_land():
     shore = find_shore(lines([(30, 500), (970, 500)]), FRAME)
     assert area([shore.unknown[OPEN]]) < 2 * np.pi * 60 * 60
     assert is_in(shore.sea, 500, 400)
     assert is_in(shore.land, 500, 600)
+    loop = lines([(-10, 500), (500, 500), (502, 501), (501, 502), (500.5, 499), (1010, 500)])
+    shore = find_shore(loop, FRAME)
+    assert shore.unknown == {}
+    assert area(shore.land) == pytest.approx(500_000, rel=0.01)
+    assert len(find_shore([], FRAME).sea) == 0
+    beyond = find_shore(lines([(2000, 0), (2000, 900)]), FRAME)
+    assert (len(beyond.sea), len(beyond.land), beyond.unknown) == (0, 0, {})
 
 
 def test_coasts_that_contradict_each_other_leave_the_ground_between_them_unknown():
@@ -136,13 +137,6 @@ def test_coasts_that_contradict_each_other_leave_the_ground_between_them_unknown
     assert area([shore.unknown[CONTRARY]]) == pytest.approx(400_000)
     assert is_in(shore.sea, 500, 100)
     assert is_in(shore.land, 500, 900)
-
-
-def test_a_badly_drawn_loop_of_a_coast_does_not_flood_the_land():
-    loop = lines([(-10, 500), (500, 500), (502, 501), (501, 502), (500.5, 499), (1010, 500)])
-    shore = find_shore(loop, FRAME)
-    assert shore.unknown == {}
-    assert area(shore.land) == pytest.approx(500_000, rel=0.01)
 
 
 # In an extract
@@ -179,16 +173,13 @@ def test_the_sea_of_an_extract_is_water_without_a_date_of_its_own(tmp_path):
     assert is_wet[quay:, 50].all()
 
 
-def test_a_window_anywhere_has_the_cells_of_the_whole(tmp_path):
+def test_a_window_anywhere_has_the_cells_of_the_whole_at_sea_and_inland(tmp_path):
     path = coast_file(tmp_path, QUAY)
     whole = water_of(read_extract(path, GRID))
     for row, col, rows, cols in ((0, 0, 150, 350), (100, 0, 200, 350), (250, 200, 50, 150)):
         window = GRID.window(row, col, rows, cols)
         here = whole[row : row + rows, col : col + cols]
         np.testing.assert_array_equal(water_of(read_extract(path, window), window), here)
-
-
-def test_at_sea_all_is_water_and_inland_nothing_changes(tmp_path):
     path = coast_file(tmp_path, QUAY)
     offshore = Grid(epsg=32632, west_m=500_200.0, north_m=5_204_900.0, cell_size_m=2.0, rows=100, cols=100)
     assert (water_of(read_extract(path, offshore), offshore) == PRESENT).all()
@@ -210,14 +201,11 @@ def test_the_graph_and_the_history_know_no_sea(tmp_path):
 ISLE = [(-300, -300), (300, -300), (300, 300), (-300, 300), (-300, -300)]  # counter-clockwise: water around it
 
 
-def test_of_whole_islands_the_sea_around_them_is_mapped_too(tmp_path):
+def test_of_whole_islands_the_sea_around_them_is_mapped_too_and_not_where_a_coast_is_broken(tmp_path):
     path = coast_file(tmp_path, ISLE, towns=False, bounds="minlat='46.9' minlon='8.9' maxlat='47.1' maxlon='9.1'")
     reading = read_extract(path, GRID)
     assert reading.coverage_source == "estimated and islands"
     assert reading.coverage.area == pytest.approx(GRID.rows * GRID.cols * 4)
-
-
-def test_where_a_coast_is_broken_an_estimate_does_not_grow(tmp_path):
     far = "minlat='46.9' minlon='8.9' maxlat='47.1' maxlon='9.1'"
     reading = read_extract(coast_file(tmp_path, ISLE[:-1], bounds=far), GRID)
     assert reading.coverage_source == "estimated"

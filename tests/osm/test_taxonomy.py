@@ -111,18 +111,12 @@ def test_a_taxonomy_with_a_fault_is_refused(old, new, fault):
         parse_toml(text.replace(old, new) if old else text + new, Taxonomy, source="taxonomy.toml")
 
 
-def test_a_value_is_matched_whole():
+def test_a_value_is_matched_whole_and_what_no_rule_knows_is_named():
     assert line_classes(highway="primary_") == []
     assert line_classes(highway="xprimary") == []
     assert line_classes(bridge="no", highway="primary") == ["road_major"]
     assert area_classes(building="no") == []
     assert area_classes(building="anything else") == ["building"]
-
-
-def test_what_no_rule_knows_is_named():
     assert classify({"railway": "razed", "name": "x"}, load_taxonomy()).unknown == ("railway=razed",)
-
-
-def test_a_rule_needs_values_or_widths():
     with pytest.raises(ValueError, match="either values or widths"):
         Rule(key="highway", geometry="line")

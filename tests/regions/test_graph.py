@@ -101,19 +101,13 @@ def test_the_village_has_the_nodes_counted_by_hand(graph: MapGraph) -> None:
     assert graph.nodes["id"].tolist() == list(range(24))
 
 
-def test_intersections_have_the_degree_of_the_roads_that_meet(graph: MapGraph) -> None:
+def test_intersections_have_the_degree_of_their_roads_and_neither_clip_edge_nor_portal_is_a_dead_end(graph) -> None:
     assert places(graph, "intersection") == [(400, 500), (600, 260), (600, 300), (600, 500)]
     nodes = graph.nodes[graph.nodes["kind"] == "intersection"]
     assert nodes["degree"].tolist() == [3, 3, 3, 4]
     assert nodes["class"].tolist() == ["road_major", "road_minor", "road_minor", "road_major"]
     assert (nodes["osm_id"] == -1).all()
-
-
-def test_neither_the_clip_edge_nor_a_tunnel_portal_is_a_dead_end(graph: MapGraph) -> None:
     assert places(graph, "dead_end") == [(150, 800), (250, 800), (400, 700), (600, 950), (800, 400), (800, 600)]
-
-
-def test_without_bounds_the_ends_at_the_clip_edge_are_dead() -> None:
     found = places(build_graph(village()), "dead_end")
     assert {(0, 500), (1000, 500), (600, 0)} <= set(found)
     assert len(found) == 9
@@ -186,13 +180,10 @@ def test_houses_in_a_row_are_adjacent_to_the_next_and_areas_to_those_they_touch(
     ]
 
 
-def test_the_river_bends_twice_towards_the_inside(graph: MapGraph) -> None:
+def test_the_river_bends_twice_towards_the_inside_and_water_over_it_changes_nothing(graph) -> None:
     assert places(graph, "river_bend") == [(300, 50), (300, 200)]
     bends = graph.nodes[graph.nodes["kind"] == "river_bend"]
     np.testing.assert_allclose(bends["bearing_deg"], [315, 135], atol=0.1)
-
-
-def test_water_over_a_river_changes_nothing_along_it(graph: MapGraph) -> None:
     water = table(area(99, "water", 280, 0, 1000, 300))
     wet = build_graph(pd.concat([village(), water], ignore_index=True), bounds_m=BOUNDS_M)
     for kind in ("river_bend", "road_water_crossing"):
@@ -207,16 +198,13 @@ def test_edges_have_the_distance_and_bearing_from_source_to_target(graph: MapGra
     assert (edge["distance_m"], edge["bearing_deg"]) == (450.0, 180.0)
 
 
-def test_columns_have_the_types_of_the_schema_even_when_empty(graph: MapGraph) -> None:
+def test_columns_have_the_types_of_the_schema_even_when_empty_and_others_are_refused(graph) -> None:
     for found in (graph, build_graph(table())):
         assert {name: str(kind) for name, kind in found.nodes.dtypes.items() if name != "geometry"} == NODE_DTYPES
         assert {name: str(kind) for name, kind in found.edges.dtypes.items()} == EDGE_DTYPES
         assert found.nodes.crs == village().crs
     empty = build_graph(table())
     assert (len(empty.nodes), len(empty.edges)) == (0, 0)
-
-
-def test_a_table_of_another_shape_is_refused() -> None:
     with pytest.raises(ShapeError, match="columns"):
         build_graph(village().drop(columns="level"))
 
@@ -230,16 +218,13 @@ def test_a_tram_in_its_street_makes_no_level_crossing_but_where_it_leaves_it_may
     assert places(build_graph(table(street, cut, across)), "level_crossing") == [(100, 40)]
 
 
-def test_a_culvert_under_a_road_is_no_crossing_and_a_ford_is_one() -> None:
+def test_a_culvert_under_a_road_is_no_crossing_and_a_ford_is_one_and_a_path_may_end_on_a_square() -> None:
     road = line(1, "road_minor", (0, 0), (50, 0), (100, 0))
     culvert = line(2, "waterway", (25, -50), (25, 50), is_visible=False, is_tunnel=True)
     ford = line(3, "waterway", (50, -50), (50, 0), (50, 50))
     graph = build_graph(table(road, culvert, ford))
     assert places(graph, "road_water_crossing") == [(50, 0)]
     assert only(graph, "road_water_crossing")["level_difference"] == 0
-
-
-def test_a_path_that_ends_on_a_square_is_no_dead_end() -> None:
     path = line(1, "path_track", (0, 5), (50, 0))
     square = {"osm_id": 2, "class": "road_minor", "geometry": shapely.Polygon([(50, 0), (90, 0), (90, 40), (50, 40)])}
     assert places(build_graph(table(path, square)), "dead_end") == [(0, 5)]

@@ -82,15 +82,12 @@ def test_its_pixels_fit_into_the_cells_of_the_map_and_a_line_says_what_it_shows(
     assert text.endswith("(c) somebody with a drone (CC-BY-4.0), may be passed on")
 
 
-def test_the_offset_of_the_picture_is_measured(built):
+def test_the_offset_of_the_picture_is_measured_and_of_one_of_elsewhere_none_is_given(built, hamlet, tmp_path):
     offset = read_manifest(built).imagery.offset
     assert (offset.east_m, offset.north_m) == pytest.approx(OFF_M, abs=0.15)
     assert offset.east_interval_m[0] - 0.1 <= OFF_M[0] <= offset.east_interval_m[1] + 0.1
     assert offset.residual_m < 0.5
     assert offset.tiles >= 9
-
-
-def test_of_a_picture_of_elsewhere_no_offset_is_given(hamlet, tmp_path):
     other = make_hamlet(tmp_path / "other", seed=8)
     shutil.copy(hamlet.folder / "houses.geojson", other.folder / "houses.geojson")
     assert read_manifest(build(other, tmp_path)).imagery.offset is None
@@ -114,16 +111,16 @@ def test_a_coarser_window_is_the_mean_of_the_finer_one(built):
     assert np.abs(coarse.rgb - means).mean() < 4  # JPEG
 
 
-def test_beyond_the_imagery_nothing_is_known(built):
+def test_beyond_the_imagery_nothing_is_known_and_a_window_of_too_many_pixels_is_refused(built, tiny):
     window = read_imagery(built).read((WEST - 10, SOUTH, WEST + 10, SOUTH + 20), gsd_m=1.0)
     assert not window.is_known[:, :10].any()
     assert window.is_known[:, 10:].all()
     assert (window.rgb[:, :10] == 0).all()
-
-
-def test_a_window_of_too_many_pixels_is_refused(built):
     with pytest.raises(ImageryError, match="read a smaller one, or a coarser gsd_m"):
         read_imagery(built).read((0.0, 0.0, 1e5, 1e5))
+    assert tiny.region.imagery is None
+    assert read_imagery(tiny.map_folder) is None
+    assert '"imagery"' not in (tiny.map_folder / "region.json").read_text()
 
 
 def test_reading_the_region_opens_no_pixel_and_a_changed_file_is_found(built, tmp_path):
@@ -134,12 +131,6 @@ def test_reading_the_region_opens_no_pixel_and_a_changed_file_is_found(built, tm
         read_imagery(mine)
     with pytest.raises(StoreError, match="build the region again"):
         read_region(mine).imagery.read((WEST, SOUTH, WEST + 10, SOUTH + 10))
-
-
-def test_a_region_without_pictures_has_no_imagery(tiny):
-    assert tiny.region.imagery is None
-    assert read_imagery(tiny.map_folder) is None
-    assert '"imagery"' not in (tiny.map_folder / "region.json").read_text()
 
 
 def test_a_second_build_is_skipped_without_its_pictures_until_they_change(hamlet, built):
@@ -166,12 +157,18 @@ def test_a_hole_of_one_colour_is_no_picture_but_a_small_white_roof_is(hamlet, tm
     assert imagery.record.share == pytest.approx(1 - hole_m2 / 344**2, abs=1e-3)
 
 
-def test_a_picture_that_is_nowhere_is_named_with_the_places_to_put_it(hamlet, tmp_path, monkeypatch):
+def test_a_picture_that_is_nowhere_or_has_another_hash_is_named_with_the_places_to_put_it(
+    hamlet, tmp_path, monkeypatch
+):
     monkeypatch.setenv("SASGEO_IMAGERY", str(tmp_path / "named"))
     with pytest.raises(
         ImageryError, match=r"mosaic.tif .* was not found: put it into .*named.* --imagery or SASGEO_IMAG"
     ):
         plan_build(hamlet.spec(), out=tmp_path, extract_folders=[hamlet.folder])
+    spec = hamlet.spec()
+    (tmp_path / "mosaic.tif").write_bytes(b"other")
+    with pytest.raises(ImageryError, match="none of those accepted"):
+        plan_build(spec, out=tmp_path, extract_folders=[hamlet.folder], imagery_folders=[tmp_path])
 
 
 def test_pictures_are_found_one_folder_deeper_and_beside_the_extracts(hamlet, tmp_path):
@@ -181,13 +178,6 @@ def test_pictures_are_found_one_folder_deeper_and_beside_the_extracts(hamlet, tm
     shutil.copy(hamlet.folder / "mosaic.tif", tmp_path / "imagery" / "hamlet")
     plan = plan_build(hamlet.spec(), out=tmp_path, extract_folders=[tmp_path / "osm"])
     assert plan.pictures[0].path == tmp_path / "imagery" / "hamlet" / "mosaic.tif"
-
-
-def test_a_picture_with_another_hash_is_not_taken(hamlet, tmp_path):
-    spec = hamlet.spec()
-    (tmp_path / "mosaic.tif").write_bytes(b"other")
-    with pytest.raises(ImageryError, match="none of those accepted"):
-        plan_build(spec, out=tmp_path, extract_folders=[hamlet.folder], imagery_folders=[tmp_path])
 
 
 GROUND = np.full((3, 64, 64), 90, dtype=np.uint8)
@@ -241,15 +231,12 @@ def test_a_truncated_picture_is_refused_and_an_older_region_stays(hamlet, built,
     assert [path.name for path in (out / "regions").iterdir() if "partial" in path.name] == []
 
 
-def test_imagery_that_must_not_be_passed_on_is_refused(hamlet, tmp_path):
+def test_imagery_must_say_whether_it_may_be_passed_on_and_is_refused_where_not(hamlet, tmp_path):
     folder = build(hamlet.but(publish=False), tmp_path)
     with pytest.raises(
         StoreError, match=r"publish = false .*: leave hamlet out, or build it .* without \[\[imagery\]\]"
     ):
         check_publishable(folder, read_manifest(folder))
-
-
-def test_an_entry_must_say_whether_it_may_be_published(hamlet):
     with pytest.raises(ConfigError, match=r"'imagery.1.publish' is missing"):
         hamlet.but(extra='[[imagery]]\nfile = "b.tif"\n').spec()
 

@@ -64,8 +64,11 @@ def written(tmp_path_factory):
     return path
 
 
-def test_what_is_read_is_what_was_burnt(written):
+def test_what_is_read_is_what_was_burnt_and_a_window_is_read_alone(written):
     assert (read_layers(written) == burn_layers(paint(), GRID)).all()
+    found = read_layers(written, window=(100, 200, 50, 60))
+    assert (found == burn_layers(paint(), GRID)[:, 100:150, 200:260]).all()
+    assert not found.flags.writeable
 
 
 def test_ground_that_is_not_mapped_is_not_stored_and_reads_as_unknown(tmp_path):
@@ -108,12 +111,6 @@ def test_a_fault_while_a_level_is_painted_or_burnt_is_the_fault_of_the_build(tmp
         write_layers(tmp_path / "a.tif", GRID, CLASSES, lambda _: lambda window: window.rows // 0)
     with pytest.raises(KeyError, match="16"):
         write_layers(tmp_path / "b.tif", GRID, CLASSES, {}.__getitem__)
-
-
-def test_a_window_is_read_alone_and_cannot_be_changed(written):
-    found = read_layers(written, window=(100, 200, 50, 60))
-    assert (found == burn_layers(paint(), GRID)[:, 100:150, 200:260]).all()
-    assert not found.flags.writeable
 
 
 def test_the_file_says_what_it_holds_and_is_cloud_optimized(written):

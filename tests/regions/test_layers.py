@@ -57,10 +57,20 @@ def test_a_road_is_as_wide_as_tagged_at_every_cell_size(cell_size_m):
     assert abs(burnt_m2 / length_m - 7.5) < 0.05 * 7.5
 
 
-def test_several_classes_may_hold_in_one_cell():
+def test_several_classes_may_hold_in_one_cell_and_beyond_the_mapped_area_all_are_unknown():
     both = table(("water", shapely.box(0, 0, 50, 40), np.nan), ("bridge", shapely.LineString([(0, 20), (50, 20)]), 6.0))
     water, bridge = burn_layers(make_paint(both, ("water", "bridge"), EVERYWHERE), GRID)
     assert ((water == 1) & (bridge == 1)).sum() == 6 * 50
+    road = table(("road_major", shapely.LineString([(0, 20), (50, 20)]), 6.0))
+    layers = burn_layers(make_paint(road, ("road_major", "water"), shapely.box(0, 0, 25, 40)), GRID)
+    assert (layers[:, :, 25:] == OUTSIDE).all()
+    assert not (layers[:, :, :25] == OUTSIDE).any()
+    assert (layers[0, :, :25] == 1).sum() == 6 * 25
+    classes = ("water", "waterway")
+    water, river = burn_layers(make_paint(table(RIVER, LAKE), classes, shapely.box(0, 0, 30, 40)), GRID)
+    assert (river[:, 30:] == OUTSIDE).all()
+    assert (river[:, 20:30] == 0).all()
+    assert (water[:, 20:30] == 1).all()
 
 
 RIVER = ("waterway", shapely.LineString([(0, 20), (50, 20)]), 6.0)
@@ -102,14 +112,6 @@ def test_nothing_but_a_river_is_covered_and_what_covers_it_stays():
     np.testing.assert_array_equal(layers[2], np.where(alone[1] == 1, 0, alone[2]))
 
 
-def test_beyond_the_mapped_area_a_covered_river_is_unknown_too():
-    classes = ("water", "waterway")
-    water, river = burn_layers(make_paint(table(RIVER, LAKE), classes, shapely.box(0, 0, 30, 40)), GRID)
-    assert (river[:, 30:] == OUTSIDE).all()
-    assert (river[:, 20:30] == 0).all()
-    assert (water[:, 20:30] == 1).all()
-
-
 @given(shapes=st.lists(stars(), min_size=1, max_size=3), row=st.integers(0, 30), col=st.integers(0, 40))
 def test_a_window_of_a_covered_river_is_that_of_the_whole(shapes, row, col):
     rows = [("water", shape, np.nan) for shape in shapes]
@@ -118,14 +120,6 @@ def test_a_window_of_a_covered_river_is_that_of_the_whole(shapes, row, col):
     part = burn_layers(paint, GRID.window(row, col, 10, 10))
     assert (part == np.stack((river, water))[:, row : row + 10, col : col + 10]).all()
     assert not (river & water).any()
-
-
-def test_beyond_the_mapped_area_every_class_is_unknown():
-    road = table(("road_major", shapely.LineString([(0, 20), (50, 20)]), 6.0))
-    layers = burn_layers(make_paint(road, ("road_major", "water"), shapely.box(0, 0, 25, 40)), GRID)
-    assert (layers[:, :, 25:] == OUTSIDE).all()
-    assert not (layers[:, :, :25] == OUTSIDE).any()
-    assert (layers[0, :, :25] == 1).sum() == 6 * 25
 
 
 def test_overviews_do_not_break_thin_lines():

@@ -69,19 +69,13 @@ def test_crossings_are_those_that_a_test_of_every_pair_finds(pairs: list) -> Non
         np.testing.assert_allclose(found.en_m, expected, atol=1e-6)
 
 
-def test_a_way_with_a_vertex_on_another_crosses_it_once_and_one_that_ends_on_it_does_not() -> None:
+def test_a_way_with_a_vertex_on_another_crosses_it_once_and_one_that_ends_on_or_runs_along_it_does_not() -> None:
     road = [(0.0, 0.0), (100.0, 0.0)]
     through = [(50.0, -40.0), (50.0, 0.0), (60.0, 40.0)]
     assert find_crossings(make_network(ways(road, through))).en_m.tolist() == [[50, 0]]
     assert find_crossings(make_network(ways(road, through[:2], through[1:]))).en_m.tolist() == [[50, 0]]
     assert len(find_crossings(make_network(ways(road, through[:2]))).en_m) == 0
-
-
-def test_ways_along_each_other_do_not_cross() -> None:
     assert len(find_crossings(make_network(ways([(0, 0), (90, 0)], [(30, 0), (120, 0)]))).en_m) == 0
-
-
-def test_nothing_crosses_below_ground_and_waterways_do_not_cross_each_other() -> None:
     cross = ([(0, 0), (90, 0)], [(30, -9), (30, 9)])
     assert len(find_crossings(make_network(ways(*cross))).en_m) == 1
     assert len(find_crossings(make_network(ways(*cross, visible=False))).en_m) == 0

@@ -28,15 +28,12 @@ def fault(content: str) -> str:
     return str(caught.value)
 
 
-def test_a_centre_and_a_size_make_a_grid_of_that_size_around_it():
+def test_a_centre_and_a_size_make_a_grid_of_that_size_around_it_and_bounds_one_that_covers_them():
     grid = read(text()).grid()
     assert grid.epsg == 32632
     assert grid.shape == (100, 100)
     assert abs(grid.west_m + 50 - 500_000) < 1
     assert read(text("center_lonlat = [18.4, -33.9]\nsize_m = [100, 100]")).grid().epsg == 32734
-
-
-def test_bounds_make_a_grid_that_covers_them():
     grid = read(text("bounds_lonlat = [9.0, 47.0, 9.01, 47.01]")).grid()
     west, south, east, north = grid.bounds_m
     assert 750 < east - west < 780

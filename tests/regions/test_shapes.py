@@ -29,19 +29,13 @@ def test_a_corner_is_a_bend_if_it_turns_enough_to_either_side(turn_deg: float) -
     assert found == ([[0.0, 0.0]] if abs(turn_deg) > 45 else [])
 
 
-def test_a_wide_curve_turns_too_slowly_to_be_a_bend() -> None:
+def test_a_wide_curve_a_short_line_and_noise_are_no_bends() -> None:
     def arc(radius_m: float) -> list[tuple[float, float]]:
         return [polar(angle, radius_m) for angle in range(0, 181, 3)]
 
     assert bends_of(*arc(400)) == []
     assert len(bends_of((60, -200), *arc(60), (-60, -200))) >= 1
-
-
-def test_a_short_line_has_no_bend() -> None:
     assert bends_of((0, 0), (50, 0), (50, 50)) == []
-
-
-def test_noise_of_a_few_metres_is_no_bend() -> None:
     assert bends_of(*[(20.0 * i, 4.0 * (-1) ** i) for i in range(40)]) == []
 
 
@@ -82,15 +76,12 @@ def test_groups_are_joined_by_gaps_no_wider_than_asked(cells: list, gap_m: float
     assert all(len(set(group[shapely.intersects(shapes, blob)].tolist())) == 1 for blob in blobs)
 
 
-def test_shapes_that_overlap_or_share_a_corner_touch() -> None:
+def test_shapes_that_overlap_or_share_a_corner_touch_and_one_without_a_rectangle_has_no_long_side() -> None:
     shapes = np.array(
         [shapely.box(0, 0, 5, 5), shapely.box(4, 4, 6, 6), shapely.box(6, 6, 9, 9), shapely.box(7, 0, 9, 5)]
     )
     assert touching_pairs(shapes).tolist() == [[0, 1], [1, 2]]
     assert touching_pairs(shapes[:0]).tolist() == []
-
-
-def test_a_shape_without_a_rectangle_has_no_long_side() -> None:
     shapes = np.array([shapely.box(0, 0, 9, 3), shapely.Polygon()])
     np.testing.assert_allclose(np.abs(long_sides(shapes)), [[9, 0], [np.nan, np.nan]], atol=1e-9)
 

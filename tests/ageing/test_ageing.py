@@ -56,16 +56,13 @@ def measured(*states, area=AREA):
     return measure_ageing(History(states=states, area=area, epsg=32632), place="here").table
 
 
-def test_shares_by_number_stand_beside_those_by_amount():
+def test_shares_by_number_stand_beside_those_by_amount_and_a_line_counts_where_half_of_it_is_gone():
     """One of two houses goes, four sheds come: a fifth of the ground is gone, and half of the houses."""
     old = state(OLD, [(1, "building", house(0, width=40)), (2, "building", house(100))])
     sheds = [(at, "building", house(200 + 20 * at, width=5, depth=5)) for at in range(3, 7)]
     found = row(measured(old, state(NEW, [(1, "building", house(0, width=40)), *sheds])), "building")
     assert (found["vanished_share"], found["vanished_number_share"]) == (0.2, 0.5)
     assert (found["appeared_share"], found["appeared_number_share"]) == (0.2, 0.8)
-
-
-def test_a_line_counts_by_number_where_more_than_half_of_it_is_gone():
     lines = [(1, "road_minor", line((0, 0), (100, 0))), (2, "road_minor", line((0, 200), (100, 200)))]
     kept = [(1, "road_minor", line((0, 0), (60, 0))), (2, "road_minor", line((0, 200), (40, 200)))]
     found = row(measured(state(OLD, lines), state(NEW, kept)), "road_minor")
@@ -146,20 +143,21 @@ def test_a_forest_that_swallows_a_house_does_not_take_its_place_but_fields_take_
     assert row(table, "farmland")["appeared_retagged_share"] == 1.0
 
 
-def test_a_road_shortened_by_half_loses_half_but_for_the_reach_of_its_end():
+def test_a_road_shortened_by_half_or_drawn_anew_or_become_a_square_loses_what_is_gone():
     found = row(
         changes([(1, "road_minor", line((0, 0), (200, 0)))], [(1, "road_minor", line((0, 0), (100, 0)))]), "road_minor"
     )
     assert found["vanished_share"] == pytest.approx(95 / 200, abs=1e-6)
     assert (found["appeared_share"], found["redrawn_share"]) == (0.0, 0.0)
     assert (found["amount_from"], found["amount_to"], found["unit"]) == (200.0, 100.0, "m")
-
-
-def test_a_road_drawn_anew_two_metres_off_with_other_nodes_and_ids_is_the_same_road():
     new = [(7, "road_minor", line((130, 2), (0, 2))), (8, "road_minor", line((130, 2), (200, 2)))]
     found = row(changes([(1, "road_minor", line((0, 0), (77, 0), (200, 0)))], new), "road_minor")
     assert (found["vanished_share"], found["appeared_share"]) == (0.0, 0.0)
     assert (found["redrawn_share"], found["shift_median_m"], found["id_vanished_share"]) == (1.0, 2.0, 1.0)
+    found = row(
+        changes([(1, "road_minor", line((0, 5), (50, 5)))], [(1, "road_minor", house(0, width=50))]), "road_minor"
+    )
+    assert (found["n_from"], found["n_to"], found["vanished_share"]) == (1, 0, 0.0)
 
 
 def test_a_street_made_a_path_is_retagged_and_one_put_into_a_tunnel_too():
@@ -172,21 +170,11 @@ def test_a_street_made_a_path_is_retagged_and_one_put_into_a_tunnel_too():
     assert row(table, "path_track")["appeared_retagged_share"] == 1.0
 
 
-def test_a_square_has_no_length_but_the_street_that_became_it_is_not_lost():
-    found = row(
-        changes([(1, "road_minor", line((0, 5), (50, 5)))], [(1, "road_minor", house(0, width=50))]), "road_minor"
-    )
-    assert (found["n_from"], found["n_to"], found["vanished_share"]) == (1, 0, 0.0)
-
-
-def test_only_what_lies_in_the_common_area_counts():
+def test_only_what_lies_in_the_common_area_counts_and_broken_polygons_are_mended():
     old, new = [(1, "building", house(0)), (2, "building", house(95))], [(1, "building", house(0))]
     table = measured(state(OLD, old), state(NEW, new), area=shapely.box(-50, -50, 100, 50))
     assert row(table, "building")["amount_from"] == 150.0
     assert row(table, "building")["vanished_share"] == pytest.approx(1 / 3, abs=1e-6)
-
-
-def test_broken_polygons_are_mended_before_they_are_compared():
     bowtie = shapely.Polygon([(0, 0), (10, 10), (10, 0), (0, 10)])
     assert shapely.area(polygons_of(np.array([bowtie]))).tolist() == [50.0]
     assert make_areas(np.array([bowtie, shapely.Polygon()])).rows.tolist() == [0]
@@ -251,9 +239,17 @@ def test_a_road_through_a_building_site_is_explained_by_it_along_the_site_only()
 # Rates
 
 
-def test_one_interval_has_the_closed_form():
+def test_one_interval_has_the_closed_form_one_block_no_interval_and_maps_a_day_apart_no_rates():
     rate = loss_rate(np.array([25.0]), np.array([100.0]), np.array([4.0]))
     assert rate == pytest.approx(-np.log(0.75) / 4)
+    alone = bootstrap_rate(np.ones((1, 1)), np.full((1, 1), 9.0), np.ones(1), things=9, rng=seeded_rng())
+    assert alone.per_year == pytest.approx(-np.log(8 / 9))
+    assert np.isnan(alone.lo)
+    assert np.isnan(alone.hi)
+    houses = [(k, "building", house(100 * k)) for k in range(4)]
+    table = measured(state(OLD, houses), state(OLD + dt.timedelta(days=1), houses[:3]))
+    assert row(table, "building")["vanished_share"] == 0.25
+    assert table[[column for column in COLUMNS if "per_year" in column]].isna().all(axis=None)
 
 
 @given(st.floats(0.001, 2.0), st.lists(st.floats(0.1, 9.0), min_size=1, max_size=6), st.floats(1.0, 1e6))
@@ -279,13 +275,6 @@ def test_nothing_to_lose_has_no_rate_all_lost_an_infinite_one_and_no_loss_the_ru
     assert spared.hi == pytest.approx(3.0 / (300 * 2), rel=0.01)
 
 
-def test_one_block_has_no_interval():
-    alone = bootstrap_rate(np.ones((1, 1)), np.full((1, 1), 9.0), np.ones(1), things=9, rng=seeded_rng())
-    assert alone.per_year == pytest.approx(-np.log(8 / 9))
-    assert np.isnan(alone.lo)
-    assert np.isnan(alone.hi)
-
-
 def test_the_block_interval_covers_a_known_rate_about_as_often_as_it_says(monkeypatch):
     monkeypatch.setattr(measure, "DRAWS", 400)
     rate, years, rng = 0.03, np.array([1.5, 4.0]), seeded_rng("coverage")
@@ -309,13 +298,6 @@ def test_pooled_rows_weigh_all_intervals_and_whole_rows_compare_the_ends():
         assert found["vanish_per_year"] == pytest.approx(np.log(2) / 2, rel=1e-3)
     assert row(table, "building")["vanished_share"] == 0.75
     assert (row(table, "building", "pooled")["n_from"], row(table, "building", "pooled")["n_to"]) == (8, 2)
-
-
-def test_maps_a_day_apart_have_shares_but_no_yearly_rates():
-    houses = [(k, "building", house(100 * k)) for k in range(4)]
-    table = measured(state(OLD, houses), state(OLD + dt.timedelta(days=1), houses[:3]))
-    assert row(table, "building")["vanished_share"] == 0.25
-    assert table[[column for column in COLUMNS if "per_year" in column]].isna().all(axis=None)
 
 
 # Files

@@ -141,12 +141,15 @@ def test_a_crop_and_its_mask_are_cut_turned_and_flipped_alike(torch):
     assert len({item["mask"].numpy().tobytes() for item in crops}) > 20
 
 
-def test_a_crop_depends_on_its_index_and_the_seed_alone(torch):
+def test_a_crop_depends_on_its_index_and_the_seed_alone_and_needs_pictures(torch):
     few, more = (sgb.PictureDataset(PICTURES[:count], crop_px=64, crops_each=5) for count in (2, 4))
     for at in reversed(range(len(few))):
         assert torch.equal(few[at]["picture"], more[at]["picture"])
     other = sgb.PictureDataset(PICTURES, crop_px=64, crops_each=5, seed=1)
     assert any(not torch.equal(more[at]["mask"], other[at]["mask"]) for at in range(len(other)))
+    del torch
+    with pytest.raises(ImageError, match="crops need pictures"):
+        sgb.PictureDataset([])
 
 
 def test_what_lies_beyond_a_small_picture_is_black_and_unknown(torch):
@@ -156,12 +159,6 @@ def test_what_lies_beyond_a_small_picture_is_black_and_unknown(torch):
     is_beyond = (item["mask"] == sgb.UNKNOWN).all(dim=0)
     assert int(is_beyond.sum()) >= 160 * 160 - 96 * 128
     assert int(((item["picture"] == 0).all(dim=0) & is_beyond).sum()) >= 160 * 160 - 96 * 128
-
-
-def test_crops_of_no_pictures_are_refused(torch):
-    del torch
-    with pytest.raises(ImageError, match="crops need pictures"):
-        sgb.PictureDataset([])
 
 
 def test_pictures_of_a_task_are_decoded_with_the_labels_of_their_frames():

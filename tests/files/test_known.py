@@ -24,9 +24,11 @@ def test_a_folder_that_cannot_be_looked_into_is_not_replaced(tmp_path, monkeypat
         check_known(tmp_path / "site", (), "a site")
 
 
-def test_a_folder_that_is_not_there_holds_nothing(tmp_path):
+def test_a_folder_that_is_not_there_holds_nothing_and_a_mount_point_is_refused(tmp_path):
     check_known(tmp_path / "none", (), "a site")
     check_site(tmp_path / "none")
+    with pytest.raises(StoreError, match="/proc is a mount point"):
+        check_room(Path("/proc"))
 
 
 @pytest.mark.parametrize("name", [".", ".."])
@@ -34,8 +36,3 @@ def test_a_folder_has_a_name_however_it_is_given(name, tmp_path, monkeypatch):
     (tmp_path / "a" / "b").mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "a" / "b")
     assert absolute(Path(name)).name == {".": "b", "..": "a"}[name]
-
-
-def test_a_mount_point_is_refused_before_anything_is_made():
-    with pytest.raises(StoreError, match="/proc is a mount point"):
-        check_room(Path("/proc"))

@@ -27,19 +27,12 @@ for _ in range(200):
 """
 
 
-def silent(line):
-    del line
-
-
-def test_nothing_is_left_of_a_lock_whatever_happened_under_it(tmp_path):
+def test_nothing_is_left_of_a_lock_and_one_that_cannot_be_made_is_a_fault(tmp_path):
     with locked(tmp_path / "site"):
         assert [path.name for path in tmp_path.iterdir()] == [".site.lock"]
     with pytest.raises(KeyError), locked(tmp_path / "site"):
         raise KeyError
     assert not [*tmp_path.iterdir()]
-
-
-def test_a_lock_that_cannot_be_made_is_a_fault_and_nobody_waits_for_it():
     refused = pytest.raises(StoreError, match="/proc/site cannot be written")
     with reporting(pytest.fail), refused, locked(Path("/proc/site")):
         pass

@@ -71,7 +71,7 @@ def test_a_pipe_is_refused_not_waited_for(pipe: Path, read: Callable[[Path], obj
         read(pipe)
 
 
-def test_a_pipe_in_place_of_a_file_of_a_folder_is_refused(tmp_path: Path) -> None:
+def test_a_pipe_in_place_of_a_file_of_a_folder_or_of_a_kind_is_refused(tmp_path, pipe) -> None:
     os.mkfifo(tmp_path / "board.json")
     with pytest.raises(SasgeoError, match="it is a pipe"):
         read_board_manifest(tmp_path)
@@ -79,9 +79,6 @@ def test_a_pipe_in_place_of_a_file_of_a_folder_is_refused(tmp_path: Path) -> Non
     stated = ArchiveSpec(sha256="0" * 64)
     with pytest.raises(SasgeoError, match="mine"):
         unpack_head_start(tmp_path / "mine.toml", stated, tmp_path / "out")
-
-
-def test_a_pipe_among_files_of_a_kind_is_refused(pipe: Path) -> None:
     with pytest.raises(SasgeoError, match="it is no plain file"):
         read_document(pipe, RegionFile, "regions")
 

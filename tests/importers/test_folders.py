@@ -228,15 +228,12 @@ def test_headings_come_into_one_turn():
 # Bad folders
 
 
-def test_there_must_be_a_folder(kind, tmp_path):
-    assert "there is no folder" in refusal(kind, tmp_path / "nowhere")
-    assert "there is no folder" in refusal(kind, writers.put(tmp_path / "file.zip"))
-
-
-def test_an_empty_folder_is_told_what_it_should_hold(kind, tmp_path):
+def test_there_must_be_a_folder_which_is_told_what_it_should_hold(kind, tmp_path):
     line = refusal(kind, tmp_path)
     assert "is empty" in line
     assert IMPORTERS[kind].layout in line
+    assert "there is no folder" in refusal(kind, tmp_path / "nowhere")
+    assert "there is no folder" in refusal(kind, writers.put(tmp_path / "file.zip"))
 
 
 NEEDED = {
@@ -263,11 +260,6 @@ def test_the_folder_of_another_kind_is_refused(kind, tmp_path):
             assert "holds no" in refusal(kind, write(tmp_path / other))
 
 
-def test_labels_have_their_digits(tmp_path):
-    root = WRITERS["dense-uav"](tmp_path / "dense")
-    assert "test/query_drone/000000 is not named by a label of 4 digits" in refusal("university-1652", root)
-
-
 @pytest.mark.parametrize("name", ["a", "00001", "\uff11\uff12\uff13\uff14", "0a00"])
 def test_a_folder_that_is_no_label_is_refused(name, tmp_path):
     root = writers.write_university(tmp_path)
@@ -275,12 +267,14 @@ def test_a_folder_that_is_no_label_is_refused(name, tmp_path):
     assert f"{name} is not named by a label of 4 digits" in refusal("university-1652", root)
 
 
-def test_a_label_needs_an_image_and_an_image_a_byte(tmp_path):
+def test_a_label_has_its_digits_and_an_image_and_an_image_a_byte(tmp_path):
     root = writers.write_university(tmp_path)
     (root / "test" / "query_drone" / "0005").mkdir()
     assert "test/query_drone/0005 holds no image" in refusal("university-1652", root)
     writers.put(root / "test" / "query_drone" / "0005" / "0.jpg", b"")
     assert "test/query_drone/0005/0.jpg is an empty file" in refusal("university-1652", root)
+    root = WRITERS["dense-uav"](tmp_path / "dense")
+    assert "test/query_drone/000000 is not named by a label of 4 digits" in refusal("university-1652", root)
 
 
 def test_other_files_are_left_out_and_counted(tmp_path):

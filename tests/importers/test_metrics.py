@@ -143,23 +143,17 @@ def test_sdm_in_degrees_takes_east_for_as_far_as_north(scores):
     assert east.corrected == pytest.approx(math.exp(-5000 / 111_320 * 96.49), rel=1e-3)
 
 
-def test_sdm_in_single_precision_cannot_tell_half_a_metre(scores):
-    near = {"g": ("b", (120.000003, 30.0))}
-    found = scores(dense({"q": ("a", (120.0, 30.0))}, near), {"q": ["g"]})
-    assert found["sdm_15m_1"].released == 1.0
-    assert found["sdm_15m_1"].corrected == pytest.approx(math.exp(-5000 / 111_320 * 0.2895), rel=1e-3)
-
-
-def test_the_two_sdm_of_one_name_are_told_apart(scores):
+def test_sdm_of_two_names_and_precisions_are_told_apart_and_the_first_answers_weigh_most(scores):
     # 100 m: exp(-4.5) against exp(-0.1).
     dataset = dense({"q": ("a", (120.0, 30.0))}, {"g": ("b", (120.0, 30.000902))})
     found = scores(dataset, {"q": ["g"]})
     assert found["sdm_15m_1"].corrected == pytest.approx(0.0112, abs=2e-4)
     assert found["sdm_693m_1"].corrected == pytest.approx(0.9048, abs=2e-4)
     assert found["sdm_693m_1"].released is None  # DenseUAV's code has no such metric
-
-
-def test_sdm_weights_the_first_answers_most(scores):
+    near = {"g": ("b", (120.000003, 30.0))}
+    found = scores(dense({"q": ("a", (120.0, 30.0))}, near), {"q": ["g"]})
+    assert found["sdm_15m_1"].released == 1.0
+    assert found["sdm_15m_1"].corrected == pytest.approx(math.exp(-5000 / 111_320 * 0.2895), rel=1e-3)
     gallery = {"near": ("a", (120.0, 30.0)), "far": ("b", (121.0, 30.0)), "farther": ("c", (122.0, 30.0))}
     dataset = dense({"q": ("a", (120.0, 30.0))}, gallery)
     found = scores(dataset, {"q": ["far", "near", "farther"]})
@@ -312,12 +306,17 @@ def test_a_wrong_ranking_is_refused_in_one_line(columns, told, tmp_path):
     assert str(fault.value).isprintable()
 
 
-def test_an_id_that_is_no_text_is_refused(tmp_path):
+def test_an_id_that_is_no_text_is_refused_and_names_may_be_stored_as_a_dictionary(tmp_path):
     dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a"})
     wrong = pa.array([b"\xf4q"], pa.binary()).view(pa.string())
     pq.write_table(pa.table({"query_id": wrong, "gallery_id": ["g1"], "rank": [1]}), tmp_path / "r.parquet")
     with pytest.raises(DatasetError, match="is no query of the dataset"):
         read_ranking([tmp_path / "r.parquet"], dataset.items)
+    dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a"})
+    table = pa.table({"query_id": ["q"], "gallery_id": ["g1"], "rank": pa.array([1], pa.int32())})
+    table = table.set_column(0, "query_id", table["query_id"].dictionary_encode())
+    pq.write_table(table, tmp_path / "r.parquet")
+    assert read_ranking([tmp_path / "r.parquet"], dataset.items).queries.tolist() == [0]
 
 
 @pytest.mark.parametrize("content", [b"", b"PAR1 no table PAR1", b"query_id,gallery_id,rank\nq,g1,1\n", None])
@@ -326,14 +325,6 @@ def test_what_is_no_table_is_refused(content, tmp_path):
         (tmp_path / "r.parquet").write_bytes(content)
     with pytest.raises(StoreError, match="ranks from 1"):
         read_ranking([tmp_path / "r.parquet"], ())
-
-
-def test_names_may_be_stored_as_a_dictionary(tmp_path):
-    dataset = dataset_of("university-1652", {"q": "a"}, {"g1": "a"})
-    table = pa.table({"query_id": ["q"], "gallery_id": ["g1"], "rank": pa.array([1], pa.int32())})
-    table = table.set_column(0, "query_id", table["query_id"].dictionary_encode())
-    pq.write_table(table, tmp_path / "r.parquet")
-    assert read_ranking([tmp_path / "r.parquet"], dataset.items).queries.tolist() == [0]
 
 
 def test_a_ranking_may_lie_in_several_files(tmp_path):

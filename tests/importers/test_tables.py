@@ -55,19 +55,18 @@ def test_a_tile_has_its_ground(tmp_path):
     np.testing.assert_allclose(edges, (116.03, 29.70, 116.04, 29.71), atol=1e-9)
 
 
-def test_the_file_says_where_it_is_from_and_what_was_left_out(tmp_path):
+def test_the_file_says_where_it_is_from_and_is_the_same_each_time_and_an_item_has_a_name_of_one_line(tmp_path):
     dataset = read_dataset(writers.write_visloc(tmp_path / "set"), "uav-visloc")
     schema = pq.read_schema(write_items(tmp_path / "out", dataset))
     about = json.loads(schema.metadata[b"dataset"])
     assert (about["kind"], about["source"]) == ("uav-visloc", "https://github.com/IntelliSensing/UAV-VisLoc")
     assert about["notes"] == list(dataset.notes)
     assert str(tmp_path) not in json.dumps(about)
-
-
-def test_the_same_folder_gives_the_same_bytes(tmp_path):
     dataset = read_dataset(writers.write_dense(tmp_path / "set", {"000000": (120.0, 30.0)}), "dense-uav")
     first, second = (write_items(tmp_path / name, dataset).read_bytes() for name in ("a", "b"))
     assert first == second
+    with pytest.raises(DatasetError, match="one printable line"):
+        Item(item_id="a\nb", role="query", view="drone")
 
 
 def test_metrics_are_written_with_the_hash_of_their_ranking(tmp_path):
@@ -106,11 +105,6 @@ def test_a_table_that_cannot_be_written_leaves_the_old_one_and_no_scratch(tmp_pa
         write_items(tmp_path / "out", dataset)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["items.parquet"]
     assert (tmp_path / "out" / "items.parquet").read_bytes() == before
-
-
-def test_an_item_has_a_name_of_one_line():
-    with pytest.raises(DatasetError, match="one printable line"):
-        Item(item_id="a\nb", role="query", view="drone")
 
 
 def test_the_guide_explains_every_column_and_metric(tmp_path):

@@ -42,11 +42,13 @@ class Raises:
         raise ValueError("first line\nsecond line")
 
 
-def test_a_rejector_is_found_by_module_and_class():
+def test_a_rejector_is_found_by_module_and_class_and_an_unknown_name_says_where_the_names_are():
     rejector = load_rejector(f"{__name__}:Half")
     assert isinstance(rejector, Rejector)
     rejector.fit([Prediction(query_id="a")], np.array([True]))
     assert check_p_false(rejector.p_false([Prediction(query_id="a")]), 1).tolist() == [0.5]
+    with pytest.raises(MatchError, match=r"there is no rejector 'halv'.*list rejectors shows all"):
+        load_rejector("halv")
 
 
 @pytest.mark.parametrize(
@@ -61,11 +63,6 @@ def test_a_rejector_is_found_by_module_and_class():
 def test_what_is_no_rejector_is_refused(name, words):
     with pytest.raises(MatchError, match=words):
         load_rejector(f"{__name__}:{name}")
-
-
-def test_an_unknown_name_says_where_the_names_are():
-    with pytest.raises(MatchError, match=r"there is no rejector 'halv'.*list rejectors shows all"):
-        load_rejector("halv")
 
 
 @pytest.mark.parametrize(

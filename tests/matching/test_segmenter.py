@@ -123,22 +123,16 @@ def test_an_answer_that_is_none_of_the_image_is_refused(found, classes, fault) -
         check_segmentation(found, tiny_images()[0].image, classes=classes)
 
 
-def test_a_sound_answer_may_be_silent() -> None:
-    silent = Segmentation(classes=("water",), probability_bytes=np.full((1, 96, 128), 255, dtype=np.uint8))
-    assert check_segmentation(silent, tiny_images()[0].image) is silent
-
-
-def test_learned_texts_may_be_longer_than_those_of_matchers_and_end_somewhere() -> None:
+def test_learned_texts_end_somewhere_a_training_has_images_and_a_sound_answer_may_be_silent() -> None:
     assert len(check_text("x" * MOST_TEXT_BYTES)) == MOST_TEXT_BYTES
     with pytest.raises(MatchError, match=f"expected at most {MOST_TEXT_BYTES}"):
         check_text("x" * (MOST_TEXT_BYTES + 1))
     with pytest.raises(MatchError, match="returned bytes, expected a text"):
         check_text(b"trees")
-
-
-def test_a_training_without_images_is_refused() -> None:
     with pytest.raises(ImageError, match="no image to learn from"):
         ImageTraining(images=[])
+    silent = Segmentation(classes=("water",), probability_bytes=np.full((1, 96, 128), 255, dtype=np.uint8))
+    assert check_segmentation(silent, tiny_images()[0].image) is silent
 
 
 def test_tiny_images_show_every_class_they_label_and_are_the_same_each_time() -> None:

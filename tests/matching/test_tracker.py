@@ -78,13 +78,10 @@ def test_the_covariance_of_many_steps_is_that_of_drawn_ones():
     assert np.cov(drawn) == pytest.approx(covariance, rel=0.15, abs=0.15 * covariance[2, 2])
 
 
-def test_a_lost_step_keeps_the_place_and_widens_it():
+def test_a_lost_step_keeps_the_place_and_widens_it_and_a_control_must_be_prepared():
     pose, covariance = advance(HERE, np.eye(3), Step(sequence_id="f", frame=4))
     assert pose == HERE
     assert covariance[0, 0] > 1e5
     assert (advance(HERE, np.eye(3), Step(sequence_id="f", frame=0))[1] == np.eye(3)).all()
-
-
-def test_a_control_that_was_not_prepared_says_so():
     with pytest.raises(RuntimeError, match="call prepare"):
         DeadReckoning().start(Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0))

@@ -72,10 +72,12 @@ def test_diffusion_has_the_covariance_of_the_increment_in_the_axes_of_the_headin
         assert grown[0] == pytest.approx((sigma_m / 2) ** 2, rel=0.06)
 
 
-def test_without_diffusion_covariances_count_nothing():
+def test_without_diffusion_covariances_count_nothing_and_the_first_view_moves_nothing():
     wide = np.diag([100.0, 100.0, 25.0]).ravel()
     kept = followed(believed(START), step(covariance=wide), diffuses=False)
     assert (kept.mass == followed(believed(START), step(), diffuses=False).mass).all()
+    first = believed(START)
+    assert followed(first, Step(sequence_id="f", frame=0), diffuses=True) is first
 
 
 def test_a_lost_increment_spreads_the_belief_widely_and_within_the_map():
@@ -87,11 +89,6 @@ def test_a_lost_increment_spreads_the_belief_widely_and_within_the_map():
     west_m, south_m, east_m, north_m = lost.grid.bounds_m
     assert min(west_m - 1000.0, south_m - 7400.0, 3000.0 - east_m, 9000.0 - north_m) >= -532.0
     assert lost.mass.sum() == pytest.approx(1.0, abs=1e-4)
-
-
-def test_the_first_view_moves_nothing():
-    first = believed(START)
-    assert followed(first, Step(sequence_id="f", frame=0), diffuses=True) is first
 
 
 def test_a_belief_that_leaves_the_map_goes_on():

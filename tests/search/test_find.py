@@ -142,12 +142,15 @@ def test_the_exhaustive_search_agrees(place):
         assert degrees <= 2.0
 
 
-def test_scale_is_found_too(place):
+def test_scale_is_found_too_and_threads_change_nothing(place):
     pose = replace(some_poses(place[0], 1)[0], scale=1.12)
     prior = replace(ANYWHERE, scale_sigma=0.1)
     best = search(place[2], as_template(view_of(place, pose)), prior).modes[0].pose
     assert off(best, pose)[0] < 1.5
     assert best.scale == pytest.approx(1.12, abs=0.02)
+    template = as_template(view_of(place, some_poses(place[0], 1)[0]))
+    one, two = (search(place[2], template, ANYWHERE, Plan(threads=threads)) for threads in (1, 2))
+    assert one == two
 
 
 def test_a_prior_is_kept(place):
@@ -204,12 +207,6 @@ def test_modes_keep_their_distance_and_their_order(place):
     assert [mode.score for mode in modes] == sorted((mode.score for mode in modes), reverse=True)
     for at, mode in enumerate(modes):
         assert all(off(mode.pose, other.pose)[0] >= Plan().apart_m for other in modes[:at])
-
-
-def test_threads_change_nothing(place):
-    template = as_template(view_of(place, some_poses(place[0], 1)[0]))
-    one, two = (search(place[2], template, ANYWHERE, Plan(threads=threads)) for threads in (1, 2))
-    assert one == two
 
 
 def test_the_right_candidate_is_first(place):

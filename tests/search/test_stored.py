@@ -105,13 +105,10 @@ def test_levels_replace_no_files_of_others(tmp_path, whole):
     assert (tmp_path / "map" / "notes.txt").is_file()
 
 
-def test_windows_that_cut_cells_of_a_level_are_refused(tmp_path, whole):
+def test_windows_that_cut_cells_and_levels_that_are_not_stored_are_refused(tmp_path, whole, stored):
     with pytest.raises(ShapeError, match=r"windows of 60 cells cut cells of the levels \[8\]: name a multiple"):
         stored_in(tmp_path / "map", whole, window_cells=60)
     assert not (tmp_path / "map").exists()
-
-
-def test_a_level_that_is_not_stored_is_told(stored):
     with pytest.raises(StoreError, match="holds the levels 1, 2, 4, 8, not 16: search for a smaller view"):
         stored.level(16)
 

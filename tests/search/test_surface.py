@@ -48,13 +48,10 @@ def poses_of(scored, *, count, seed=0):
         yield pose, float(scored.scores[yaw, row, col])
 
 
-def test_at_right_angles_a_score_is_that_of_the_pose(town, view):
+def test_a_score_is_that_of_the_pose_but_for_how_cells_are_interpolated(town, view):
     scored = surface(town, view, center_m=MIDDLE_M, radius_m=60.0, yaws_deg=[270, 0, 90, 180])
     for pose, score in poses_of(scored, count=40):
         assert score == pytest.approx(score_at(town, view, pose), abs=0.02)
-
-
-def test_at_any_heading_a_score_is_that_of_the_pose_but_for_how_cells_are_interpolated(town, view):
     scored = surface(town, view, center_m=MIDDLE_M, radius_m=60.0, yaws_deg=np.arange(5.0, 360.0, 15.0))
     got, asked = np.array([(score, score_at(town, view, pose)) for pose, score in poses_of(scored, count=80)]).T
     assert np.std(got - asked) < 0.05 * np.std(asked)
@@ -110,15 +107,12 @@ def test_each_heading_scores_alike_whatever_others_are_asked_for(town, view, yaw
         np.testing.assert_allclose(score, alone.scores[0], atol=0.2)
 
 
-def test_a_view_that_says_nothing_scores_0_everywhere(town):
-    blank = Template(weights=np.zeros((2, 9, 9), np.float32), known=np.zeros((9, 9), np.float32), cell_size_m=2.0)
-    assert not surface(town, blank, center_m=MIDDLE_M, radius_m=20.0, yaws_deg=[0.0]).scores.any()
-
-
-def test_what_cannot_be_scored_is_refused(town, view):
+def test_what_cannot_be_scored_is_refused_and_a_view_that_says_nothing_scores_0(town, view):
     with pytest.raises(PoseError, match="does not meet the map"):
         surface(town, view, center_m=(0.0, 0.0), radius_m=10.0, yaws_deg=[0.0])
     with pytest.raises(PoseError, match="at least one finite heading"):
         surface(town, view, center_m=MIDDLE_M, radius_m=10.0, yaws_deg=[])
     with pytest.raises(PoseError, match="scale positive"):
         surface(town, view, center_m=MIDDLE_M, radius_m=10.0, yaws_deg=[0.0], scale=0.0)
+    blank = Template(weights=np.zeros((2, 9, 9), np.float32), known=np.zeros((9, 9), np.float32), cell_size_m=2.0)
+    assert not surface(town, blank, center_m=MIDDLE_M, radius_m=20.0, yaws_deg=[0.0]).scores.any()

@@ -113,7 +113,7 @@ def test_a_fault_while_a_level_is_painted_or_burnt_is_the_fault_of_the_build(tmp
         write_layers(tmp_path / "b.tif", GRID, CLASSES, {}.__getitem__)
 
 
-def test_the_file_says_what_it_holds_and_is_cloud_optimized(written):
+def test_the_layout_is_that_of_a_cloud_optimized_file(written):
     assert cog_validate(written, quiet=True)[0]
     with rasterio.open(written) as source:
         assert source.descriptions == CLASSES

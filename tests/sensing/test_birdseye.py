@@ -117,12 +117,17 @@ def test_behind_a_house_nothing_is_known_and_its_foot_stays(tilt, low, high):
     assert (aware.layer("road_minor")[leaned] == UNKNOWN).all()
 
 
-def test_a_house_as_high_as_the_camera_is_unknown_altogether():
+def test_a_house_as_high_as_the_camera_and_all_that_a_camera_to_the_sky_sees_are_unknown():
     camera = camera_of(height_m=10.0)
     seen = picture_of(camera, disc(0, 0, 3.0), classes=("building",))
     reading = Reading(widths_m={}, standing_m={"building": 9.0})
     cells = to_evidence(seen, camera, Plane(), size_cells=16, cell_size_m=1.0, reading=reading).cells
     assert (cells != PRESENT).all()
+    camera = camera_of(tilt_deg=180.0)
+    evidence = to_evidence(
+        Planes(("water",), np.ones((1, 400, 400), np.float32)), camera, Plane(), size_cells=8, cell_size_m=1.0
+    )
+    assert (evidence.cells == UNKNOWN).all()
 
 
 def test_behind_a_hill_nothing_is_known():
@@ -177,11 +182,3 @@ def test_absurd_lattices_and_readings_and_probabilities_of_another_picture_are_r
         to_evidence(small, camera_of(), Plane(), size_cells=9, cell_size_m=1)
     with pytest.raises(ShapeError, match="another size"):
         rectify(np.zeros((9, 9, 3), np.uint8), camera_of(), Plane(), size_cells=9, cell_size_m=1.0)
-
-
-def test_a_camera_that_sees_no_ground_says_nothing():
-    camera = camera_of(tilt_deg=180.0)
-    evidence = to_evidence(
-        Planes(("water",), np.ones((1, 400, 400), np.float32)), camera, Plane(), size_cells=8, cell_size_m=1.0
-    )
-    assert (evidence.cells == UNKNOWN).all()

@@ -35,10 +35,14 @@ def mounted(body, mount=None):
     return Camera.mounted(intrinsics=WIDE, east_m=0.0, north_m=0.0, height_m=100.0, body=body, mount=mount)
 
 
-def test_a_pointed_camera_is_a_mounted_one_without_roll():
+def test_a_pointed_camera_is_a_mounted_one_and_roll_comes_first_in_the_body_and_yaw_last():
     place = {"intrinsics": WIDE, "east_m": 3.0, "north_m": 4.0, "height_m": 100.0}
     pointed = Camera.pointed(**place, yaw_deg=33.0, tilt_deg=25.0)
     assert pointed == Camera.mounted(**place, body=Attitude(yaw_deg=33.0), mount=Mount(tilt_deg=25.0))
+    # Right side down by 90, then nose up by 30: forward is up by 30, right points straight down along the new axes.
+    forward, right, _ = Attitude(roll_deg=90.0, pitch_deg=30.0).matrix.T
+    np.testing.assert_allclose(forward, [np.cos(np.pi / 6), 0, -0.5], atol=1e-12)
+    np.testing.assert_allclose(right, [0.5, 0, np.cos(np.pi / 6)], atol=1e-12)
 
 
 @given(yaw=angles, tilt=tilts, roll=st.floats(-20, 20), lens=st.sampled_from([WIDE, BENT]), seed=st.integers(0, 99))
@@ -120,13 +124,6 @@ def test_a_fixed_camera_looks_where_the_body_points(body, middle):
     assert steady.yaw_deg == pytest.approx(body.yaw_deg)
 
 
-def test_roll_comes_first_in_the_body_and_yaw_last():
-    # Right side down by 90, then nose up by 30: forward is up by 30, right points straight down along the new axes.
-    forward, right, _ = Attitude(roll_deg=90.0, pitch_deg=30.0).matrix.T
-    np.testing.assert_allclose(forward, [np.cos(np.pi / 6), 0, -0.5], atol=1e-12)
-    np.testing.assert_allclose(right, [0.5, 0, np.cos(np.pi / 6)], atol=1e-12)
-
-
 def test_a_turned_mounted_or_moved_camera_looks_where_that_says():
     for error, middle in ((Attitude(pitch_deg=45.0), (0, 100)), (Attitude(roll_deg=45.0), (-100, 0))):
         np.testing.assert_allclose(camera_of().turned(error).unproject(MIDDLE, Plane())[0, :2], middle, atol=1e-9)
@@ -137,19 +134,21 @@ def test_a_turned_mounted_or_moved_camera_looks_where_that_says():
     assert (moved.position_m.tolist(), moved.rotation) == ([5.0, -2.0, 103.0], side.rotation)
 
 
-def test_the_sampling_distance_grows_with_the_slant():
-    camera = camera_of(tilt_deg=60.0)  # slant 200 m: 200 / 400 across, and twice that along the ground
-    assert camera.gsd_m(MIDDLE, Plane())[0] == pytest.approx(1.0, rel=1e-3)
-    assert np.isnan(camera.gsd_m(np.array([[400.0, 0.0]]), Plane()))[0]
-
-
-def test_the_footprint_of_a_tilted_view_is_a_trapezoid():
+def test_the_footprint_of_a_tilted_view_is_a_trapezoid_that_holds_what_its_pixels_show():
     outline = camera_of(tilt_deg=45.0).footprint(Plane())
     # Up and down the picture spans +-atan(300 / 400) = 36.87 degrees around 45.
     near, far = 100 * np.tan(np.radians(45 - 36.8699)), 100 * np.tan(np.radians(45 + 36.8699))
     assert outline.bounds[1] == pytest.approx(near, abs=0.01)
     assert outline.bounds[3] == pytest.approx(far, abs=0.1)
     assert outline.is_valid
+    for lens in (WIDE, BENT):
+        camera = camera_of(lens, yaw_deg=33.0, tilt_deg=25.0, roll_deg=5.0)
+        inside = np.random.default_rng(0).uniform((5, 5), (795, 595), (50, 2))
+        ground = camera.unproject(inside, Plane())
+        assert shapely.contains_xy(camera.footprint(Plane()), ground[:, 0], ground[:, 1]).all()
+    camera = camera_of(tilt_deg=60.0)  # slant 200 m: 200 / 400 across, and twice that along the ground
+    assert camera.gsd_m(MIDDLE, Plane())[0] == pytest.approx(1.0, rel=1e-3)
+    assert np.isnan(camera.gsd_m(np.array([[400.0, 0.0]]), Plane()))[0]
 
 
 def test_a_view_with_the_horizon_in_it_ends_at_its_reach_and_one_of_the_sky_has_no_footprint():
@@ -159,14 +158,6 @@ def test_a_view_with_the_horizon_in_it_ends_at_its_reach_and_one_of_the_sky_has_
     assert not outline.contains(shapely.Point(0, -10))
     assert camera_of(tilt_deg=170.0).footprint(Plane()).is_empty
     assert camera_of(height_m=-5.0).footprint(Plane()).is_empty
-
-
-def test_the_footprint_holds_what_its_pixels_show():
-    for lens in (WIDE, BENT):
-        camera = camera_of(lens, yaw_deg=33.0, tilt_deg=25.0, roll_deg=5.0)
-        inside = np.random.default_rng(0).uniform((5, 5), (795, 595), (50, 2))
-        ground = camera.unproject(inside, Plane())
-        assert shapely.contains_xy(camera.footprint(Plane()), ground[:, 0], ground[:, 1]).all()
 
 
 def test_hills_end_the_footprint_where_their_heights_end():

@@ -48,16 +48,13 @@ def test_a_ray_to_a_slope_meets_it_where_geometry_says(east, north, right, up):
         assert np.isnan(met).all()
 
 
-def test_a_ray_stops_at_the_hill_in_front():
+def test_a_ray_stops_at_the_hill_in_front_and_a_camera_under_ground_sees_none():
     cells = np.zeros((10, 12), dtype=np.float32)
     cells[:, 6] = 30.0
     hill = Dem(grid=GRID, cells_m=cells).relative_to(GRID.west_m, GRID.north_m - 100.0)
     met = hill.meet(np.array([5.0, 50.0, 40.0]), np.array([[1.0, 0.0, -0.4]]))[0]
     assert 50 < met[0] < 65
     assert met[2] == pytest.approx(40 - 0.4 * (met[0] - 5))
-
-
-def test_a_camera_under_ground_sees_none():
     assert np.isnan(slope_of().meet(np.array([500_060.0, 5_200_050.0, 1.0]), np.array([[0.0, 0.0, -1.0]]))).all()
 
 
@@ -135,27 +132,21 @@ def test_a_file_that_is_no_ground_is_refused_on_one_line(tmp_path, how, hint):
     assert "\n" not in str(caught.value)
 
 
-def test_a_ground_that_gdal_alone_finds_no_way_from_is_refused_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(ground, "_check_source", lambda *_: None)  # asks a library with tables of its own
-    path = write_dem(tmp_path / "dem.tif", slope_of(), crs="IAU_2015:30100")
-    with pytest.raises(CameraError, match="cannot be transformed to EPSG:32632"):
-        read_dem(path, GRID)
-
-
-def test_heights_in_an_unknown_unit_are_refused(tmp_path):
-    path = write_dem(tmp_path / "dem.tif", slope_of())
-    with rasterio.open(path, "r+") as file:
-        file.units = ("dBZ",)
-    with pytest.raises(CameraError, match="heights in 'dbz', metres or feet"):
-        read_dem(path, GRID)
-
-
-def test_a_file_that_is_no_raster_is_refused(tmp_path):
+def test_a_file_that_is_no_raster_or_of_an_unknown_unit_or_place_is_refused(tmp_path, monkeypatch):
     (tmp_path / "dem.tif").write_bytes(b"no heights")
     os.mkfifo(tmp_path / "pipe.tif")
     for name in ("dem.tif", "none.tif", "pipe.tif"):
         with pytest.raises(CameraError, match="cannot be read"):
             read_dem(tmp_path / name, GRID)
+    path = write_dem(tmp_path / "dem.tif", slope_of())
+    with rasterio.open(path, "r+") as file:
+        file.units = ("dBZ",)
+    with pytest.raises(CameraError, match="heights in 'dbz', metres or feet"):
+        read_dem(path, GRID)
+    monkeypatch.setattr(ground, "_check_source", lambda *_: None)  # asks a library with tables of its own
+    path = write_dem(tmp_path / "dem.tif", slope_of(), crs="IAU_2015:30100")
+    with pytest.raises(CameraError, match="cannot be transformed to EPSG:32632"):
+        read_dem(path, GRID)
 
 
 @pytest.mark.parametrize(

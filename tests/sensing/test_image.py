@@ -79,16 +79,13 @@ def test_sixteen_bits_of_grey_are_rounded_to_eight_and_those_of_colour_read() ->
     assert decode_image(png(2, 1, bits=16, kind=2, pixels=pixels)).tolist() == [[[255, 0, 0], [0, 0, 255]]]
 
 
-def test_a_palette_grey_and_two_levels_become_colours() -> None:
+def test_a_palette_grey_two_levels_and_transparent_pixels_become_colours() -> None:
     palette = Image.new("P", (2, 1))
     palette.putpalette([*RED, *GREEN])
     palette.putpixel((1, 0), 1)
     assert decode_image(encoded(palette)).tolist() == [[list(RED), list(GREEN)]]
     assert decode_image(encoded(Image.new("L", (1, 1), 77))).tolist() == [[[77, 77, 77]]]
     assert decode_image(encoded(Image.new("1", (1, 1), 1))).tolist() == [[[255, 255, 255]]]
-
-
-def test_transparent_pixels_lie_over_black() -> None:
     image = Image.new("RGBA", (3, 1), (200, 100, 50, 255))
     image.putpixel((1, 0), (200, 100, 50, 0))
     image.putpixel((2, 0), (200, 100, 50, 51))

@@ -24,11 +24,15 @@ from sasgeo_bench.sensing.tiny_images import tiny_images
 IMAGE = replace(tiny_images()[0].image, observed_on=dt.date(2024, 7, 1), season="leaf_on", height_sigma_m=2.5)
 
 
-def test_an_image_keeps_pixels_camera_sigmas_and_day() -> None:
+def test_an_image_keeps_pixels_camera_sigmas_and_day_and_a_body_without_end_is_not_unpacked() -> None:
     again = image_from(image_bytes(IMAGE))
     np.testing.assert_array_equal(again.rgb, IMAGE.rgb)
     for name in ("camera", "height_sigma_m", "attitude_sigma_deg", "observed_on", "season"):
         assert getattr(again, name) == getattr(IMAGE, name)
+    (count,) = struct.unpack("!I", SOUND[6:10])
+    bomb = SOUND[: 10 + count] + zlib.compress(bytes(10**7))
+    with pytest.raises(ImageError, match="does not hold the 36864 bytes"):
+        image_from(bomb)
 
 
 def test_labelled_images_are_read_from_their_files_when_they_are_asked_for(tmp_path) -> None:
@@ -90,13 +94,6 @@ def test_bytes_that_are_no_image_are_refused_in_one_line(data, fault) -> None:
     with pytest.raises(ImageError, match=fault) as refused:
         image_from(data)
     assert "\n" not in str(refused.value)
-
-
-def test_a_body_that_unpacks_without_end_is_not_unpacked() -> None:
-    (count,) = struct.unpack("!I", SOUND[6:10])
-    bomb = SOUND[: 10 + count] + zlib.compress(bytes(10**7))
-    with pytest.raises(ImageError, match="does not hold the 36864 bytes"):
-        image_from(bomb)
 
 
 @pytest.mark.parametrize(

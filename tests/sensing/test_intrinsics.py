@@ -47,15 +47,12 @@ def test_what_the_lens_would_fold_into_the_picture_gets_no_pixel_and_what_lies_b
     assert barrel.to_pixels(np.empty((0, 2))).shape == barrel.to_slopes(np.empty((0, 2))).shape == (0, 2)
 
 
-def test_a_matrix_of_opencv_and_a_field_of_view_come_back():
+def test_a_matrix_and_a_field_of_view_come_back_and_the_border_runs_once_around_the_picture():
     lens = lens_of()
     assert Intrinsics.from_matrix(lens.matrix, width_px=800, height_px=600, distortion=LENS) == lens
     lens = Intrinsics.from_field_of_view(horizontal_deg=70.0, width_px=801, height_px=600)
     assert lens.centre_px == (400.5, 300.0)
     assert lens.horizontal_deg == pytest.approx(70.0)
-
-
-def test_the_border_runs_once_around_the_picture():
     border = lens_of().border_px(4)
     assert border[[0, 4, 8, 12]].tolist() == [[0, 0], [800, 0], [800, 600], [0, 600]]
 

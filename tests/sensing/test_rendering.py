@@ -86,15 +86,12 @@ def overlap(found, expected) -> float:
     return (found & expected).sum() / (found | expected).sum()
 
 
-def test_the_sun_stands_where_the_published_example_says():
+def test_the_sun_stands_where_the_published_example_says_and_a_time_without_zone_is_utc():
     # Reda and Andreas, NREL/TP-560-34302, appendix A.5: zenith 50.11 (refraction included), azimuth 194.34.
     when = dt.datetime(2003, 10, 17, 12, 30, 30, tzinfo=dt.timezone(dt.timedelta(hours=-7)))
     sun = sun_at(when, -105.1786, 39.742476)
     assert sun.elevation_deg == pytest.approx(90 - 50.11, abs=0.3)
     assert sun.azimuth_deg == pytest.approx(194.34, abs=0.5)
-
-
-def test_a_time_without_zone_is_utc():
     moment = dt.datetime(2024, 5, 5, 10, 0, tzinfo=dt.UTC)
     assert sun_at(moment.replace(tzinfo=None), 10.0, 50.0) == sun_at(moment, 10.0, 50.0)
 
@@ -147,18 +144,15 @@ def test_a_low_sun_reaches_as_far_as_step_by_step():
     np.testing.assert_allclose(shade, expected, atol=0.05)
 
 
-def test_without_a_sun_all_is_in_shadow():
-    heights = np.full((4, 4), 3.0, dtype=np.float32)
-    assert (cast_shadows(heights, 1.0, Sun(elevation_deg=-5.0, azimuth_deg=0.0)) > heights).all()
-
-
-def test_light_fades_and_turns_blue_at_nightfall():
+def test_light_fades_and_turns_blue_at_nightfall_and_without_a_sun_all_is_in_shadow():
     noon, dusk = (expose(replace(CLEAR, sun=Sun(elevation_deg=e, azimuth_deg=0.0))) for e in (45.0, -6.0))
     assert dusk.sky.sum() < 0.5 * (noon.sky + noon.sun).sum()
     assert dusk.sky[2] > dusk.sky[0]
     assert not noon.lamp.any()
     assert dusk.lamp.any()
     assert noon.dark < dusk.dark <= 1
+    heights = np.full((4, 4), 3.0, dtype=np.float32)
+    assert (cast_shadows(heights, 1.0, Sun(elevation_deg=-5.0, azimuth_deg=0.0)) > heights).all()
 
 
 def test_a_roof_lies_where_the_camera_projects_it_and_leans_outwards():

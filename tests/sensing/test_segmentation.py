@@ -49,10 +49,14 @@ def test_new_shares_are_met_keep_the_order_and_leave_silence_alone(planes: np.nd
     assert (np.diff(moved.probability_bytes[said][order].astype(int)) >= 0).all()
 
 
-def test_odds_change_by_one_factor() -> None:
+def test_odds_change_by_one_factor_and_classes_without_a_new_share_stay() -> None:
     moved = seen(np.array([[[51, 127, 203]]], np.uint8)).with_shares({"c0": 0.3})
     before, after = (item / (1 - item) for item in (np.array([51, 127, 203]) / 254, moved.probabilities()[0, 0]))
     np.testing.assert_allclose(after / before, (after / before)[1], rtol=0.05)
+    first = seen(np.array([[[10, 200]], [[10, 200]]], np.uint8))
+    moved = first.with_shares({"c1": 1.0})
+    assert moved.probability_bytes.tolist() == [[[10, 200]], [[254, 254]]]
+    assert first.probability_bytes.tolist() == [[[10, 200]], [[10, 200]]]
 
 
 def test_shares_of_the_training_place_are_replaced_by_those_of_the_new_one() -> None:
@@ -66,13 +70,6 @@ def test_shares_of_the_training_place_are_replaced_by_those_of_the_new_one() -> 
     right = 1 / (1 + 9 * np.exp(-2 * look))
     assert np.abs(moved.probabilities().ravel() - right).max() < 0.02
     assert np.abs(raw.probabilities().ravel() - right).max() > 0.4
-
-
-def test_classes_without_a_new_share_stay_and_nobody_is_changed_in_place() -> None:
-    first = seen(np.array([[[10, 200]], [[10, 200]]], np.uint8))
-    moved = first.with_shares({"c1": 1.0})
-    assert moved.probability_bytes.tolist() == [[[10, 200]], [[254, 254]]]
-    assert first.probability_bytes.tolist() == [[[10, 200]], [[10, 200]]]
 
 
 @pytest.mark.parametrize(

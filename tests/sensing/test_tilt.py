@@ -63,10 +63,13 @@ def test_a_narrow_road_says_less_than_a_wide_one():
     assert sigmas == sorted(sigmas, reverse=True)
 
 
-def test_without_roads_the_camera_is_the_believed_one():
+def test_without_roads_or_with_borders_above_the_horizon_the_camera_is_about_the_believed_one():
     fit = refine_tilt(camera_of(), [], attitude_sigma_deg=3.0)
     assert off_deg(fit.camera, camera_of()) == pytest.approx(0.0, abs=1e-5)
     assert (fit.before_deg, fit.pitch_sigma_deg) == (0.0, pytest.approx(3.0))
+    level = camera_of(tilt_deg=85.0)
+    sky = np.array([[[100.0, 10.0], [200, 12]], [[100, 50], [200, 52]]])
+    assert np.isfinite(refine_tilt(level, [sky], attitude_sigma_deg=2.0).camera.tilt_deg)
 
 
 def test_a_road_that_widens_pulls_little():
@@ -77,18 +80,6 @@ def test_a_road_that_widens_pulls_little():
     assert off_deg(fit.camera, true) < 2.0  # of 28 degrees between its borders
 
 
-def test_borders_above_the_horizon_do_no_harm():
-    level = camera_of(tilt_deg=85.0)
-    sky = np.array([[[100.0, 10.0], [200, 12]], [[100, 50], [200, 52]]])
-    assert np.isfinite(refine_tilt(level, [sky], attitude_sigma_deg=2.0).camera.tilt_deg)
-
-
-def test_streets_of_a_grid_are_joined_by_direction():
-    true = camera_of()
-    roads = [seen_by(true, NORTH), seen_by(true, EAST), seen_by(true, NORTH + np.array([10.0, 0.0]))]
-    assert [len(lines) for lines in join_parallel(true, roads, within_deg=3.0)] == [4, 2]
-
-
 def mask_of(camera, rings):
     mask = np.zeros((768, 768), dtype=np.uint8)
     for ring in rings:
@@ -97,13 +88,16 @@ def mask_of(camera, rings):
     return mask.astype(bool)
 
 
-def test_borders_of_roads_are_found_and_houses_are_not():
+def test_borders_of_roads_are_found_and_joined_by_direction_and_houses_are_not():
     camera = camera_of()
     road = [(-4, -60), (4, -60), (4, 60), (-4, 60)]
     house = [(20, 20), (30, 20), (30, 32), (20, 32)]
     (borders,) = road_borders(mask_of(camera, [road, house]))
     ground = camera.unproject(borders.reshape(-1, 2), Plane())[:, 0]
     assert np.sort(ground) == pytest.approx([-4, -4, 4, 4], abs=0.4)
+    true = camera_of()
+    roads = [seen_by(true, NORTH), seen_by(true, EAST), seen_by(true, NORTH + np.array([10.0, 0.0]))]
+    assert [len(lines) for lines in join_parallel(true, roads, within_deg=3.0)] == [4, 2]
 
 
 def test_masks_without_roads_have_no_borders():

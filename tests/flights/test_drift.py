@@ -70,15 +70,11 @@ def test_where_the_estimates_frame_lies_and_points_is_no_error(turn_deg, east_m)
     np.testing.assert_allclose(found.yaw_deg, 0, atol=1e-6)
 
 
-def test_a_heading_that_drifts_gives_its_rate_with_its_sign() -> None:
+def test_a_heading_that_drifts_gives_its_rate_with_its_sign_and_a_segment_is_aligned_at_its_first_pose() -> None:
     flown = flight(600.0)
     turned = changed(flown, turn_deg=flown.distance_m / 100 * 2)  # clockwise, 2 degrees after 100 m
     found = segment_errors(pair_run(flown, turned, sequence="a"), 50.0, spacing_m=5.0)
     np.testing.assert_allclose(found.yaw_deg, 1.0, atol=1e-6)
-
-
-def test_a_segment_is_aligned_at_its_first_pose() -> None:
-    """Believed heading is 10 degrees off where the segment begins, so the displacement is seen 10 degrees off."""
     flown = flight(450.0)  # straight north
     turned = changed(flown, turn_deg=10.0)
     found = segment_errors(pair_run(flown, turned, sequence="a"), 100.0, spacing_m=10.0)
@@ -113,12 +109,15 @@ def test_a_gap_is_a_lost_stretch_and_a_hover_is_none() -> None:
     assert pair_run(hover, hover, sequence="a").lost == 0
 
 
-def test_a_length_that_no_run_reaches_has_no_figure() -> None:
+def test_a_length_that_no_run_reaches_has_no_figure_and_poses_too_far_apart_are_told_of() -> None:
     flown = flight(300.0)
     figures = measure_drift([pair_run(flown, flown, sequence="a")], lengths_m=[100.0, 5000.0], draws=10)
     row = value_of(figures, "position_pct", 5000.0)
     assert math.isnan(row["value"])
     assert (row["sequences"], row["segments"]) == (0, 0)
+    run = pair_run(flight(600.0, step_m=20.0), flight(600.0, step_m=20.0), sequence="a", lost_s=60)
+    with pytest.warns(UserWarning, match=r"poses are 20\.0 m apart, farther than a tenth of 50 m"):
+        measure_drift([run], lengths_m=[50.0], draws=10)
 
 
 def test_runs_of_one_sequence_are_one_cluster_and_one_cluster_alone_has_no_interval() -> None:
@@ -229,12 +228,6 @@ def test_a_heading_that_saturates_is_told_from_one_that_walks() -> None:
     fitted = fit_profile(drawn_runs(profile, 12), name="saturates", lengths_m=(50.0, 100.0, 400.0), draws=50)
     assert fitted.profile.heading.length_m in (50.0, 100.0)
     assert fitted.profile.heading.walk_deg_at_100m == pytest.approx(3.0, rel=0.3)
-
-
-def test_poses_too_far_apart_for_the_segments_are_told_of() -> None:
-    run = pair_run(flight(600.0, step_m=20.0), flight(600.0, step_m=20.0), sequence="a", lost_s=60)
-    with pytest.warns(UserWarning, match=r"poses are 20\.0 m apart, farther than a tenth of 50 m"):
-        measure_drift([run], lengths_m=[50.0], draws=10)
 
 
 # Real runs

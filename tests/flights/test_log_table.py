@@ -279,12 +279,11 @@ def test_what_contradicts_or_may_be_two_things_is_refused(tmp_path, head, row, f
         ({"speed_mps": float("nan")}, "--speed-mps must be a number from 0.1 to 100, got nan"),
     ],
 )
-def test_facts_that_cannot_be_are_refused(facts: dict, match: str) -> None:
+def test_facts_that_cannot_be_are_refused_and_units_are_not_said_of_files_that_state_them(
+    facts, match, tmp_path
+) -> None:
     with pytest.raises(FlightError, match=match):
         LogFacts(**facts)
-
-
-def test_units_are_not_said_of_files_that_state_them(tmp_path: Path) -> None:
     (tmp_path / "a.gpx").write_text("<gpx/>")
     with pytest.raises(FlightError, match=r"a\.gpx is no table, and its units are known: leave out --height-unit"):
         read_log(tmp_path / "a.gpx", LogFacts(height_unit="ft"))

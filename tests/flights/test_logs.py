@@ -252,7 +252,7 @@ def test_any_bytes_are_read_or_refused_in_one_line(tmp_path_factory, content, su
     assert _refused(path)
 
 
-def test_points_before_the_first_fix_and_of_one_time_are_left_out_with_a_word(written: Callable) -> None:
+def test_points_before_the_first_fix_and_of_one_time_or_place_are_left_out_with_a_word(written) -> None:
     """Logs of PX4 and ArduPilot begin at 0, 0; those with times in whole seconds repeat them."""
     rows = [f"{at // 2},{LAT + at * 5e-5 if at > 3 else 0},{LON if at > 3 else 0},8" for at in range(20)]
     path = written("a.csv", _csv("time_s,lat,lon,height_m", *rows))
@@ -264,17 +264,17 @@ def test_points_before_the_first_fix_and_of_one_time_are_left_out_with_a_word(wr
     ]
     assert log.time_s.tolist() == list(range(8))
     assert log.lat_deg[:2] == pytest.approx([LAT + 2e-4, LAT + 3e-4])
-
-
-def test_points_of_one_place_without_times_are_left_out_with_a_word(written: Callable) -> None:
     with pytest.warns(UserWarning, match=r"a\.kml: left out 1 point with the place of the point before"):
         log = read_log(written("a.kml", LINE.format("9.52,47.14 9.52,47.14 9.52,47.15")))
     assert log.lat_deg.tolist() == [47.14, 47.15]
 
 
-def test_more_elements_than_a_track_has_are_refused(written: Callable, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_more_elements_than_a_track_has_and_a_log_of_days_are_refused(written, monkeypatch, region) -> None:
     monkeypatch.setattr(log_xml, "_MOST_ELEMENTS", 8)
     assert "more than 8 elements" in _refused(written("a.gpx", "<gpx>" + "<a/>" * 8))
+    path = written("a.csv", _csv("time_s,lat,lon", "0,48.05,11.05", "300000,48.05,11.06"))
+    with pytest.raises(FlightError, match=r"lasts 300000 s, more than 1000000 steps of 0\.2 s: cut it"):
+        read_flight(path, region, height_m=80.0)
 
 
 # Onto a region
@@ -430,9 +430,3 @@ def test_wishes_that_cannot_be_are_refused(written: Callable, region: Region, wi
     path = written("a.csv", _table(region, _across(region)))
     with pytest.raises(FlightError, match=next(iter(wish)).replace("_m", "-m")):
         read_flight(path, region, **({"height_m": 100.0} | wish))
-
-
-def test_a_log_of_days_is_refused_before_it_is_resampled(written: Callable, region: Region) -> None:
-    path = written("a.csv", _csv("time_s,lat,lon", "0,48.05,11.05", "300000,48.05,11.06"))
-    with pytest.raises(FlightError, match=r"lasts 300000 s, more than 1000000 steps of 0\.2 s: cut it"):
-        read_flight(path, region, height_m=80.0)

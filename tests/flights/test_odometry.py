@@ -69,14 +69,11 @@ def end_errors(flown, drift, count, seed=0):
 # Increments
 
 
-def test_without_drift_the_increments_lead_along_the_flight() -> None:
+def test_without_drift_the_increments_lead_along_the_flight_in_the_axes_of_the_body() -> None:
     flown = curved()
     reckoned = dead_reckon(flown, true_odometry(flown))
     np.testing.assert_allclose(reckoned.position_m, flown.position_m, atol=1e-9)
     np.testing.assert_allclose(reckoned.rotation.as_matrix(), flown.rotation.as_matrix(), atol=1e-9)
-
-
-def test_a_body_that_flies_where_it_heads_goes_up_in_its_own_axes() -> None:
     flown = Trajectory.of_angles(time_s=[0.0, 1.0], position_m=[[0, 0, 80], [10, 0, 80]], yaw_deg=[90.0, 120.0])
     steps = true_odometry(flown)
     assert (steps.right_m[0], steps.up_m[0], steps.yaw_deg[0]) == pytest.approx((0, 10, 30))
@@ -187,12 +184,15 @@ def test_a_lost_step_says_nothing_and_reckoning_goes_on_from_where_it_was() -> N
     assert believed.position_m[-1, 1] == pytest.approx(3000.0 - 10 * steps.is_lost.sum())
 
 
-def test_nothing_drifts_while_hovering() -> None:
+def test_nothing_drifts_while_hovering_and_a_process_over_steps_of_nothing_stays() -> None:
     hover = Trajectory.of_angles(time_s=np.arange(9.0), position_m=np.zeros((9, 3)), yaw_deg=np.arange(9.0))
     steps = draw_odometry(hover, load_profile("vio-mono"), rng=np.random.default_rng(0))
     assert not steps.up_m.any()
     np.testing.assert_allclose(steps.yaw_deg, 1.0)
     assert (np.linalg.eigvalsh(steps.covariance) > 0).all()
+    drawn = draw_gauss_markov(np.zeros(4), length_m=10.0, rng=np.random.default_rng(0))
+    assert len(set(drawn.values.tolist())) == 1
+    np.testing.assert_allclose(drawn.means, drawn.values[:-1])
 
 
 def test_what_cannot_be_drawn_is_refused() -> None:
@@ -212,12 +212,6 @@ def test_what_cannot_be_drawn_is_refused() -> None:
 def test_a_lattice_has_the_variance_of_one_long_step(length_m) -> None:
     whole = mean_variance(np.array([40.0]), length_m=length_m)[0]
     assert lattice_covariance(8, 5.0, length_m=length_m).mean() == pytest.approx(whole, rel=1e-6)
-
-
-def test_a_process_over_steps_of_nothing_stays() -> None:
-    drawn = draw_gauss_markov(np.zeros(4), length_m=10.0, rng=np.random.default_rng(0))
-    assert len(set(drawn.values.tolist())) == 1
-    np.testing.assert_allclose(drawn.means, drawn.values[:-1])
 
 
 # Profiles

@@ -133,20 +133,14 @@ def test_a_long_survey_lies_along_the_longer_side_of_what_is_mapped(regions: Cal
     assert np.ptp(path_m[:, 1]) > 2 * np.ptp(path_m[:, 0])
 
 
-def test_a_transit_leads_far_away_without_sharp_turns(regions: Callable[[str], Region]) -> None:
+def test_a_transit_leads_far_away_a_loiter_stays_and_waypoints_have_straight_legs(regions) -> None:
     path_m = _drawn(regions("town-grid"), "transit")
     assert np.hypot(*(path_m[-1] - path_m[0])) > 0.8 * 2000
     assert np.abs(_turns_deg(path_m)).max() < 3
-
-
-def test_a_loiter_stays_near_one_place(regions: Callable[[str], Region]) -> None:
     for seed in range(6):
         path_m = _drawn(regions("town-grid"), "loiter", seed=seed, length_m=6000.0)
         assert np.ptp(path_m, axis=0).max() < 650
         assert np.abs(_turns_deg(path_m)).max() < 6
-
-
-def test_waypoints_have_straight_legs_of_a_least_length(regions: Callable[[str], Region]) -> None:
     path_m = _drawn(regions("town-grid"), "waypoints", length_m=6000.0)
     lengths = np.hypot(*np.diff(path_m, axis=0).T)
     legs = lengths[lengths > 50]

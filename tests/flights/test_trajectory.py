@@ -64,13 +64,10 @@ def test_impossible_values_are_refused(changes: dict[str, object], told: str) ->
         _straight(**changes)
 
 
-def test_a_quaternion_of_another_order_or_length_is_refused() -> None:
+def test_a_quaternion_of_another_order_or_length_is_refused_and_times_since_1970_are_told_in_full() -> None:
     with pytest.raises(FlightError, match="pose 1 has length 0, not 1: order is x y z w"):
         Trajectory(time_s=np.arange(2.0), position_m=np.zeros((2, 3)), quaternion_xyzw=np.zeros((2, 4)))
     turned = Rotation.from_rotvec([[0, 0, 0], [0, 0, np.pi / 2]]).as_quat()
     flown = Trajectory(time_s=np.arange(2.0), position_m=np.zeros((2, 3)), quaternion_xyzw=turned)
     assert np.sin(np.radians(flown.yaw_deg)).tolist() == pytest.approx([1, 0])
-
-
-def test_times_since_1970_are_told_apart_in_messages() -> None:
     assert _straight(time_s=[1413393212.25, 1413393214.5]).span_text() == "1413393212.250 to 1413393214.500 s"

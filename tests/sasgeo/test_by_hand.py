@@ -30,14 +30,11 @@ def test_the_right_place_leads_and_an_older_map_says_less(tiny, asked):
     assert leads[0] > leads[1] > leads[2] > 0
 
 
-def test_what_is_unknown_to_the_view_or_to_the_map_counts_nothing(tiny, asked):
+def test_what_is_unknown_counts_nothing_and_cells_are_a_whole_number_of_those_of_the_map(tiny, asked):
     query, _ = asked
     seen = query.evidence
     blind = Evidence(classes=seen.classes, cells=np.full_like(seen.cells, UNKNOWN), cell_size_m=seen.cell_size_m)
     day = tiny.region.manifest.extract.date
     assert not view_by_hand(replace(query, evidence=blind), tiny.region.classes, map_date=day).bands.any()
     assert not view_by_hand(query, (), map_date=day).bands.any()
-
-
-def test_cells_are_a_whole_number_of_those_of_the_map(tiny):
     assert map_by_hand(tiny.region, cell_size_m=4.3).grid == tiny.region.grid.coarsen(4)

@@ -46,16 +46,13 @@ def test_by_block_the_promise_holds_where_whole_blocks_go_wrong():
     assert alone / SPLITS > DELTA  # taking the answers of a block for independent promises too much, too often
 
 
-def test_answers_without_a_false_one_promise_from_the_count_on_that_carries_it():
+def test_answers_without_a_false_one_promise_from_the_count_on_and_where_none_can_nothing_is_accepted():
     for count, is_promised in ((76, False), (77, True)):  # 0.95^77 < 0.1 / 5
         for blocks in (None, [str(at) for at in range(count)]):
             bound = risk_threshold(np.full(count, 0.001), np.zeros(count), alpha=ALPHA, delta=DELTA, blocks=blocks)
             assert bound.is_promised == is_promised
             assert (bound.accepted, bound.false, bound.units) == ((count, 0, count) if is_promised else (0, 0, 0))
             assert bound.is_by_block == (blocks is not None)
-
-
-def test_where_none_can_be_promised_nothing_is_accepted():
     for p_false, is_false in ((np.full(500, 0.01), np.ones(500)), (np.ones(500), np.zeros(500)), ([], [])):
         bound = risk_threshold(p_false, is_false, alpha=ALPHA, delta=DELTA)
         assert bound.threshold == 0.0

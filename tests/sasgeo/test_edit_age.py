@@ -19,23 +19,16 @@ def dated(region, years):
     return replace(region, features=region.features.assign(timestamp=edited))
 
 
-def test_a_stratum_is_where_its_class_is(tiny):
+def test_a_stratum_is_where_its_class_is_and_what_was_touched_last_counts(tiny):
     region = dated(tiny.region, [0.5, 2.0, 4.0, 9.0])
     found = strata(region)
     assert ((found == NEVER) == (region.layers != PRESENT)).all()
     assert set(np.unique(found[found != NEVER]).tolist()) == set(range(STRATA))
-
-
-def test_what_was_touched_last_counts_where_features_overlap(tiny):
     old, new = (strata(dated(tiny.region, years)) for years in ([9.0], [9.0, 0.5]))
     there = old != NEVER
     assert (old[there] == STRATA - 1).all()
     assert (new[there] <= old[there]).all()
     assert (new[there] == 0).any()
-
-
-def test_a_map_edited_after_its_date_is_fresh():
-    assert idle_years(pd.Series(["2021-01-01"]), dt.date(2020, 1, 1)).tolist() == [0.0]
 
 
 def test_full_trust_changes_no_map_and_none_takes_the_class_away(tiny):
@@ -52,7 +45,8 @@ def test_full_trust_changes_no_map_and_none_takes_the_class_away(tiny):
     assert (some.known == plain.known).all()
 
 
-def test_strata_without_cells_are_as_their_class_and_silent_classes_stay():
+def test_strata_without_cells_are_as_their_class_and_a_map_edited_after_its_date_is_fresh():
     none = np.zeros((1, STRATA), dtype=np.int64)
     far = np.zeros(1, dtype=np.int64)
     assert fit_trust([StampTally(seen=none, missed=none, far_seen=far, far_missed=far)]).tolist() == [[1.0] * STRATA]
+    assert idle_years(pd.Series(["2021-01-01"]), dt.date(2020, 1, 1)).tolist() == [0.0]

@@ -22,16 +22,10 @@ def chosen(count, *, seed=1, modes=12):
     return made
 
 
-def test_the_true_exponents_come_back():
+def test_the_true_exponents_come_back_whatever_is_added_to_a_search_or_overflows():
     assert fit_scaling(chosen(1500)) == pytest.approx(TRUE, rel=0.25)
-
-
-def test_the_same_number_added_to_a_search_changes_nothing():
     searches = chosen(50)
     assert fit_scaling([one + 1e4 for one in searches]) == pytest.approx(fit_scaling(searches), rel=1e-3)
-
-
-def test_scores_so_large_that_an_exponential_overflows_are_taken_and_one_mode_teaches_nothing():
     assert np.isfinite(fit_scaling([np.array([[1e7, 0.0], [0.0, 1e7]])])).all()
     assert fit_scaling([np.ones((1, 4))]) == pytest.approx([START] * 4)
 

@@ -64,13 +64,20 @@ def mapped():
     return mapped_from(drawn())
 
 
-def test_all_is_found_where_it_is(seen, mapped):
+def test_all_is_found_where_it_is_and_unknown_cells_change_nothing_where_nothing_is(seen, mapped):
     found = score(seen, mapped)
     assert found.matched == 3 + 1 + len(HOUSES)  # junctions, and an end
     assert (found.unmatched_seen, found.unmatched_mapped, found.contradicting) == (0, 0, 0)
     assert found.rms_m == pytest.approx(0.0, abs=1e-6)
     assert found.consistency == 1.0
     assert found.score > 20
+    cells = BLANK.cells.copy()
+    cells[:, 150:180, 5:25] = UNKNOWN
+    assert asdict(score(ObservedGraph.make(BLANK.replace(cells), drawn()), mapped)) == asdict(score(seen, mapped))
+    one = vector_table([("building", 0, False, shapely.box(-30, 20, -22, 28))])
+    assert score(ObservedGraph.make(BLANK, one), mapped).matched == 1
+    assert score(ObservedGraph.make(BLANK, one), mapped_from(one)).score > 0
+    assert verify(ObservedGraph.make(BLANK, one), mapped, []) == []
 
 
 @pytest.mark.parametrize("yaw_deg", [30.0, 90.0, 200.0])
@@ -111,12 +118,6 @@ def test_nothing_is_missed_where_the_view_is_unknown_or_does_not_reach(seen, map
     assert score(seen, mapped_from(beyond)).unmatched_mapped == 0
 
 
-def test_unknown_cells_change_nothing_where_nothing_is(seen, mapped):
-    cells = BLANK.cells.copy()
-    cells[:, 150:180, 5:25] = UNKNOWN
-    assert asdict(score(ObservedGraph.make(BLANK.replace(cells), drawn()), mapped)) == asdict(score(seen, mapped))
-
-
 def test_nothing_is_made_up_where_the_map_ends(seen):
     vectors = drawn(houses=HOUSES[:4])
     features, grid = as_features(vectors), Grid.around(0.0, 0.0, size_m=(800.0, 800.0), cell_size_m=1.0, epsg=32632)
@@ -140,13 +141,6 @@ def test_an_empty_view_or_map_says_nothing(seen, mapped, vectors):
     blind = BLANK.replace(np.full_like(BLANK.cells, UNKNOWN))
     assert score(ObservedGraph.make(blind, vectors), mapped) == GraphScore()
     assert score(seen, mapped_from(vector_table([]))) == GraphScore()
-
-
-def test_a_single_node_is_scored(mapped):
-    one = vector_table([("building", 0, False, shapely.box(-30, 20, -22, 28))])
-    assert score(ObservedGraph.make(BLANK, one), mapped).matched == 1
-    assert score(ObservedGraph.make(BLANK, one), mapped_from(one)).score > 0
-    assert verify(ObservedGraph.make(BLANK, one), mapped, []) == []
 
 
 def test_every_figure_is_finite_anywhere(seen, mapped):

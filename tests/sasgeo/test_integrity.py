@@ -24,10 +24,12 @@ def drawn(seed, count=5):
     return rng.uniform(0, 300, (count, 2)), by_class[np.argsort(-by_class.sum(axis=1))]
 
 
-def test_names_are_said_once_and_fit_into_an_answer():
+def test_names_are_said_once_fit_into_an_answer_and_others_are_refused():
     names = [item.name for item in (*EVIDENCE, *PROTECTION)]
     assert len(set(names)) == len(names) < MOST_DIAGNOSTICS
     assert all(item.meaning and item.unit for item in (*EVIDENCE, *PROTECTION))
+    with pytest.raises(ShapeError, match="'margin' is no evidence that a matcher supplies"):
+        evidence_of(modes_of([[0, 0]], [[1.0]]), margin=2.0)
 
 
 def test_evidence_by_hand():
@@ -48,15 +50,12 @@ def test_evidence_by_hand():
     assert found["spread_m"] == pytest.approx(math.sqrt(weights @ ((modes.positions_m - middle) ** 2).sum(axis=1)))
 
 
-def test_a_mode_alone_is_held_against_none_being_right():
+def test_a_mode_alone_is_held_against_none_being_right_and_what_is_not_known_is_left_out():
     found = evidence_of(modes_of([[5, 5]], [[3, -1]], none_nats=0.5))
     assert found["margin_nats"] == 1.5
     assert found["modes_above"] == 1.0
     assert found["spread_m"] == 0.0
     assert found["class_agreement"] == 0.75
-
-
-def test_what_is_not_known_is_left_out():
     flat = Null(best=1.0, mean=1.0, deviation=0.0, places=1)
     found = evidence_of(modes_of([[0, 0]], [[0, 0]]), null=flat, unknown_share=None, map_age_years=math.nan)
     assert set(found) == set(OF_MODES) - {"class_agreement"}
@@ -97,8 +96,3 @@ def test_a_larger_lead_is_a_larger_margin_and_no_more_entropy(seed, more):
 def test_what_is_no_list_of_modes_is_refused(positions_m, by_class, changes, words):
     with pytest.raises(ShapeError, match=words):
         modes_of(positions_m, by_class, **changes)
-
-
-def test_a_name_that_is_not_in_the_list_is_refused():
-    with pytest.raises(ShapeError, match="'margin' is no evidence that a matcher supplies"):
-        evidence_of(modes_of([[0, 0]], [[1.0]]), margin=2.0)

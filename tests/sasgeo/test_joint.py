@@ -14,7 +14,7 @@ def test_weights_that_turn_a_term_around_are_refused(name, value):
         Blend(**{name: value})
 
 
-def test_by_hand():
+def test_by_hand_contradiction_is_never_covered_up():
     terms = columns(
         np.array([[2.0, -4.0], [1.0, 0.5]]), np.array([3.0, -1.0]), Blend(alpha=2.0, beta=0.5, eta=0.25), nodes=2
     )
@@ -23,7 +23,4 @@ def test_by_hand():
     assert not columns(np.ones((3, 2)), np.array([5.0, -5.0, 0.0]), Blend(), nodes=0)[:, 2].any()
     by_class = np.array([[2.0, -4.0], [1.0, 0.5]])
     assert (columns(by_class, None, Blend(), nodes=9) == by_class).all()  # without a graph
-
-
-def test_contradiction_is_never_covered_up():
     assert contradiction(np.array([[100.0, -3.0], [0.0, 0.0]])).tolist() == [3.0, 0.0]

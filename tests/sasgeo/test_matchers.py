@@ -148,10 +148,14 @@ def test_without_vectors_burning_them_changes_nothing_and_with_them_something(ti
     assert drawing.match(query, top_k=5).scores != unburnt.scores
 
 
-def test_a_blind_view_is_withheld(tiny, whole):
+def test_a_blind_view_is_withheld_and_without_a_heading_the_graph_proposes_poses(tiny, whole):
     query, _ = first(tiny, "localization")
     blind = query.evidence.replace(np.full_like(query.evidence.cells, UNKNOWN))
     assert not whole.match(replace(query, evidence=blind), top_k=5).poses
+    query = next(item for item in tiny.queries if item.prior.yaw_deg is None and item.evidence.shape[0] == 192)
+    check_match(whole.match(query, top_k=5), query, top_k=5)
+    with pytest.raises(RuntimeError, match="prepare"):
+        Sasgeo().match(tiny.queries[0], top_k=5)
 
 
 @pytest.mark.parametrize("state", [ABSENT, PRESENT])
@@ -194,11 +198,6 @@ def test_unknown_cells_change_nothing_where_they_are_silent_and_something_where_
     half = replace(query, evidence=query.evidence.replace(cells), vectors=None)
     silent, blind = (prepared(arm, tiny.region).match(half, top_k=1) for arm in (Sasgeo, SasgeoStability))
     assert silent.scores != blind.scores
-
-
-def test_without_a_heading_the_graph_proposes_poses(tiny, whole):
-    query = next(item for item in tiny.queries if item.prior.yaw_deg is None and item.evidence.shape[0] == 192)
-    check_match(whole.match(query, top_k=5), query, top_k=5)
 
 
 @pytest.fixture(scope="module")
@@ -251,12 +250,7 @@ def test_the_even_graph_learns_rules_and_blend_alone(drawn):
     assert replace(said, rules=hand.rules, blend=hand.blend, views=0, blocks=0) == hand
 
 
-def test_without_vectors_to_learn_from_the_starting_rules_hold(training):
-    pairs = [(replace(query, vectors=None), truth) for query, truth in training.pairs]
-    assert ScorerModel.from_text(SasgeoGraph().learn(replace(training, pairs=pairs))).rules == GraphRules()
-
-
-def test_nothing_to_learn_from_is_said(training):
+def test_nothing_to_learn_from_is_said_and_without_vectors_the_starting_rules_hold(training):
     with pytest.raises(ConfigError, match="no view of the training part"):
         Sasgeo().learn(replace(training, pairs=[]))
     absent = [(query, replace(truth, is_present=False)) for query, truth in training.pairs]
@@ -264,8 +258,5 @@ def test_nothing_to_learn_from_is_said(training):
         Sasgeo().learn(replace(training, pairs=absent))
     with pytest.raises(ConfigError, match="has no place: give views of present places"):
         _pose(replace(training.pairs[0][1], pose=None))
-
-
-def test_match_before_prepare_says_so(tiny):
-    with pytest.raises(RuntimeError, match="prepare"):
-        Sasgeo().match(tiny.queries[0], top_k=5)
+    pairs = [(replace(query, vectors=None), truth) for query, truth in training.pairs]
+    assert ScorerModel.from_text(SasgeoGraph().learn(replace(training, pairs=pairs))).rules == GraphRules()

@@ -140,15 +140,12 @@ def scorer() -> dict[str, str]:
     return read("sasgeo", "*.py")
 
 
-def test_no_constant_of_the_scorer_has_the_value_of_one_of_the_generator(scorer):
+def test_neither_a_constant_nor_a_comment_of_the_scorer_has_or_quotes_one_of_the_generator(scorer):
     found = shared(scorer, read("tasks", *GENERATOR))
     news = {name: those for name, those in found.items() if name not in ARGUED}
     assert not news, f"say in ARGUED where they come from, or choose other values: {news}"
     ours = {f"{path}:{name} = {value:g}" for path, text in scorer.items() for name, _, value in parameters(text)}
     assert set(ARGUED) <= ours, f"no longer there, so not to be argued: {set(ARGUED) - ours}"
-
-
-def test_no_comment_of_the_scorer_speaks_of_what_the_generator_does(scorer):
     assert quotes(scorer) == []
 
 

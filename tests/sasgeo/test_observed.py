@@ -105,13 +105,10 @@ def test_an_empty_or_unknown_view_has_no_nodes_and_no_lines():
 # Thinned masks
 
 
-def test_a_mask_is_thinned_to_its_middle_line():
+def test_a_mask_is_thinned_to_its_middle_line_and_a_crossroads_to_four_without_a_spur():
     [line] = middle_lines(view(road_minor=[(57, 63, 0, 120)]).layer("road_minor") == PRESENT, 1.0)
     assert line.length == pytest.approx(120, abs=8)
     assert np.abs(shapely.get_coordinates(line)[:, 1]).max() <= 1.5
-
-
-def test_a_crossroads_of_masks_has_four_lines_and_no_spur():
     cross = view(road_minor=[(57, 63, 0, 120), (0, 120, 57, 63)])
     lines = lines_of_mask(cross)
     assert sorted(shapely.length(lines.geometry.to_numpy()).round(-1).tolist())[-4:] == [60.0] * 4

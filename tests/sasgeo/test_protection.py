@@ -39,14 +39,11 @@ def test_classes_that_agree_leave_the_uncertainty_of_a_refined_position():
     assert separation_level(AGREED, 1e-2) < density_level(AGREED, 1e-2) < 10.0
 
 
-def test_the_class_whose_loss_moves_the_answer_farthest_sets_the_level():
+def test_the_class_whose_loss_moves_the_answer_farthest_sets_the_level_and_of_ties_the_farthest():
     # Without the first class the third mode wins, 60 m away; without the second, the second one, 80 m away.
     modes = modes_of([[0, 0], [0, 80], [60, 0]], [[5, 5, 2], [5, -3, 3], [-2, 6, 3]])
     assert separation_level(modes, 1e-2) == pytest.approx(80.0 + sigmas(1e-2) * SIGMA_M)
     assert separation_level(modes, 1e-3) > separation_level(modes, 1e-2)
-
-
-def test_of_places_that_tie_without_a_class_the_farthest_counts():
     modes = modes_of([[0, 0], [30, 0], [90, 0], [200, 0]], [[5, 1], [1, 1], [0, 1], [0, 0]])
     assert separation_level(modes, 1e-2) == pytest.approx(90.0 + sigmas(1e-2) * SIGMA_M)
 
@@ -62,19 +59,11 @@ def test_where_nothing_is_left_that_could_disagree_there_is_no_separation_level(
     assert np.isfinite(list(levels_of(modes).values())).all()
 
 
-def test_a_class_that_says_nothing_changes_nothing():
-    wider = modes_of(AGREED.positions_m, np.hstack((AGREED.by_class, np.zeros((3, 1)))))
-    assert levels_of(wider) == pytest.approx(levels_of(AGREED))
-
-
-def test_two_modes_alike_are_as_uncertain_as_their_distance():
+def test_two_modes_alike_are_as_uncertain_as_their_distance_by_the_longer_axis():
     modes = modes_of([[0, 0], [100, 0]], [[5, 5], [5, 5]], none_nats=-50.0)
     assert posterior_sigma_m(modes) == pytest.approx(math.sqrt(0.5 * 100**2 + SIGMA_M**2))
     assert gauss_level(modes, 1e-2) == pytest.approx(sigmas(1e-2) * posterior_sigma_m(modes))
     assert density_level(modes, 1e-2) == pytest.approx(100.0 + sigmas(5e-3) * SIGMA_M)
-
-
-def test_the_longer_axis_counts():
     line = modes_of([[0, 0], [30, 40]], [[1], [1]], none_nats=-50.0)
     assert posterior_sigma_m(line) == pytest.approx(math.sqrt(0.5 * 50**2 + SIGMA_M**2))
 
@@ -86,8 +75,10 @@ def test_no_radius_holds_the_chance_that_none_is_right():
     assert density_level(modes, 0.1) < math.inf
 
 
-def test_levels_grow_as_the_risk_falls_and_have_the_names_that_are_listed():
+def test_levels_grow_as_the_risk_falls_and_a_class_that_says_nothing_changes_nothing():
     found = levels_of(AGREED)
     assert list(found) == [item.name for item in PROTECTION]
     for method in ("separation", "gauss", "density"):
         assert found[f"hpl_{method}_0.001_m"] > found[f"hpl_{method}_0.01_m"] > 0
+    wider = modes_of(AGREED.positions_m, np.hstack((AGREED.by_class, np.zeros((3, 1)))))
+    assert levels_of(wider) == pytest.approx(levels_of(AGREED))

@@ -40,11 +40,15 @@ def test_fitted_rates_are_the_true_ones_on_average():
         assert np.mean([getattr(one, name) for one in worlds]) == pytest.approx(getattr(TRUE, name), rel=0.1), name
 
 
-def test_where_nothing_was_seen_the_hand_decides():
+def test_where_nothing_was_seen_the_hand_decides_as_of_ageing_on_a_map_of_one_age():
     nothing = np.zeros((1, FAR + 1), dtype=np.int64)
     fitted = fit_rates([as_tally(nothing, nothing, age_years=5.0)])["building"]
     assert fitted.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-3)
     assert likeness([as_tally(nothing, nothing)])[0].tolist() == [1.0, 0.0, 0.0, 0.0, 0.0]
+    fitted = fit_rates(made_up(TRUE, ages_years=(0.0,)))["building"]
+    assert fitted.hit == pytest.approx(TRUE.hit, abs=0.01)
+    assert fitted.false_alarm == pytest.approx(TRUE.false_alarm, rel=0.1)
+    assert fitted.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-2)
 
 
 def test_rings_are_metres_from_the_nearest_cell_of_a_class():
@@ -68,13 +72,6 @@ def test_a_map_that_lies_beside_the_world_makes_being_near_alike():
     )
     assert straight[0, 1] < 0.2
     assert shifted[0, 1] > 0.8
-
-
-def test_a_map_of_one_age_tells_the_detector_and_leaves_ageing_to_the_hand():
-    fitted = fit_rates(made_up(TRUE, ages_years=(0.0,)))["building"]
-    assert fitted.hit == pytest.approx(TRUE.hit, abs=0.01)
-    assert fitted.false_alarm == pytest.approx(TRUE.false_alarm, rel=0.1)
-    assert fitted.vanish_per_year == pytest.approx(hand_rates("building").vanish_per_year, rel=1e-2)
 
 
 def test_an_empty_train_part_and_classes_that_differ_are_refused():

@@ -30,12 +30,9 @@ def test_the_true_factor_comes_back(factor):
     assert fit_season("snow", winters(factor, views=60), [RATES])[0] == pytest.approx(factor, abs=0.03)
 
 
-def test_where_little_was_seen_the_hand_decides():
+def test_where_little_was_seen_the_hand_decides_and_a_season_that_nobody_tells_changes_nothing():
     (few,) = fit_season("snow", winters(1.0, views=1, cells=20), [RATES])
     assert few == pytest.approx(SEASON_SHARES["snow"]["path_track"], abs=0.03)
-
-
-def test_a_season_that_nobody_tells_changes_nothing():
     classes = load_taxonomy().names
     assert (by_hand("", classes) == 1.0).all()
     assert (by_hand("monsoon", classes) == 1.0).all()

@@ -72,14 +72,11 @@ def test_without_odometry_what_the_odometer_says_changes_nothing(region):
     assert [fix.pose for fix in told] == [fix.pose for fix in misled]
 
 
-def test_the_scale_of_a_flight_is_learned(region):
+def test_the_scale_of_a_flight_is_learned_and_a_prior_of_it_kept_where_nothing_was_seen(region):
     poses = [replace(pose, scale=1.05) for pose in way_of(START, VIEWS, STEP_M)]
     fixes = flown(SasgeoTrack(), region, views_of(region, poses))
     assert fixes[0].pose.scale == pytest.approx(1.0, abs=0.05)
     assert fixes[-1].pose.scale == pytest.approx(1.05, abs=0.02)
-
-
-def test_a_prior_of_scale_is_kept_where_nothing_was_seen():
     scale = FlightScale.of(replace(PRIOR, scale_sigma=0.0))
     assert scale.mean == 1.0
 

@@ -129,8 +129,6 @@ def read_flight(
         What the file does not say: units of a table, axes of a TUM file, the speed of a log without times (10 m/s).
     step_s : float
         Seconds between poses.
-    tell : callable
-        Gets each line on what was read of a log, and what was not.
 
     Returns
     -------
@@ -158,7 +156,7 @@ def read_flight(
     >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
     >>> with tempfile.TemporaryDirectory() as out:
     ...     spec = read_region_file(find_region_file("town-suburb"))
-    ...     _ = build_region(plan_build(spec, out=Path(out)), tell=lambda _: None)
+    ...     _ = build_region(plan_build(spec, out=Path(out)))
     ...     region = read_region(Path(out) / "regions" / "town-suburb")
     ...     west, south, east, north = region.manifest.bounds_lonlat
     ...     path = Path(out) / "flight.csv"

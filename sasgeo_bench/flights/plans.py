@@ -110,7 +110,7 @@ def plan_flight(
     >>> from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
     >>> with tempfile.TemporaryDirectory() as out:
     ...     spec = read_region_file(find_region_file("town-suburb"))
-    ...     _ = build_region(plan_build(spec, out=Path(out)), tell=lambda _: None)
+    ...     _ = build_region(plan_build(spec, out=Path(out)))
     ...     region = read_region(Path(out) / "regions" / "town-suburb")
     >>> path = plan_flight(region, "loiter", length_m=2000.0, rng=np.random.default_rng(3))
     >>> round(length_m(path)), bool(flight_area(region).covers(shapely.LineString(path)))

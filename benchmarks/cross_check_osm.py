@@ -68,7 +68,7 @@ def read_ours(path: Path, frame: Frame, *, at: str) -> pd.DataFrame:
     features = read_extract(path, grid, at=day).features
     features = features[features["osm_type"].isin(["way", "relation"])]  # the sea comes from the coast, not from a tag
     geometry = features.geometry.to_numpy()
-    is_area = shapely.get_dimensions(geometry) == 2  # noqa: PLR2004 - polygons
+    is_area = shapely.get_dimensions(geometry) == 2  # polygons
     size, holes, _ = sizes(geometry, is_area, frame)
     table = {"kind": features["osm_type"].str[0], "id": features["osm_id"], "class": features["class"]}
     form = np.where(is_area, "area", "line")

@@ -100,7 +100,7 @@ def measure(mapped: MappedGraph, state: State, look: Look, *, views: int, least_
         near = (at for at, (one, _) in enumerate(found) if is_near(one, pose))
         ranks.append(next(near, CANDIDATES))
         junctions.append(int(np.isfinite(seen.nodes.arms_deg[:, 2]).sum()))
-    rank, enough = np.array(ranks), np.array(junctions) > 2  # noqa: PLR2004 - at least three pairs
+    rank, enough = np.array(ranks), np.array(junctions) > 2  # at least three pairs
     shares = [float((rank < least).mean()) for least in (1, 10, CANDIDATES)]
     with_pairs = float((rank < CANDIDATES)[enough].mean()) if enough.any() else float("nan")
     columns = [statistics.median(view_ms), statistics.median(verify_ms), max(verify_ms), statistics.median(propose_ms)]

@@ -72,7 +72,7 @@ def main() -> None:
         f"evidence and levels of {MODES} modes: {millis(lambda: told_of(next(fresh)), runs * SINGLES):.2f} ms an answer"
     )
     answers = [answer_of(modes, rng) for modes in searches]
-    is_false = rng.random(len(answers)) < 0.3  # noqa: PLR2004 - some are false; timing needs no more
+    is_false = rng.random(len(answers)) < 0.3  # some are false; timing needs no more
     asked = answers[:ASKED]
     print(f"{'rejector':>16} {'fitted on':>10} {'fit, s':>8} {'one at a time, ms':>18} {'together, ms each':>18}")
     for rule in (SasgeoLogistic, SasgeoBoosted):

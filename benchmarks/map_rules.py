@@ -92,7 +92,7 @@ def rings(ways: list[Way]) -> list[shapely.Geometry]:
     open_ends: dict[int, list[int]] = defaultdict(list)
     closed, left = [], {}
     for index, way in enumerate(ways):
-        if len(way.refs) < 2:  # noqa: PLR2004 - no line
+        if len(way.refs) < 2:  # no line
             continue
         if way.refs[0] == way.refs[-1]:
             closed.append(way.places)
@@ -117,7 +117,7 @@ def rings(ways: list[Way]) -> list[shapely.Geometry]:
 
 
 def _filled(places: list[Place]) -> shapely.Geometry:
-    return shapely.make_valid(shapely.Polygon(places)) if len(set(places)) > 2 else shapely.Polygon()  # noqa: PLR2004
+    return shapely.make_valid(shapely.Polygon(places)) if len(set(places)) > 2 else shapely.Polygon()
 
 
 def by_role(relation: Relation, facts: Facts) -> shapely.Geometry:
@@ -190,7 +190,7 @@ def no_line_across_a_gap(case: Case) -> float | None:
 def ring_of_two_places(case: Case) -> float | None:
     """A closed way that goes there and back: a line, and no area."""
     way = case.way
-    if way is None or way.lacks_nodes or len(set(way.places)) > 2:  # noqa: PLR2004 - no ring
+    if way is None or way.lacks_nodes or len(set(way.places)) > 2:  # no ring
         return None
     return 0.0 if case.form == "area" else float(shapely.length(shapely.LineString(way.places)))
 
@@ -257,7 +257,7 @@ def outer_ways_that_disagree(case: Case) -> float | None:
         return None
     outer = [case.facts.ways[ref] for ref, role in relation.members if role in ("outer", "") and ref in case.facts.ways]
     forms = [TAGS.forms(way.tags, "closed") for way in outer]
-    if len({tuple(each) for each in forms}) < 2:  # noqa: PLR2004 - they agree
+    if len({tuple(each) for each in forms}) < 2:  # they agree
         return None
     own = [way for way, each in zip(outer, forms, strict=True) if (case.name, case.form) in each]
     return float(sum(case.size(area) for area in rings(own)))
@@ -300,7 +300,7 @@ def ring_that_crosses_itself(case: Case) -> float | None:
     if case.way is None:
         return None
     points = [place for run in case.way.runs() for place in run]
-    if len(points) < 4 or shapely.is_valid(shapely.Polygon(points)):  # noqa: PLR2004 - no ring
+    if len(points) < 4 or shapely.is_valid(shapely.Polygon(points)):  # no ring
         return None
     return case.size(_filled(points))
 

@@ -397,14 +397,14 @@ def _area(geometry: Any) -> Any:  # noqa: ANN401 - a geometry
     if shapely.get_dimensions(geometry) != 1:
         return geometry
     points = shapely.get_coordinates(geometry)
-    return shapely.Polygon(points) if len(points) > 3 else shapely.Polygon()  # noqa: PLR2004 - a triangle
+    return shapely.Polygon(points) if len(points) > 3 else shapely.Polygon()  # a triangle
 
 
 def _polygons(geometry: Any) -> tuple[Any, Any]:  # noqa: ANN401 - arrays
     """All polygons in geometries, and which of them each belongs to."""
     parts, first = shapely.get_parts(geometry, return_index=True)
     parts, second = shapely.get_parts(parts, return_index=True)
-    is_polygon = shapely.get_dimensions(parts) == 2  # noqa: PLR2004
+    is_polygon = shapely.get_dimensions(parts) == 2
     return parts[is_polygon], first[second][is_polygon]
 
 

@@ -74,7 +74,7 @@ class Ability:
 
 ABILITIES = (
     Ability("Graph", lambda rows: rows["suite"].isin(TWINS)),
-    Ability("Persistence", lambda rows: (rows["suite"] == "real-age") & (rows["strength"] == 10)),  # noqa: PLR2004 - years
+    Ability("Persistence", lambda rows: (rows["suite"] == "real-age") & (rows["strength"] == 10)),  # years
     Ability("Unknown", lambda rows: rows["suite"] == "occlusion"),
 )
 DENSE = {"metric": "within_25m", "suite": "clean", "stratum": "stress", "rejector": ""}
@@ -97,7 +97,7 @@ def read_board(board: Path) -> tuple[pd.DataFrame, pd.DataFrame]:
     SCHEMAS["scores"].check(scores)
     check_columns(scores)
     is_control = scores["matcher"].isin(rows.loc[rows["is_control"], "matcher"])
-    hit = (scores["position_error_m"] <= 25.0).astype(float)  # noqa: PLR2004 - the radius
+    hit = (scores["position_error_m"] <= 25.0).astype(float)  # the radius
     own = (rows["track"] == "localization") & (rows["prior_group"] == PRIOR)
     of_column = [(rows[list(wanted)] == pd.Series(wanted)).all(axis=1) for wanted in (DENSE, REJECTION)]
     found = rows[own & np.logical_or(*of_column)]

@@ -83,7 +83,7 @@ def made_up_task(suite: str, region: str, count: int, evidence: Evidence, rng: n
     """Queries in the order of their ids; every fourth is a control, every tenth place is absent."""
     queries, truths = [], []
     for at, name in enumerate(sorted(rng.bytes(12).hex() for _ in range(count))):
-        is_choice, is_control, is_present = at % 2 == 1, at % 4 < 2, at % 10 > 0  # noqa: PLR2004 - shares as told
+        is_choice, is_control, is_present = at % 2 == 1, at % 4 < 2, at % 10 > 0  # shares as told
         places = somewhere(POOL, rng)
         right = int(rng.integers(POOL))
         query = Query(
@@ -126,7 +126,7 @@ def answers(task: Task, skill: float, rng: np.random.Generator) -> list[Predicti
     """Answers of 25 poses, of which the first is right as often as the skill says; one in fifty is a time-out."""
     found = []
     for query, truth in zip(task.queries, task.truths, strict=True):
-        if rng.random() < 0.02:  # noqa: PLR2004 - one in fifty
+        if rng.random() < 0.02:  # one in fifty
             found.append(Prediction(query_id=query.query_id, status="timeout", message="late"))
             continue
         near = replace(truth.pose or SAME, easting_m=(truth.pose or SAME).easting_m + float(rng.normal(0.0, 8.0)))
@@ -153,7 +153,7 @@ def answers(task: Task, skill: float, rng: np.random.Generator) -> list[Predicti
 
 def tasks_of(queries: int, rng: np.random.Generator) -> Iterator[Task]:
     """Yield tasks of all suites and places that hold some queries together."""
-    cells = (rng.random((len(CLASSES), 192, 192)) < 0.1).astype(np.uint8)  # noqa: PLR2004 - a tenth is drawn
+    cells = (rng.random((len(CLASSES), 192, 192)) < 0.1).astype(np.uint8)  # a tenth is drawn
     evidence = Evidence(classes=CLASSES, cells=cells, cell_size_m=1.0)
     names = [(suite, f"place-{at}") for suite in SUITES for at in range(PLACES)]
     counts = np.diff(np.linspace(0, queries, len(names) + 1).astype(int)).tolist()

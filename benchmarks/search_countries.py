@@ -173,7 +173,7 @@ def measure(way: str, name: str, threads: int, given: argparse.Namespace) -> dic
     costs, right, modes = [], 0, []
     for at, look in zip(poses, looks, strict=True):
         costs.append(seconds(lambda look=look: modes.append(best_of(found, look, ANYWHERE, plan))))
-        right += math.dist(at, (modes[-1].pose.easting_m, modes[-1].pose.northing_m)) <= 10.0  # noqa: PLR2004
+        right += math.dist(at, (modes[-1].pose.easting_m, modes[-1].pose.northing_m)) <= 10.0
     wall_s, cpu_s = (statistics.median(column) for column in zip(*costs, strict=True))
     row = {"ready_s": ready_s, "ready_mb": ready_mb, "wall_s": wall_s, "cpu_s": cpu_s, "peak_mb": peak_mb()}
     same = higher = 0
@@ -198,7 +198,7 @@ def made(folder: Path, levels: Path) -> list[float]:
     rng, spent, manifest = np.random.default_rng(2), [], read_manifest(folder)
     west, south, east, north = manifest.bounds_m
     stored = StoredField.open(levels)
-    while len(spent) < 7:  # noqa: PLR2004
+    while len(spent) < 7:
         bounds_m = around(rng.uniform((west + 500, south + 500), (east - 500, north - 500)), 1000.0)
         part = read_region(folder, bounds_m=bounds_m, with_layers=False)
         if not part.known().all():

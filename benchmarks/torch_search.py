@@ -51,7 +51,7 @@ def town(side: int, rng: np.random.Generator) -> Field:
     layers = np.zeros((CLASSES, side, side), dtype=np.uint8)
     km2 = (side * CELL_M / 1000) ** 2
     for at, layer in enumerate(layers):
-        if at < 4:  # noqa: PLR2004 - a third of the classes are lines
+        if at < 4:  # a third of the classes are lines
             for _ in range(math.ceil(12 * km2)):
                 start, turn = rng.uniform(0, side, 2), rng.uniform(0, 2 * math.pi)
                 bends = turn + np.cumsum(rng.normal(0, 0.25, 12))

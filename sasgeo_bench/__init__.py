@@ -19,13 +19,11 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - any public name
-    """A public name, imported now."""
     get, _, names = _public()
     return names if name == "__all__" else get(name)
 
 
 def __dir__() -> list[str]:
-    """The public names."""
     return _public()[1]()
 
 

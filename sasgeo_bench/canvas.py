@@ -167,7 +167,6 @@ class PlainFigure(Figure):
             canvas.print_png(path, metadata={"Title": title, "Copyright": data, "Software": None})
 
     def _repr_png_(self) -> bytes:
-        """Return the figure as a notebook shows it, whether pyplot is imported or not."""
         shown = io.BytesIO()
         self.savefig(shown, format="png")
         return shown.getvalue()
@@ -238,15 +237,12 @@ def broken(text: str, width_inches: float, points: float) -> str:
 
 
 def _keys_across(names: Sequence[str], width_inches: float) -> int:
-    """Return the number of legend entries in a row."""
     return max(1, min(len(names), int(width_inches / (0.6 + 0.075 * max(map(len, names))))))
 
 
 def _rounded(svg: str) -> str:
-    """Shorten an SVG: hundredths of a point at most, no indents or names of groups, each style written once.
-
-    This halves the file.
-    """
+    """Shorten an SVG: hundredths of a point at most, no indents or names of groups, each style written once."""
+    # This halves the file.
     return _classed(_TAGS.sub(lambda tag: _short(tag[0]), _INDENTS.sub("\n", svg)))
 
 

@@ -279,12 +279,7 @@ def find_document(id_or_path: str, noun: str, mend: str, list_known: Callable[[]
 
 
 def _hint(name: str, known: Mapping[str, str]) -> str:
-    """Suggest the value of the name that is most like one, or else list all values if they are few.
-
-    >>> shipped = {"crossfit": "crossfit", "holdout": "holdout"}
-    >>> _hint("crosfit", shipped), _hint("mine", shipped)
-    (", did you mean 'crossfit'?", ': there are crossfit, holdout')
-    """
+    """Suggest the value of the name that is most like one, or else list all values if they are few."""
     near = difflib.get_close_matches(name, known, n=1)
     if near:
         return f", did you mean {known[near[0]]!r}?"

@@ -254,7 +254,7 @@ def spread(
 
 
 def _found(work: Callable[[Item], Found], items: Sequence[Item], jobs: int) -> Iterator[Found]:
-    if jobs == 1 or len(items) < 2:  # noqa: PLR2004 - one item is no work to share
+    if jobs == 1 or len(items) < 2:  # one item is no work to share
         yield from map(work, items)
         return
     try:
@@ -283,7 +283,6 @@ class _Tried(NamedTuple, Generic[Found]):
 
 
 def _found_on_cluster(work: Callable[[Item], Found], items: Sequence[Item], address: str) -> Iterator[Found]:
-    """Yield results in the order of the items."""
     early: dict[int, Found] = {}
     following = 0
     with connected(address) as client:
@@ -327,7 +326,6 @@ def done_on(client: "Client", work: Callable[[Item], Found], items: Sequence[Ite
 
 
 def _try(work: Callable[[Item], Found], folder: str, item: Item) -> _Tried[Found]:
-    """Do an item in the folder of the program that asked for it."""
     from distributed import get_worker  # noqa: PLC0415
 
     try:
@@ -338,11 +336,9 @@ def _try(work: Callable[[Item], Found], folder: str, item: Item) -> _Tried[Found
 
 
 def _end_with_parent() -> None:
-    """End this process at once on an interrupt, or when the program that it works for has gone.
-
-    Files are written whole or not at all, and the next run resumes. Without this a killed program leaves its processes
-    waiting for work for ever: each of them holds the other end of the pipe that the others read.
-    """
+    """End this process at once on an interrupt, or when the program that it works for has gone."""
+    # Files are written whole or not at all, and the next run resumes. Without this a killed program leaves its
+    # processes waiting for work for ever: each of them holds the other end of the pipe that the others read.
     signal(SIGINT, SIG_DFL)
     parent = parent_process()
     if parent is not None:

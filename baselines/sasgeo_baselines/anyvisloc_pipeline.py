@@ -185,10 +185,8 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         return self._matched(view, tiles, discs, most=len(tiles))
 
     def _matched(self, view: Sight, tiles: Sequence[Pose], discs: Sequence[Disc], *, most: int) -> list[Mode | None]:
-        """Return a mode for each of the `most` tiles that are most alike, None for the others.
-
-        Its score is the number of inliers of the first `TOP` tiles; without any, minus the distance of descriptors.
-        """
+        """Return a mode for each of the `most` tiles that are most alike, None for the others."""
+        # Its score is the number of inliers of the first `TOP` tiles; without any, minus the distance of descriptors.
         away = self._distances(view, points_of(tiles))
         found: list[Mode | None] = [None] * len(tiles)
         for rank, at in enumerate(np.argsort(away, kind="stable")[:most].tolist()):
@@ -254,5 +252,4 @@ def map_features(drawing: Drawing, grid: Grid, *, per_m2: float) -> Features:
 
 
 def _most(shape: tuple[int, ...], grid: Grid, per_m2: float) -> int:
-    """Return how many features an area has at most."""
     return max(1, round(per_m2 * shape[0] * shape[1] * grid.cell_size_m**2))

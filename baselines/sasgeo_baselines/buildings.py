@@ -39,7 +39,6 @@ class Buildings:
     shape: Floats
 
     def __len__(self) -> int:
-        """Return the number of buildings."""
         return len(self.middle_m)
 
     @classmethod
@@ -69,7 +68,6 @@ class Buildings:
         cells = np.bincount(label, minlength=len(rim_m)).astype(np.float64)
 
         def mean(values: Floats) -> Floats:
-            """Return the mean over the cells of each building."""
             return np.asarray(np.bincount(label, weights=values, minlength=len(rim_m)) / cells)
 
         area_m2 = cells * cell_m**2

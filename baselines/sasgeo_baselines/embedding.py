@@ -191,12 +191,11 @@ class Embedding:
         """Read a learned text for the matcher `name`; raise one line if it is damaged."""
 
         def read(saved: dict[str, Any]) -> Embedding:
-            """Return all numbers."""
             content = base64.b85decode(saved["numbers"])
             numbers = np.frombuffer(content, dtype="<f2").astype(np.float32).reshape(NUMBERS, -1)
             found = Embedding(mean=numbers[:, 0], spread=numbers[:, 1], weights=numbers[:, 2:])
             is_whole = saved["format"] == _FORMAT and saved["crc32"] == zlib.crc32(content)
-            is_sound = numbers.shape[1] > 2 and bool(np.isfinite(numbers).all() and (found.spread > 0).all())  # noqa: PLR2004
+            is_sound = numbers.shape[1] > 2 and bool(np.isfinite(numbers).all() and (found.spread > 0).all())
             return sound(found, is_sound=is_whole and is_sound)
 
         return read_learned(name, text, read)
@@ -294,7 +293,6 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
     def _ranked(
         self, view: Sight, places_m: NDArray[np.float64], features: NDArray[np.floating], *, most: int
     ) -> list[Mode]:
-        """Return the places whose features are most similar to those of a view at any heading."""
         if not len(places_m):
             return []
         cosine = features.astype(np.float32) @ view.features.T
@@ -326,7 +324,7 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
             errors = np.concatenate([lesson.errors for lesson in seen])
             lessons.extend(lesson.rows for lesson in seen)
             lessons.extend(self._of_others(ground, region.grid, others, errors, _rng(name)))
-        if len(lessons) < 2:  # noqa: PLR2004 - two classes
+        if len(lessons) < 2:  # two classes
             raise ValueError(f"{self.card.name}: training shows {len(lessons)} locations, expected two at least")
         return fitted(lessons, shrinkage=self.numbers["shrinkage"], size=int(self.numbers["size"])).to_text()
 
@@ -425,7 +423,6 @@ def fitted(locations: Sequence[Stored], *, shrinkage: float, size: int) -> Embed
 
 
 def _together(locations: Sequence[Stored]) -> Iterator[tuple[Rows, list[int]]]:
-    """Yield the descriptors of some locations at a time, and how many each has."""
     for first in range(0, len(locations), _AT_ONCE):
         some = locations[first : first + _AT_ONCE]
         yield np.concatenate(some).astype(np.float32), [len(rows) for rows in some]
@@ -444,12 +441,10 @@ def _measured(locations: Sequence[Stored]) -> Embedding:
 
 
 def _plain(rows: Stored) -> Embedding:
-    """Return the plain descriptor, standardised over a map, of whose places it has rows and columns."""
     mean = rows.mean(axis=(0, 1), dtype=np.float32)
     variance = np.mean([np.square(row - mean).mean(axis=0) for row in rows], axis=0)
     return Embedding(mean=mean, spread=np.maximum(np.sqrt(variance), _SMALL).astype(np.float32))
 
 
 def _rng(name: str) -> np.random.Generator:
-    """Return the random generator of a name."""
     return np.random.default_rng(int.from_bytes(hashlib.sha256(name.encode()).digest()[:8], "big"))

@@ -233,7 +233,6 @@ def _searched(view: _ViewOnMap, prior: Prior) -> tuple[NDArray[np.float64], NDAr
 
 
 def _things_of(view: Evidence, chosen: list[int], radius_m: float) -> Descriptor:
-    """Describe classes of a view on coarse cells."""
     factor = _factor(view.cell_size_m)
     layers = [block_max((view.cells[at] == PRESENT).astype(np.uint8), factor) for at in chosen]
     return _described([layer * _disc(layer.shape) for layer in layers], view.cell_size_m * factor, radius_m)
@@ -244,13 +243,11 @@ def _described(layers: list[NDArray[np.uint8]], cell_size_m: float, radius_m: fl
 
 
 def _factor(cell_size_m: float) -> int:
-    """Return cells a side of a coarse cell."""
     return max(1, round(CELL_M / cell_size_m))
 
 
 @lru_cache(maxsize=16)
 def _disc(shape: tuple[int, ...]) -> NDArray[np.bool_]:
-    """Return cells whose centres lie in the largest disc around the centre of a raster."""
     rows, cols = (np.arange(count) + 0.5 - count / 2 for count in shape)
     found = np.asarray(np.hypot(*np.meshgrid(rows, cols, indexing="ij")) <= min(shape) / 2)
     found.flags.writeable = False

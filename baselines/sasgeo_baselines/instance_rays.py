@@ -110,7 +110,6 @@ def cast_lattice(number: Numbers, step: int, count: int, *, cell_m: float) -> Ra
     )
 
     def shifted(down: int, right: int) -> Numbers:
-        """Return the numbers at an offset from each place."""
         row, col = margin + step // 2 + down, margin + step // 2 + right
         part = phases[row % step, col % step, row // step : row // step + rows, col // step : col // step + cols]
         return np.asarray(part)

@@ -105,10 +105,8 @@ class Encoders:
         return self.torch.exp(level + power * self.torch.log(known_m2.clamp(min=CELL_M**2) / _USUAL_M2))
 
     def _unusual(self, present: Tensor, known: Tensor) -> Tensor:
-        """Return by how much each share differs from that of its class on maps, in standard deviations; 0 if unknown.
-
-        A class that is rare counts as much as one that is common, and a cell that is unknown is an average one.
-        """
+        """By how much each share differs from that of its class on maps, in standard deviations; 0 if unknown."""
+        # A class that is rare counts as much as one that is common, and a cell that is unknown is an average one.
         mean, spread = self.arrays["usual"][:, :, None, None]
         return (present - mean * known) / spread
 
@@ -184,7 +182,6 @@ def weights_of(learned: str) -> tuple[tuple[str, ...], Weights]:
     """Read the text of `weights_text`; raise one line if it is damaged."""
 
     def read(saved: dict[str, Any]) -> tuple[tuple[str, ...], Weights]:
-        """Return classes and weights."""
         classes = tuple(str(name) for name in saved["classes"])
         found: Weights = {}
         for name, shape in shapes(len(classes)).items():
@@ -466,7 +463,6 @@ def usual_shares(lessons: Sequence[Lesson]) -> Floats:
 
 
 def _looks(lessons: Sequence[Lesson]) -> Iterator[tuple[Lesson, np.random.Generator]]:
-    """Yield lessons again and again, each time in another order, with a source of randomness."""
     round_of = 0
     while True:
         for lesson in sorted(lessons, key=lambda one: seed_of(f"{one.name} {round_of}")):

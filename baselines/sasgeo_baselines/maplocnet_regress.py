@@ -246,7 +246,7 @@ def peak_of(scores: Floats, grid: Grid, yaws_deg: Floats, disc: Disc) -> Peak | 
     easting_m, northing_m = grid.to_centres_m(np.array([(row, col)]))[0].tolist()
     pose = Pose(easting_m=easting_m, northing_m=northing_m, yaw_deg=float(yaws_deg[yaw]))
     level = np.where(np.isnan(scores), np.nanmean(scores), scores)
-    is_round = len(yaws_deg) * YAW_STEP_DEG >= 360.0  # noqa: PLR2004 - degrees
+    is_round = len(yaws_deg) * YAW_STEP_DEG >= 360.0  # degrees
     level = np.pad(level, ((1, 1), (0, 0), (0, 0)), mode="wrap" if is_round else "edge")
     level = np.pad(level, ((0, 0), (REACH, REACH), (REACH, REACH)), mode="edge")
     part = level[yaw : yaw + 3, row : row + _SIDE, col : col + _SIDE] - scores[yaw, row, col]
@@ -276,7 +276,6 @@ def weights_of(learned: str) -> Floats:
     """Read the coefficients; raise one line if their text is damaged."""
 
     def read(saved: dict[str, Any]) -> Floats:
-        """Return the coefficients."""
         weights = np.array(saved["weights"], dtype=np.float64)
         is_whole = saved["format"] == _FORMAT and weights.shape == _SHAPE and bool(np.isfinite(weights).all())
         return sound(weights, is_sound=is_whole)

@@ -121,7 +121,6 @@ class Pairs:
         return thinned(sorted(found, key=lambda mode: -mode.score), PEAKS_APART_M, count)
 
     def _peaks(self, disc: Disc, yaw_deg: float) -> Iterator[Mode]:
-        """Yield the best places of one heading."""
         places_m = self.places_m(yaw_deg)
         inside = disc.wider(CELL_M).holds(places_m)
         if not inside.any():

@@ -70,11 +70,9 @@ class OracleObjects:
     card: MatcherCard
 
     def __init_subclass__(cls, *, inner: type[Matcher]) -> None:
-        """Name the matcher that answers."""
         cls.inner, cls.card = inner, oracle_card(inner.card)
 
     def __init__(self) -> None:
-        """Make the matcher that answers."""
         self._inner = self.inner()
         self._poses: dict[str, Pose] = {}
 

@@ -153,7 +153,6 @@ class Square:
 
 
 def _axes_m(grid: Grid) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Return eastings of the columns and northings of the rows of a grid."""
     rows, cols = grid.shape
     east_m = grid.west_m + (np.arange(cols) + 0.5) * grid.cell_size_m
     return east_m, grid.north_m - (np.arange(rows) + 0.5) * grid.cell_size_m
@@ -369,7 +368,6 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         return Posterior(surfaces=[square.surface() for square in squares], yaws_deg=yaws_deg)
 
     def _add(self, view: Sight, squares: Sequence[Square], yaws_deg: Sequence[float], first: int) -> None:
-        """Add the likelihoods of some headings to squares of places."""
         torch, step_m = self._encoders.torch, self._map.grid.cell_size_m
         half, places = half_of(view.template.shape[1:], view.cells_m, step_m), squares[0].grid.rows
         side = places + 2 * half
@@ -473,13 +471,11 @@ def _lesson(part: Region, query: Query, pose: Pose, classes: Sequence[str]) -> L
 
 
 def _is_on(grid: Grid, pose: Pose) -> bool:
-    """Return whether a place is a cell of a map."""
     row, col = grid.to_cells(np.array([(pose.easting_m, pose.northing_m)]))[0].tolist()
     return bool(0 <= row < grid.rows and 0 <= col < grid.cols)
 
 
 def _pose(truth: Truth) -> Pose:
-    """Return the pose of a truth that has one."""
     assert truth.pose is not None  # noqa: S101 - others were left out
     return truth.pose
 

@@ -60,7 +60,6 @@ class Patches:
 
 
 def _away(present: NDArray[np.bool_]) -> Floats:
-    """Return the distance of each cell from the nearest present one, cells."""
     if not present.any():
         return np.full(present.shape, np.inf, dtype=np.float32)
     away = cv2.distanceTransform((~present).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -103,7 +103,6 @@ def view_planes(evidence: sgb.Evidence) -> NDArray[np.float32]:
 
 
 def _view_means(present: NDArray[np.float32], known: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return means of sectors and of the disc over what is known, by group."""
     occupancy = np.divide(present, np.maximum(known, 1e-6), dtype=np.float32)
     planes = planes_of(occupancy.reshape(-1, SIDE, SIDE)).reshape(1 + len(DISTANCES_M), len(GROUPS), -1)
     sectors, disc = sector_weights(), _disc()

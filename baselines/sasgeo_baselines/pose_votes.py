@@ -118,7 +118,6 @@ class Votes:
         return kept[:count]
 
     def _mean(self, rows: Ints, *, score: float) -> Mode:
-        """Return the mean of poses, with a score."""
         weight = self.weight[rows]
         east_m, north_m = weight @ self.poses[rows, :2] / weight.sum()
         turn = complex(weight @ np.exp(1j * np.radians(self.poses[rows, 2])))

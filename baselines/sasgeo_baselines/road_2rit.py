@@ -211,7 +211,6 @@ class Road2Rit(PlaceMatcher[RoadSight]):
                     yield poses[may]
 
     def _tested(self, view: RoadSight, poses: Floats, disc: Disc) -> list[Mode]:
-        """Return poses fitted to the roads, by the agreement of the roads, best first."""
         if not len(poses):
             return []
         points_m = view.roads.points_m

@@ -171,13 +171,11 @@ class Alignment:
         at, outward = seen.places_m / half_m, seen.outward @ turn.T
 
         def nearest(parameters: Floats) -> tuple[Floats, Floats]:
-            """Return the way to the nearest mapped border, and its normal, in the axes of the view."""
             there_m = pose.to_map(through(matrix_of(parameters), at) * half_m)
             _, row = tree.query(Borders(places_m=there_m, outward=outward).embedded())
             return (mapped.places_m[row] - there_m) @ turn, mapped.outward[row] @ turn
 
         def share(parameters: Floats) -> float:
-            """Return the share of the borders that lie on mapped ones."""
             return float((np.linalg.norm(nearest(parameters)[0], axis=1) <= NEAR_M).mean())
 
         found = np.zeros(8)
@@ -190,7 +188,6 @@ class Alignment:
 
 
 def _step(parameters: Floats, at: Floats, normal: Floats, way_m: Floats, weight: Floats) -> Floats:
-    """Return the change of the parameters that brings points nearer to lines (Gauss and Newton)."""
     ahead = np.column_stack([at, np.ones(len(at))])
     below = np.maximum(ahead @ matrix_of(parameters)[2], _HORIZON)
     across = (normal * through(matrix_of(parameters), at)).sum(axis=1)
@@ -328,7 +325,6 @@ class PopovRoadplane(Tunable):
         return max(flat, key=lambda alignment: alignment.share, default=None)
 
     def _around(self, pose: Pose, radius_m: float) -> Borders:
-        """Return the borders of the map around a pose."""
         row, col = self._grid.to_cells(np.array([[pose.easting_m, pose.northing_m]]))[0].tolist()
         reach = round(radius_m / self._grid.cell_size_m)
         top, left = max(row - reach, 0), max(col - reach, 0)

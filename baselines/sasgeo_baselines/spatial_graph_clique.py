@@ -82,7 +82,6 @@ class SpatialGraphClique(ObjectMatcher):
 
 
 def _around(pairs: Pairs, pose: Pose, near_m: float) -> Ints:
-    """Return rows of the pairs that vote for a place near a pose, the nearest first."""
     away_m = np.hypot(*(pairs.places_m(pose.yaw_deg) - (pose.easting_m, pose.northing_m)).T)
     near = np.flatnonzero(away_m <= near_m)
     return np.asarray(near[np.argsort(away_m[near], kind="stable")[:MOST_PAIRS]], dtype=np.int64)

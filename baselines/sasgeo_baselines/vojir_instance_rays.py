@@ -248,7 +248,6 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         return thinned(_ranked(refined, disc.wider(STEPS_M[0])), APART_M, count)
 
     def _described(self, buildings: BuildingMap, step_m: float) -> Iterator[tuple[Points, Floats]]:
-        """Yield places of a map and their magnitudes, tile by tile."""
         grid = buildings.grid
         step = min(max(1, round(step_m / grid.cell_size_m)), grid.rows, grid.cols)
         for places_m, rays in buildings.lattice(step, INDEXED):
@@ -281,7 +280,6 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
 
 
 def _ranked(modes: Sequence[Mode], disc: Disc) -> list[Mode]:
-    """Return modes in a disc that have a score, best first."""
     return sorted(
         (mode for mode in modes if np.isfinite(mode.score) and disc.has(mode.pose)), key=lambda mode: -mode.score
     )

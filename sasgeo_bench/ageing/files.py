@@ -139,7 +139,6 @@ def _together(places: Sequence[Ageing]) -> pd.DataFrame:
 
 
 def _classes_of(table: pd.DataFrame) -> list[str]:
-    """Return the class names in a table, in the order of their ids."""
     found = set(table["class"])
     return [name for name in load_taxonomy().names if name in found]
 

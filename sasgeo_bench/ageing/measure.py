@@ -116,7 +116,7 @@ def bootstrap_rate(lost: Floats, total: Floats, years: Floats, *, things: int, r
     if best == 0.0:
         return Rate(per_year=0.0, lo=0.0, hi=float(-np.log(_NEVER_SEEN) / (max(things, 1) * years.mean())))
     blocks = len(total)
-    if blocks < 2:  # noqa: PLR2004 - one block cannot differ from itself
+    if blocks < 2:  # one block cannot differ from itself
         return Rate(per_year=best, lo=math.nan, hi=math.nan)
     weights = rng.multinomial(blocks, np.full(blocks, 1 / blocks), size=DRAWS).astype(np.float64)
     drawn = loss_rate(weights @ lost, weights @ total, years)
@@ -192,7 +192,6 @@ class _Change:
 
     @property
     def years(self) -> float:
-        """Return the time between the two states."""
         return (self.date_to - self.date_from).days / DAYS_PER_YEAR
 
 
@@ -322,7 +321,6 @@ def _verdict(these: _Stock, others: _Stock) -> Verdict:
 
 
 def _lost_shapes(stock: _Stock, verdict: Verdict) -> Geometries:
-    """Return things, or middles of line pieces, that the other state does not have."""
     if isinstance(stock.things, Areas):
         return stock.things.shapes[verdict.is_lost]
     return np.asarray(shapely.points(stock.things.middles[verdict.is_lost]))
@@ -341,7 +339,6 @@ def _taken(stock: _Stock, verdict: Verdict, others: Geometries) -> Floats:
 
 
 def _is_near(stock: _Stock, verdict: Verdict, hints: Geometries) -> NDArray[np.bool_]:
-    """Return which of the units that lost anything lie in a hinted place."""
     near = np.zeros(len(verdict.lost), dtype=bool)
     units = np.flatnonzero(verdict.lost > 0)
     if isinstance(stock.things, Areas):
@@ -435,7 +432,6 @@ class _Blocks:
 
 
 def _block_tables(changes: Sequence[_Change]) -> tuple[_Blocks, _Blocks]:
-    """Add up the amounts of the older states, then of the newer ones, in the same blocks."""
     sides = ([change.old for change in changes], [change.new for change in changes])
     cells = [[_cells(verdict.xy_m) for verdict in side] for side in sides]
     blocks = np.unique(np.concatenate([cell for side in cells for cell in side]))
@@ -459,13 +455,11 @@ def _added_up(verdicts: Sequence[Verdict], cells: Sequence[Ints], blocks: Ints) 
 
 
 def _cells(xy_m: Floats) -> Ints:
-    """Return one number for the block around each point."""
     cells = np.floor(xy_m / BLOCK_M).astype(np.int64).reshape(-1, 2)
     return np.asarray(cells[:, 0] * 2**32 + cells[:, 1])
 
 
 def _moved(verdict: Verdict) -> tuple[Floats, Floats]:
-    """Return the shift of each re-drawn thing, and the amount kept of it."""
     left = verdict.amount - verdict.lost
     kept = np.bincount(verdict.thing, weights=left, minlength=len(verdict.shift_m)).astype(np.float64)
     is_redrawn = np.nan_to_num(verdict.shift_m) > REDRAWN_M

@@ -151,7 +151,6 @@ def make_pieces(shapes: Geometries, widths_m: Floats | None = None) -> Pieces:
 
 
 def _linear_parts(shapes: Geometries) -> tuple[Geometries, Ints]:
-    """Return the plain lines within geometries, and the geometry each comes from."""
     parts, owner = shapely.get_parts(shapes, return_index=True)
     deeper, inner = shapely.get_parts(parts, return_index=True)
     is_line = np.isin(shapely.get_type_id(deeper), _LINEAR)
@@ -159,7 +158,6 @@ def _linear_parts(shapes: Geometries) -> tuple[Geometries, Ints]:
 
 
 def _segment_keys(starts: Floats, ends: Floats) -> NDArray[np.uint64]:
-    """Return one number for each segment, the same in both directions, rounded to a centimetre as OSM is."""
     first, last = (np.round(points * _CENTIMETRES).astype(np.int64).reshape(-1, 2) for points in (starts, ends))
     turned = (first[:, 0] > last[:, 0]) | ((first[:, 0] == last[:, 0]) & (first[:, 1] > last[:, 1]))
     low, high = np.where(turned[:, None], last, first), np.where(turned[:, None], first, last)

@@ -116,7 +116,6 @@ def _dress(chart: Axes, title: str, rows: int) -> None:
 
 
 def _keys() -> list[Line2D]:
-    """Explain the marks."""
     common: dict[str, Any] = {"ls": "", "marker": "o"}
     return [
         Line2D([], [], color=_POOLED, marker="o", ms=5, lw=1.6, label="rate over all intervals, 95 %"),

@@ -120,7 +120,6 @@ class QueryDataset(Dataset):  # type: ignore[misc]  # of no type: PyTorch is an 
         self._map = None if region is None else _Map.of(region, self.classes)
 
     def __len__(self) -> int:
-        """Return the number of queries."""
         return int(self._rows.num_rows)
 
     def query(self, index: int) -> Query:
@@ -195,7 +194,6 @@ class PictureDataset(Dataset):  # type: ignore[misc]  # as above
         self._pictures, self.classes = pictures, pictures[0].classes
 
     def __len__(self) -> int:
-        """Return the number of crops."""
         return len(self._pictures) * self.crops_each
 
     def __getitem__(self, index: int) -> Item:
@@ -254,7 +252,6 @@ def task_pictures(task: str | Path, truths: str | Path) -> Sequence[LabelledImag
 
 
 def _opened(task: str | Path, truths: str | Path | None) -> Task:
-    """Open a task whose truths lie where the user says."""
     opened = Task.open(task)
     return opened if truths is None else replace(opened, truth=Path(truths))
 
@@ -270,14 +267,12 @@ class _Pictures(Sequence[LabelledImage]):
     @overload
     def __getitem__(self, at: slice) -> "_Pictures": ...
     def __getitem__(self, at: int | slice) -> "LabelledImage | _Pictures":
-        """Return a picture, or select some."""
         if isinstance(at, slice):
             return _Pictures(self._pairs[at], self._place)
         frame, labels = self._pairs[at]
         return labels.labelled(frame.image(), self._place)
 
     def __len__(self) -> int:
-        """Return the number of pictures."""
         return len(self._pairs)
 
 
@@ -292,7 +287,6 @@ def _numbers(values: Sequence[float | None]) -> Tensor:
 
 
 def _pose_of(truth: Truth, middle_m: tuple[float, float]) -> Tensor:
-    """Return east and north of the true pose from a point, its heading and scale."""
     if truth.pose is None:
         return _numbers([None] * 4)
     pose = truth.pose
@@ -347,7 +341,6 @@ class _Map:
 
     @property
     def middle_m(self) -> tuple[float, float]:
-        """Return easting and northing of the middle of the map."""
         west_m, south_m, east_m, north_m = self.grid.bounds_m
         return ((west_m + east_m) / 2, (south_m + north_m) / 2)
 

@@ -123,19 +123,13 @@ def _tree(data: bytes) -> ast.Module | None:
 
 
 def _forget_modules(tree: ast.Module) -> None:
-    """Take out of a tree where the names of our own modules come from."""
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in SHIPPED_MODULES:
             node.module = None
 
 
 def _shape(tree: ast.AST) -> str:
-    """Return what a syntax tree says: types, fields and values, without docstrings, and what is empty or no code.
-
-    >>> one, two = (ast.parse(text) for text in ("def f(): 'Say.'; return 1", "def f(): return (1)  # one"))
-    >>> _shape(one) == _shape(two)
-    True
-    """
+    """Return what a syntax tree says: types, fields and values, without docstrings, and what is empty or no code."""
     said: list[str] = []
     left: list[Any] = [tree]  # what is still to be said, last first: trees and lists, or how the rest is said
     while left:
@@ -160,7 +154,6 @@ def _shape(tree: ast.AST) -> str:
 
 
 def _part(value: object) -> object:
-    """Return a tree or list as it is, and any other value as it is said."""
     if isinstance(value, ast.AST | list):
         return value
     return f"{hex(value) if isinstance(value, int) and value.bit_length() > _MOST_BITS else repr(value)};"
@@ -174,7 +167,6 @@ def _has_docstring(node: ast.AST) -> bool:
 
 
 def _own_files(spec: str, module: str, name: str, paths: Sequence[str]) -> dict[str, Path]:
-    """Return the files of a plugin's own code by name."""
     found: dict[str, Path] = {}
     for one in _ways(module, name, paths):
         if one.partition(".")[0] == _OURS:
@@ -217,10 +209,8 @@ def _ways(module: str, name: str, paths: Sequence[str]) -> list[str]:
 
 
 def _named(label: str, path: Path) -> dict[str, Path]:
-    """Return a file, or the files of a folder, by name, without what Python itself has compiled, and hidden ones.
-
-    A linked folder counts where it leads to one beside the package, which its process may read.
-    """
+    """Return a file, or the files of a folder, by name, without what Python itself has compiled, and hidden ones."""
+    # A linked folder counts where it leads to one beside the package, which its process may read.
     if path.is_file():
         return {f"{label}{path.suffix}": path}
     found: dict[str, Path] = {}
@@ -243,10 +233,8 @@ def _named(label: str, path: Path) -> dict[str, Path]:
 
 
 def _beside(home: Home, paths: Sequence[str]) -> dict[str, Path]:
-    """Return the files of modules beside one of somebody's own, and that it imports, but what is installed or ships.
-
-    In a checkout of ours, our own packages lie beside it; what counts of them are its tools, as everywhere.
-    """
+    """Return the files of modules beside one of somebody's own, and that it imports, but what is installed or ships."""
+    # In a checkout of ours, our own packages lie beside it; what counts of them are its tools, as everywhere.
     root = _root_of(home)
     if is_installed(root) or is_shipped(home.name, paths):
         return {}
@@ -279,11 +267,7 @@ def _finder(paths: Sequence[str]) -> Callable[[str], Home | None]:
 
 
 def _root_of(home: Home) -> Path:
-    """Return the folder on the import path that holds a module: above those without `__init__.py` that it lies in.
-
-    >>> str(_root_of(Home("plugin.inner.code", Path("/root/plugin/inner/code.py"))))
-    '/root'
-    """
+    """Return the folder on the import path that holds a module: above those without `__init__.py` that it lies in."""
     above = home.path.parents
     return above[min(home.name.count("."), len(above) - 1)]
 
@@ -297,7 +281,6 @@ def _resolved(name: str, package: str) -> str:
 
 
 def _rooms(files: Iterable[Path], tools: Collection[str]) -> set[str]:
-    """Return the tools that some files import, and those that these import."""
     rooms: set[str] = set()
     left = [path for path in files if path.suffix == _PYTHON]
     while left:
@@ -340,14 +323,12 @@ def _absolute(node: ast.ImportFrom, module: str, *, is_package: bool) -> str:
 
 @lru_cache(maxsize=1)
 def _public() -> Mapping[str, str]:
-    """Return the module that each public name of this package comes from, as its stub says."""
     tree = ast.parse((_PACKAGE / "__init__.pyi").read_bytes())
     froms = [node for node in tree.body if isinstance(node, ast.ImportFrom)]
     return {alias.name: f"{_OURS}.{node.module}" for node in froms for alias in node.names}
 
 
 def _room_files(room: str) -> list[Path]:
-    """Return the files of a module, with the data of its name, or of a folder of this package."""
     place: Any = _PACKAGE.joinpath(*room.split("."))
     files = place.rglob("*.py") if place.is_dir() else (place.with_suffix(end) for end in (_PYTHON, ".toml"))
     return sorted(path for path in files if path.is_file())

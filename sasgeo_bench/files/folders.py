@@ -191,7 +191,6 @@ def _clear(path: Path) -> None:
 
 
 def _flush(path: Path) -> None:
-    """Force a file to the disk before the folder gets its name."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -246,11 +245,9 @@ def absolute(path: Path) -> Path:
 
 
 def _walk(folder: Path, without: Collection[str]) -> Iterator[tuple[str, Path]]:
-    """Yield everything below a folder except folders, by relative path; links are not followed.
+    """Yield everything below a folder except folders, by relative path; links are not followed."""
 
-    Raise `StoreError` for a folder that cannot be looked into: nobody knows what it holds.
-    """
-
+    # Raise `StoreError` for a folder that cannot be looked into: nobody knows what it holds.
     def refuse(error: OSError) -> None:
         """Name the folder; of what is not there, or no folder, the caller speaks."""
         if isinstance(error, FileNotFoundError | NotADirectoryError):

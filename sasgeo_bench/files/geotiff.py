@@ -35,9 +35,5 @@ def open_geotiff(path: Path, *, has_more: bool = False, **options: Any) -> Itera
 
 
 def _is_own(name: Path, path: Path) -> bool:
-    """Return whether a file lies beside another one and begins with its name.
-
-    >>> [_is_own(Path(name), Path("maps/a.tif")) for name in ("maps/a.tif.ovr", "maps/a.tfw", "/etc/a.tif", "maps/b")]
-    [True, True, False, False]
-    """
+    """Return whether a file lies beside another one and begins with its name."""
     return name.resolve().parent == path.resolve().parent and name.name.startswith(path.stem)

@@ -143,7 +143,6 @@ def read_kept(
 
 
 def _ranges(group: "pq.RowGroupMetaData") -> dict[str, tuple[Any, Any]]:
-    """Return the least and the greatest value of each column of a row group that has them."""
     chunks = [(chunk.path_in_schema, chunk.statistics) for chunk in map(group.column, range(group.num_columns))]
     return {name: (known.min, known.max) for name, known in chunks if known is not None and known.has_min_max}
 
@@ -189,10 +188,8 @@ def _texts_fault(about: "pq.FileMetaData", texts: Collection[str], text_bytes: i
 
 
 def _unpacked_fault(path: Path, about: "pq.FileMetaData", *, is_whole: bool) -> str | None:
-    """Describe texts that become too large when each of their rows gets its own, or return None.
-
-    The footer does not tell. Columns that could are read as dictionaries first, which hold each distinct text once.
-    """
+    """Describe texts that become too large when each of their rows gets its own, or return None."""
+    # The footer does not tell. Columns that could are read as dictionaries first, which hold each distinct text once.
     groups = range(about.num_row_groups)
     for together in (groups,) if is_whole else ((at,) for at in groups):
         total = 0
@@ -273,7 +270,6 @@ def _size_of(chunk: "pq.ColumnChunkMetaData", leaf: "pq.ColumnSchema") -> int:
 
 
 def _seal(path: Path) -> None:
-    """Write the CRC of the footer, computed with zeros in its place, where the writer left zeros."""
     with path.open("r+b") as file:
         footer = _read_footer(file)
         at = footer.index(_MARK) + len(_MARK)

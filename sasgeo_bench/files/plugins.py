@@ -63,7 +63,6 @@ def list_entry_points(group: str = MATCHERS) -> dict[str, EntryPoint]:
 
 
 def _installed(group: str) -> tuple[EntryPoint, ...]:
-    """Return the entry points of a group, our own first."""
     try:
         return _read(group, tuple(sys.path))
     except Exception as error:
@@ -203,7 +202,7 @@ def unknown(name: str, *groups: str, others: Collection[str] = ()) -> MatchError
     hint = f", did you mean {near[0]!r}?" if near else ""
     kinds = [KINDS[group] for group in groups]
     kind = " or ".join(filter(None, (", ".join(kinds[:-1]), kinds[-1])))
-    lists = " and ".join(f"list {one}s" for one in kinds) if len(kinds) <= 2 else "list"  # noqa: PLR2004 - to be read
+    lists = " and ".join(f"list {one}s" for one in kinds) if len(kinds) <= 2 else "list"  # to be read
     shown = f"{lists} show{'s' if ' and ' not in lists else ''} all"
     return MatchError(f"there is no {kind} {name!r}{hint} ({shown}; or module:{_WHAT.get(groups[0], 'Class')})")
 

@@ -173,7 +173,6 @@ def _names_of(folder: Path) -> tuple[list[str], int]:
 
 
 def _check_apart(folder: Path, system: "AbstractFileSystem", root: str) -> None:
-    """Refuse a place on this disk that lies in the folder to send, or holds it."""
     if "file" not in (system.protocol if isinstance(system.protocol, tuple) else (system.protocol,)):
         return
     here, there = folder.resolve(), Path(root).resolve()
@@ -182,11 +181,7 @@ def _check_apart(folder: Path, system: "AbstractFileSystem", root: str) -> None:
 
 
 def _content_of(folder: Path) -> str:
-    """Return what a region, a task or a run says that it is; empty for another folder, or a damaged one.
-
-    >>> _content_of(Path("nowhere"))
-    ''
-    """
+    """Return what a region, a task or a run says that it is; empty for another folder, or a damaged one."""
     for name, keys in _CONTENT.items():
         with suppress(OSError, ValueError, KeyError, TypeError, RecursionError):
             about: Any = parse_json(read_bounded(folder / name, MOST_BYTES))
@@ -225,7 +220,6 @@ def _begun(target: Path, sent: "_Sent") -> Path:
 
 
 def _whole(target: Path) -> Path:
-    """Return the name of a folder that is fetched to its end, until it gets its own."""
     return target.with_name(f".{target.name}.whole")
 
 
@@ -320,11 +314,7 @@ def _read_list(system: "AbstractFileSystem", root: str, name: str, url: str) -> 
 
 
 def _is_within(name: str) -> bool:
-    """Return whether a name is a plain path below a folder, which storage and every disk can keep.
-
-    >>> [_is_within(name) for name in ("layers/a.tif", "../a", "/a", "a//b", ".a", "sent.json")]
-    [True, False, False, False, False, False]
-    """
+    """Return whether a name is a plain path below a folder, which storage and every disk can keep."""
     is_plain = "\\" not in name and "\0" not in name and name not in {LIST, _SENDING}
     parts = name.split("/")
     sizes = (len(part.encode(errors="replace")) for part in parts)

@@ -95,12 +95,10 @@ def _out_of_camera(flown: Trajectory) -> Trajectory:
 
 
 def _between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:
-    """Return the angle between two lines of unit vectors."""
     return math.degrees(math.acos(min(1.0, abs(float(first @ second)))))
 
 
 def _lies_across(position_m: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:
-    """Return whether a path is flat, and the normal of its plane is an axis."""
     _, spread, normals = np.linalg.svd(position_m - position_m.mean(axis=0), full_matrices=False)
     is_plane = spread[1] > _WIDE * spread[0] and spread[2] < _THIN * spread[1]
     return bool(is_plane) and _between_deg(normals[2], axis) < _ACROSS_DEG

@@ -54,7 +54,6 @@ class Corridors:
     heading: Floats  # (E, 2) radians at the start and at the end, counter-clockwise from east
 
     def __len__(self) -> int:
-        """Return the number of directed ways."""
         return len(self.lines_m)
 
     @classmethod
@@ -125,7 +124,6 @@ class Corridors:
         return None
 
     def _choices(self, leaving: dict[int, list[int]], walk: list[int], rng: np.random.Generator) -> list[int]:
-        """Return the ways on from the end of a walk, the preferred one last."""
         here = walk[-1]
         ways = [way for way in leaving.get(int(self.end[here]), []) if way != here ^ 1]
         if not ways:
@@ -161,7 +159,6 @@ def _forward(line_m: Floats) -> Floats:
 
 
 def _turns_back(line_m: Floats) -> bool:
-    """Return whether a line turns back on itself within the length of a link."""
     along_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
     even_m = np.arange(0.0, along_m[-1], _TURN_STEP_M)
     sides = np.diff(np.stack([np.interp(even_m, along_m, axis) for axis in line_m.T], axis=1), axis=0)

@@ -105,7 +105,7 @@ def pair_run(truth: Trajectory, estimate: Trajectory, *, sequence: str, lost_s: 
         If the times do not overlap, attitudes differ by more than a turn about the vertical, or most steps are resets.
     """
     is_timed = (estimate.time_s >= truth.time_s[0]) & (estimate.time_s <= truth.time_s[-1])
-    if is_timed.sum() < 2:  # noqa: PLR2004 - one step
+    if is_timed.sum() < 2:  # one step
         raise FlightError(
             f"{is_timed.sum()} of {counted(len(estimate), 'pose')} of the estimate ({estimate.span_text()}) within the "
             f"time of the truth ({truth.span_text()}), two are needed: give both one clock, in seconds"
@@ -238,7 +238,6 @@ def poisson_interval(count: int) -> tuple[float, float]:
 def _length_rows(
     runs: Sequence[PairedRun], length_m: float, spacing_m: float, draws: int, rng: np.random.Generator
 ) -> Iterator[dict[str, object]]:
-    """Yield the rows of one length of segment."""
     by_sequence: dict[str, list[Segments]] = {}
     for run in runs:
         found = segment_errors(run, length_m, spacing_m=spacing_m)
@@ -263,7 +262,6 @@ def _length_rows(
 
 
 def _rate_rows(runs: Sequence[PairedRun]) -> Iterator[dict[str, object]]:
-    """Yield the rows of rare events."""
     rest = {"length_m": math.nan, "sequences": len({run.sequence for run in runs}), "segments": 0}
     tracked_km = sum(run.path_m for run in runs) / _M_PER_KM
     lost_km = sum(run.lost_m for run in runs) / _M_PER_KM
@@ -275,7 +273,6 @@ def _rate_rows(runs: Sequence[PairedRun]) -> Iterator[dict[str, object]]:
 
 
 def _warn_of_spacing(runs: Sequence[PairedRun], spacing_m: float) -> None:
-    """Warn where poses are so far apart that lines between them hide errors."""
     steps_m = np.concatenate([np.diff(stretch.path_m) for run in runs for stretch in run.stretches])
     if steps_m.any() and (typical_m := float(np.median(steps_m[steps_m > 0]))) > 1.01 * spacing_m:
         message = (

@@ -100,7 +100,7 @@ def fit_profile(
     segments without overlap.
     """
     squares, designs = _tables(runs, lengths_m)
-    if len(squares) < 2:  # noqa: PLR2004 - to draw from
+    if len(squares) < 2:  # to draw from
         raise FlightError(
             f"a profile needs whole segments of two sequences, got {len(squares)}: measure more or longer flights"
         )
@@ -152,7 +152,6 @@ class _Lengths:
 
 
 def _by_sequence(runs: Sequence[PairedRun], table_of: Callable[[PairedRun], Floats]) -> dict[str, Floats]:
-    """Return the mean of the tables of each sequence's runs."""
     found: dict[str, list[Floats]] = {}
     for run in runs:
         found.setdefault(run.sequence, []).append(table_of(run))
@@ -160,10 +159,8 @@ def _by_sequence(runs: Sequence[PairedRun], table_of: Callable[[PairedRun], Floa
 
 
 def _tables(runs: Sequence[PairedRun], lengths_m: Sequence[float]) -> tuple[Floats, dict[_Choice, Floats]]:
-    """Return mean squares by sequence, shape (K, R), and designs of `PARTS` by lengths, shape (K, R, 4).
-
-    Rows are position, heading and scale of each length. Sequences without a segment are left out.
-    """
+    """Return mean squares by sequence, shape (K, R), and designs of `PARTS` by lengths, shape (K, R, 4)."""
+    # Rows are position, heading and scale of each length. Sequences without a segment are left out.
     lengths = _Lengths(slip_m=_SLIP_M, heading_m=_HEADING_M, wander_m=max(lengths_m))
     squares = _by_sequence(runs, lambda run: _squares(run, lengths_m))
     kept = [name for name, values in squares.items() if np.isfinite(values).any()]
@@ -264,7 +261,6 @@ def _solved(design: Floats, target: Floats, columns: NDArray[np.int64] | NDArray
 
 
 def _best_lengths(designs: Mapping[_Choice, Floats], target: Floats) -> tuple[_Choice, Floats]:
-    """Return the lengths of slip and heading that fit best, and their designs."""
     misfits = {
         choice: _misfit(_mean(design), target) * (_GAIN if choice[1] is None else 1.0)
         for choice, design in designs.items()
@@ -274,7 +270,6 @@ def _best_lengths(designs: Mapping[_Choice, Floats], target: Floats) -> tuple[_C
 
 
 def _misfit(design: Floats, target: Floats) -> float:
-    """Return the mean square of the relative differences that are left."""
     is_known = np.isfinite(target) & (target > 0)
     modelled = design @ _solved(design, target, np.arange(len(PARTS)))
     return float(np.mean((modelled[is_known] / target[is_known] - 1) ** 2)) if is_known.any() else 0.0
@@ -314,6 +309,6 @@ def _run_spread(runs: Sequence[PairedRun], length_m: float) -> float:
             logs.append(math.log(float(np.mean(errors**2))) / 2)
             # The square of a plane's normal error has a relative variance of 1; its root's logarithm has a quarter.
             chance.append(length_m / (4 * max(run.path_m, length_m)))
-    if len(logs) < 2:  # noqa: PLR2004 - a spread needs two
+    if len(logs) < 2:  # a spread needs two
         return 0.0
     return min(math.sqrt(max(float(np.var(logs, ddof=1)) - float(np.mean(chance)), 0.0)), _MOST_SPREAD)

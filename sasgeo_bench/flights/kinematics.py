@@ -73,14 +73,13 @@ class Limits:
     tilt_deg: float = 24.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         slow, fast = self.speed_mps
         values = (slow, self.corner_mps, self.turn_rate_deg_s, self.acceleration_mps2, self.climb_mps, self.tilt_deg)
         if not all(math.isfinite(value) and value > 0 for value in (*values, fast)):
             raise FlightError(f"limits of a flight are positive numbers, got {self!r}")
         if not self.corner_mps <= slow <= fast:
             raise FlightError(f"corner_mps, and the least and most of speed_mps must not fall, got {self!r}")
-        if not self.tilt_deg < 90:  # noqa: PLR2004 - level
+        if not self.tilt_deg < 90:  # level
             raise FlightError(f"tilt_deg is less than 90, got {self.tilt_deg!r}")
 
     @property
@@ -264,11 +263,11 @@ def crab_deg(flown: Trajectory) -> Floats:
 def _checked(polyline: ArrayLike) -> Floats:
     """Return a polyline without repeated points."""
     line_m = np.asarray(polyline, dtype=np.float64)
-    if line_m.ndim != 2 or line_m.shape[1:] != (2,) or not np.isfinite(line_m).all():  # noqa: PLR2004 - a table of pairs
+    if line_m.ndim != 2 or line_m.shape[1:] != (2,) or not np.isfinite(line_m).all():  # a table of pairs
         raise FlightError(f"a path has finite eastings and northings, shape (N, 2), got shape {line_m.shape}")
     kept = np.append(True, np.hypot(*np.diff(line_m, axis=0).T) > _SMALLEST_M)[: len(line_m)]
     line_m = np.asarray(line_m[kept])
-    if len(line_m) < 2:  # noqa: PLR2004 - a side
+    if len(line_m) < 2:  # a side
         raise FlightError(f"a path has two distinct points at least, got {len(line_m)}")
     if length_m(line_m) > _STEP_M * MOST_POINTS:
         raise FlightError(
@@ -290,7 +289,6 @@ def _smooth(line_m: Floats) -> Floats:
 
 
 def _move(path_m: Floats, cruise_mps: float, limits: Limits, step_s: float) -> _Motion:
-    """Return when a drone is where along a path."""
     from scipy.interpolate import CubicSpline  # noqa: PLC0415 - slow to import, and most processes fly nothing
 
     along_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(path_m, axis=0).T)))
@@ -349,7 +347,6 @@ def _lean(motion: _Motion, yaw_deg: Floats, limits: Limits, rng: np.random.Gener
 
 
 def _gimbal(count: int, step_s: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    """Return pitch and roll of what a gimbal carries."""
     lean_deg, sd_deg = RIDE.gimbal_deg
     pitch, roll = (sd_deg * _wander(rng, count, step_s, RIDE.gimbal_tau_s) for _ in range(2))
     return lean_deg + pitch, roll
@@ -374,10 +371,8 @@ def _heights(height_m: float | tuple[float, float], time_s: Floats, limits: Limi
 
 
 def _wander(rng: np.random.Generator, count: int, step_s: float, tau_s: float) -> Floats:
-    """Return a stationary Gauss-Markov process of second order, critically damped, with a standard deviation of 1.
-
-    Two equal filters of first order in a row; their joint gain is (1 + a^2) / (1 - a^2)^3.
-    """
+    """Return a stationary Gauss-Markov process of second order, critically damped, with a standard deviation of 1."""
+    # Two equal filters of first order in a row; their joint gain is (1 + a^2) / (1 - a^2)^3.
     from scipy.signal import lfilter  # noqa: PLC0415 - slow to import, and most processes fly nothing
 
     keep = math.exp(-step_s / tau_s)

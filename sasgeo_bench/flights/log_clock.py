@@ -50,12 +50,12 @@ class Clock:
     def _of_day(self, match: "re.Match[str]", date: str, number: int) -> float:
         hours, half = int(match[1]), (match[4] or "").lower()
         if half:
-            is_right = 1 <= hours <= 12  # noqa: PLR2004 - of a clock's face
+            is_right = 1 <= hours <= 12  # of a clock's face
             hours = hours % 12 + (12 if half == "p" else 0)
         else:
-            is_right = hours < 24  # noqa: PLR2004 - of a day
+            is_right = hours < 24  # of a day
         seconds = float(match[3].replace(",", "."))
-        if not is_right or int(match[2]) > 59 or seconds >= 60:  # noqa: PLR2004 - minutes and seconds
+        if not is_right or int(match[2]) > 59 or seconds >= 60:  # minutes and seconds
             message = f"time is no time of day, {match[0]!r}: mend it"
             raise self.source.fault(message, number)
         time_s = hours * 3600 + int(match[2]) * 60 + seconds

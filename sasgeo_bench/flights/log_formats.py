@@ -346,7 +346,6 @@ def _check_meaning(
 
 
 def _receiver(header: Sequence[str], keys: Sequence[tuple[str, str]], told: Format, topic: str | None) -> Column | None:
-    """Return the column that tells receivers, of the topic of the places or of none."""
     if told.receiver:
         return _named([name if _topic_of(name) == topic else "" for name in header], keys, (told.receiver,))
     names = [name if _topic_of(name) in (topic, "") else "" for name in header]
@@ -389,7 +388,6 @@ def _words_of(key: str, words: Mapping[str, str]) -> tuple[str, str]:
 
 
 def _is_yaw_of_gps(yaw: Column, short: Sequence[str]) -> bool:
-    """Return whether a yaw is of ArduPilot's message GPS, and not of one of attitudes."""
     topic = _topic_of(yaw.name)
     if topic:
         return topic.upper().startswith("GPS")
@@ -442,9 +440,8 @@ def _topic_of(name: str) -> str:
 
 
 def _unit_of(key: str, name: str) -> tuple[bool, str | None]:
-    """Return whether a key stands for a field, and the unit that it states."""
     words = WORDS[QUANTITIES[name]]
-    if name == "time" and key in words and len(key) > 2:  # noqa: PLR2004 - "seconds", and no "s"
+    if name == "time" and key in words and len(key) > 2:  # "seconds", and no "s"
         return True, words[key]
     for base in NAMES[name]:
         if key == base:

@@ -143,7 +143,7 @@ class FlightLog:
             same = "time" if "time_s" in columns else "place"
             tell_left_out(source, int((~is_new).sum()), f"with the {same} of the point before")
             numbers, columns = np.asarray(numbers)[is_new], {name: column[is_new] for name, column in columns.items()}
-        if len(numbers) < 2:  # noqa: PLR2004 - a way
+        if len(numbers) < 2:  # a way
             raise source.fault(f"a flight has two points at least, the log has {len(numbers)}: export more of it")
         _check_times(source, numbers, columns)
         for name, most in {**_ANGLES, "height_m": HIGHEST_M}.items():
@@ -157,7 +157,6 @@ class FlightLog:
         )
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.lon_deg)
 
 
@@ -216,7 +215,7 @@ def _check_places(source: LogSource, numbers: Sequence[int], columns: Mapping[st
     _check(
         source,
         numbers,
-        (np.abs(lon) <= 180) & (np.abs(lat) <= 90),  # noqa: PLR2004 - the globe
+        (np.abs(lon) <= 180) & (np.abs(lat) <= 90),  # the globe
         lambda at: (
             f"latitude {lat[at]:g}, longitude {lon[at]:g} are no degrees on Earth: mend them, or delete the point"
         ),

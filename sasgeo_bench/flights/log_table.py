@@ -180,7 +180,6 @@ def _trimmed(source: LogSource, cells: list[str], count: int, number: int) -> li
 
 
 def _has_no_fix(layout: Layout, row: Sequence[str]) -> bool:
-    """Return whether the receiver says that it has no fix."""
     if layout.fix is None:
         return False
     try:
@@ -261,10 +260,8 @@ def _with_parts(source: LogSource, layout: Layout, values: dict[str, Floats], *,
 
 
 def _as_px4(layout: Layout, values: dict[str, Floats]) -> Layout:
-    """Return the layout of PX4 for a few of its columns: `timestamp` first, and all of the message's integers.
-
-    PX4 counts from its start, so times that count from 1970 are of another format, whose unit is open.
-    """
+    """Return the layout of PX4 for a few of its columns: `timestamp` first, and all of the message's integers."""
+    # PX4 counts from its start, so times that count from 1970 are of another format, whose unit is open.
     time = layout.fields.get("time")
     if time is None:
         return layout

@@ -97,7 +97,6 @@ class LogFacts:
     speed_mps: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the values."""
         for quantity in UNITS:
             unit, choices = self.unit(quantity), choices_of(quantity)
             if unit is not None and unit not in choices:

@@ -57,7 +57,6 @@ class _Track:
             self.unread.append(what)
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.lat_deg)
 
 
@@ -156,10 +155,8 @@ def _add_place(line: _Track, parts: Sequence[str | None]) -> None:
 
 
 def _elements(source: LogSource) -> Iterator[tuple[str, Element, str]]:
-    """Yield elements, with the name of what they stand in, as they begin and end; keep none of them in memory.
-
-    Refuse document types and entities, what is larger or nests deeper than any track, and what is no XML.
-    """
+    """Yield elements, with the name of what they stand in, as they begin and end; keep none of them in memory."""
+    # Refuse document types and entities, what is larger or nests deeper than any track, and what is no XML.
     open_ones: list[Element] = []
     count = 0
     try:

@@ -80,7 +80,6 @@ def _read(path: Path, facts: LogFacts, *, has_height: bool) -> FlightLog:
 
 
 def _meaningless(path: Path, why: str, option: str) -> FlightError:
-    """Return the error of an option that says nothing of a file."""
     return FlightError(f"{path.name} {why}: leave out {option}")
 
 
@@ -229,11 +228,11 @@ def _at_height(flown: Trajectory, height_m: float) -> Trajectory:
 
 
 def _resampled(flown: Trajectory, path: Path, step_s: float) -> Trajectory:
-    if len(flown) < 2:  # noqa: PLR2004 - a way
+    if len(flown) < 2:  # a way
         raise FlightError(f"{path.name}: a flight has two poses at least, got {len(flown)}")
     first_s, last_s = float(flown.time_s[0]), float(flown.time_s[-1])
     count = math.floor((last_s - first_s) / step_s) + 1
-    if count < 2:  # noqa: PLR2004 - a way
+    if count < 2:  # a way
         raise FlightError(
             f"{path.name} lasts {last_s - first_s:g} s, less than one step of {step_s:g} s: take a smaller step_s"
         )

@@ -73,7 +73,6 @@ class Odometry:
             object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
-        """Return the number of increments."""
         return len(self.right_m)
 
 
@@ -194,7 +193,6 @@ class _Law:
     steps_m: Floats
 
     def draw(self, rng: np.random.Generator) -> _Drift:
-        """Draw the errors of one run."""
         profile, steps_m = self.profile, self.steps_m
         # Mean square 1: what a profile gives are standard deviations over all runs.
         factor = math.exp(rng.normal(-(profile.run_spread**2), profile.run_spread))

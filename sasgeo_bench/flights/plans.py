@@ -175,7 +175,6 @@ def _survey(wish: _Wish, rng: np.random.Generator) -> Floats | None:
 
 
 def _corridor(wish: _Wish, rng: np.random.Generator) -> Floats | None:
-    """Draw a way along roads or waterways."""
     if wish.corridors is None or not len(wish.corridors):
         return None
     for _ in range(_DRAWS):
@@ -322,7 +321,6 @@ def _oval(radius_m: float, rng: np.random.Generator) -> Floats:
 
 
 def _eight(radius_m: float, _: np.random.Generator) -> Floats:
-    """Return two circles that touch, flown in opposite senses."""
     radius_m /= 2
     off_m = np.array([radius_m, 0.0])
     right, left = _arc(radius_m, math.pi, 3 * math.pi) + off_m, _arc(radius_m, 0.0, -2 * math.pi) - off_m

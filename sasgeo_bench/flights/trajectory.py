@@ -100,7 +100,6 @@ class Trajectory:
         )
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.time_s)
 
     @property

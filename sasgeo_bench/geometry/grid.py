@@ -24,7 +24,7 @@ def utm_epsg(lon_deg: float, lat_deg: float) -> int:
     (32632, 32610, 32734)
     """
     low, high = _MAX_UTM_DEG
-    if not (-180 <= lon_deg <= 180 and low <= lat_deg <= high):  # noqa: PLR2004 - degrees of longitude
+    if not (-180 <= lon_deg <= 180 and low <= lat_deg <= high):  # degrees of longitude
         raise GridError(
             f"UTM covers longitudes -180..180 and latitudes {low:g}..{high:g}, got {lon_deg!r}, {lat_deg!r}"
         )
@@ -57,7 +57,6 @@ class Grid:
     cols: int
 
     def __post_init__(self) -> None:
-        """Check that the values define a lattice."""
         _check_cell_size(self.cell_size_m)
         if not (math.isfinite(self.west_m) and math.isfinite(self.north_m)):
             raise GridError(f"west_m and north_m must be finite, got {self.west_m!r}, {self.north_m!r}")

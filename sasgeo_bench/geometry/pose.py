@@ -18,7 +18,7 @@ from sasgeo_bench.texts import BOUNDS, bounds_text
 def normalize_deg(angle_deg: ArrayLike) -> NDArray[np.float64]:
     """Reduce any angle to [0, 360), degrees."""
     turned = np.mod(np.asarray(angle_deg, dtype=np.float64), 360.0)
-    return np.where(turned >= 360.0, 0.0, turned)  # noqa: PLR2004 - mod of a tiny negative angle rounds up to a full turn
+    return np.where(turned >= 360.0, 0.0, turned)  # mod of a tiny negative angle rounds up to a full turn
 
 
 def wrap_deg(angle_deg: ArrayLike) -> NDArray[np.float64]:
@@ -70,7 +70,7 @@ class Pose:
             raise PoseError(f"a pose has finite values, got {self!r}")
         if self.scale <= 0:
             raise PoseError(f"scale must be positive, got {self.scale!r}")
-        if type(self.yaw_deg) is not float or not 0.0 < self.yaw_deg < 360.0:  # noqa: PLR2004 - in its range already
+        if type(self.yaw_deg) is not float or not 0.0 < self.yaw_deg < 360.0:  # in its range already
             if not abs(self.yaw_deg) <= BOUNDS["yaw_deg"][1]:
                 raise PoseError(f"yaw_deg must lie within {bounds_text('yaw_deg')}, got {self.yaw_deg!r}")
             object.__setattr__(self, "yaw_deg", float(normalize_deg(self.yaw_deg)))
@@ -100,7 +100,6 @@ class Prior:
     scale_sigma: float
 
     def __post_init__(self) -> None:
-        """Refuse halves of pairs and impossible values."""
         if (self.center_m is None) != (self.radius_m is None) or (self.yaw_deg is None) != (self.yaw_sigma_deg is None):
             raise PoseError(
                 f"a prior has center_m with radius_m and yaw_deg with yaw_sigma_deg, or neither, got {self!r}"

@@ -48,7 +48,6 @@ def _view(name: str) -> str:
 
 
 def _placed(item: Item, positions: dict[str, Position]) -> Item:
-    """Give an item the position of its label, and to a drone's image the nominal height of its name."""
     if item.label not in positions:
         raise DatasetError(f"{POSITIONS} has no line for the label of {item.item_id}: copy the file again")
     height = _HEIGHT.fullmatch(item.item_id.rsplit("/", maxsplit=1)[1])
@@ -84,7 +83,7 @@ def read_positions(reader: FolderReader) -> tuple[dict[str, Position], tuple[str
 def _read_line(line: str, *, where: str) -> tuple[str, Position]:
     parts = _LINE.fullmatch(line)
     folders = parts["path"].replace("\\", "/").split("/") if parts else []
-    if parts is None or len(folders) < 2:  # noqa: PLR2004 - the label is the folder of the image
+    if parts is None or len(folders) < 2:  # the label is the folder of the image
         raise DatasetError(
             f"{where}: expected '<folder>/<label>/<image> E<longitude> N<latitude> [height]', got {line[:80]!r}"
         )

@@ -39,9 +39,9 @@ class Position:
     def __post_init__(self) -> None:
         """Refuse what lies on no map of ours."""
         low, high = _MAX_LATITUDE_DEG
-        if -180 <= self.longitude_deg <= 180 and low <= self.latitude_deg <= high:  # noqa: PLR2004 - degrees of longitude
+        if -180 <= self.longitude_deg <= 180 and low <= self.latitude_deg <= high:  # degrees of longitude
             return
-        is_swapped = low <= self.longitude_deg <= high < abs(self.latitude_deg) <= 180  # noqa: PLR2004 - as above
+        is_swapped = low <= self.longitude_deg <= high < abs(self.latitude_deg) <= 180  # as above
         hint = " (are the two swapped?)" if is_swapped else ""
         raise DatasetError(
             f"longitude {self.longitude_deg!r}, latitude {self.latitude_deg!r} is no place: longitudes lie within "
@@ -59,7 +59,6 @@ class Box:
     north_deg: float
 
     def __post_init__(self) -> None:
-        """Refuse a box that is turned over or not finite."""
         if not (self.west_deg < self.east_deg and self.south_deg < self.north_deg):
             raise DatasetError(
                 f"a box grows from west to east and from south to north, got west {self.west_deg!r}, south "
@@ -144,7 +143,6 @@ class Item:
     taken_on: dt.date | None = None
 
     def __post_init__(self) -> None:
-        """Refuse heights that no drone reaches, and names that are no printable line."""
         if not self.item_id.isprintable():
             raise DatasetError(f"an item needs a name of one printable line, got {self.item_id!a}")
         if self.height_m is not None and not _LOWEST_M <= self.height_m <= _HIGHEST_M:

@@ -67,7 +67,6 @@ def read_ranking(paths: Sequence[Path], items: Sequence[Item]) -> Ranking:
 
 
 def _read_columns(path: Path, items: Sequence[Item]) -> tuple[Ints, Ints, Ints]:
-    """Read queries and answers, by position in the dataset, and ranks."""
     _check_columns(path, read_schema(path, mend=_MEND))
     with open_table(path, mend=_MEND, most_rows=MOST_ROWS, read_dictionary=list(COLUMNS[:2])) as source:
         table = source.read(columns=list(COLUMNS))

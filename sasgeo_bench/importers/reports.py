@@ -124,7 +124,6 @@ class _Columns:
 
     @classmethod
     def of(cls, items: Sequence[Item]) -> "_Columns":
-        """Take columns from items."""
         nothing = (np.nan, np.nan)
         places = [(p.longitude_deg, p.latitude_deg) if p else nothing for p in (item.position for item in items)]
         boxes = [
@@ -161,7 +160,6 @@ def _keys(columns: _Columns, ranking: Ranking, *, by_height: bool) -> Ints:
 
 
 def _part(ranking: Ranking, which: Ints) -> Ranking:
-    """Return the answers to some of the queries."""
     lengths = np.diff(ranking.starts)[which]
     keep = np.repeat(np.isin(np.arange(len(ranking.queries)), which), np.diff(ranking.starts))
     starts = np.concatenate([[0], np.cumsum(lengths)])
@@ -233,17 +231,14 @@ class _Scope:
 
     @cached_property
     def best(self) -> Ints:
-        """Return the ranks of the first right answers, of the queries that have one."""
         return np.array([ranks[0] for ranks in self.hit_ranks if len(ranks)], dtype=np.int64)
 
     @cached_property
     def answered(self) -> Ints:
-        """Return the place of each answered query among all queries."""
         return np.searchsorted(self.queries, self.ranking.queries)
 
     @property
     def with_positive(self) -> int:
-        """Return how many queries have a right answer in the gallery."""
         return int((self.positives > 0).sum())
 
     def mean(self, values: NDArray[np.floating] | Bools) -> float:

@@ -118,11 +118,7 @@ def _frame(row: TableRow, flight: str) -> Item:
 
 
 def _day(text: str) -> dt.date | None:
-    """Return the day of a date or time in ISO form, None for anything else.
-
-    >>> _day("2018-10-13 09:12:33"), _day("autumn")
-    (datetime.date(2018, 10, 13), None)
-    """
+    """Return the day of a date or time in ISO form, None for anything else."""
     try:
         return dt.datetime.fromisoformat(text).date()
     except ValueError:
@@ -172,7 +168,6 @@ def _mosaic_px(parts: Mapping[tuple[int, int], tuple[int, int]], relative: str) 
 def _notes(
     flights: Sequence[str], sheets: Sequence[_Corners], frames: Sequence[Item], tiles: Sequence[Item]
 ) -> Iterator[str]:
-    """Yield what a reader of the items should know."""
     extra = [f"satellite{sheet.name}.tif" for sheet in sheets if sheet.flight not in flights]
     if extra:
         yield f"left out {named(extra, 'map')} of flights without a folder"

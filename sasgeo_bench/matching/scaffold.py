@@ -170,10 +170,8 @@ def package_files(
 
 
 def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, str]:
-    """Return the words of a new package: its kind, group, name, distribution, module, class and title.
-
-    The class is called as none of the `imported` names is. Raise `ConfigError` if the name is not allowed, or taken.
-    """
+    """Return the words of a new package: its kind, group, name, distribution, module, class and title."""
+    # The class is called as none of the `imported` names is. Raise `ConfigError` if the name is not allowed, or taken.
     kind = KINDS[group]
     module = name.replace("-", "_")
     if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):

@@ -70,7 +70,7 @@ def _through_ways(path: Path, flat: Callable[[Any], Any]) -> list[tuple[shapely.
     found = []
     for way in elements(ways.with_filter(osmium.filter.EntityFilter(osmium.osm.WAY)).with_filter(wanted)):
         places = [(node.lon, node.lat) for node in way.nodes if node.location.valid()]
-        if way.is_closed() or len(set(places)) < 2:  # noqa: PLR2004 - no line
+        if way.is_closed() or len(set(places)) < 2:  # no line
             continue
         ends = places[-1:] if "waterway" in way.tags else [places[0], places[-1]]  # streams begin anywhere
         found.append((flat(shapely.LineString(places)), [flat(shapely.Point(place)) for place in ends]))
@@ -106,7 +106,7 @@ def _filled_share(objects: Geometries, area: shapely.Geometry, box: shapely.Geom
     if len(probes) == 0:
         return 1.0
     is_filled = shapely.intersects(probes, area)
-    areas = objects[shapely.get_dimensions(objects) == 2]  # noqa: PLR2004 - polygons
+    areas = objects[shapely.get_dimensions(objects) == 2]  # polygons
     probe, _ = overlapping(probes, areas, predicate="intersects")
     is_filled[probe] = True
     return float(is_filled.mean())

@@ -62,7 +62,6 @@ def _disc(radius_m: float) -> NDArray[np.bool_]:
 
 
 def _closed(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Close cells by distance transforms, whose cost does not grow with the radius, then fill holes."""
     reach = CLOSE_M / CELL_M / 2
     near = ndimage.distance_transform_edt(~cells) <= reach
     return np.asarray(ndimage.binary_fill_holes(ndimage.distance_transform_edt(near) > reach))

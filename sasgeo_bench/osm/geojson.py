@@ -190,7 +190,6 @@ def _is_sequence(text: bytes) -> bool:
 
 
 def _is_lonlat(crs: Any) -> bool:  # noqa: ANN401 - what a file holds
-    """Return whether a coordinate reference system, as old files name it, is longitude and latitude."""
     said = crs.get("properties", crs) if isinstance(crs, dict) else {"name": crs}
     name = said.get("name", said.get("code")) if isinstance(said, dict) else None
     return _WGS84.fullmatch(str(name)) is not None
@@ -343,10 +342,8 @@ def _whole(value: Any) -> int | None:  # noqa: ANN401 - any JSON
 def _take(
     found: _Found, scan: Scan, classifier: Classifier, parts: dict[tuple[Identity, int], int], *, is_twin: bool
 ) -> None:
-    """Classify one feature by its tags, and keep it under its id; a further part joins those before it.
-
-    `is_twin`: it is one of the two features, a line and an area, that a closed way came as.
-    """
+    """Classify one feature by its tags, and keep it under its id; a further part joins those before it."""
+    # `is_twin`: it is one of the two features, a line and an area, that a closed way came as.
     get, identity, shape = found.tags.get, found.identity, found.shape
     labels: tuple[Label, ...] = ()
     is_area = shape.geom_type in _AREAS

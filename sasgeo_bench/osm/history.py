@@ -282,7 +282,7 @@ def _own_date(path: Path) -> dt.date:
     with open_snapshot(path) as snapshot:
         every = elements(osmium.FileProcessor(str(snapshot.path), OBJECTS))
         newest = max((item.timestamp for item in every), default=None)
-    if newest is None or newest.year <= 1970:  # noqa: PLR2004 - osmium returns 1970 if a file has no times
+    if newest is None or newest.year <= 1970:  # osmium returns 1970 if a file has no times
         raise ExtractError(
             f"{path.name} does not say what day it is of: date it with --at, or put YYYY-MM-DD into its name"
         )

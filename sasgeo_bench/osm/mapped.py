@@ -71,14 +71,13 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
 
 
 def _plain_lines(coast: Sequence[shapely.Geometry] | Geometries) -> Geometries:
-    """Return single lines, joined where one ends and another begins."""
     parts = shapely.get_parts(np.array(coast, dtype=object))
     return np.asarray(shapely.get_parts(shapely.line_merge(shapely.multilinestrings(parts), directed=True)))
 
 
 def _without(faces: Geometries, doubt: shapely.Geometry) -> Geometries:
     parts = shapely.get_parts(shapely.get_parts(shapely.difference(faces, doubt)))
-    return np.asarray(parts[shapely.get_dimensions(parts) == 2])  # noqa: PLR2004 - polygons
+    return np.asarray(parts[shapely.get_dimensions(parts) == 2])  # polygons
 
 
 def _links(lines: Geometries, mapped: shapely.Geometry, edge: shapely.Geometry) -> list[shapely.Geometry]:
@@ -137,7 +136,6 @@ def _coast_m(lines: Geometries, faces: Geometries, edge: shapely.Geometry) -> tu
 
 
 def _length_in(faces: Geometries, points: Floats, length_m: Floats) -> Floats:
-    """Return the summed length of the points that each face contains."""
     face, point = shapely.STRtree(shapely.points(points)).query(faces, predicate="contains")
     return np.bincount(face, weights=length_m[point], minlength=len(faces)).astype(np.float64)
 

@@ -156,7 +156,6 @@ def _drawn(label: Label) -> tuple[str, bool]:
 
 
 def _is_told_by(tags: Tags, others: Tags) -> bool:
-    """Return whether all tags are among others, but for what is about the map and not about the ground."""
     told = {key: value for key, value in tags.items() if key.lower().split(":")[0] not in _ABOUT_THE_MAP}
     return told.items() <= others.items()
 

@@ -139,7 +139,6 @@ def misdated(
 
 
 def _objects(scan: Scan) -> NDArray[np.object_]:
-    """Return the geometry of the rows of a scan and, after them, of what lies far off or has no class."""
     return np.asarray(shapely.from_wkb(np.array([*(row.wkb for row in scan.rows), *scan.far], dtype=object)))
 
 
@@ -287,7 +286,7 @@ def _table(
 
 def _drawn(label: Label, shape: shapely.Geometry) -> Label:
     """Return how an object in metres is drawn: an area that is too wide to be what it says is an outline."""
-    if label.fills_to_m is None or shapely.get_dimensions(shape) < 2:  # noqa: PLR2004 - a line stays one
+    if label.fills_to_m is None or shapely.get_dimensions(shape) < 2:  # a line stays one
         return label
     is_wide = not shapely.is_empty(shapely.buffer(shape, -label.fills_to_m / 2))
     return replace(label, is_outline=label.is_outline or is_wide)
@@ -328,7 +327,6 @@ def _width_m(label: Label, traits: Traits) -> float:
 
 
 def _shapes(geometry: NDArray[np.object_], labels: list[Label]) -> NDArray[np.object_]:
-    """Turn outlines into lines, and multi-geometries of one part into that part."""
     is_outline = np.array([label.is_outline for label in labels], dtype=bool)
     shaped = geometry.copy()
     shaped[is_outline] = shapely.boundary(geometry[is_outline])

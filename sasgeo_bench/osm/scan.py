@@ -172,11 +172,9 @@ def _traits(tags: dict[str, str], labels: tuple[Label, ...], *, is_area: bool) -
 
 
 def _hidden_by(tags: dict[str, str], classes: set[str], *, level: int) -> str | None:
-    """Return the reason why an object is not visible from above, or None.
-
-    Water below the level of the ground is open to the sky, and so is what lies in a cutting. A building or a
-    bridge is not hidden by its own roof.
-    """
+    """Return the reason why an object is not visible from above, or None."""
+    # Water below the level of the ground is open to the sky, and so is what lies in a cutting. A building or a
+    # bridge is not hidden by its own roof.
     if tags.get("tunnel") not in _NO:
         return f"tunnel={tags['tunnel']}"
     for key in ("location", "parking"):
@@ -197,7 +195,7 @@ def _integer(text: str | None) -> int:
         value = int(text or 0)
     except ValueError:
         return 0
-    return value if abs(value) <= 20 else 0  # noqa: PLR2004 - far beyond the -5..5 that the OSM wiki allows
+    return value if abs(value) <= 20 else 0  # far beyond the -5..5 that the OSM wiki allows
 
 
 def tagged_width_m(width: str | None, lanes: str | None) -> float | None:

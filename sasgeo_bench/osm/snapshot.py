@@ -327,7 +327,6 @@ def _cut_history(path: Path, target: Path, *, at: dt.date | None) -> None:
 
 
 def _with_places(target: Path) -> osmium.io.File:
-    """Return a file to write to that keeps the places of nodes on ways, where there are any."""
     return osmium.io.File(str(target), "pbf,locations_on_ways=true")
 
 

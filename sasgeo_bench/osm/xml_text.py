@@ -134,7 +134,7 @@ class _Cleaner:
         depth = len(self._open)
         if depth == 1:
             self._out.write(f"<{name}{_attributes(values)}>\n")
-        elif depth == 2 and name in _OBJECTS:  # noqa: PLR2004 - below the root
+        elif depth == 2 and name in _OBJECTS:  # below the root
             self._is_deleted = values.get("action") == "delete"
             if not self._is_deleted:
                 self._out.write(f"<{name}{_attributes(values)}>")
@@ -142,13 +142,13 @@ class _Cleaner:
                     self._ways.add(values.get("id", ""))
         elif self._is_deleted:
             return
-        elif depth == 3 and name in _PARTS.get(self._open[1], ()):  # noqa: PLR2004 - of an object
+        elif depth == 3 and name in _PARTS.get(self._open[1], ()):  # of an object
             self._out.write(f"<{name}{_attributes(values)}/>")
             is_way = name == "member" and values.get("type") == "way"
             self._member = self._members.setdefault(values.get("ref", ""), []) if is_way else None
             if self._member:
                 self._member = None  # another relation has described this way already
-        elif depth == 4 and name == "nd" and self._member is not None:  # noqa: PLR2004 - of a member
+        elif depth == 4 and name == "nd" and self._member is not None:  # of a member
             is_placed = "lat" in values and "lon" in values
             self._member.append((values["lat"], values["lon"]) if is_placed else None)
 

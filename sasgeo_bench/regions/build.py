@@ -215,7 +215,6 @@ def _build_into(scratch: Path, plan: BuildPlan) -> Manifest:
 
 
 def _read(plan: BuildPlan, source: Path) -> Reading:
-    """Read the extract in its format."""
     stated = plan.spec.stated_coverage()
     if plan.extract.format == "geojson" and stated is not None:
         return read_geojson(
@@ -396,10 +395,8 @@ def _source(plan: BuildPlan) -> Iterator[Path]:
 
 
 def _painter(reading: Reading, grid: Grid, classes: tuple[str, ...], factor: int) -> PaintWindow:
-    """Return what burns a window of one overview, or of the map itself (factor 1).
-
-    Overviews draw lines at least one of their cells wide.
-    """
+    """Return what burns a window of one overview, or of the map itself (factor 1)."""
+    # Overviews draw lines at least one of their cells wide.
     least_width_m = 0.0 if factor == 1 else grid.cell_size_m * factor
     return partial(burn_mapped, make_paint(reading.features, classes, reading.coverage, least_width_m=least_width_m))
 

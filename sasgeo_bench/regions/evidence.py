@@ -42,7 +42,7 @@ class Evidence:
 
     def __post_init__(self) -> None:
         """Check shapes, types and values; lock the arrays."""
-        if self.cells.dtype != np.uint8 or self.cells.ndim != 3 or len(self.cells) != len(self.classes):  # noqa: PLR2004
+        if self.cells.dtype != np.uint8 or self.cells.ndim != 3 or len(self.cells) != len(self.classes):
             raise ShapeError(
                 f"evidence for {len(self.classes)} classes is uint8 of shape (C, rows, cols), "
                 f"got {self.cells.dtype} of shape {self.cells.shape}"

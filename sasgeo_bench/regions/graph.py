@@ -214,7 +214,6 @@ class _Stops:
     at_m: list[Floats]
 
     def add(self, layer: int, nodes: Ints, chain: Ints, at_m: Floats) -> None:
-        """Record nodes by their distance along chains of a layer."""
         self.layers.append(np.full(len(nodes), layer))
         self.nodes.append(nodes)
         self.chain.append(chain)
@@ -229,7 +228,6 @@ class _Stops:
         self.add(layer, nodes, chains.of_segment[segments], begin_m + shares * (end_m - begin_m))
 
     def connect(self, draft: _Draft) -> None:
-        """Link each node to the next along its chain."""
         layer, node, chain = (np.concatenate(part) for part in (self.layers, self.nodes, self.chain))
         at_m = np.concatenate(self.at_m)
         order = np.lexsort([node, at_m, chain, layer])
@@ -240,7 +238,6 @@ class _Stops:
 
 
 def _is_on_square(network: Network, ways: gpd.GeoDataFrame) -> Bools:
-    """Return which vertices lie on the outline of a square (a road mapped as an area), where a way does not end."""
     shapes = np.asarray(ways.geometry.array)
     vertex = network.lookup(shapely.get_coordinates(shapes[shapely.get_dimensions(shapes) == AREA_DIMENSION]))
     return np.isin(np.arange(len(network.vertices)), vertex)
@@ -323,7 +320,6 @@ def _link_to_ends(draft: _Draft, roads: Chains, junction: Ints, nodes: Ints, seg
 
 
 def _add_bends(draft: _Draft, ways: _Ways, stops: _Stops) -> None:
-    """Add the bends of waterways, except under ground."""
     chains, network = stops.chains[WATER], ways.network
     bends = find_bends(
         chains.en_m,

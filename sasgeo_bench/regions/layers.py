@@ -301,10 +301,8 @@ def _lay_out(path: Path, grid: Grid, classes: tuple[str, ...], factors: Sequence
 
 
 def _fill(page: TiffPage, grid: Grid, burn_window: PaintWindow, packing: ThreadPoolExecutor) -> None:
-    """Burn a window while the one before is packed, which needs no interpreter, and add them to the file in order.
-
-    Blocks beyond the mapped area are not stored: one that is missing reads as OUTSIDE, the value of no data.
-    """
+    """Burn a window while the one before is packed, which needs no interpreter, and add them to the file in order."""
+    # Blocks beyond the mapped area are not stored: one that is missing reads as OUTSIDE, the value of no data.
     down, across = (-(-side // BLOCK_CELLS) for side in grid.shape)
     places = np.zeros((2, len(page.tags["TileOffsets"].value) // (down * across), down, across), np.uint64)
     file = page.parent.filehandle
@@ -452,7 +450,6 @@ def cog_faults(path: Path) -> list[str]:
 
 
 def _is_tiled(path: Path) -> bool:
-    """Return whether all levels of a raster have square blocks."""
     with open_geotiff(path) as source:
         levels = range(len(source.overviews(1)))
         shapes = {*source.block_shapes}

@@ -99,7 +99,6 @@ class _Edges:
 
     @classmethod
     def of_map(cls, outlines: NDArray[np.object_], tile: Grid) -> "_Edges":
-        """Return the edges of buildings on a tile, of unit weight along walls."""
         roofs = burn(outlines, tile).astype(np.float32)
         return cls(field=_doubled(roofs, tile.cell_size_m))
 
@@ -132,7 +131,6 @@ def _correlation(on_map: _Edges, seen: _Edges) -> Surface:
 
 
 def _peak_m(surface: Surface, step_m: float) -> tuple[float, float]:
-    """Return the offset east and north of the highest point, by parabolas through it and its neighbours."""
     row, col = (int(at) for at in np.unravel_index(np.argmax(surface), surface.shape))
     reach = surface.shape[0] // 2
     down = row - reach + _vertex(surface[:, col], row)

@@ -133,7 +133,6 @@ def _check_kind(path: Path, source: rasterio.io.DatasetReader) -> None:
 
 
 def _box(source: rasterio.io.DatasetReader) -> tuple[float, float, float, float]:
-    """Return the box around a picture in its own CRS, whichever way its rows and columns run."""
     cols, rows = np.array([0, source.width] * 2), np.repeat([0, source.height], 2)
     x, y = source.transform @ (cols, rows)
     return float(x.min()), float(y.min()), float(x.max()), float(y.max())
@@ -268,7 +267,6 @@ def _write_draft(path: Path, grid: Grid, tiles: Generator[OrthoTile], *, attribu
 
 
 def _warped_tiles(pictures: Sequence[Picture], grid: Grid) -> Generator[OrthoTile]:
-    """Yield the pictures on the lattice window by window."""
     with ExitStack() as stack:
         views = [_Warped(item, stack, grid) for item in pictures]
         for row, col, part in grid.windows(_WINDOW_PIXELS):

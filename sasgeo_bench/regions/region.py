@@ -174,7 +174,6 @@ class Late(Generic[Value]):
     """
 
     def __set_name__(self, owner: type, name: str) -> None:
-        """Remember the field's name."""
         self._name = name
 
     def __get__(self, instance: Any, owner: type) -> Value:  # noqa: ANN401 - of any class
@@ -187,7 +186,6 @@ class Late(Generic[Value]):
         return cast("Value", value)
 
     def __set__(self, instance: Any, value: Value | Callable[[], Value]) -> None:  # noqa: ANN401 - of any class
-        """Keep a value, or what reads it."""
         vars(instance)[self._name] = value
 
 

@@ -115,7 +115,7 @@ def _check_bounds(manifest: Manifest) -> None:
     """Refuse rows and columns that are not those of the bounds: arrays are made by them before a file is opened."""
     grid, (west_m, south_m, east_m, north_m) = manifest.grid, manifest.bounds_m
     rows, cols = (north_m - south_m) / grid.cell_size_m, (east_m - west_m) / grid.cell_size_m
-    if not (abs(rows - grid.rows) < 0.5 and abs(cols - grid.cols) < 0.5):  # noqa: PLR2004 - of a cell
+    if not (abs(rows - grid.rows) < 0.5 and abs(cols - grid.cols) < 0.5):  # of a cell
         raise GridError(f"it has {grid.rows} x {grid.cols} cells, its bounds hold {rows:.0f} x {cols:.0f}")
 
 
@@ -167,23 +167,19 @@ def read_region(
         coverage = shapely.intersection(coverage, shapely.box(*box))
 
     def layers() -> "NDArray[np.uint8]":
-        """Read the layers when they are first used."""
         with around():
             return read_layers(folder / LAYERS, window=window)
 
     def layer(index: int) -> "NDArray[np.uint8]":
-        """Read one layer whenever it is used."""
         with around_layer():
             found: NDArray[np.uint8] = read_layers(folder / LAYERS, window=window, bands=(index,))[0]
             return found
 
     def features() -> "gpd.GeoDataFrame":
-        """Read the features when they are first used."""
         with around():
             return check_features(_read_geometry(folder / FEATURES, box))
 
     def graph() -> MapGraph:
-        """Read the graph when it is first used."""
         with around():
             nodes = _read_geometry(folder / NODES, box)
             if box is None:
@@ -287,10 +283,8 @@ def _check_file(path: Path, record: FileRecord) -> None:
 
 
 def _read_geometry(path: Path, box: Bounds | None = None) -> "gpd.GeoDataFrame":
-    """Read a table of geometry as `geopandas.read_parquet` does, which parses the same CRS anew for each table.
-
-    Of a `box` read what meets it alone: row groups, and rows, are chosen by the boxes of their shapes.
-    """
+    """Read a table of geometry as `geopandas.read_parquet` does, which parses the same CRS anew for each table."""
+    # Of a `box` read what meets it alone: row groups, and rows, are chosen by the boxes of their shapes.
     import geopandas as gpd  # noqa: PLC0415 - only tables of geometry need it
     from pyproj.exceptions import CRSError  # noqa: PLC0415
 
@@ -332,7 +326,6 @@ def _read_near(path: Path, box: Bounds) -> pa.Table:
         return bool(across and south_most[0] <= north and north_most[1] >= south)
 
     def keep(part: pa.Table) -> pa.BooleanArray:
-        """Mark the rows whose boxes meet the box."""
         xmin, ymin, xmax, ymax = (_numbers_at(part, covering[side]) for side in ("xmin", "ymin", "xmax", "ymax"))
         return pa.array((xmin <= east) & (xmax >= west) & (ymin <= north) & (ymax >= south))
 

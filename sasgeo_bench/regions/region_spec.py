@@ -195,7 +195,6 @@ class RegionFile(NamedDocument):
         return (longitude_deg, latitude_deg, longitude_deg, latitude_deg)
 
     def _size_estimate_m(self) -> tuple[float, float]:
-        """Estimate width and height, well enough to refuse far too large regions before anything is projected."""
         if self.size_m is not None:
             return self.size_m
         west, south, east, north = self.lonlat_box()

@@ -133,7 +133,6 @@ def touching_pairs(shapes: Shapes) -> Ints:
 
 
 def _near_pairs(shapes: Shapes, gap_m: float) -> Ints:
-    """Return rows of shapes whose bounding boxes are at most the gap apart along both axes, smaller row first."""
     grown = shapely.box(*(shapely.bounds(shapes) + np.array([-gap_m, -gap_m, gap_m, gap_m])).T)
     pairs = overlapping(grown, shapes).T
     return np.asarray(pairs[pairs[:, 0] < pairs[:, 1]], dtype=np.int64)

@@ -83,7 +83,6 @@ class Schedule(Generic[Item]):
         return None
 
     def _in_need(self) -> "_Line[Item] | None":
-        """Return the map where help pays and that has most pending queries per worker."""
         in_need = (line for line in self._lines if line.pays())
         return max(in_need, key=lambda line: line.left / (line.askers + 1), default=None)
 
@@ -141,7 +140,6 @@ class _Line(Generic[Item]):
             self._spent_s, self._count = self._spent_s + seconds, self._count + count
 
     def pays(self) -> bool:
-        """Return whether one more process pays."""
         pace_s = self._spent_s / self._count if self._count else None
         return self.left > 0 and pays(left=self.left, askers=self.askers, start_s=self._start_s, pace_s=pace_s)
 
@@ -238,7 +236,6 @@ def answer(
 
 
 def _ask_all(schedule: Schedule[Question], maps: Sequence["_Map"]) -> None:
-    """Work on map after map in one thread, each in a new process."""
     while (number := schedule.take()) is not None:
         maps[number].ask(schedule, number)
 
@@ -279,10 +276,8 @@ class _Map:
                 yield writer, query, blob
 
     def ask(self, schedule: Schedule[Question], number: int) -> None:
-        """Prepare the map in a new process with the first query, then answer groups of queries until none is left.
-
-        Each flight has a process and a scratch folder of its own: others may fly the same way, or have flown it.
-        """
+        """Prepare the map in a new process with the first query, then answer groups of queries until none is left."""
+        # Each flight has a process and a scratch folder of its own: others may fly the same way, or have flown it.
         ready = self._failed_training() or self._given_up()
         with self._process() as worker:
             is_warm = False
@@ -330,7 +325,6 @@ class _Map:
                 )
 
     def _asked(self, ask: Callable[[], Reply]) -> Reply:
-        """Return the reply to a question, which tells how long to go on asking."""
         reply = guarded(self._plan, ask)
         self._patience.note(reply.status, reply.message)
         return reply
@@ -414,12 +408,10 @@ class _Writer:
         self._is_open = False
 
     def begin(self) -> None:
-        """Begin to collect rows."""
         self._watch.begin(self.part)
         self._is_open = True
 
     def add_process(self, worker: Worker | Oracle, ready: Reply) -> None:
-        """Record a process that answers, and the outcome of preparing the map in it."""
         with self._lock:
             self._processes[id(worker)] = (worker, ready)
 
@@ -438,7 +430,6 @@ class _Writer:
                 self.end()
 
     def flush(self) -> None:
-        """Write the rows collected so far."""
         with self._lock:
             if self._rows:
                 prediction_files.write_part(self.part.folder, self._rows, asked=self.part.asked)
@@ -454,14 +445,12 @@ class _Writer:
 
     @property
     def cost(self) -> Cost:
-        """Cost of the rows so far and of their processes."""
         with self._lock:
             own = Cost(counts=dict(self._counts), cpu_s=self._cpu_s, messages=dict(self._messages))
             return pool_costs([own, *(_process_cost(*process) for process in self._processes.values())])
 
 
 def _process_cost(worker: Worker | Oracle, ready: Reply) -> Cost:
-    """Return the cost of a process and its map."""
     is_described = "truth" in worker.isolation
     isolation = {} if is_described else dict.fromkeys(PROMISES, "trusted code, not shut in")
     return Cost(

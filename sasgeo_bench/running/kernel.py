@@ -214,7 +214,8 @@ _CLONE3: Final = 435
 
 def is_offered() -> bool:
     """Return whether the system call numbers of this processor are known here."""
-    return os.uname().sysname == "Linux" and os.uname().machine in _ARCHITECTURE and struct.calcsize("P") == 8  # noqa: PLR2004 - bytes of a pointer
+    is_linux = os.uname().sysname == "Linux"
+    return is_linux and os.uname().machine in _ARCHITECTURE and struct.calcsize("P") == 8  # bytes of a pointer
 
 
 def refuse(*, metadata: bool) -> bool:
@@ -259,7 +260,6 @@ def program(machine: str, *, metadata: bool, own: int) -> bytes:
 
 
 def _numbered(calls: Sequence[str], machine: str) -> list[tuple[str, int]]:
-    """Return names of calls with their numbers on a kind of processor."""
     at = 1 + list(_ARCHITECTURE).index(machine)
     return [(call.split()[0], int(call.split()[at])) for call in calls]
 

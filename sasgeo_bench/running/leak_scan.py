@@ -127,7 +127,6 @@ def walk(roots: Sequence[str], *, most_entries: int = MOST_ENTRIES, most_depth: 
 
 
 def _is_installed(folder: str) -> bool:
-    """Return whether a folder is the interpreter's own, or holds installed packages."""
     prefixes = {os.path.realpath(path) for path in (sys.prefix, sys.base_prefix)}
     installed = {os.path.realpath(path) for path in sysconfig.get_paths().values()} - prefixes
     return folder in prefixes or any(Path(folder).is_relative_to(path) for path in installed)
@@ -148,7 +147,6 @@ def _listed(folder: str, most: int) -> dict[str, bool]:
 
 
 def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]:
-    """Return the revealing files in a folder, and its subfolders still to scan."""
     names = held.keys()
     if names & _INTERPRETER or folder in {*SYSTEM, "/dev"}:
         return [], []

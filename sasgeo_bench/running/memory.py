@@ -294,7 +294,6 @@ class _Shared:
 
 
 def _family(number: int) -> list[int]:
-    """Return a process and its descendants."""
     if not _has_children_lists():
         try:
             root = psutil.Process(number)
@@ -311,7 +310,6 @@ def _family(number: int) -> list[int]:
 
 @cache
 def _has_children_lists() -> bool:
-    """Return whether the kernel lists the children of a thread, which spares a look at all processes of the system."""
     number = os.getpid()
     return Path(f"/proc/{number}/task/{number}/children").is_file()
 
@@ -346,10 +344,8 @@ def _shared(family: Sequence[int], scratch: Path) -> _Shared:
 
 
 def _scratch_in_memory(number: int, scratch: Path) -> tuple[int, int]:
-    """Return device and used bytes of a process's scratch folder if it lies in memory, or else -1 and 0.
-
-    Resolve the path once: while a process enters its root, it leads to the system's disk for a moment.
-    """
+    """Return device and used bytes of a process's scratch folder if it lies in memory, or else -1 and 0."""
+    # Resolve the path once: while a process enters its root, it leads to the system's disk for a moment.
     inside = os.open(f"/proc/{number}/root{scratch}", os.O_PATH | os.O_CLOEXEC)
     try:
         device = os.fstat(inside).st_dev

@@ -38,7 +38,6 @@ class Oracle:
         self._truths: dict[str, Truth] = {}
 
     def __enter__(self) -> Self:
-        """Start nothing."""
         return self
 
     def __exit__(

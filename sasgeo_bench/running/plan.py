@@ -177,7 +177,6 @@ class RunPlan:
 
 
 def _state(parts: Sequence[RunPart]) -> str:
-    """Count the pending and finished queries of some tasks."""
     left, done, aside = (sum(column) for column in zip(*((len(x.left), x.done, x.aside) for x in parts), strict=True))
     others = f", {counted(aside, 'answer')} to other queries set aside" if aside else ""
     return f"{counted(left, 'query', 'queries')} left, {done} done{others}"
@@ -243,7 +242,6 @@ def _check_seen(tasks: Sequence[Task], card: MatcherCard) -> None:
 
 
 def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
-    """Return the limits that are part of a run's hash."""
     left_out = {name for name in _LATER_LIMITS if getattr(limits, name) == getattr(Limits(), name)}
     left_out |= set() if learns else {"learn_s"}
     return {name: value for name, value in asdict(limits).items() if name not in left_out}
@@ -261,14 +259,12 @@ def _run_folder(request: RunRequest, card: MatcherCard, found: str) -> Path:
 
 
 def _key(training_set: TrainingSet, result: TrainingResult | None) -> str:
-    """Return the hash of the learned text or, where there is none, of the training set."""
     text = None if result is None else result.text
     hashed = f"nothing yet from {training_set.sha256}" if text is None else text
     return hashlib.sha256(hashed.encode()).hexdigest()
 
 
 def _check(request: RunRequest) -> None:
-    """Refuse numbers out of range."""
     index, count = request.shard
     if not 1 <= index <= count:
         raise ConfigError(f"--shard must be i/n with 1 <= i <= n, got {index}/{count}")

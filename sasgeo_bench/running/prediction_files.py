@@ -119,7 +119,6 @@ def predictions_of(table: pa.Table) -> list[Prediction]:
 
 
 def _with_candidates(row: Mapping[str, Any], candidates: tuple[tuple[Pose, float], ...]) -> Prediction:
-    """Make a prediction of a row whose candidates were read by columns."""
     return Prediction(
         query_id=row["query_id"],
         candidates=candidates,
@@ -311,12 +310,10 @@ class StoredAnswers(Mapping[str, Prediction]):
         return self._of(task)[query_id]
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the ids of all queries that are answered."""
         for task in self._read:
             yield from self._of(task)
 
     def __len__(self) -> int:
-        """Return the number of answers."""
         return sum(len(self._of(task)) for task in self._read)
 
     def _of(self, task: Path) -> dict[str, Prediction]:
@@ -562,7 +559,6 @@ def merge_runs(runs: Sequence[Path], into: Path, *, asked: Mapping[str, str] | N
 
 
 def _to_merge(path: Path, asked: Mapping[str, str] | None) -> Iterable[Prediction]:
-    """Read all rows of a file, or the answers of a folder to the requested queries."""
     if asked is None or not path.is_dir() or not parts_of(path):
         return read_predictions(path)
     return Answers.open(path, asked).found.values()

@@ -144,7 +144,7 @@ class Profile:
         rows = self.minutes()
         heat = [one.celsius for one in self.readings if one.celsius is not None]
         known = f"{heat[0]:.0f} to {max(heat):.0f} degrees Celsius" if heat else "this computer has no sensor of heat"
-        if len(rows) < 2:  # noqa: PLR2004
+        if len(rows) < 2:
             return f"too short to tell whether it slows down; {known}"
         change = rows[-1]["p50_s"] / rows[0]["p50_s"] - 1
         side = "above" if change > 0 else "below"
@@ -289,7 +289,6 @@ def _sustained(
     *,
     meter: EnergyMeter,
 ) -> tuple[list[Fix], list[Reading]]:
-    """Ask for the time requested, and look at the sensors meanwhile."""
     fixes: list[Fix] = []
     readings: list[Reading] = []
     begun, label, told = time.perf_counter(), f"{request.spec} profiled", 0

@@ -145,7 +145,6 @@ class _Loaded(Strictly):
     learns: bool
 
     def reply(self) -> Reply:
-        """Return the reply for the runner."""
         return Reply(status="ok", card=MatcherCard(**self.card.fields()), learns=self.learns)
 
 
@@ -155,7 +154,6 @@ class _Trained(Strictly):
     learned: str
 
     def reply(self) -> Reply:
-        """Return the reply for the runner."""
         return Reply(status="ok", own_s=self.seconds, learned=check_learned(self.learned))
 
 
@@ -165,7 +163,6 @@ class _Prepared(Strictly):
     grown_bytes: Annotated[int, Field(ge=0, le=_MOST_BYTES)]
 
     def reply(self) -> Reply:
-        """Return the reply for the runner."""
         return Reply(status="ok", own_s=self.seconds, grown_bytes=self.grown_bytes)
 
 
@@ -184,7 +181,6 @@ class _Matched(Strictly):
     match: _Row
 
     def reply(self) -> Reply:
-        """Return the reply for the runner."""
         row = self.match
         match = Match(
             poses=[Pose(easting_m=x, northing_m=y, yaw_deg=yaw, scale=scale) for x, y, yaw, scale, _ in row.candidates],

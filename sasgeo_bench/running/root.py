@@ -125,7 +125,6 @@ def _make_read_only(new: str, *, writable: Sequence[str]) -> None:
 
 
 def _place(new: str, path: str) -> None:
-    """Bind a folder or file, with all that is mounted in it, at its own path in the new root."""
     target = f"{new}{path}"
     if os.path.isdir(path):
         os.makedirs(target, exist_ok=True)

@@ -103,7 +103,6 @@ class RunManifest(Record):
     @field_validator("map_bytes", "prepare_s", "index_bytes", "cpu_s", "peak_bytes", mode="before")
     @classmethod
     def _check_number(cls, value: object, info: ValidationInfo) -> object:
-        """Refuse what is no measurement."""
         is_number = isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= _MOST
         if value is not None and not is_number:
             raise ValueError(f"{info.field_name} of a run is {value!r}, expected a number from 0 to {_MOST:.0e}")

@@ -68,16 +68,13 @@ def _chunks(ids: Sequence[str], threads: int, unit_of: Callable[[str], str]) -> 
 
 
 def _answer_chunk(plan: RunPlan, token: str, part: RunPart) -> Cost:
-    """Ask one chunk in the process of a dask worker, except queries that an earlier try of it has answered.
-
-    `token` tells one run from another, which the worker may have taken part in before.
-    """
+    """Ask one chunk in the process of a dask worker, except queries that an earlier try of it has answered."""
+    # `token` tells one run from another, which the worker may have taken part in before.
     return answer(plan, _still_left(plan, [part]), jobs=1, watch=Watch(), patience=_patience_of(token))
 
 
 @lru_cache(maxsize=16)
 def _patience_of(token: str) -> Patience:
-    """Return the patience of this process with the matcher of one run, over all chunks of it."""
     del token
     return Patience()
 
@@ -204,7 +201,6 @@ class _Notes(Watch):
             progress.advance(self._plan.card.name, 1)
 
     def end(self, part: RunPart, cost: Cost) -> None:
-        """Write the cost of the task."""
         _write_run(self._plan, part, cost, self._before[part.folder])
 
 

@@ -275,7 +275,6 @@ class _Keeper:
     can_die: bool
 
     def prepare(self) -> None:
-        """Adopt orphans where no namespace holds them."""
         if not self.is_apart:
             kernel.prctl(kernel.PR_SET_CHILD_SUBREAPER, 1)
 
@@ -283,7 +282,6 @@ class _Keeper:
         """Wait for a child and end as it did; by its signal, or by its signal's number and 128."""
 
         def end(number: int, frame: FrameType | None) -> NoReturn:
-            """Kill first, then end with the status of a shell."""
             del frame
             self._kill(child)
             os._exit(_BY_SIGNAL + number)

@@ -76,7 +76,6 @@ class _Group:
 
     @property
     def is_taught_from(self) -> bool:
-        """Return whether these are the train places of a hold-out."""
         return self.name == _TRAIN
 
 
@@ -171,7 +170,6 @@ def _pictured(folder: Path) -> Task:
 
 
 def _groups(wanted: SegmentTasks) -> list[_Group]:
-    """Return the groups of tasks that learn from the same places."""
     split = wanted.split
     tasks = {folder: _pictured(folder) for folder in dict.fromkeys((*wanted.tasks, *wanted.taught))}
     region = {folder: base_of(task.manifest.region) for folder, task in tasks.items()}
@@ -290,10 +288,8 @@ def _segmented(sight: _Sight, task: Task) -> tuple[Path, list[str]]:
 
 
 def _is_made(folder: Path, record: Mapping[str, str], root: Path) -> bool:
-    """Return whether a task was made of these pictures by this segmenter with what it has learned.
-
-    Pictures that it failed at are tried again: it may have been late on a busy machine.
-    """
+    """Return whether a task was made of these pictures by this segmenter with what it has learned."""
+    # Pictures that it failed at are tried again: it may have been late on a busy machine.
     try:
         task = Task.open(folder)
         task.check_queries()
@@ -352,10 +348,8 @@ def _next_labels(rows: Iterator[tuple[str, int, FrameLabels]], query_id: str, nu
 def _with_evidence(
     query: Query, truth: Truth, suite: str, segmenter: str, seen: Sequence[Segmentation | None]
 ) -> tuple[Query, Truth]:
-    """Return a query with the evidence of its pictures, under an id of its own, and its truth.
-
-    A query without pictures keeps the evidence of its model of perception.
-    """
+    """Return a query with the evidence of its pictures, under an id of its own, and its truth."""
+    # A query without pictures keeps the evidence of its model of perception.
     evidence = query.evidence
     if query.frames:
         size_cells, cell_size_m = evidence.shape[0], evidence.cell_size_m

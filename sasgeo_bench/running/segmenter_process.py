@@ -54,7 +54,6 @@ class _Loaded(Strictly):
     learns: bool
 
     def reply(self, data: bytes) -> SegmenterReply:
-        """Return the reply for the runner."""
         del data
         return SegmenterReply(status="ok", card=SegmenterCard(**self.card.fields()), learns=self.learns)
 

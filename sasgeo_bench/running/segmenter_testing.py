@@ -113,7 +113,6 @@ class _Kit:
         return check_of(name, fault and f"learned = None: {fault}", "1 image")
 
     def checks(self) -> Iterator[Check]:
-        """Run every check in turn."""
         if "training" in self.card.needs and self.process.learned is None:
             found = "the card needs training, and there is no learned text"
             yield Check(name="answers an image", outcome="not applicable", found=found)
@@ -152,7 +151,6 @@ class _Kit:
         return check_of("shapes, known classes, and an unchanged picture", shown, self._told())
 
     def _told(self) -> str:
-        """Describe the first answers."""
         told = [reply.segmentation for reply in self.first.values() if reply.segmentation is not None]
         if not told:
             return "no answer"
@@ -183,7 +181,6 @@ class _Kit:
         again = {name: self._ask(images[name]) for name in reversed(list(images))}
 
         def other(name: str, image: AerialImage) -> str | None:
-            """Return how the later answer about an image differs from the first one."""
             del image
             return _difference(name, self.first[name], again[name], "after others, in a fresh process")
 
@@ -201,7 +198,6 @@ class _Kit:
 
 
 def _fault(name: str, reply: SegmenterReply) -> str | None:
-    """Return why a reply is not a sound answer."""
     return None if reply.segmentation is not None else f"{name}: {reply.status}: {reply.message}"
 
 

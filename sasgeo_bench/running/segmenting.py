@@ -123,13 +123,11 @@ class SegmenterRun:
         )
 
     def __enter__(self) -> Self:
-        """Start nothing yet."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process."""
         self._process.end()
 
     def segment(self, image: AerialImage | LabelledImage) -> SegmenterReply:

@@ -19,7 +19,7 @@ def hottest_celsius(root: Path = _SYS) -> float | None:
     """Return the temperature of the hottest zone, degrees Celsius; of zones that say something possible."""
     found = (_number(path) for path in (root / _THERMAL).glob("thermal_zone*/temp"))
     celsius = (milli / _PER_DEGREE for milli in found if milli)
-    return max((value for value in celsius if -50 < value < 200), default=None)  # noqa: PLR2004 - others are no sensor
+    return max((value for value in celsius if -50 < value < 200), default=None)  # others are no sensor
 
 
 def clock_mhz() -> float | None:
@@ -65,7 +65,6 @@ def processor_name(info: Path = Path("/proc/cpuinfo")) -> str:
 
 
 def _packages(root: Path) -> Iterator[Path]:
-    """Yield the counters of whole packages, not of the parts that these contain."""
     yield from (path for path in sorted((root / _POWER).glob("*:*")) if path.name.count(":") == 1)
 
 

@@ -137,7 +137,6 @@ class Server(PluginServer):
         return {"seconds": seconds, "cpu_s": cpu_s, "match": match_row(check_match(found, query, top_k=top_k))}, b""
 
     def _following(self, matcher: Matcher) -> Tracker:
-        """Return the tracker that asks a matcher of single views about flights."""
         if self._follower is None:
             self._follower = Follower(matcher, grid=self._grid)
         return self._follower
@@ -175,11 +174,7 @@ def package_of(plugin: object) -> str:
 
 
 def _last_line(error: Exception, package: str) -> str:
-    """Return file and line of the innermost code of a package that an error came through, in brackets; else nothing.
-
-    >>> _last_line(ValueError("never raised"), "my_tracker")
-    ''
-    """
+    """Return file and line of the innermost code of a package that an error came through, in brackets; else nothing."""
     lines = [
         f" ({Path(frame.f_code.co_filename).name}:{line})"
         for frame, line in traceback.walk_tb(error.__traceback__)
@@ -195,12 +190,10 @@ class _Cost:
         self.seconds, self.grown_bytes = 0.0, 0
 
     def __enter__(self) -> Self:
-        """Begin to count."""
         self._before, self._start = _resident_bytes(), time.perf_counter()
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Add the cost of the block."""
         self.seconds += time.perf_counter() - self._start
         self.grown_bytes += _resident_bytes() - self._before
 
@@ -213,7 +206,6 @@ class Maps(Mapping[str, Region]):
         self._kept: OrderedDict[str, Region] = OrderedDict()
 
     def __getitem__(self, name: str) -> Region:
-        """Read a map, or return it from the cache."""
         folder = self._folders[name]
         if name not in self._kept:
             while len(self._kept) >= MOST_MAPS:
@@ -231,12 +223,10 @@ class Maps(Mapping[str, Region]):
         return iter(self._folders)
 
     def __len__(self) -> int:
-        """Number of maps."""
         return len(self._folders)
 
 
 def _resident_bytes() -> int:
-    """Return the resident memory of this process by its number in /proc, which differs in a namespace."""
     try:
         number = int(os.readlink("/proc/self"))  # noqa: PTH115 - no file, a number
     except OSError:

@@ -63,7 +63,6 @@ def _lost_role(suite: Suite) -> str | None:
 
 
 def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
-    """Draw the suite, and check what was drawn."""
     wanted = Wanted(suites=(spec,), regions=(TOWN,), split=_SPLIT, count=_COUNT, seed=1, out=folder, may_be_fewer=True)
     with reporting(silent):
         (request,) = plan_requests(wanted)
@@ -102,11 +101,8 @@ def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
 
 
 class _AsControl(Shot):
-    """A shot of a falsifier by the errors of its control."""
-
     @property
     def draw(self) -> tuple[str, ...]:
-        """Return what the errors of the control are named by."""
         return self.variant.others
 
 
@@ -120,7 +116,6 @@ class _Kit:
 
     @cached_property
     def pairs(self) -> list[tuple[Query, Truth]]:
-        """Return all queries and truths."""
         return self._draw(self.drawer)
 
     def _draw(self, drawer: Drawer) -> list[tuple[Query, Truth]]:
@@ -132,26 +127,22 @@ class _Kit:
         return self.drawer.suite.draw(shot(scene=self.drawer.scene, site=site, variant=variant, seeds=seeds))
 
     def _control(self, variant: Variant) -> Variant | None:
-        """Return the control whose views have the size of those of a variant."""
         controls = (one for one in self.drawer.suite.variants if one.role == "control")
         return next((one for one in controls if one.side_m == variant.side_m), None)
 
     def repeats(self) -> str | None:
-        """Draw everything twice."""
         for (query, truth), (again, other) in zip(self.pairs, self._draw(self.drawer), strict=True):
             if not _is_same(query, again) or truth != other:
                 return f"query {query.query_id[:8]} ({truth.kind}) is another one when it is drawn again"
         return None
 
     def depends_on_seed(self) -> str | None:
-        """Draw by another seed."""
         others = self._draw(replace(self.drawer, seeds=replace(self.drawer.seeds, root=2)))
         first = {query.query_id for query, _ in self.pairs}
         same = any(query.query_id in first for query, _ in others)
         return "queries of two seeds have one id" if same else None
 
     def keeps_size(self) -> str | None:
-        """Compare size and classes of every view with what is said of it."""
         for job in self.drawer.jobs(self.sites):
             seen, variant = self._draft(job.site, job.variant).evidence, job.variant
             if seen.shape != (variant.view_cells, variant.view_cells) or seen.cell_size_m != variant.cell_size_m:
@@ -161,7 +152,6 @@ class _Kit:
         return None
 
     def falsifiers_are_controls(self) -> str | None:
-        """Draw falsifiers by the errors of their controls."""
         for variant in (one for one in self.drawer.suite.variants if one.role == "falsifier"):
             control = self._control(variant)
             if control is None:

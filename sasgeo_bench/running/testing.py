@@ -175,7 +175,6 @@ def _chosen(queries: Iterable[Query]) -> list[Query]:
 
 
 def _one_of_each_track(queries: Sequence[Query]) -> list[Query]:
-    """Choose the smallest view of each track."""
     ordered = sorted(queries, key=lambda item: item.evidence.shape, reverse=True)
     return list({query.track: query for query in ordered}.values())
 
@@ -197,7 +196,6 @@ class _Kit:
     second: dict[str, Reply] = field(default_factory=dict)
 
     def checks(self) -> Iterator[Check]:
-        """Run every check in turn."""
         able = _chosen(query for query in self.place.queries if self._lacks(query) is None)
         if not able and self.card.tracks == (SEQUENCE,):
             fault = "it follows flights: check it as a tracker (--kind tracker)"
@@ -351,7 +349,6 @@ class _Kit:
 
 
 def _fault(reply: Reply, query: Query, *, top_k: int = TOP_K) -> str | None:
-    """Return why a reply is not a sound answer."""
     if reply.status != "ok" or reply.match is None:
         return f"{reply.status}: {reply.message}"
     try:

@@ -168,7 +168,6 @@ class _Kit:
         return replies
 
     def _again(self, name: str, first: Sequence[Reply], views: Sequence[Query]) -> Check:
-        """Fly again and compare."""
         for frame, (before, now) in enumerate(zip(first, self._fly(views), strict=False)):
             if now.status != "ok":
                 return Check(name=name, outcome="fail", found=f"frame {frame}: {now.status}: {now.message}")
@@ -251,7 +250,6 @@ def _stepped(query: Query, increment: tuple[float, float, float] | None, *, sigm
 
 
 def _fault(replies: Sequence[Reply], views: Sequence[Query]) -> str | None:
-    """Return where and why a flight ended before its last view."""
     if replies and replies[-1].status != "ok":
         return f"frame {len(replies) - 1} of 0 to {len(views) - 1}: {replies[-1].status}: {replies[-1].message}"
     return None

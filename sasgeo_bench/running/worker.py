@@ -102,13 +102,11 @@ class PluginProcess(ABC, Generic[AnyReply]):
     _kept: contextlib.ExitStack = field(default_factory=contextlib.ExitStack)  # its scratch folder, until it ends
 
     def __enter__(self) -> Self:
-        """Start nothing yet."""
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """End the process."""
         self.end()
 
     @abstractmethod
@@ -230,7 +228,6 @@ class PluginProcess(ABC, Generic[AnyReply]):
         self._memory.start()
 
     def _end_watch(self) -> None:
-        """Stop measuring, and remove the control group with its processes."""
         if self._memory is not None:
             self._memory.stop()
             self._peak_bytes = max(self._peak_bytes, self._memory.peak_bytes)
@@ -367,7 +364,6 @@ def _environment(scratch: Path) -> dict[str, str]:
 
 
 def _command(channel: int, *, is_shut_in: bool) -> list[str]:
-    """Return the command that starts the process, directly or through the sandbox."""
     if not is_shut_in:
         return [sys.executable, *_ANSWERS, str(channel)]
     package = str(Path(sasgeo_bench.running.child.__file__).parents[2])
@@ -375,7 +371,6 @@ def _command(channel: int, *, is_shut_in: bool) -> list[str]:
 
 
 def _code() -> list[Path]:
-    """Return the folders of the interpreter and of everything importable."""
     found = [Path(sys.prefix), Path(sys.base_prefix), Path(sys.executable), Path(os.getcwd())]  # noqa: PTH109
     found += [Path(entry) for entry in sys.path if entry]
     found.append(Path(sasgeo_bench.running.child.__file__).parents[2] / "sasgeo_bench")
@@ -393,7 +388,6 @@ def _drain(stream: IO[bytes] | None, printed: deque[bytes]) -> None:
 
 
 def _memory_words(limits: Limits, group: Group | None) -> str:
-    """Describe how memory and processes are limited."""
     most = f"{limits.memory_bytes / 1e6:.0f} MB at most"
     if group is not None:
         return f"{most}, and {limits.processes} processes and threads, held by the kernel (cgroup v{group.version})"
@@ -401,7 +395,6 @@ def _memory_words(limits: Limits, group: Group | None) -> str:
 
 
 def _kill_family(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process, its session, and descendants elsewhere."""
     try:
         family = psutil.Process(process.pid).children(recursive=True)
     except psutil.Error:

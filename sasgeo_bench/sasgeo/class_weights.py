@@ -106,7 +106,6 @@ class Rarity:
 
 
 def _nearest(rows: NDArray[np.float32], words: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Return the index of the nearest word of each row."""
     far = (words**2).sum(axis=1) - 2 * rows @ words.T
     return np.asarray(far.argmin(axis=1))
 
@@ -131,7 +130,6 @@ def _configurations(
 
 
 def _sectors(cell_m: float) -> list[list[NDArray[np.float32]]]:
-    """Return a mean kernel for each sector of each ring."""
     reach = int(np.ceil(RINGS_M[-1] / cell_m))
     down, right = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     far_m, turn = np.hypot(down, right) * cell_m, np.arctan2(-down, right)

@@ -138,7 +138,6 @@ class _Pairs:
     score: Floats
 
     def some(self, keep: Bools) -> Self:
-        """Return selected pairs."""
         return type(self)(seen=self.seen[keep], mapped=self.mapped[keep], score=self.score[keep])
 
 
@@ -158,17 +157,14 @@ class _Judge:
         return cls(seen=seen, mapped=mapped, rules=rules, pull=_pull(seen.nodes.places_m, stretch_m))
 
     def score(self, pose: Pose) -> GraphScore:
-        """Assign the nodes and sum up."""
         stage = self._stage(pose)
         return self._summed(stage, self._matched(stage))
 
     def matching(self, pose: Pose) -> Matching:
-        """Assign the nodes and tell what they show."""
         stage = self._stage(pose)
         return self._shown(stage, self._matched(stage))
 
     def _matched(self, stage: _Stage) -> _Pairs:
-        """Assign, shift each node with its neighbours, and assign again."""
         pairs = self._assigned(stage, np.zeros_like(stage.places_m))
         if len(pairs.seen) < _LEAST_MATCHED:
             return pairs
@@ -180,7 +176,6 @@ class _Judge:
         return np.asarray(_by_kind(self.rules, "gate_m") + _SPREAD_M)
 
     def _by_drawing(self, is_drawn: Bools) -> tuple[tuple[GraphRules, Bools], ...]:
-        """Return the rules of vectors and of masks, and which rows they hold for."""
         return ((self.rules, is_drawn), (START, ~is_drawn))
 
     def _stage(self, pose: Pose) -> _Stage:
@@ -223,7 +218,6 @@ class _Judge:
         return pairs.some(chosen[pairs.seen, pairs.mapped] & (gain > 0))
 
     def _near(self, stage: _Stage, shift_m: Floats) -> _Pairs:
-        """Return pairs of one kind within the gate and their scores."""
         ours = self.seen.nodes
         row, there = self.mapped.like(stage.places_m + shift_m, ours.kind, self._gate_m[ours.kind])
         place = np.searchsorted(stage.around, there)
@@ -287,7 +281,6 @@ class _Judge:
         )
 
     def _by_neighbours(self, stage: _Stage, pairs: _Pairs, off_m: Floats) -> Floats:
-        """Return scores of the relative places of matched neighbours."""
         ends, kind, length_m = self._neighbours(stage, pairs)
         strain_2 = ((off_m[ends[:, 0]] - off_m[ends[:, 1]]) ** 2).sum(axis=1)
         spread_2 = (_SPREAD_M[kind] ** 2).sum(axis=1)
@@ -310,11 +303,9 @@ class _Judge:
         return at[near], self.seen.nodes.kind[near], length_m
 
     def _links(self, stage: _Stage, pairs: _Pairs) -> Ints:
-        """Count ways between matched nodes of vectors and of masks, shape (2, 3).
-
-        On both sides, in the view alone, on the map alone. A way past an unmatched node is no contradiction: that node
-        is counted already.
-        """
+        """Count ways between matched nodes of vectors and of masks, shape (2, 3)."""
+        # On both sides, in the view alone, on the map alone. A way past an unmatched node is no contradiction: that
+        # node is counted already.
         ours, theirs = self.seen.links, self.mapped.links
         to_map = dict(zip(pairs.seen.tolist(), stage.around[pairs.mapped].tolist(), strict=True))
         to_view = {there: here for here, there in to_map.items()}
@@ -336,7 +327,6 @@ class _Judge:
         return found
 
     def _shown(self, stage: _Stage, pairs: _Pairs) -> Matching:
-        """Return what matched nodes share, and counts."""
         ours, theirs = self.seen.nodes, self.mapped.nodes
         own = _IS_DRAWN[ours.kind[pairs.seen]]
         seen, mapped = ours.degree[pairs.seen[own]], theirs.degree[stage.around[pairs.mapped[own]]]
@@ -358,14 +348,11 @@ class _Judge:
 
 
 def _by_kind(rules: GraphRules, name: str) -> Floats:
-    """Return a number for each kind of node, shape (K,): of these rules for vectors, the starting value for masks.
-
-    Shares of kinds are counted in the view itself, whatever it was drawn from.
-    """
+    """Return a number for each kind of node, shape (K,): of these rules for vectors, the starting value for masks."""
+    # Shares of kinds are counted in the view itself, whatever it was drawn from.
     value = np.asarray(getattr(rules, name), dtype=np.float64)
     return value if value.ndim else np.where(_IS_DRAWN, value, getattr(START, name))
 
 
 def _passes(links: dict[int, set[int]], one: int, two: int, *, matched: dict[int, int]) -> bool:
-    """Return whether a way leads from one node to another past an unmatched one."""
     return any(node not in matched for node in links.get(one, _NONE) & links.get(two, _NONE))

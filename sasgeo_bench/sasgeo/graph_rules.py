@@ -75,7 +75,6 @@ class GraphRules:
     extra: tuple[float, ...] = tuple(kind.extra for kind in NODE_KINDS)
 
     def __post_init__(self) -> None:
-        """Check ranges."""
         for item in fields(self):
             values = np.atleast_1d(getattr(self, item.name))
             fits = np.isfinite(values) if item.name in _RATIOS else np.isfinite(values) & (values > 0)

@@ -122,7 +122,7 @@ class Modes:
         """Check shapes and numbers."""
         count = len(self.positions_m)
         shapes = (np.shape(self.positions_m), np.shape(self.by_class)[:1])
-        if not count or shapes != ((count, 2), (count,)) or np.ndim(self.by_class) != 2:  # noqa: PLR2004 - (M, C)
+        if not count or shapes != ((count, 2), (count,)) or np.ndim(self.by_class) != 2:  # (M, C)
             raise ShapeError(
                 f"positions_m has shape {np.shape(self.positions_m)} and by_class {np.shape(self.by_class)}, expected "
                 "(M, 2) and (M, C) with at least one mode: an answer without a mode is withheld"

@@ -27,7 +27,6 @@ class Blend:
     eta: float = 0.1
 
     def __post_init__(self) -> None:
-        """Refuse weights that are negative or not finite."""
         for name in ("alpha", "beta", "eta"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):

@@ -184,7 +184,6 @@ def classes_of(regions: Iterable[Region]) -> tuple[str, ...]:
 def _fit_classes(
     regions: Mapping[str, Region], views: ViewsByMap, switches: Switches, classes: tuple[str, ...]
 ) -> ScorerModel:
-    """Fit rates, likeness, seasons and trust of classes."""
     tallies: dict[str, list[Tally]] = {"": []}
     stamps: list[StampTally] = []
     for name, some in views.items():
@@ -197,7 +196,6 @@ def _fit_classes(
 
 
 def _even(views: ViewsByMap, classes: tuple[str, ...]) -> ScorerModel:
-    """Return the model set by hand for the classes of the maps."""
     truths = [truth for some in views.values() for _, truth in some]
     model = ScorerModel.by_hand(classes)
     return replace(model, views=len(truths), blocks=len({truth.block for truth in truths}))
@@ -213,12 +211,10 @@ class _ScoredModes:
 
     @cached_property
     def seen(self) -> ObservedGraph:
-        """Return the graph of the view."""
         return ObservedGraph.of(self.query)
 
 
 def _graphs(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> Iterator[tuple[_ScoredModes, MappedGraph]]:
-    """Yield searches with the graphs of their maps, one map after the other."""
     for name, some in groupby(lists, key=lambda one: one.query.region):
         mapped = MappedGraph.of(regions[name])
         for one in some:
@@ -226,7 +222,6 @@ def _graphs(lists: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> Ite
 
 
 def _fit_rules(drawn: Sequence[_ScoredModes], regions: Mapping[str, Region]) -> GraphRules:
-    """Estimate the rules of the graph from views with vectors."""
     right: list[Matching] = []
     wrong: list[Matching] = []
     for one, mapped in _graphs(drawn, regions):
@@ -265,7 +260,6 @@ class _Footprint:
 
     @classmethod
     def of(cls, grid: Grid, pose: Pose, seen: Evidence) -> Self:
-        """Return the cells of a map under a view."""
         rows, cols = np.indices(seen.shape)
         right_m = (cols - (seen.shape[1] - 1) / 2) * seen.cell_size_m
         up_m = ((seen.shape[0] - 1) / 2 - rows) * seen.cell_size_m
@@ -279,7 +273,6 @@ class _Footprint:
         return np.where(self.is_inside, layers[:, self.row, self.col], np.uint8(NOWHERE))
 
     def rings(self, region: Region) -> NDArray[np.uint8]:
-        """Return the rings of each class under the view, computed on a window of the map."""
         cell_m = region.grid.cell_size_m
         reach = math.ceil(RINGS_M[-1] / cell_m) + 1
         top, left = max(0, int(self.row.min()) - reach), max(0, int(self.col.min()) - reach)
@@ -326,7 +319,6 @@ def _in_classes(layers: NDArray[np.uint8], own: Sequence[str], classes: Sequence
 def _searched(
     views: ViewsByMap, regions: Mapping[str, Region], model: ScorerModel, switches: Switches, plan: Plan
 ) -> list[_ScoredModes]:
-    """Search for all views, and return those of which a wrong place was found."""
     lists: list[_ScoredModes] = []
     for name, some in views.items():
         reader = Reader.of(regions[name], model, replace(switches, has_graph=False))

@@ -96,7 +96,6 @@ def _sectors(turned_deg: Floats) -> Bits:
 
 
 def _widened(arms: Bits) -> Bits:
-    """Return sectors and their neighbours."""
     return np.asarray((arms | (arms << _ONE) | (arms >> _LAST) | (arms >> _ONE) | (arms << _LAST)) & _ALL)
 
 
@@ -174,7 +173,6 @@ class MappedGraph:
 
 
 def _raised(places_m: Floats, kind: Ints) -> Floats:
-    """Return places with their kind as a third coordinate."""
     return np.column_stack((places_m, kind * _APART_M))
 
 

@@ -122,7 +122,6 @@ class Nodes:
     feature: Ints
 
     def __len__(self) -> int:
-        """Return the number of nodes."""
         return len(self.kind)
 
     @property
@@ -351,7 +350,7 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
     """
     names, seen = features["class"].to_numpy(dtype=object), features["is_visible"].to_numpy(dtype=bool)
     all_shapes = np.asarray(features.geometry.array)
-    is_area = seen & (shapely.get_dimensions(all_shapes) == 2) & (shapely.area(all_shapes) > 0)  # noqa: PLR2004
+    is_area = seen & (shapely.get_dimensions(all_shapes) == 2) & (shapely.area(all_shapes) > 0)
     parts = []
     for name in PATCHES:
         chosen = np.flatnonzero(is_area & (names == name))
@@ -398,7 +397,7 @@ def out_of_water(nodes: Nodes, features: gpd.GeoDataFrame) -> Nodes:
     """
     shapes = np.asarray(features.geometry.array)
     is_water = (features["class"] == "water").to_numpy() & features["is_visible"].to_numpy(dtype=bool)
-    water = shapely.STRtree(shapes[is_water & (shapely.get_dimensions(shapes) == 2)])  # noqa: PLR2004 - areas
+    water = shapely.STRtree(shapes[is_water & (shapely.get_dimensions(shapes) == 2)])  # areas
     rivers = np.flatnonzero(np.isin(nodes.kind, _OF_RIVERS))
     covered = water.query(shapely.points(nodes.places_m[rivers]), predicate="intersects")[0]
     keep = np.ones(len(nodes), dtype=bool)

@@ -67,10 +67,8 @@ def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.o
 
 
 def _links(thin: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return pairs of neighbouring cells by number, row by row, shape (E, 2).
-
-    Diagonal neighbours are linked only where no common neighbour is set: else each fork would be a triangle.
-    """
+    """Return pairs of neighbouring cells by number, row by row, shape (E, 2)."""
+    # Diagonal neighbours are linked only where no common neighbour is set: else each fork would be a triangle.
     number = np.arange(thin.size).reshape(thin.shape)
     falls = thin[:-1, :-1] & thin[1:, 1:] & ~thin[:-1, 1:] & ~thin[1:, :-1]
     rises = thin[:-1, 1:] & thin[1:, :-1] & ~thin[:-1, :-1] & ~thin[1:, 1:]
@@ -85,14 +83,12 @@ def _links(thin: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _merged(lines: NDArray[np.object_]) -> NDArray[np.object_]:
-    """Merge lines where exactly two ends meet."""
     if not len(lines):
         return lines
     return np.asarray(shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines))), dtype=object)
 
 
 def _is_spur(lines: NDArray[np.object_]) -> NDArray[np.bool_]:
-    """Return which lines are short, with one free end and one at a fork."""
     tips_m = np.stack([shapely.get_coordinates(shapely.get_point(lines, at)) for at in (0, -1)], axis=1)
     _, tip = np.unique(tips_m.reshape(-1, 2), axis=0, return_inverse=True)
     tip = tip.reshape(-1, 2)
@@ -212,7 +208,7 @@ def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     free = np.flatnonzero(network.degree(ROAD) == 1)
     places_m = network.vertices[free]
     arm_deg = arms_of(features, places_m)[:, 0]
-    if len(free) < 2:  # noqa: PLR2004 - a join has two ends
+    if len(free) < 2:  # a join has two ends
         return vectors
     pairs = cKDTree(places_m).query_pairs(BRIDGED_M, output_type="ndarray")
     ahead_deg = bearing_deg(*(places_m[pairs[:, 1]] - places_m[pairs[:, 0]]).T)

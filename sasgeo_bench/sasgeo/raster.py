@@ -231,7 +231,6 @@ def _around(layers: NDArray[np.float32], is_known: NDArray[np.float32], *, sigma
     coarse = max(1, cols // step), max(1, rows // step)
 
     def summed(layer: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return the weighted sum around each cell."""
         small = cv2.resize(layer, coarse, interpolation=cv2.INTER_AREA)
         spread = cv2.GaussianBlur(small, (0, 0), sigma / step, borderType=cv2.BORDER_CONSTANT)
         return np.asarray(cv2.resize(spread, (cols, rows), interpolation=cv2.INTER_LINEAR), dtype=np.float32)

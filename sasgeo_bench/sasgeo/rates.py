@@ -50,7 +50,6 @@ class ClassRates:
     mapped: float
 
     def __post_init__(self) -> None:
-        """Check ranges."""
         for name in _SHARES:
             if not 0 <= getattr(self, name) <= 1:
                 raise ConfigError(f"{name} is a share within 0..1, got {getattr(self, name)!r}")
@@ -220,7 +219,6 @@ def _fitted(hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[n
     start = _to_vector(hand)
 
     def loss(vector: NDArray[np.float64]) -> float:
-        """Return the negative log posterior of the rates, counted in witnesses."""
         mapped, empty = _chances(vector, ages_years)
         chances = np.stack((mapped, 1 - mapped, empty, 1 - empty), axis=1)
         losses = np.einsum("bak,ak->b", counts, np.log(chances)) / -_CELLS_PER_WITNESS

@@ -111,7 +111,6 @@ def _similarities(
 
 
 def _may_be(cast: Floats, prior: Prior) -> Bools:
-    """Return which poses a prior allows."""
     fits = np.ones(len(cast), dtype=bool)
     if prior.center_m is not None and prior.radius_m is not None:
         fits &= np.hypot(*(cast[:, :2] - prior.center_m).T) <= prior.radius_m + _PLACE_M

@@ -224,8 +224,6 @@ class SasgeoBoosted(_Fitted):
 
 @dataclass(frozen=True, kw_only=True)
 class _FittedModel:
-    """A frame of features and the model fitted in it."""
-
     frame: Frame
     log_odds: LogOdds
     answers: int

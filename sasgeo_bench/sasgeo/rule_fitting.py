@@ -57,11 +57,9 @@ def _kinds(counts: Ints) -> tuple[tuple[float, ...], tuple[float, ...]]:
 
 
 def _ratios(right: Sequence[Ints], wrong: Sequence[Ints], start: Sequence[float]) -> tuple[float, ...]:
-    """Return log ratios of the frequencies of some outcomes, right over wrong, mixed with starting values.
-
-    One observation of each outcome is shared out by the totals, so that what was never seen has ratio 0. A ratio counts
-    by its precision, a starting value as known to within one nat.
-    """
+    """Return log ratios of the frequencies of some outcomes, right over wrong, mixed with starting values."""
+    # One observation of each outcome is shared out by the totals, so that what was never seen has ratio 0. A ratio
+    # counts by its precision, a starting value as known to within one nat.
     here, there = (np.sum([*counts, np.zeros(len(start))], axis=0) for counts in (right, wrong))
     if not (here.sum() and there.sum()):
         return tuple(start)

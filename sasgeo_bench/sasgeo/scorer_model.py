@@ -114,11 +114,9 @@ class ScorerModel:
     blocks: int = 0
 
     def __eq__(self, other: object) -> bool:
-        """Compare all numbers."""
         return isinstance(other, ScorerModel) and self.to_text() == other.to_text()
 
     def __hash__(self) -> int:
-        """Hash all numbers."""
         return hash(self.to_text())
 
     @classmethod
@@ -236,7 +234,6 @@ class ScorerModel:
 
 
 def _check(scaling: NDArray[np.float64], shares: Mapping[str, NDArray[np.float64]]) -> None:
-    """Raise ValueError for numbers out of range."""
     if not (np.isfinite(scaling).all() and (scaling >= 0).all()):
         raise ValueError("an exponent is negative or not finite")
     for name, values in shares.items():
@@ -245,7 +242,6 @@ def _check(scaling: NDArray[np.float64], shares: Mapping[str, NDArray[np.float64
 
 
 def _rounded(values: dict[str, Any]) -> dict[str, Any]:
-    """Round to six significant digits."""
     return {name: _short(value) for name, value in values.items()}
 
 

@@ -221,7 +221,6 @@ class SasgeoTrack:
         )
 
     def _way_m(self, step: Step) -> float:
-        """Return how far the drone flew, as far as is known."""
         if not self.over_time.has_odometry:
             return _USUAL_M
         return math.inf if step.increment is None else math.hypot(*step.increment[:2])
@@ -257,10 +256,8 @@ class SasgeoTrack:
     def _held(
         self, weighed: GridBelief, pose: Pose, lead_nats: float, logs_on: Callable[[GridBelief], Floats]
     ) -> GridBelief:
-        """Follow a rival where views fit better elsewhere, and return the belief that has more evidence.
-
-        `lead_nats` is minus the evidence of this view for the tracker's own belief.
-        """
+        """Follow a rival where views fit better elsewhere, and return the belief that has more evidence."""
+        # `lead_nats` is minus the evidence of this view for the tracker's own belief.
         rival = self._rival
         if rival is None:
             if self._doubts < _DOUBTS:
@@ -297,10 +294,8 @@ class _Scored:
     weight: float
 
     def on(self, belief: GridBelief, *, elsewhere: float) -> Floats:
-        """Return the scores at the headings in `belief.asked` and each cell of its window.
-
-        Of a cell that the map does not know nothing is known: there a view scores `elsewhere`.
-        """
+        """Return the scores at the headings in `belief.asked` and each cell of its window."""
+        # Of a cell that the map does not know nothing is known: there a view scores `elsewhere`.
         logs = surface_logs(self.field, self.template, belief, temper=self.weight, scale=self.scale)
         known = known_on(self.field, belief.grid)
         return np.asarray(known * logs + (1 - known) * np.float32(elsewhere))
@@ -337,13 +332,11 @@ def _off(step: Step, before: Pose, after: Pose) -> float:
 
 
 def _evidence(belief: GridBelief, logs: Floats) -> float:
-    """Return the logarithm of the likelihood of a view that a belief expects."""
     top = float(logs.max())
     return top + math.log(max(float((belief.mass[belief.asked] * np.exp(logs - top)).sum(dtype=np.float64)), 1e-30))
 
 
 def _middle_m(belief: GridBelief) -> tuple[float, float]:
-    """Return the mean place of a belief."""
     plane = belief.mass.sum(axis=0, dtype=np.float64).ravel()
     east_m, north_m = (plane @ belief.places_m / plane.sum()).tolist()
     return east_m, north_m

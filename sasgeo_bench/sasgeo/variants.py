@@ -128,7 +128,6 @@ def _of_candidates(reading: Reading, plan: Plan, *, top_k: int) -> Match:
 
 
 def _at_candidate(query: Query, at: int, mode: Mode) -> Pose:
-    """Return the place of a candidate with heading and scale of the best pose near it."""
     return replace(query.candidates[at], yaw_deg=mode.pose.yaw_deg, scale=mode.pose.scale)
 
 

@@ -143,7 +143,6 @@ class GridBelief:
         return found
 
     def _held(self) -> Box:
-        """Return the box between quantiles of the mass along rows and columns."""
         plane = self.mass.sum(axis=0, dtype=np.float64)
         sides = []
         for axis in (1, 0):
@@ -228,7 +227,6 @@ def _middle_m(grid: Grid) -> tuple[float, float]:
 
 
 def _about(yaws_deg: NDArray[np.float64], yaw_deg: float | None, sigma_deg: float | None) -> Floats:
-    """Return the probability of each heading."""
     if yaw_deg is None or sigma_deg is None:
         return np.full(len(yaws_deg), 1 / len(yaws_deg), dtype=np.float32)
     step_deg = _CIRCLE_DEG / len(yaws_deg)

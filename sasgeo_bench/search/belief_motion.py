@@ -65,17 +65,14 @@ def moved(
 
 
 def _around(belief: GridBelief, reach_m: float) -> Box:
-    """Return the window of a belief with a margin."""
     reach = math.ceil(reach_m / belief.mapped.cell_size_m)
     top, left, bottom, right = belief.box
     return clipped((top - reach, left - reach, bottom + reach, right + reach), belief.mapped, beyond_m=BEYOND_M)
 
 
 def _moved(belief: GridBelief, increment: tuple[float, float, float], *, spread_m: float) -> GridBelief:
-    """Move every cell and heading by an increment in its own axes, linear between cells and headings.
-
-    The new window has a margin for what spreads from it afterwards.
-    """
+    """Move every cell and heading by an increment in its own axes, linear between cells and headings."""
+    # The new window has a margin for what spreads from it afterwards.
     right_m, up_m, turn_deg = increment
     before = np.arange(len(belief.mass)) - turn_deg / belief.yaw_step_deg  # the heading of each, in steps
     low = np.floor(before).astype(np.int64)
@@ -111,10 +108,8 @@ def _add(into: Floats, part: Floats, down: float, right: float) -> None:
 
 
 def _spread(belief: GridBelief, covariance: Matrix) -> GridBelief:
-    """Diffuse a belief by the covariance of an increment, in the axes of each heading.
-
-    Errors of place and heading count as independent.
-    """
+    """Diffuse a belief by the covariance of an increment, in the axes of each heading."""
+    # Errors of place and heading count as independent.
     mass = belief.mass
     step = belief.yaw_step_deg
     if covariance[2, 2] > _TINY * step**2:
@@ -143,11 +138,9 @@ def _turning(count: int, variance: float) -> Floats:
 
 
 def _blurred(layer: Floats, covariance: Matrix) -> Floats:
-    """Convolve with a Gaussian of a covariance of (east, north), cells2.
-
-    A Gaussian much narrower than a cell cannot be sampled: a wider one is mixed with no move, which has the same
-    variance.
-    """
+    """Convolve with a Gaussian of a covariance of (east, north), cells2."""
+    # A Gaussian much narrower than a cell cannot be sampled: a wider one is mixed with no move, which has the same
+    # variance.
     values_, vectors = np.linalg.eigh(covariance)
     share = min(1.0, float(values_[-1]) / _SMALL)
     wide = np.maximum(values_ / share, _SMALL)

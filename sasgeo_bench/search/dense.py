@@ -36,7 +36,6 @@ def dense(
     locks = [Lock() for _ in tiles]
 
     def peaks_of(base: Pose) -> list[tuple[int, _Peaks]]:
-        """Return the peaks of each tile at the turns of one base pose, and keep the highest scores."""
         found = []
         for at, turn, score in votes.scores(base):
             score[~tiles[at].allowed] = _LOW
@@ -74,7 +73,6 @@ class _Peaks:
 
     @classmethod
     def of(cls, score: NDArray[np.float32], turn: Pose, *, most: int) -> Self:
-        """Return the best local maxima of a tile at one heading and scale."""
         is_peak = (score == cv2.dilate(score, np.ones((3, 3), dtype=np.uint8))) & (score > _LOW)
         row, col = np.nonzero(is_peak)
         if len(row) > most:
@@ -231,6 +229,5 @@ def polished(level_view: LevelView, stride: Stride, guess: Guess, disc: Disc) ->
 
 
 def _vertex(less: float, here: float, more: float) -> float:
-    """Return the vertex of a parabola through three neighbours, in steps from the middle one, within half a step."""
     bend = 2 * here - less - more
     return float(np.clip((more - less) / (2 * bend), -0.5, 0.5)) if bend > _NOTHING else 0.0

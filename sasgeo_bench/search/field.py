@@ -132,7 +132,6 @@ class Template:
     cell_size_m: float
 
     def __post_init__(self) -> None:
-        """Check shapes and numbers."""
         if self.weights.ndim != _AXES or self.weights.shape[1:] != self.known.shape:
             shapes = (self.weights.shape, self.known.shape)
             raise ShapeError(f"a template has weights (K, rows, cols) and known (rows, cols), got {shapes}")
@@ -177,11 +176,9 @@ def _level(field: Field, factor: int) -> Level:
 
 
 def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], float]:
-    """Return a spread class, and its former share of that area.
-
-    A coarse pose may be off by a cell, which misses lines and houses but hardly woods and fields. Spread woods would
-    outscore the right place, so a class that grows little stays unchanged.
-    """
+    """Return a spread class, and its former share of that area."""
+    # A coarse pose may be off by a cell, which misses lines and houses but hardly woods and fields. Spread woods would
+    # outscore the right place, so a class that grows little stays unchanged.
     grown = np.asarray(cv2.dilate(band, kernel), dtype=np.uint8)
     share = float(band.sum(dtype=np.float64) / max(grown.sum(dtype=np.float64), 1.0))
     return (grown, share) if is_thin(np.float64(share)) else (band, 1.0)

@@ -111,7 +111,6 @@ class Search:
         return Found(modes=tuple(thinned(inside, self.plan.apart_m, count)), null=null)
 
     def _proposed(self, starts: Sequence[Pose]) -> list[Guess]:
-        """Score proposed poses on the coarsest level."""
         if not starts or not len(self.template.active):
             return []
         level_view = LevelView.of(self.field, self.template, self.factor)
@@ -173,7 +172,6 @@ class Search:
         return turns_of(self.prior, spread=self.plan.spread, step=step)
 
     def _begun(self, tiles: Sequence[Tile], *, most: int) -> tuple[list[Guess], Null]:
-        """Return the best modes of each tile on the coarsest level, best first."""
         level = self.field.level(self.factor)
         found, null = dense(level, self.template, tiles, self.turns, most=most, threads=self.plan.threads)
         return _ranked(Guess(mode=mode, owner=owner) for owner, modes in enumerate(found) for mode in modes), null
@@ -209,7 +207,6 @@ def _ranked(guesses: Iterable[Guess]) -> list[Guess]:
 
 
 def _merged(guesses: Sequence[Guess], apart_m: float, apart_deg: float) -> list[Guess]:
-    """Drop guesses near a better one of the same candidate."""
     kept: list[Guess] = []
     for guess in guesses:
         pose, owner = guess.mode.pose, guess.owner
@@ -224,7 +221,6 @@ def _merged(guesses: Sequence[Guess], apart_m: float, apart_deg: float) -> list[
 
 
 def _below(kept: Sequence[Guess], rest: Sequence[Guess]) -> list[Guess]:
-    """Return guesses dropped at one level, shifted below the last kept one."""
     if not kept or not rest:
         return []
     down = min(guess.mode.score for guess in kept) - rest[0].mode.score

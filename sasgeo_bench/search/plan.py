@@ -115,7 +115,7 @@ def turns_of(prior: Prior, *, spread: float, step: float) -> Turns:
     """Return headings and scales that a prior allows, in steps of at most `step` (radians of heading, and scale)."""
     offsets, scale_step = _steps(min(spread * prior.scale_sigma, 0.9), step)
     scales = [1 + offset for offset in offsets]
-    if prior.yaw_deg is None or prior.yaw_sigma_deg is None or spread * prior.yaw_sigma_deg >= 180:  # noqa: PLR2004
+    if prior.yaw_deg is None or prior.yaw_sigma_deg is None or spread * prior.yaw_sigma_deg >= 180:
         return all_around(math.degrees(step), scales, scale_step)
     yaws_deg, yaw_step_deg = _steps(spread * prior.yaw_sigma_deg, math.degrees(step))
     bases = tuple(_turn(prior.yaw_deg + yaw_deg, scale) for scale in scales for yaw_deg in yaws_deg)

@@ -167,7 +167,6 @@ class ShiftSearch:
 
     @property
     def _yaws_deg(self) -> list[float]:
-        """Return the headings to try."""
         turns = turns_of(replace(self.prior, scale_sigma=0.0), spread=self.plan.spread, step=self._step)
         return [base.yaw_deg + 90.0 * quarter for base in turns.bases for quarter in range(turns.quarters)]
 
@@ -183,7 +182,6 @@ class ShiftSearch:
         return row, col
 
     def _half(self, factor: int) -> int:
-        """Return cells of a factor from the middle of the view to its rim."""
         step_m = factor * self.chart.grid.cell_size_m
         return math.ceil(math.hypot(*self.channels.shape[1:]) * self.cell_size_m / 2 / step_m) + 1
 
@@ -204,7 +202,6 @@ class ShiftSearch:
                 yield self._tile(row, col, count, factor, disc.wider(factor * self.chart.grid.cell_size_m))
 
     def _around(self, point_m: tuple[float, float], reach_m: float, factor: int, disc: Disc) -> "_Tile":
-        """Return a square of places whose middle one is the cell of a point."""
         reach = math.ceil(reach_m / (factor * self.chart.grid.cell_size_m))
         row, col = self._cell(point_m)
         back = reach * factor + factor // 2
@@ -244,7 +241,6 @@ class ShiftSearch:
     def _peaks(
         self, high: NDArray[np.float32], which: NDArray[np.int64], tile: "_Tile", yaws_deg: Sequence[float]
     ) -> Iterator[Mode]:
-        """Yield peaks, best first."""
         left = high.copy()
         for _ in range(self.plan.refined):
             at = np.unravel_index(int(left.argmax()), left.shape)
@@ -273,14 +269,12 @@ class ShiftSearch:
         return np.stack([warped(band, to_view, around.shape) for band in blurred])
 
     def _blurred(self, factor: int) -> NDArray[np.float32]:
-        """Return means of the view over about a cell of the lattice."""
         size = 2 * round((factor * self.chart.grid.cell_size_m / self.cell_size_m - 1) / 2) + 1
         if size <= 1:
             return self.channels
         return np.stack([cv2.blur(band, (size, size), borderType=cv2.BORDER_CONSTANT) for band in self.channels])
 
     def _refined(self, mode: Mode, disc: Disc) -> Mode:
-        """Return the best pose around a coarse one, in smaller cells and steps of heading."""
         coarse_m, factor = self.plan.coarse_m, self._factor(self.plan.fine_m)
         tile = self._around(place_m(mode.pose), coarse_m, factor, disc.wider(coarse_m))
         offsets_deg = self.plan.yaw_step_deg / _STEPS * np.arange(-_STEPS, _STEPS + 1)

@@ -193,18 +193,15 @@ def _name(factor: int) -> str:
 
 
 def _made(folder: Path, name: str, shape: tuple[int, int], bands: int) -> NDArray[np.uint8]:
-    """Make a file of zeros and map it into memory."""
     return open_memmap(folder / name, mode="w+", dtype=np.uint8, shape=(*shape, bands))
 
 
 def _store_level(
     folder: Path, base: NDArray[np.uint8], grid: Grid, factor: int, window_cells: int
 ) -> NDArray[np.float64]:
-    """Store a level, as `Field.level` makes it, and return its `thinner`.
-
-    Whether a class is thin is known when all of the map was looked at: until then there are two versions, the class as
-    it is and spread.
-    """
+    """Store a level, as `Field.level` makes it, and return its `thinner`."""
+    # Whether a class is thin is known when all of the map was looked at: until then there are two versions, the class
+    # as it is and spread.
     shape, bands = grid.coarsen(factor).shape, base.shape[-1]
     plain, grown = (_made(folder, name, shape, bands) for name in (_name(factor), "grown.npy"))
     before, after = np.zeros(bands), np.zeros(bands)
@@ -240,13 +237,11 @@ def _store_level(
 
 
 def _averaged(layer: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
-    """Return means over squares of cells, zeros beyond the layer."""
     rows, cols = (-(-side // factor) for side in layer.shape)
     padded = np.pad(layer, ((0, -layer.shape[0] % factor), (0, -layer.shape[1] % factor)))
     return np.asarray(cv2.resize(padded, (cols, rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _stripes(rows: int) -> Iterator[slice]:
-    """Yield slices of some rows each."""
     for top in range(0, rows, WINDOW_CELLS):
         yield slice(top, top + WINDOW_CELLS)

@@ -137,7 +137,6 @@ def _check(center_m: tuple[float, float], radius_m: float, yaws: NDArray[np.floa
 
 
 def _joined(grid: Grid, tiles: Sequence[Tile]) -> Grid:
-    """Return the cells of all tiles, of which the first one is at the top left."""
     bottom, right = (max(first + side for first, side in _sides(tiles, axis)) for axis in (0, 1))
     return grid.window(tiles[0].row, tiles[0].col, bottom - tiles[0].row, right - tiles[0].col)
 
@@ -147,7 +146,6 @@ def _sides(tiles: Sequence[Tile], axis: int) -> list[tuple[int, int]]:
 
 
 def _part(scores: NDArray[np.float32], first: Tile, tile: Tile) -> NDArray[np.float32]:
-    """Return the part of the scores of one heading that belongs to a tile."""
     (rows, cols), row, col = tile.allowed.shape, tile.row - first.row, tile.col - first.col
     return scores[row : row + rows, col : col + cols]
 
@@ -179,5 +177,4 @@ class _Headings:
         return cls(turns=turns, base=base, quarter=quarter)
 
     def members(self, base: int) -> list[tuple[int, int]]:
-        """Return index and right angles of each heading of a base pose."""
         return [(int(yaw), int(self.quarter[yaw])) for yaw in np.flatnonzero(self.base == base)]

@@ -288,7 +288,6 @@ def _padded(view: Tensor, pose: Tensor, score: Tensor, shape: tuple[int, int]) -
 
 
 def _product(one: Tensor, other: Tensor) -> Tensor:
-    """Return products of matrices, summed and kept in single precision."""
     return torch.bmm(one, other, out_dtype=torch.float32) if one.is_cuda else torch.bmm(one, other)
 
 

@@ -111,7 +111,6 @@ class Guesses:
         return cls(pose=torch.cat([part.pose for part in even]), score=torch.cat([part.score for part in even]))
 
     def __getitem__(self, some: slice) -> Self:
-        """Return a part of the modes of each view."""
         return type(self)(pose=self.pose[:, some], score=self.score[:, some])
 
     def filled(self, count: int) -> Self:
@@ -256,6 +255,5 @@ def polished(windows: Windows, stride: Tensor, guesses: Guesses, discs: Tensor) 
 
 
 def _vertex(less: Tensor, here: Tensor, more: Tensor) -> Tensor:
-    """Return vertices of parabolas through three neighbours, in steps from the middle one, within half a step."""
     bend = 2 * here - less - more
     return ((more - less) / (2 * bend)).clamp(-0.5, 0.5).where(bend > _NOTHING, 0.0)

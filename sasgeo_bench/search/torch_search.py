@@ -103,7 +103,6 @@ class BatchSearch:
     _levels: dict[int, Tensor] = made(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        """Check that the device is there."""
         if torch is None:
             raise ConfigError("search_batch needs PyTorch: pip install 'sasgeo-bench[torch]'")
         if self.device not in DEVICES:
@@ -156,7 +155,6 @@ class BatchSearch:
         return self._searches[key]
 
     def _coarse(self, views: Views, search: Search) -> Coarse:
-        """Prepare views of one prior for the coarsest level."""
         level = self.field.level(search.factor)
         return Coarse.of(
             cells=self._cells(views, search.factor),
@@ -240,7 +238,6 @@ class BatchSearch:
 
 
 def _modes(poses: NDArray[np.float64], scores: NDArray[np.float64]) -> tuple[Mode, ...]:
-    """Return modes of rows of easting, northing, yaw and scale."""
     rows = zip(poses.tolist(), scores.tolist(), strict=True)
     return tuple(
         Mode(pose=Pose(easting_m=row[0], northing_m=row[1], yaw_deg=row[2], scale=row[3]), score=score)

@@ -157,7 +157,6 @@ class Patch:
 
 
 def _blocks(rows: int, cols: int) -> list[slice]:
-    """Cut the rows of a view into parts that stay in the cache during look-up."""
     step = max(1, _AT_ONCE // cols)
     return [slice(start, start + step) for start in range(0, rows, step)]
 

@@ -88,7 +88,7 @@ def turns(prior: Prior, plan: VotePlan) -> tuple[Pose, ...]:
 
 
 def _is_any_heading(prior: Prior) -> bool:
-    return prior.yaw_sigma_deg is None or SPREAD * prior.yaw_sigma_deg >= 180  # noqa: PLR2004
+    return prior.yaw_sigma_deg is None or SPREAD * prior.yaw_sigma_deg >= 180
 
 
 def _yaws_deg(prior: Prior, plan: VotePlan) -> list[float]:
@@ -164,7 +164,6 @@ class VoteSearch:
         return max(1, round(size_m / self.chart.grid.cell_size_m))
 
     def _factor(self) -> int:
-        """Return map cells a side of a coarse cell."""
         top, left, bottom, right = self._box()
         area_m2 = max(bottom - top, 0) * max(right - left, 0) * self.chart.grid.cell_size_m**2
         return self._cells(self.plan.coarse_wide_m if area_m2 > self.plan.wide_m2 else self.plan.coarse_m)
@@ -179,12 +178,10 @@ class VoteSearch:
         return max(row - reach, 0), max(col - reach, 0), min(row + reach + 1, rows), min(col + reach + 1, cols)
 
     def _limit(self, factor: int) -> Disc:
-        """Return the disc of the prior, wider by a coarse cell."""
         around_m = factor * self.chart.grid.cell_size_m
         return Disc(center_m=self.prior.center_m, radius_m=(self.prior.radius_m or 0.0) + around_m)
 
     def _half(self, factor: int) -> int:
-        """Return coarse cells from the middle of a template to its rim."""
         largest = self._turns[-1].scale
         return math.ceil(self.view.reach_m * largest / (factor * self.chart.grid.cell_size_m)) + 1
 
@@ -311,19 +308,16 @@ class VoteSearch:
         )
 
     def _rough(self, mode: Mode, disc: Disc) -> Mode:
-        """Refine a coarse mode on blurred squares."""
         patch = self._patch(mode, factor=self._cells(self.plan.coarse_m / 2))
         return self._climbed(mode, self._levels[0], patch, disc)
 
     def _fine(self, mode: Mode, disc: Disc) -> Mode:
-        """Refine a mode on the map's own cells."""
         patch = self._patch(mode, factor=1)
         for level in self._levels[1:]:
             mode = self._climbed(mode, level, patch, disc)
         return mode
 
     def _patch(self, mode: Mode, *, factor: int) -> Patch:
-        """Read the map under a view and a margin around it."""
         half_m = self.view.reach_m * (self._turns[-1].scale + _WIDEN) + 2 * _MARGIN_M
         return Patch.around(self.chart, self.view.bands, place_m(mode.pose), half_m, factor=factor)
 
@@ -350,7 +344,6 @@ def _turned_back(layers: NDArray[np.float32], quarters: int) -> NDArray[np.float
 
 
 def _joined(tiles: Sequence[_Tile], parts: Sequence[_Votes]) -> tuple[_Votes, NDArray[np.float64]]:
-    """Join votes and places of all tiles."""
     score = np.concatenate([np.zeros(0), *(part.score for part in parts)])
     turn = np.concatenate([np.zeros(0, dtype=np.int64), *(part.turn for part in parts)])
     points_m = np.concatenate([np.zeros((0, 2)), *(tile.points_m for tile in tiles)])

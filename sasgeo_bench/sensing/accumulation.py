@@ -43,7 +43,6 @@ class Errors:
     yaw_deg_per_km: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the values."""
         values = [getattr(self, each.name) for each in fields(self)]
         shares = (self.height_share, self.position_share)
         if not all(map(math.isfinite, values)) or min(values) < 0 or max(shares) >= _MOST_SHARE:
@@ -191,13 +190,11 @@ def _check(frames: Sequence[SoftView], steps: Sequence[Pose], correlation: float
 
 
 def _after(first: Pose, second: Pose) -> Pose:
-    """Return a pose given in the axes of another one in the axes of that one's own frame."""
     place = first.to_map(np.array([[second.easting_m, second.northing_m]]))[0].tolist()
     return Pose(easting_m=place[0], northing_m=place[1], yaw_deg=first.yaw_deg + second.yaw_deg)
 
 
 def _seen_from(pose: Pose, other: Pose) -> Pose:
-    """Return a pose of the map in the axes (right, up) of another one of the map."""
     back = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=-pose.yaw_deg)
     offset = np.array([[other.easting_m - pose.easting_m, other.northing_m - pose.northing_m]])
     right_m, up_m = back.to_map(offset)[0].tolist()

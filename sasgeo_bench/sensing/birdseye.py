@@ -62,7 +62,6 @@ class Reading:
     standing_m: Mapping[str, float] = field(default_factory=lambda: STANDING_M)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         if not 0 <= self.absent_at <= self.present_at <= 1:
             raise CameraError(f"0 <= absent_at <= present_at <= 1, got {self.absent_at!r} and {self.present_at!r}")
         if not all(value >= 0 for value in (*self.widths_m.values(), *self.standing_m.values())):
@@ -81,7 +80,7 @@ class SoftView:
 
     def __post_init__(self) -> None:
         """Check the shape."""
-        if self.probabilities.ndim != 3 or len(self.probabilities) != len(self.classes):  # noqa: PLR2004 - C, rows, cols
+        if self.probabilities.ndim != 3 or len(self.probabilities) != len(self.classes):  # C, rows, cols
             raise ShapeError(f"{len(self.classes)} classes need (C, rows, cols), got shape {self.probabilities.shape}")
 
     def to_evidence(self, reading: Reading | None = None) -> Evidence:
@@ -169,7 +168,6 @@ class BirdsEye:
         return found
 
     def _factor(self) -> int:
-        """Return by how much a picture is reduced before it is sampled."""
         if not self.is_seen.any():
             return 1
         return max(1, int(self.cell_size_m / max(np.nanpercentile(self.gsd_m, _FINEST), 1e-6)))

@@ -59,7 +59,6 @@ class Attitude:
     yaw_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the angles."""
         _check_finite(self, self.roll_deg, self.pitch_deg, self.yaw_deg)
 
     @property
@@ -82,7 +81,6 @@ class Mount:
     is_stabilized: bool = False
 
     def __post_init__(self) -> None:
-        """Check the angles."""
         _check_finite(self, self.tilt_deg, self.roll_deg, self.yaw_deg)
 
 
@@ -111,7 +109,6 @@ class Camera:
     rotation: Nine = field(repr=False)
 
     def __post_init__(self) -> None:
-        """Check the values."""
         _check_finite(self, self.east_m, self.north_m, self.height_m, *self.rotation)
         if max(abs(self.east_m), abs(self.north_m)) > _MOST_M or abs(self.height_m) > _HIGHEST_M:
             raise CameraError(
@@ -292,14 +289,12 @@ class Camera:
         return _largest(seen.intersection(shapely.Point(self.east_m, self.north_m).buffer(reach_m, quad_segs=64)))
 
     def _outline(self, ground: Plane, slope: float) -> shapely.Geometry:
-        """Return the outline of the picture on a plane, cut far beyond where rays fall less than a slope."""
         rays = self.rays(self.intrinsics.border_px(_MESH))
         points_m = ground.meet(self.position_m, _cut(rays[np.isfinite(rays).all(axis=1)], slope * _BEYOND))
         seen = points_m[np.isfinite(points_m).all(axis=1), :2].round(6)
-        return shapely.Polygon(seen).buffer(0) if len(seen) > 2 else shapely.Polygon()  # noqa: PLR2004 - a triangle
+        return shapely.Polygon(seen).buffer(0) if len(seen) > 2 else shapely.Polygon()  # a triangle
 
     def _patches(self, ground: Ground) -> shapely.Geometry:
-        """Return the union of the quadrilaterals of a mesh over the picture whose four corners show ground."""
         steps = np.linspace(0.0, 1.0, _MESH + 1)
         mesh = np.stack(np.meshgrid(steps * self.intrinsics.width_px, steps * self.intrinsics.height_px), axis=-1)
         points_m = self.unproject(mesh.reshape(-1, 2), ground)[:, :2].reshape(*mesh.shape)

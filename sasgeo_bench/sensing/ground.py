@@ -46,7 +46,6 @@ class Plane:
     height_m: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check the height."""
         if not _LOWEST_M <= self.height_m <= _HIGHEST_M:
             raise CameraError(f"the ground lies {_LOWEST_M:g} to {_HIGHEST_M:g} m high, got {self.height_m!r}")
 

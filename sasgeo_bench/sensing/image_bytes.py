@@ -152,5 +152,4 @@ class LabelledFiles(Sequence[LabelledImage]):
             raise StoreError(f"{path} cannot be read ({error.strerror or error}): make the images again") from error
 
     def __len__(self) -> int:
-        """Number of images."""
         return len(self.paths)

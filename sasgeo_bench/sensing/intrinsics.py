@@ -180,5 +180,5 @@ def _fold(distortion: Distortion) -> float:
     k1, k2, _, _, k3 = distortion
     slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])  # the derivative of r (1 + k1 r2 + k2 r4 + k3 r6), in r2
     squares = np.roots(np.where(np.abs(slope) < _NO_BEND, 0.0, slope))
-    real = squares.real[(np.abs(squares.imag) < 1e-12) & (squares.real > 0)]  # noqa: PLR2004 - rounding of a real root
+    real = squares.real[(np.abs(squares.imag) < 1e-12) & (squares.real > 0)]  # rounding of a real root
     return float(np.sqrt(real.min())) if len(real) else math.inf

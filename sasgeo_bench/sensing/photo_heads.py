@@ -139,7 +139,7 @@ def number_of(value: Any) -> float | None:  # noqa: ANN401 - whatever metadata h
     """
     try:
         parts = value.split("/") if isinstance(value, str) else [value]
-        number = float(parts[0]) / float(parts[1]) if len(parts) == 2 else float(value)  # noqa: PLR2004 - a fraction
+        number = float(parts[0]) / float(parts[1]) if len(parts) == 2 else float(value)  # a fraction
     except (TypeError, ValueError, ZeroDivisionError):
         return None
     return number if math.isfinite(number) else None

@@ -236,10 +236,8 @@ def _projection(xmp: Xmp) -> str:
 
 
 def _calibration(xmp: Xmp) -> tuple[float | None, Size | None]:
-    """Return the calibrated focal length, pixels, and the size of the picture with that optical centre in its middle.
-
-    DJI's centre counts from the picture's corner, Skydio's from the middle of its first pixel.
-    """
+    """The calibrated focal length, pixels, and the size of the picture with that optical centre in its middle."""
+    # DJI's centre counts from the picture's corner, Skydio's from the middle of its first pixel.
     focal_px = positive_of(xmp.get((DJI, "CalibratedFocalLength")))
     uri, axis, half_px = (DJI, "", 0.0) if focal_px else (SKYDIO, "/", 0.5)
     if not focal_px:
@@ -253,13 +251,13 @@ def _place(gps: Mapping[int, Any]) -> tuple[float, float] | tuple[None, None]:
     """Return longitude and latitude, or nothing where there was no fix (0, 0 included)."""
     lon_deg = _degrees(gps.get(ExifTags.GPS.GPSLongitude), gps.get(ExifTags.GPS.GPSLongitudeRef), "E", "W")
     lat_deg = _degrees(gps.get(ExifTags.GPS.GPSLatitude), gps.get(ExifTags.GPS.GPSLatitudeRef), "N", "S")
-    if lon_deg is None or lat_deg is None or abs(lon_deg) > 180 or abs(lat_deg) > 90:  # noqa: PLR2004 - the globe
+    if lon_deg is None or lat_deg is None or abs(lon_deg) > 180 or abs(lat_deg) > 90:  # the globe
         return None, None
     return (lon_deg, lat_deg) if lon_deg or lat_deg else (None, None)
 
 
 def _degrees(parts: object, side: object, plus: str, minus: str) -> float | None:
-    if not isinstance(parts, tuple) or len(parts) != 3 or side not in (plus, minus):  # noqa: PLR2004 - deg, min, s
+    if not isinstance(parts, tuple) or len(parts) != 3 or side not in (plus, minus):  # deg, min, s
         return None
     numbers = [number_of(part) for part in parts]
     if None in numbers:
@@ -269,7 +267,6 @@ def _degrees(parts: object, side: object, plus: str, minus: str) -> float | None
 
 
 def _time(text: object) -> dt.datetime | None:
-    """Return the drone's local time, which names no zone."""
     try:
         return dt.datetime.strptime(str(text).strip("\0 "), "%Y:%m:%d %H:%M:%S")  # noqa: DTZ007 - EXIF has no zone here
     except ValueError:

@@ -59,7 +59,6 @@ class Look:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Check every value."""
         for name, known in (("family", tuple(PALETTES)), ("season", SEASONS)):
             if getattr(self, name) not in known:
                 raise ConfigError(f"{name} is one of {', '.join(known)}, got {getattr(self, name)!r}")
@@ -154,7 +153,6 @@ class _Rendering:
 
     @property
     def place(self) -> str:
-        """Return the place that seeds the styles."""
         return place_of(self.manifest.id)
 
 
@@ -241,10 +239,8 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _measured(scratch: Path, rendering: _Rendering, grid: Grid) -> OrthoRecord:
-    """Return the record with the share of the region's mapped ground that is shown.
-
-    There is no offset to measure: the image lies on the map that it shows.
-    """
+    """Return the record with the share of the region's mapped ground that is shown."""
+    # There is no offset to measure: the image lies on the map that it shows.
     record = OrthoRecord.unmeasured((rendering.picture,), grid)
     imagery = Imagery(path=scratch / ORTHO, file=file_record(scratch / ORTHO), record=record, epsg=grid.epsg)
     mapped = shapely.from_wkt(rendering.manifest.coverage.wkt)
@@ -265,7 +261,6 @@ def _tiles(rendering: _Rendering, grid: Grid) -> Generator[OrthoTile]:
 
 
 def _scene(rendering: _Rendering, part: Grid) -> Scene:
-    """Return the painted surroundings of a tile."""
     cell_m = min(part.cell_size_m, _COARSEST_CELL_M)
     west, south, east, north = part.bounds_m
     window = Grid.from_bounds(

@@ -100,7 +100,6 @@ def _strips(total: int, side: int) -> Iterator[tuple[int, int]]:
 
 
 def _view(imagery: Imagery, classes: tuple[str, ...], paint: Paint, grid: Grid, place: str) -> LabelledImage:
-    """Return the view of one window of the lattice."""
     shown = imagery.read(grid.bounds_m, gsd_m=grid.cell_size_m)
     labels = burn_layers(paint, grid)
     labels[(labels == OUTSIDE) | ~shown.is_known] = UNKNOWN

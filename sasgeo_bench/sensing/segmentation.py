@@ -55,7 +55,7 @@ class Segmentation:
         """Check shape and type; lock the bytes."""
         check_classes(self.classes)
         planes = self.probability_bytes
-        is_sound = planes.dtype == np.uint8 and planes.ndim == 3 and len(planes) == len(self.classes)  # noqa: PLR2004
+        is_sound = planes.dtype == np.uint8 and planes.ndim == 3 and len(planes) == len(self.classes)
         if not is_sound or planes.size == 0:
             raise ImageError(
                 f"a segmentation of {len(self.classes)} classes is uint8 of shape (C, H, W) with a pixel at least, "
@@ -216,7 +216,7 @@ def _read_head(head: Mapping[str, Any]) -> tuple[tuple[str, ...], tuple[int, int
         isinstance(classes, list)
         and all(isinstance(name, str) for name in classes)
         and isinstance(shape, list)
-        and len(shape) == 2  # noqa: PLR2004 - rows and columns
+        and len(shape) == 2  # rows and columns
         and all(type(side) is int and side > 0 for side in shape)
     )
     if not is_sound or classes is None or shape is None:

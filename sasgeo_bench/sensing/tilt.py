@@ -109,14 +109,13 @@ def refine_tilt(
             "standard deviations are positive, got "
             f"attitude_sigma_deg={attitude_sigma_deg!r}, {end_sigma_px!r}, {parallel_sigma_deg!r}"
         )
-    if any(lines.ndim != 3 or lines.shape[1:] != (2, 2) or len(lines) < 2 for lines in roads):  # noqa: PLR2004
+    if any(lines.ndim != 3 or lines.shape[1:] != (2, 2) or len(lines) < 2 for lines in roads):
         raise CameraError(
             f"borders of a road have shape (2 or more, 2 ends, 2), got {[lines.shape for lines in roads]!r}"
         )
     sigmas = [_sigmas_deg(lines, end_sigma_px, parallel_sigma_deg) for lines in roads]
 
     def residuals(turn_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return by how many standard deviations borders are not parallel after a turn, and the turn itself is off."""
         turned = _turned(camera, turn_deg)
         of_roads = [_angles_deg(turned, lines, sigma) / sigma for lines, sigma in zip(roads, sigmas, strict=True)]
         prior = turn_deg / attitude_sigma_deg
@@ -237,20 +236,19 @@ def _straight_pieces(is_road: NDArray[np.bool_], least_px: float) -> list[Lines]
     for outline in outlines:
         points = outline.reshape(-1, 2)
         corners = cv2.approxPolyDP(outline, _BEND_PX, closed=True).reshape(-1, 2)
-        if len(corners) < 2:  # noqa: PLR2004 - a speck
+        if len(corners) < 2:  # a speck
             continue
         at = sorted(int(np.flatnonzero((points == corner).all(axis=1))[0]) for corner in corners)
         looped = np.concatenate([points, points])
         for begin, end in zip(at, [*at[1:], at[0] + len(points)], strict=True):
             piece = looped[begin + _END_PX : end - _END_PX]
             piece = piece[((piece > 0) & (piece < limit)).all(axis=1)]  # the picture's edge is no border of a road
-            if len(piece) > 2 and np.linalg.norm(piece[-1] - piece[0]) >= least_px:  # noqa: PLR2004 - to fit a line
+            if len(piece) > 2 and np.linalg.norm(piece[-1] - piece[0]) >= least_px:  # to fit a line
                 pieces.append(_fitted(piece.astype(np.float64)))
     return pieces
 
 
 def _fitted(points: Lines) -> Lines:
-    """Return the ends of the line through points, from the first to the last, in pixel-is-area coordinates."""
     dx, dy, x, y = cv2.fitLine(points.astype(np.float32), cv2.DIST_HUBER, 0, 0.01, 0.01).ravel().tolist()
     middle, along = np.array([x, y]), np.array([dx, dy])
     ends = (points[[0, -1]] - middle) @ along

@@ -86,5 +86,4 @@ def _drawn(rng: np.random.Generator) -> NDArray[np.uint8]:
 
 
 def _at(rng: np.random.Generator) -> tuple[int, int]:
-    """Draw a point of the picture, as column and row."""
     return int(rng.integers(0, SIZE_PX[1])), int(rng.integers(0, SIZE_PX[0]))

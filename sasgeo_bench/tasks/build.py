@@ -246,7 +246,6 @@ def look_of(split: Split, block: Block) -> Family:
 
 
 def _ageing(spec: RegionFile) -> Ageing:
-    """Return ageing by the rates measured in all places but the region's own."""
     book = load_ratebook()
     place = book.place_of(spec.pick(None).file)
     return ageing_of(pool_rates(book, exclude=[place] if place else []), place=place or spec.id)
@@ -327,7 +326,6 @@ def put_task(pairs: Iterable[tuple[Query, Truth]], origin: TaskOrigin, hidden: T
 
 
 def _check_unmixed(truth_folder: Path, hidden: TruthManifest) -> None:
-    """Refuse to draw with a public seed over queries of a private one, and the other way round."""
     before = TruthManifest.read(truth_folder)
     if before.model_fields_set and (before.private_seed is None) != (hidden.private_seed is None):
         kinds = ("private", "public") if hidden.private_seed is None else ("public", "private")

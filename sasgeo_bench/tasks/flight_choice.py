@@ -148,11 +148,9 @@ class Airspace:
         return None
 
     def _views(self, kind: PlanKind, length_m: float, spacing_m: float, rng: np.random.Generator) -> Trajectory | None:
-        """Return the poses of the views of a flight, None if no such path fits.
-
-        Their spacing is uneven, and its mean differs from flight to flight: else it would tell how far an odometer is
-        off.
-        """
+        """Return the poses of the views of a flight, None if no such path fits."""
+        # Their spacing is uneven, and its mean differs from flight to flight: else it would tell how far an odometer is
+        # off.
         margin_m = self.suite.clear_m(self.scene)
         length_m = min(length_m, LOITER_M) if kind == "loiter" else length_m
         try:
@@ -177,12 +175,10 @@ class Airspace:
         return len(parts) == 1 and None not in parts
 
     def _block(self, views: Trajectory) -> str:
-        """Return the block of the view in the middle."""
         middle = pose_of(views, len(views) // 2, 1.0)
         return next(block.id for block in self.scene.blocks if block.holds((middle.easting_m, middle.northing_m)))
 
     def _is_drawn(self, views: Trajectory, scale: float) -> bool:
-        """Return whether enough cells are drawn, on average over all views, on the map that shows least."""
         variant, maps = self.suite.variants[0], (self.scene.map, *self.suite.older(self.scene))
         poses = [pose_of(views, frame, scale) for frame in range(len(views))]
         means = [np.mean([drawn_share(state, pose, variant) for pose in poses]) for state in maps]

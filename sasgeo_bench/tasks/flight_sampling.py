@@ -158,7 +158,6 @@ class FlightDrawer:
     def _view(
         self, job: Job, mission: Mission, pose: Pose, step: Step, measured: dict[str, float]
     ) -> tuple[Query, Truth]:
-        """Draw one view."""
         scene, variant, group = self.scene, job.variant, mission.group or self.airspace.group
         seeds = self._seeds(job.site)
         of_view = seeds.under("view", step.frame, *([mission.draw] if mission.draw else []))
@@ -223,7 +222,6 @@ class FlightDrawer:
 
 
 def _changes(flight: Flight, variant: Variant) -> dict[str, float]:
-    """Return what truths say of the changes of the map that a variant searches."""
     if flight.plot is None:
         return {}
     if variant.role == "control":
@@ -236,10 +234,8 @@ def _moved(pose: Pose, by_m: tuple[float, float]) -> Pose:
 
 
 def _likeness(state: State, pose: Pose, copy: Pose, variant: Variant) -> dict[str, float]:
-    """Return how like a view of the map is to that at its copy: equal cells of all present in either, and if all are.
-
-    Of an exact copy, also the way to it.
-    """
+    """How like a view of the map is to that at its copy: equal cells of all present in either, and if all are."""
+    # Of an exact copy, also the way to it.
     here, there = (variant.view(state, at) for at in (pose, copy))
     is_copied = bool(np.array_equal(here.cells, there.cells))
     found = {"copy_likeness": round(1 - changed_share(here, there), 4), "is_copied": float(is_copied)}
@@ -262,7 +258,6 @@ def _joined(before: Trajectory, flight: Flight) -> Trajectory:
 
 
 def _gap_m(flight: Flight, mission: Mission) -> float | None:
-    """Return the longest gap of a mission that is not too long for a flight."""
     return max((gap_m for gap_m in mission.gaps_m if gap_m <= _MOST_GAP * flight.length_m), default=None)
 
 
@@ -279,7 +274,6 @@ def _unseen(flight: Flight, mission: Mission) -> NDArray[np.bool_]:
 
 
 def _step(sequence_id: str, frame: int, steps: Odometry, *, is_lost: bool) -> Step:
-    """Return what is known of the way to a view."""
     if frame == 0 or is_lost or steps.is_lost[frame - 1]:
         return Step(sequence_id=sequence_id, frame=frame)
     at = frame - 1

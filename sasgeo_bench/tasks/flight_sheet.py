@@ -126,7 +126,6 @@ def flight_panels(task: Task, *, count: int = 12, flight: str | None = None) -> 
 
 
 def _of_sites(truths: Mapping[str, Sequence[Truth]], count: int) -> list[str]:
-    """Return the flights of whole sites, in the order in which they are drawn."""
     sites: dict[str, list[str]] = {}
     for name, (first, *_) in sorted(truths.items(), key=lambda item: item[1][0].pair_id):
         sites.setdefault(first.pair_id, []).append(name)
@@ -195,10 +194,8 @@ def write_flight_sheet(path: Path, task: Task, shown: Sequence[FlightPanel]) -> 
 
 
 def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
-    """Yield row and column of each panel: a site begins a row, and takes a second one if it has many variants.
-
-    Where each site has one panel alone, rows are filled.
-    """
+    """Yield row and column of each panel: a site begins a row, and takes a second one if it has many variants."""
+    # Where each site has one panel alone, rows are filled.
     sizes: dict[str, int] = {}
     for panel in shown:
         sizes[panel.truth.pair_id] = sizes.get(panel.truth.pair_id, 0) + 1
@@ -279,14 +276,13 @@ def draw_flight(chart: Axes, panel: FlightPanel, ground: Ground) -> None:
 
 
 def _draw_bar(chart: Axes, bounds_m: tuple[float, float, float, float]) -> None:
-    """Draw a bar of a round length in the lower left corner."""
     west, east, south, _ = bounds_m
     length_m = max(step for step in (100, 200, 500, 1000, 2000, 5000) if step <= max(100.0, (east - west) / 4))
     left_m, bottom_m = west + 0.04 * (east - west), south + 0.04 * (east - west)
     chart.plot([left_m, left_m + length_m], [bottom_m] * 2, color="white", lw=5, solid_capstyle="butt", zorder=8)
     chart.plot([left_m, left_m + length_m], [bottom_m] * 2, color="black", lw=2.2, solid_capstyle="butt", zorder=9)
     box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0}
-    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m} m"  # noqa: PLR2004 - metres in a kilometre
+    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m} m"  # metres in a kilometre
     middle_m = (left_m + length_m / 2, bottom_m + 0.02 * (east - west))
     chart.text(*middle_m, text, ha="center", va="bottom", fontsize=7.5, bbox=box, zorder=9)
 

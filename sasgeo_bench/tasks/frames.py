@@ -80,7 +80,6 @@ class Frame:
     yaw_sigma_deg: float = 0.0
 
     def __post_init__(self) -> None:
-        """Check size and standard deviations."""
         if len(self.picture) > MOST_PICTURE_BYTES:
             raise ImageError(
                 f"a picture has at most {MOST_PICTURE_BYTES} bytes, got {len(self.picture)}: compress it more"

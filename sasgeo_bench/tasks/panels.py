@@ -73,7 +73,6 @@ def panels(
 
 
 def _no_query(task_folder: Path, query_id: str, known: Sequence[str]) -> ConfigError:
-    """Return the error for an id that no query of a task has, with the first of those they have."""
     message = (
         f"{task_folder} holds no query {query_id!r}: it has {counted(len(known), 'query', 'queries')}, "
         f"as {', '.join(known[:SOME_IDS])}; the column query_id of {QUERIES} lists all"
@@ -105,16 +104,13 @@ def _others(query: Query, truth: Truth) -> tuple[Pose, ...]:
 
 
 def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple[Pose, ...]]) -> Panel:
-    """Return a panel with the map at the truth and at its twin; without a twin, at the most similar candidate.
-
-    A query without candidates takes those of another one at the same place, or mined ones.
-    """
+    """Return a panel with the map at the truth and at its twin; without a twin, at the most similar candidate."""
+    # A query without candidates takes those of another one at the same place, or mined ones.
     if truth.pose is None:
         return Panel(query=query, truth=truth, at_truth=None, at_decoy=None)
     size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
 
     def view(pose: Pose) -> Evidence:
-        """Return the map at a pose, of the size and classes of the query."""
         return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
 
     at_truth = view(truth.pose)

@@ -41,7 +41,6 @@ class PrivateSeed:
     is_sealed: bool = field(default=False, repr=False)
 
     def __post_init__(self) -> None:
-        """Check the digits."""
         if not _DIGITS.fullmatch(self.text):
             raise ConfigError(
                 f"the {self.kind} seed of {self.file or 'the environment'} must be random digits 0-9 and a-f alone, as "
@@ -139,6 +138,5 @@ def _read(file: Path) -> str:
 
 
 def _close_memory() -> None:
-    """Keep other processes of the user from reading this one's memory or environment (/proc/<pid>, ptrace)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_DUMPABLE, 0, 0, 0, 0)

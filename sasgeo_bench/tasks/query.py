@@ -166,7 +166,6 @@ class Step:
     covariance: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Check the numbers."""
         counts = [0 if values is None else len(values) for values in (self.increment, self.covariance)]
         numbers = (*(self.increment or ()), *(self.covariance or ()))
         is_whole = counts == [0, 0] or (counts == [3, 9] and self.frame > 0)
@@ -180,7 +179,6 @@ class Step:
 
 
 def _is_covariance(values: tuple[float, ...]) -> bool:
-    """Return whether nine numbers are a matrix that is symmetric and positive semidefinite, but for rounding."""
     matrix = np.reshape(values, (3, 3))
     slack = 1e-6 * float(np.abs(matrix).max())
     return bool((np.abs(matrix - matrix.T) <= slack).all()) and float(np.linalg.eigvalsh(matrix).min()) >= -slack
@@ -261,7 +259,6 @@ class Query(_Question):
         return html_facts(f"query {self.query_id}", facts)
 
     def __post_init__(self) -> None:
-        """Check the vectors."""
         if self.vectors is None or not len(self.vectors):
             return
         is_whole = all(name in self.vectors for name in ("class", "level", "is_bridge"))

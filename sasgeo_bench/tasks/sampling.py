@@ -172,7 +172,6 @@ class Drawer:
         )
 
         def share(center_m: tuple[float, float], radius_m: float) -> float:
-            """Return the share of a disc that is mapped, from points on a spiral."""
             row, col = state.grid.to_cells(center_m + radius_m * spiral).T
             inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
             return float(state.known[row[inside], col[inside]].sum()) / _SAMPLES
@@ -271,7 +270,6 @@ def drawn_share(state: State, pose: Pose, variant: Variant) -> float:
 
 
 def _unanswerable(draft: Draft, state: State, pose: Pose, variant: Variant) -> dict[str, float]:
-    """Mark queries at places where the searched map shows hardly any feature."""
     is_blank = draft.has_pose and drawn_share(state, pose, variant) < LEAST_DRAWN
     return {UNANSWERABLE: 1.0} if is_blank else {}
 
@@ -322,13 +320,7 @@ def make_prior(
 
 
 def _holding(places_m: NDArray[np.float64], reach_m: float, *, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre.
-
-    Raises
-    ------
-    ConfigError
-        If no point, or hardly any, is.
-    """
+    """Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre."""
     low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
     # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
     points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (_HOLDING, 2))
@@ -370,13 +362,11 @@ def away(
 
 
 def _outside_m(prior: Prior, pose: Pose) -> float:
-    """Return the distance of a pose from the rim of a prior's disc, positive outside."""
     center_m = prior.center_m or (pose.easting_m, pose.northing_m)
     return math.hypot(pose.easting_m - center_m[0], pose.northing_m - center_m[1]) - (prior.radius_m or 0.0)
 
 
 def _around(pose: Pose, distance_m: float, turn: float) -> tuple[float, float]:
-    """Return a place at a distance from a pose, to a decimetre."""
     return (
         round(float(pose.easting_m + distance_m * np.sin(turn)), 1),
         round(float(pose.northing_m + distance_m * np.cos(turn)), 1),

@@ -271,10 +271,8 @@ class Split:
 
 
 def _fold(spec: SplitFile, held_out: str) -> Fold:
-    """Hold one place out: the rest of its half calibrates, the other half trains.
-
-    Sealed places do neither, nor do other places of its country, whose mappers it shares.
-    """
+    """Hold one place out: the rest of its half calibrates, the other half trains."""
+    # Sealed places do neither, nor do other places of its country, whose mappers it shares.
     own = next(place for place in spec.place if place.name == held_out)
     others = [place for place in spec.place if not place.sealed and (not own.country or place.country != own.country)]
     parts: dict[str, Part] = {place.name: "calibration" if place.half == own.half else "train" for place in others}
@@ -380,7 +378,6 @@ def _disc(blocks: list[Block]) -> tuple[float, float, float]:
 
 
 def _gaps(first: Iterable[Block], second: Iterable[Block]) -> Iterator[Pair]:
-    """Yield the distance of every pair, with the second group in the CRS of the first."""
     for a in first:
         for b in second:
             outline = b.polygon()

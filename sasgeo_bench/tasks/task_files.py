@@ -590,7 +590,6 @@ class Task:
         return cls(root / "tasks" / below, manifest, truths / below, root)
 
     def __reduce__(self) -> tuple[type[Self], tuple[Path, TaskManifest, Path, Path]]:
-        """Leave behind what was read, where the task goes to another process."""
         return type(self), (self.folder, self.manifest, self.truth, self.root)
 
     @property
@@ -621,7 +620,6 @@ class Task:
         return {row["query_id"]: self._asked_of(row) for row in rows}
 
     def _asked_of(self, row: Mapping[str, Any]) -> str:
-        """Return the recorded hash, or compute it for files of versions that did not record it."""
         recorded = row.get(ASKED)
         return asked_sha256(row, self.manifest.map_hashes) if recorded is None else str(recorded)
 
@@ -805,7 +803,6 @@ def write_task(
 
 
 def _label_rows(part: Sequence[tuple[Query, Truth]]) -> list[dict[str, Any]]:
-    """Return the labels of all frames of some queries as rows."""
     return [label_row(truth.query_id, number, item) for _, truth in part for number, item in enumerate(truth.labels)]
 
 
@@ -814,7 +811,6 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def _candidate_bytes(query: Query) -> bytes:
-    """Return the poses of the candidates as four little-endian doubles each, for the task's hash."""
     rows = [(pose.easting_m, pose.northing_m, pose.yaw_deg, pose.scale) for pose in query.candidates]
     return np.array(rows, dtype="<f8").tobytes()
 
@@ -919,7 +915,6 @@ def _check_columns(path: Path, found: pa.Schema, needed: Sequence[str]) -> None:
 
 
 def _is_known(field: pa.Field) -> bool:
-    """Return whether a column has the type that it has in our files or in a release."""
     schemas = (FILE_SCHEMA, TRUTH_SCHEMA, PLAIN_TRUTH_SCHEMA)
     types = [schema.field(field.name).type for schema in schemas if field.name in schema.names]
     return not types or any(is_like(field.type, kind) for kind in types)

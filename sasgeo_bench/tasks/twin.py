@@ -132,7 +132,7 @@ def _same_dimension(shapes: NDArray[np.object_], like: NDArray[np.object_]) -> N
     for at, shape in enumerate(shapes):
         parts = shapely.get_parts(shapely.get_parts(shape))
         parts = [part for part in parts if shapely.get_dimensions(part) == kinds[at] and not shapely.is_empty(part)]
-        gather = shapely.MultiPolygon if kinds[at] == 2 else shapely.MultiLineString  # noqa: PLR2004
+        gather = shapely.MultiPolygon if kinds[at] == 2 else shapely.MultiLineString
         found[at] = parts[0] if len(parts) == 1 else gather(parts)  # of none it makes an empty one
     return found
 
@@ -210,7 +210,7 @@ def open_gaps(
     for point in junctions_m:
         place = shapely.Point(point)
         near = np.flatnonzero(is_road & (shapely.distance(shapes, place) < _AT_M))
-        if len(near) < 2:  # noqa: PLR2004 - two roads make a junction
+        if len(near) < 2:  # two roads make a junction
             continue
         picked = int(near[rng.integers(len(near))])
         others = [index for index in near if index != picked]
@@ -239,7 +239,7 @@ def stagger(
             for two in arms[at + 1 :]
             if float(np.dot(one.direction, two.direction)) < _OPPOSITE
         ]
-        if len(pairs) < 2:  # noqa: PLR2004 - two roads that both go on make an X
+        if len(pairs) < 2:  # two roads that both go on make an X
             continue
         order = rng.permutation(len(pairs))
         moving, other = pairs[order[0]][int(rng.integers(2))], pairs[order[1]][0]
@@ -315,15 +315,14 @@ def level_crossings(features: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
 
 
 def _with_vertices(line: shapely.Geometry, points: list[shapely.Geometry]) -> shapely.Geometry:
-    """Add points on a line as vertices of it."""
     for point in points:
         parts = []
         for part in shapely.get_parts(line):
             along_m = float(shapely.line_locate_point(part, point))
             at = shapely.get_coordinates(part)
             lengths = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(at, axis=0).T))))
-            on_it = float(shapely.distance(part, point)) < 0.01  # noqa: PLR2004 - metres
-            if on_it and np.abs(lengths - along_m).min() > 1e-6:  # noqa: PLR2004 - not a vertex yet
+            on_it = float(shapely.distance(part, point)) < 0.01  # metres
+            if on_it and np.abs(lengths - along_m).min() > 1e-6:  # not a vertex yet
                 place = int(np.searchsorted(lengths, along_m))
                 part = shapely.LineString(np.insert(at, place, shapely.get_coordinates(point)[0], axis=0))  # noqa: PLW2901
             parts.append(part)

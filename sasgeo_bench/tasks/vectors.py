@@ -34,7 +34,7 @@ def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> "gpd.Ge
     """
     shapes = np.array([row[3] for row in rows], dtype=object)
     rounded = shapely.transform(shapes, lambda at: at.round(_DECIMALS) + 0.0) if len(rows) else shapes
-    is_outline = shapely.get_dimensions(shapes) == 2  # noqa: PLR2004 - polygons
+    is_outline = shapely.get_dimensions(shapes) == 2  # polygons
     for at in np.flatnonzero(is_outline & ~shapely.is_valid(rounded)).tolist():
         parts = shapely.get_parts(shapely.set_precision(shapely.make_valid(shapes[at]), 10.0**-_DECIMALS))
         parts = parts[shapely.area(parts) > 0]

@@ -30,7 +30,6 @@ class Features:
     descriptors: NDArray[np.uint8]
 
     def __len__(self) -> int:
-        """Return the number of features."""
         return len(self.points)
 
     def chosen(self, which: NDArray[np.bool_]) -> Self:

@@ -93,12 +93,11 @@ def centred(layers: list[Planes] | Planes, known: NDArray[np.bool_]) -> Stack:
 
 def _mapped(region: sgb.Region, factor: int) -> Stack:
     """Return channels of the classes of the map, in pixels of `factor` cells a side."""
-    known = pooled(region.known(), factor) > 0.5  # noqa: PLR2004 - most of a pixel
+    known = pooled(region.known(), factor) > 0.5  # most of a pixel
     return centred([pooled(region.layer(name) == sgb.PRESENT, factor) for name in region.classes], known)
 
 
 def _pictured(region: sgb.Region, grid: sgb.Grid) -> Stack | None:
-    """Return directions of gradients of the imagery on the lattice of the map."""
     ortho = Ortho.of(region, gsd_m=grid.cell_size_m)
     if ortho is None:
         return None
@@ -110,7 +109,7 @@ def _pictured(region: sgb.Region, grid: sgb.Grid) -> Stack | None:
     planes = [
         cv2.warpAffine(plane, onto, size, flags=how) for plane in (*stack.channels, stack.is_known.astype(np.float32))
     ]
-    is_known = np.asarray(planes[-1]) > 0.99  # noqa: PLR2004 - all of a pixel, but for rounding
+    is_known = np.asarray(planes[-1]) > 0.99  # all of a pixel, but for rounding
     return Stack(channels=np.stack([np.where(is_known, plane, 0) for plane in planes[:-1]]), is_known=is_known)
 
 
@@ -237,7 +236,6 @@ def _share(saved: dict[str, float]) -> float:
 
 
 def _is_right(field: Field | None, query: sgb.Query, truth: sgb.Truth) -> bool:
-    """Return whether the best place is the true one."""
     found = field.best(disc_of(query.prior), most=1) if field else []
     if not found or truth.pose is None:
         return False
@@ -254,11 +252,9 @@ class _Part:
     size_px: int
 
     def scores(self, turn: sgb.Pose) -> Planes:
-        """Return the score of each place at a heading and scale."""
         return self.search.scores(self.view.turned(turn, self.size_px))
 
     def scale(self, turns: Sequence[sgb.Pose]) -> tuple[np.float32, np.float32]:
-        """Return mean and standard deviation of the scores of some headings over all places."""
         some = [self.scores(turn) for turn in turns[:: max(1, len(turns) // _SAMPLED)]]
         values = np.concatenate([scores[np.isfinite(scores)] for scores in some])
         spread = values.std() if len(values) else np.float32(0)
@@ -323,8 +319,6 @@ class _Pair:
 
 @dataclass(frozen=True, kw_only=True)
 class _Pictured:
-    """A picture."""
-
     sight: Sight
 
     def turned(self, turn: sgb.Pose, size_px: int) -> Stack:
@@ -351,7 +345,7 @@ class _Drawn:
             if name in seen.classes:
                 cells = seen.layer(name)
                 layers[at] = _resized(cells == sgb.PRESENT, size)
-                is_known[at] = _resized(cells != sgb.UNKNOWN, size) > 0.5  # noqa: PLR2004 - most of a pixel
+                is_known[at] = _resized(cells != sgb.UNKNOWN, size) > 0.5  # most of a pixel
         return cls(layers=layers, is_known=is_known) if centred(layers, is_known).channels.any() else None
 
     def turned(self, turn: sgb.Pose, size_px: int) -> Stack:
@@ -364,7 +358,7 @@ class _Drawn:
             np.array([cv2.warpAffine(plane, matrix, (size_px, size_px), flags=how) for plane in planes])
             for planes in (self.layers, self.is_known.astype(np.float32))
         )
-        return centred(layers, is_known > 0.5)  # noqa: PLR2004 - most of a pixel
+        return centred(layers, is_known > 0.5)  # most of a pixel
 
 
 def _resized(mask: NDArray[np.bool_], size: int) -> Planes:

@@ -131,7 +131,6 @@ class NccGradient:
 
 
 def _search(stack: Stack, grid: sgb.Grid, question: Question) -> Field:
-    """Correlate a picture with a part of a map, in all headings and scales."""
     size_px = size_for(question.turns, len(question.sight.rgb))
     search = Search.of(stack, grid, question.bounds, margin=size_px // 2)
     turned = (question.sight.turned(turn, size_px) for turn in question.turns)

@@ -53,7 +53,7 @@ def similarity(seen: NDArray[np.float64], mapped: NDArray[np.float64]) -> sgb.Mo
     if matrix is None or int(np.count_nonzero(agreeing)) < LEAST_MATCHES:
         return None
     scale = math.hypot(matrix[0, 0], matrix[1, 0])
-    if not 0.1 < scale < 10:  # noqa: PLR2004 - all matches in one point
+    if not 0.1 < scale < 10:  # all matches in one point
         return None
     east_m, north_m = (matrix[:, 2] + origin).tolist()
     yaw_deg = math.degrees(math.atan2(-matrix[1, 0], matrix[0, 0]))
@@ -144,14 +144,13 @@ class OrbHomography:
     def _window(
         self, seen: Features, middle_m: tuple[float, float], side_m: float, prior: sgb.Prior
     ) -> sgb.Mode | None:
-        """Match a view with a window of the imagery."""
         assert self._features is not None  # noqa: S101 - match() has looked
         within = np.asarray((np.abs(self._features.points - middle_m) <= _REACH * side_m).all(axis=1))
         mapped = self._features.chosen(within)
         if min(len(seen), len(mapped)) < LEAST_MATCHES:
             return None
         pairs = cv2.BFMatcher(cv2.NORM_HAMMING).knnMatch(seen.descriptors, mapped.descriptors, k=2)
-        chosen = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]  # noqa: PLR2004
+        chosen = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < RATIO * pair[1].distance]
         if len(chosen) < LEAST_MATCHES:
             return None
         ours, theirs = (np.array([getattr(item, name) for item in chosen]) for name in ("queryIdx", "trainIdx"))

@@ -84,7 +84,6 @@ class _Model:
 
     @classmethod
     def of(cls, answers: Sequence[Prediction], is_false: NDArray[np.bool_]) -> Self:
-        """Fit the model to answers."""
         shared = set.intersection(*(set(item.diagnostics) for item in answers))
         names = tuple(sorted(name for name in shared if any(math.isfinite(item.diagnostics[name]) for item in answers)))
         raw = features(answers, names)

@@ -51,5 +51,4 @@ def _chances(bands: Plane) -> tuple[Plane, Plane, Plane]:
 
 
 def _slope(beyond: Plane) -> Plane:
-    """Return a chance of one half where an index is at its limit, that rises beyond it."""
     return np.asarray(_MOST / (1 + np.exp(-_STEEP * beyond)) + (1 - _MOST) / 2, dtype=np.float32)

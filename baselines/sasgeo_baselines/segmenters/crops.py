@@ -87,7 +87,6 @@ class Crops:
     def _place_of_a_class(
         self, picture: LearningPicture, rng: np.random.Generator, otherwise: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return a pixel of a class that the picture shows, drawn evenly over those classes."""
         shown = [at for at in self.classes if (picture.labels[at] == sgb.PRESENT).any()]
         if not shown:
             return otherwise
@@ -145,5 +144,5 @@ class Light:
 def _blurred(rgb: Pixels, rng: np.random.Generator) -> Pixels:
     """Return a crop out of focus, if so drawn, and with noise."""
     sigma_px, noise = rng.uniform(-1.0, 1.2), rng.uniform(0, 8)
-    soft = cv2.GaussianBlur(rgb, (0, 0), sigma_px) if sigma_px > 0.3 else rgb  # noqa: PLR2004 - less moves nothing
+    soft = cv2.GaussianBlur(rgb, (0, 0), sigma_px) if sigma_px > 0.3 else rgb  # less moves nothing
     return np.rint(np.clip(soft + rng.normal(0, noise, rgb.shape), 0, 255)).astype(np.uint8)

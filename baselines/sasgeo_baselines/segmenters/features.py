@@ -62,7 +62,7 @@ def reduced_labels(labels: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray
         cv2.resize((labels == state).astype(np.float32), shape[::-1], interpolation=cv2.INTER_AREA)
         for state in (sgb.PRESENT, sgb.UNKNOWN)
     ]
-    found = np.asarray(parts[0] >= 0.5, dtype=np.uint8)  # noqa: PLR2004 - half
+    found = np.asarray(parts[0] >= 0.5, dtype=np.uint8)  # half
     found[parts[1] > 0] = sgb.UNKNOWN
     return found
 
@@ -128,7 +128,6 @@ def features(rgb: NDArray[np.uint8], pixel_m: float) -> tuple[tuple[str, ...], P
 
 
 def _named(bands: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
-    """Yield every feature with its name."""
     light = bands[0]
     yield from (("light", light), ("green_red", bands[1]), ("blue_yellow", bands[2]))
     for sigma_m in _BLURS_M:
@@ -150,7 +149,6 @@ def _named(bands: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
 
 
 def _plain(lab: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
-    """Yield the colours as they are, near a pixel and around it."""
     for sigma_m in _PLAIN_M:
         for name, band in zip(("light", "green_red", "blue_yellow"), lab, strict=True):
             yield f"plain_{name}_{sigma_m:g}", blurred(band, sigma_m / pixel_m)
@@ -158,10 +156,10 @@ def _plain(lab: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
 
 def blurred(band: Plane, sigma_px: float) -> Plane:
     """Return a band after a Gaussian, of a smaller picture where it is wide."""
-    if sigma_px < 0.3:  # noqa: PLR2004 - pixels; it would move nothing
+    if sigma_px < 0.3:  # pixels; it would move nothing
         return band
     shrink = int(sigma_px // _SHRUNK)
-    if shrink < 2 or min(band.shape) < 2 * shrink:  # noqa: PLR2004 - nothing to gain
+    if shrink < 2 or min(band.shape) < 2 * shrink:  # nothing to gain
         return np.asarray(cv2.GaussianBlur(band, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), dtype=np.float32)
     size = (-(-band.shape[1] // shrink), -(-band.shape[0] // shrink))
     small = cv2.resize(band, size, interpolation=cv2.INTER_AREA)

@@ -91,7 +91,6 @@ def unet_shapes(classes: int) -> dict[str, tuple[int, ...]]:
 
 
 def _block_shapes(name: str, given: int, width: int) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of two convolutions, each with the scale and shift of its normalization."""
     found: dict[str, tuple[int, ...]] = {}
     for at, channels in enumerate((given, width)):
         found[f"{name}.{at}.kernel"] = (width, channels, 3, 3)
@@ -231,5 +230,4 @@ def _file_bytes(path: Path) -> bytes:
 
 
 def _shown(error: Exception) -> str:
-    """Return what an error says, in one short line."""
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]

@@ -159,7 +159,6 @@ def _trees(values: Plane, present: NDArray[np.bool_], weights: NDArray[np.float6
 
 
 def _lightgbm() -> Any:  # noqa: ANN401 - a module
-    """Import LightGBM, which needs a library of the system."""
     try:
         import lightgbm  # noqa: PLC0415 - the other segmenters work without it
     except OSError as error:

@@ -135,7 +135,6 @@ def _fit(torch: Any, weights: Weights, crops: Crops, *, steps: int, rng: np.rand
 
 
 def _loss(torch: Any, found: Any, labels: Any) -> Any:  # noqa: ANN401 - tensors
-    """Return the mean cross-entropy over what is labelled, all classes together."""
     known = labels != sgb.UNKNOWN
     truth = (labels == sgb.PRESENT).to(found.dtype)
     each = torch.nn.functional.binary_cross_entropy_with_logits(found, truth, reduction="none")
@@ -165,7 +164,6 @@ Window = tuple[slice, slice]
 
 
 def _tiles(rows: int, cols: int) -> Iterator[tuple[Window, Window, Window]]:
-    """Yield windows of a picture, each with its surroundings, and where it lies in those."""
     for row in range(0, rows, _TILE_PX):
         for col in range(0, cols, _TILE_PX):
             top, left = max(row - _MARGIN_PX, 0), max(col - _MARGIN_PX, 0)
@@ -175,6 +173,5 @@ def _tiles(rows: int, cols: int) -> Iterator[tuple[Window, Window, Window]]:
 
 
 def _padded(planes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return planes with mirrored rows and columns added, until the network can halve them at every level."""
     rows, cols = planes.shape[1:]
     return np.pad(planes, ((0, 0), (0, -rows % MULTIPLE), (0, -cols % MULTIPLE)), mode="symmetric")

@@ -219,7 +219,6 @@ def agreed(window: Window, own: Floats, plan: EkfPlan) -> sgb.Pose | None:
 
 
 def _nearest(seen: Seen, pose: sgb.Pose, own: Floats) -> float:
-    """Return the least Mahalanobis distance between a pose and those of an earlier view, carried on to now."""
     carried = (
         sgb.Belief(pose=seen.carried(item), covariance=seen.carried_covariance(item, own)) for item in seen.poses
     )

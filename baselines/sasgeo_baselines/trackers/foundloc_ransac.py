@@ -143,7 +143,6 @@ def laid_over(members: Sequence[tuple[Seen, sgb.Pose]], plan: RansacPlan) -> _La
     points_m = np.array([(pose.easting_m, pose.northing_m) for _, pose in members]).reshape(-1, 2)
 
     def away_m(pose: sgb.Pose) -> Floats:
-        """Return how far each member is from where an alignment has it."""
         return np.asarray(np.hypot(*(pose.to_map(places_m) - points_m).T))
 
     pairs = [list(pair) for pair in combinations(range(len(members)), 2)]

@@ -187,6 +187,5 @@ def others(grid: sgb.Grid, pose: sgb.Pose, *, apart_m: float, rng: np.random.Gen
 
 
 def _distance(described: Described, view: Parts, pose: sgb.Pose) -> float:
-    """Return the distance at the cell around a pose."""
     row, col = described.grid.to_cells(np.array([(pose.easting_m, pose.northing_m)]))[0].tolist()
     return float(described.compared(view, described.grid.window(row, col, 1, 1)).distances(pose.yaw_deg)[0, 0])

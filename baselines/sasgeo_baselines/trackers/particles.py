@@ -64,7 +64,6 @@ class Particles:
     weight: Floats
 
     def __len__(self) -> int:
-        """Return the number of particles."""
         return len(self.weight)
 
     @classmethod

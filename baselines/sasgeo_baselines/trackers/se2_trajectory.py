@@ -185,7 +185,6 @@ def anchors_of(views: Sequence[Seen], plan: TrajectoryPlan) -> Anchors:
 
 
 def _is_peaked(seen: Seen, plan: TrajectoryPlan) -> bool:
-    """Return whether the best score of a view stands out from its others."""
     if len(seen.scores) == 1:
         return True
     return seen.scores[0] - float(np.mean(seen.scores[1:])) > plan.flat * abs(seen.scores[0])

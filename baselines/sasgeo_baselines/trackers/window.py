@@ -159,11 +159,9 @@ class Window:
         self._views: deque[Seen] = deque(maxlen=most)
 
     def __iter__(self) -> Iterator[Seen]:
-        """Iterate over the views, oldest first."""
         return iter(self._views)
 
     def __len__(self) -> int:
-        """Return the number of views."""
         return len(self._views)
 
     def add(

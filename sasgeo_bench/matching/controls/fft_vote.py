@@ -123,7 +123,6 @@ class DenseMatcher(ABC):
         return ranked_candidates(query, scores, top_k=top_k, poses=poses, diagnostics=diagnostics)
 
     def _read(self, evidence: Evidence, chart: Chart) -> Evidence:
-        """Return the classes that the map has, as this matcher reads them."""
         shared = [index for index, name in enumerate(evidence.classes) if name in chart.classes]
         return Evidence(
             classes=tuple(evidence.classes[index] for index in shared),
@@ -139,7 +138,6 @@ class DenseMatcher(ABC):
         return View.of(seen, np.concatenate((whole[chosen], whole[-2:])), bands[chosen])
 
     def _check(self, seen: Evidence, chart: Chart) -> PoseCheck:
-        """Prepare comparisons at single poses, in the classes that view or map hold."""
         bands = _bands(seen, chart)
         chosen = self._used[bands] | (seen.cells == PRESENT).any(axis=(1, 2))
         return PoseCheck(chart=chart, bands=bands[chosen], seen=seen.cells[chosen], cell_size_m=seen.cell_size_m)

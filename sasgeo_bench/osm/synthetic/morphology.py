@@ -214,7 +214,6 @@ def _suburb(sketch: Sketch) -> None:
 
 
 def _hedges_between(sketch: Sketch, reach_m: float) -> None:
-    """Draw a hedge at every fifth house, where nothing is in the way."""
     houses = [way for way in sketch.ways if way.tags.get("building") == "house"]
     for way in houses[::5]:
         box = shapely.Polygon(way.line).minimum_rotated_rectangle
@@ -410,7 +409,6 @@ def _stream(sketch: Sketch, line: Line) -> None:
 
 
 def _railway(sketch: Sketch, points: list[tuple[float, float]], *, tunnel_from_m: float | None) -> None:
-    """Draw a railway, in a tunnel beyond a distance along it."""
     line = curve(points, step_m=40.0)
     sketch.keep_free(shapely.linestrings(line).buffer(8))
     if tunnel_from_m is None or tunnel_from_m > shapely.linestrings(line).length - 30:

@@ -71,7 +71,7 @@ class Sketch:
         """Draw an area, with holes as a multipolygon; return False if the ground is taken or too small."""
         if polygon.geom_type == "Polygon" and not self.square.contains(polygon):
             polygon = shapely.intersection(polygon, self.square)
-        if polygon.geom_type != "Polygon" or polygon.area < 4.0:  # noqa: PLR2004 - m2
+        if polygon.geom_type != "Polygon" or polygon.area < 4.0:  # m2
             return False
         if is_free and self.is_taken(polygon):
             return False
@@ -191,7 +191,6 @@ def join_streets(ways: list[Way]) -> list[Way]:
 
 
 def _with_points(line: Line, cuts: list[tuple[float, float]]) -> Line:
-    """Insert points that lie on a line at their places along it."""
     base = shapely.linestrings(line)
     corners = [(float(base.project(shapely.Point(point))), tuple(point)) for point in line.round(_DECIMALS).tolist()]
     if len(corners) > 1:

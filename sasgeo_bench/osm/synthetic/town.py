@@ -70,7 +70,6 @@ class _Thing:
     changes: tuple[_Change, ...]
 
     def alive(self, on: dt.date) -> bool:
-        """Return whether the object is in the map at the end of a day."""
         return self.born <= on and (self.died is None or on < self.died)
 
 
@@ -194,7 +193,7 @@ def _thing_elements(thing: _Thing, on: dt.date, own_base: int, network_ids: list
     moves = [change.on for change in counted if change.dx_m or change.dy_m]
     ring_refs, count = [], 0
     for ring in thing.rings:
-        is_closed = len(ring) > 3 and bool((ring[0] == ring[-1]).all())  # noqa: PLR2004 - a triangle has four points
+        is_closed = len(ring) > 3 and bool((ring[0] == ring[-1]).all())  # a triangle has four points
         corners = ring[:-1] if is_closed else ring
         if network_ids is None:
             refs = [own_base + id_shift + 200_000_000 * bool(id_shift) + count + i for i in range(len(corners))]

@@ -43,7 +43,6 @@ class Buildings:
     rust: Numbers
 
     def __len__(self) -> int:
-        """Return the number of buildings."""
         return len(self.eave_m)
 
 

@@ -106,7 +106,6 @@ class Conditions:
     jpeg_quality: int = 88
 
     def __post_init__(self) -> None:
-        """Check every value."""
         if self.season not in SEASONS:
             raise ConfigError(f"season is one of {', '.join(SEASONS)}, got {self.season!r}")
         for name, (low, high) in _RANGES.items():

@@ -60,7 +60,6 @@ def _roughen(canvas: Canvas) -> None:
 
 
 def _grass(canvas: Canvas) -> tuple[Numbers, Numbers]:
-    """Return the fresh and the dry colour of grass in the season."""
     growth = GROWTH[canvas.season]
     fresh, dry = (np.array(colour) for colour in canvas.plan.palette.grass)
     return tuple(colour + growth.grass_share * (np.array(growth.grass) - colour) for colour in (fresh, dry))
@@ -128,10 +127,8 @@ def _drawn_by_plot(plot: tuple[Field, Field], seeds: tuple[int, int]) -> tuple[F
 
 
 def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Mask]:
-    """Give each house the ground next to it; return whose ground each cell is (0 none) and where two grounds meet.
-
-    Distances are those of every second cell, which is exact enough for a garden.
-    """
+    """Give each house the ground next to it; return whose ground each cell is (0 none) and where two grounds meet."""
+    # Distances are those of every second cell, which is exact enough for a garden.
     grid, plan = canvas.grid, canvas.plan
     if not numbers.any():
         return np.zeros(grid.shape, dtype=np.int32), np.zeros(grid.shape, dtype=bool)
@@ -156,7 +153,6 @@ def _paint_yards(canvas: Canvas, numbers: Cells, soil: Field) -> tuple[Cells, Ma
 
 
 def _nearest_house(numbers: Cells, cell_size_m: float) -> tuple[Field, Cells, Mask]:
-    """Return distance to the nearest house, its number, and where two houses are equally near."""
     outside = np.ascontiguousarray(numbers == 0).astype(np.uint8)
     away, nearest = cv2.distanceTransformWithLabels(outside, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     owners = np.zeros(int(nearest.max()) + 1, dtype=np.int32)
@@ -176,7 +172,6 @@ def _whole(values: NDArray[Any], strip: slice, cols: int) -> NDArray[Any]:
 
 
 def _paint_yard_styles(canvas: Canvas, yard: Cells, style: NDArray[np.int64], soil: Field) -> None:
-    """Paint lawns, bare soil, paving and beds."""
     palette, grid, seed = canvas.plan.palette, canvas.grid, canvas.plan.seed("beds")
     fresh, dry = _grass(canvas)
     kind = np.where(yard > 0, style[yard] + 1, 0)

@@ -48,7 +48,6 @@ class Shapes:
     is_sea: Mask
 
     def __len__(self) -> int:
-        """Return the number of features."""
         return len(self.geometry)
 
     def part(self, chosen: Mask | NDArray[np.int64]) -> "Shapes":

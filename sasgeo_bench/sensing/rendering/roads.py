@@ -82,7 +82,6 @@ def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:
 
 
 def _tint_each(canvas: Canvas, numbers: Cells, colours: Numbers, cover: Field) -> None:
-    """Tint numbered areas and the cells just beside them, each in its colour, by how much of a cell they cover."""
     grown = cv2.dilate(numbers.astype(np.uint16), np.ones((5, 5), np.uint8))
     for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
         reach = cover[strip] > 0.02
@@ -91,7 +90,6 @@ def _tint_each(canvas: Canvas, numbers: Cells, colours: Numbers, cover: Field) -
 
 
 def _paint_verges(canvas: Canvas, shapes: Shapes, mask: Mask) -> None:
-    """Paint pavements in built-up quarters and worn strips elsewhere."""
     beside = (burn_numbers(shapes.areas(2.2), canvas.grid) > 0) & ~mask & (canvas.kind != WATER)
     is_town = canvas.built > 0.13 / max(canvas.plan.palette.paved_share, 0.1)
     canvas.tint(beside & is_town, canvas.plan.palette.paving, 0.8)
@@ -160,7 +158,6 @@ def _paint_tracks(canvas: Canvas) -> None:
 
 
 def _paint_rails(canvas: Canvas) -> None:
-    """Paint ballast, sleepers and two rails."""
     shapes = canvas.plan.of("railway")
     if not len(shapes):
         return

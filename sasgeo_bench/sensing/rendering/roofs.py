@@ -145,7 +145,6 @@ def _add_panels(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Num
 
 
 def _lots(cells: _Cells, size_m: float, seed: int) -> tuple[Mask, Numbers]:
-    """Return which cells lie in the box that is drawn in each lot of a roof, and the draw of the lot."""
     lots = np.floor(cells.u_m / size_m).astype(np.int64), np.floor(cells.v_m / size_m).astype(np.int64)
     middle = [0.5 + 0.35 * (draw(seed + part, cells.key, *lots) - 0.5) for part in (1, 2)]
     half = [0.1 + 0.2 * draw(seed + part, cells.key, *lots) for part in (3, 4)]

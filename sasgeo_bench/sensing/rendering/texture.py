@@ -79,7 +79,6 @@ def noise(grid: Grid, wavelength_m: float, seed: int) -> Field:
 
 
 def _joined(values: Field, at: NDArray[np.floating]) -> Field:
-    """Interpolate along the first axis with a smooth step."""
     low = np.floor(at).astype(np.int64)
     part = (at - low).astype(np.float32)
     part = (part * part * (3 - 2 * part))[:, None]

@@ -244,10 +244,8 @@ class _Scratch:
         self._numbers = np.empty((2, _AT_ONCE * count), dtype=np.int32)
 
     def look(self, raster: Field, rays: Field) -> tuple[Field, Field]:
-        """Return heights of the next steps of rays, shape (steps, N), and the heights of the cells under them.
-
-        Beyond the raster those are 0, as its border is level ground.
-        """
+        """Return heights of the next steps of rays, shape (steps, N), and the heights of the cells under them."""
+        # Beyond the raster those are 0, as its border is level ground.
         (rows, cols), count = raster.shape, rays.shape[1]
         z_m, col, row = self._fields[:, : _AT_ONCE * count].reshape(3, _AT_ONCE, count)
         cell, at_col = self._numbers[:, : _AT_ONCE * count].reshape(2, _AT_ONCE, count)

@@ -77,7 +77,6 @@ def make_trees(canvas: Canvas, points: Numbers, *, size: tuple[float, float], is
 
 
 def _leaves(canvas: Canvas, key: NDArray[np.int64], form: NDArray[np.int64]) -> Numbers:
-    """Return the colour of each crown in its season."""
     growth, crowns = GROWTH[canvas.season], np.array(canvas.plan.palette.crowns)
     colour = crowns[(draw(4, key) * len(crowns)).astype(int)]
     colour = colour * (1 + 0.12 * bell(5, key))[:, None] + 5.0 * np.stack(

@@ -45,7 +45,6 @@ class Rates:
     ground_gained_per_year: float | None = None
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         ground = [
             name for name in ("ground_lost_per_year", "ground_gained_per_year") if getattr(self, name) is not None
         ]
@@ -91,7 +90,6 @@ class Ageing:
     shift_m: float = 2.0
 
     def __post_init__(self) -> None:
-        """Check the ranges, and that the rates are not the place's own."""
         check_ranges(self, years=(0, 200), shift_m=(0, 100))
         if self.place in self.measured_in:
             raise PerturbError(f"Ageing: the rates come from {self.place!r} itself, take those of other places")

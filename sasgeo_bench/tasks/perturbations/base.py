@@ -56,7 +56,6 @@ class Occlusion(ABC):
     share: float
 
     def __post_init__(self) -> None:
-        """Check the range."""
         check_ranges(self, share=(0, 1))
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:

@@ -46,7 +46,6 @@ class NoisePool:
     """
 
     def __init__(self, shape: tuple[int, int], streams: Streams) -> None:
-        """Draw nothing yet."""
         self._shape = shape
         self._streams = streams
         self._fields: dict[float, Field] = {}
@@ -85,7 +84,7 @@ def highest_within(field: Field, mask: Mask, count: float, rng: np.random.Genera
     """Return `highest` of a field within a mask; of a sample of rows if the mask is large (to about half a percent)."""
     size = np.count_nonzero(mask)
     step = size // _FEWEST
-    if step < 2:  # noqa: PLR2004 - a part must be smaller than the whole
+    if step < 2:  # a part must be smaller than the whole
         return highest(field[mask], count)
     first = int(rng.random() * step)
     part = field[first::step][mask[first::step]]

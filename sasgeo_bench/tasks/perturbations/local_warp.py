@@ -39,7 +39,6 @@ class Warp(ABC):
     rms_m: float
 
     def __post_init__(self) -> None:
-        """Check the range."""
         check_ranges(self, rms_m=(0, 1e3))
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
@@ -145,7 +144,6 @@ class Tilt(Warp):
 
 
 def _without_similarity(shown: NDArray[np.complex128], ground: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return how far points, as complex numbers, lie from others after the similarity that brings them nearest."""
     off = shown - shown.mean()
     spread = float((np.abs(off) ** 2).mean())
     factor = (off.conj() * ground).mean() / spread if spread > 0 else 1.0

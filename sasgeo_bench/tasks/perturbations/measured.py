@@ -62,7 +62,6 @@ class MeasuredPerception:
     errors: Mapping[str, MeasuredErrors] = field(default_factory=lambda: MEASURED, repr=False, hash=False)
 
     def __post_init__(self) -> None:
-        """Check the range."""
         check_ranges(self, error_factor=(0, 20))
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
@@ -106,7 +105,6 @@ class _View:
 
     @classmethod
     def of(cls, evidence: Evidence, errors: Mapping[str, MeasuredErrors], streams: Streams) -> "_View":
-        """Split a view into masks."""
         masks, unknown = evidence.cells == PRESENT, evidence.cells == UNKNOWN
         shows = [not (name in errors and errors[name].is_ground) for name in evidence.classes]
         ground = ~(masks | unknown)[shows].any(axis=0)
@@ -134,7 +132,6 @@ class _View:
         return self.outlines[name]
 
     def any_of(self, names: tuple[str, ...]) -> Mask:
-        """Return where any of the classes is present."""
         found = [self.masks[self.at[name]] for name in names if name in self.at]
         return np.any(found, axis=0) if found else np.zeros_like(self.ground)
 
@@ -271,10 +268,8 @@ class _View:
     def _add(
         seen: Mask, free: Mask, budget: float, shapes: list[tuple[NDArray[np.int32], int]], rng: np.random.Generator
     ) -> None:
-        """Draw shapes onto free cells until the budget is spent; the last one by lot, so that the mean is the budget.
-
-        A shape is a polygon if its thickness is 0, else a line.
-        """
+        """Draw shapes onto free cells until the budget is spent, the last one by lot, so the mean is the budget."""
+        # A shape is a polygon if its thickness is 0, else a line.
         for points, thickness in shapes:
             drawn = np.zeros(seen.shape, dtype=np.uint8)
             if thickness:
@@ -292,13 +287,11 @@ class _View:
 
 
 def _closed(mask: Mask) -> Mask:
-    """Return a mask with its pinholes filled."""
     return np.asarray(cv2.morphologyEx(mask.view(np.uint8), cv2.MORPH_CLOSE, disc(_PINHOLE_CELLS))).view(np.bool_)
 
 
 def _rounded(mask: Mask, sigma_cells: float) -> Mask:
-    """Return a mask with its corners cut, as by a network of coarser resolution."""
-    if sigma_cells < 0.3:  # noqa: PLR2004 - a blur that moves no cell
+    if sigma_cells < 0.3:  # a blur that moves no cell
         return mask.copy()
     blurred = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), sigma_cells, borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(blurred > 0.5)  # noqa: PLR2004 - the outline
+    return np.asarray(blurred > 0.5)  # the outline

@@ -122,7 +122,7 @@ def _score(shape: tuple[int, int], index: int) -> NDArray[np.float32]:
     elif kind == 1:
         offsets = rng.uniform(-0.7, 0.7, size=int(rng.integers(1, 4)))
         score = np.max([-np.abs(across - offset) for offset in offsets], axis=0)
-    elif kind == 2:  # noqa: PLR2004 - the third kind
+    elif kind == 2:  # the third kind
         score = smooth_noise(shape, max(shape) / float(rng.uniform(3, 6)), rng).astype(np.float64)
     else:
         score = along + rng.uniform(0, 0.8) * np.abs(across)

@@ -68,7 +68,6 @@ class Perception:
     error_factor: float = 1.0
 
     def __post_init__(self) -> None:
-        """Check the range."""
         check_ranges(self, error_factor=(0, 20))
 
     def __call__(self, evidence: Evidence, rng: np.random.Generator, /) -> Evidence:
@@ -130,12 +129,10 @@ class _Look:
     mixed_up: Field
 
     def noise(self, width_m: float, rng: np.random.Generator) -> Field:
-        """Take smooth noise of a width from the pool."""
         return self.pool.take(width_m / self.cell_size_m, rng)
 
     @property
     def is_thin(self) -> bool:
-        """Return whether the class is drawn as lines."""
         return self.name in load_taxonomy().lines
 
     def lose(self, rng: np.random.Generator) -> tuple[Mask, Mask | None]:
@@ -229,7 +226,6 @@ def _drop(mask: Mask, budget_cells: float, rng: np.random.Generator) -> Mask:
 
 
 def _inner_edge(mask: Mask, noise: Field, budget_cells: float, rng: np.random.Generator) -> Mask:
-    """Return cells one or two from the edge where the noise is strong."""
     first = eroded(mask, TOLERANCE_CELLS)
     second = eroded(first, TOLERANCE_CELLS)
     ring = mask & ~first
@@ -238,7 +234,6 @@ def _inner_edge(mask: Mask, noise: Field, budget_cells: float, rng: np.random.Ge
 
 
 def _outer_edge(mask: Mask, free: Mask, noise: Field, budget_cells: float, rng: np.random.Generator) -> Mask:
-    """Return free cells one or two beyond the edge where the noise is strong."""
     first = dilated(mask, TOLERANCE_CELLS)
     ring = first & free & ~mask
     limit = highest_within(noise, ring, 0.8 * budget_cells, rng)

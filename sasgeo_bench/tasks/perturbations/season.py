@@ -43,7 +43,6 @@ class Season:
     strength: float
 
     def __post_init__(self) -> None:
-        """Check the season and the range."""
         check_ranges(self, strength=(0, 1))
         if self.kind not in get_args(Kind):
             raise PerturbError(f"Season: kind is one of {', '.join(get_args(Kind))}, got {self.kind!r}")
@@ -112,10 +111,8 @@ def _strongest(noise: Field, mask: Mask, share: float) -> Mask:
 
 
 def _some_parcels(mask: Mask, boundary: Mask, share: float, rng: np.random.Generator, *, most: float = 1.0) -> Mask:
-    """Choose parcels between boundaries with probability `share`; return them with their boundary cells.
-
-    Parcels that cover more than `most` of the view are never chosen.
-    """
+    """Choose parcels between boundaries with probability `share`; return them with their boundary cells."""
+    # Parcels that cover more than `most` of the view are never chosen.
     parcels = find_objects(mask & ~boundary)
     is_chosen = (rng.random(len(parcels.areas_cells)) < share) & (parcels.areas_cells <= most * mask.size)
     chosen = parcels.mask_of(is_chosen)

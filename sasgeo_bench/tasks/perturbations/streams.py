@@ -27,7 +27,6 @@ class Streams:
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
-        """Take the seed of all streams."""
         self._root = rng.integers(0, 2**32, size=_WORDS, dtype=np.uint32).tolist()
         self._made: dict[str, np.random.Generator] = {}
 

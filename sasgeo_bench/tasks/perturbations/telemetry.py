@@ -122,7 +122,6 @@ def _masks(evidence: Evidence) -> list[tuple[list[int], int, Mask]]:
 
 
 def _polygons(mask: Mask) -> NDArray[np.object_]:
-    """Return polygons of (column, row) around the patches of a mask."""
     from rasterio.features import shapes  # noqa: PLC0415 - suites are listed without it
 
     found = [shapely.geometry.shape(item) for item, _ in shapes(mask.astype(np.uint8), mask=mask)]
@@ -154,12 +153,10 @@ def _outline_bytes(message: Sequence[Sequence[Outline]]) -> bytes:
 
 
 def _largest(message: list[list[Outline]], budget_bytes: int) -> list[list[Outline]]:
-    """Return as many of the largest outlines as the budget allows."""
     places = [(layer, at) for layer, some in enumerate(message) for at in range(len(some))]
     order = sorted(places, key=lambda place: (-shapely.Polygon(message[place[0]][place[1]][0]).area, *place))
 
     def first(count: int) -> list[list[Outline]]:
-        """Return the first few, layer by layer."""
         chosen = set(order[:count])
         return [[rings for at, rings in enumerate(some) if (layer, at) in chosen] for layer, some in enumerate(message)]
 
@@ -167,7 +164,6 @@ def _largest(message: list[list[Outline]], budget_bytes: int) -> list[list[Outli
 
 
 def _filled(some: Sequence[Outline], shape: tuple[int, int]) -> Mask:
-    """Return the cells whose middles lie in one of the outlines."""
     from rasterio.features import rasterize  # noqa: PLC0415 - suites are listed without it
 
     polygons = [shapely.Polygon(rings[0], rings[1:]) for rings in some]
@@ -186,7 +182,6 @@ def junctions(evidence: Evidence, vectors: "gpd.GeoDataFrame", *, budget_bytes: 
     side_m = max(evidence.size_m)
 
     def message(count: int) -> bytes:
-        """Return the first few."""
         rows = [[*_place_steps(place_m, side_m), len(arms), *arms] for place_m, arms in found[:count]]
         return bytes([value for row in rows for value in row])
 
@@ -217,7 +212,6 @@ def _junctions(vectors: "gpd.GeoDataFrame") -> Iterator[tuple[tuple[float, float
 
 
 def _place_steps(place_m: tuple[float, float], side_m: float) -> list[int]:
-    """Return a place as a byte for each axis."""
     steps = np.floor((np.array(place_m) / side_m + 0.5) * _PLACE_STEPS)
     return [int(value) for value in np.clip(steps, 0, _PLACE_STEPS - 1)]
 
@@ -228,7 +222,6 @@ def _frame(evidence: Evidence) -> shapely.Polygon:
 
 
 def _drawn(evidence: Evidence, lines: Sequence[shapely.Geometry]) -> Evidence:
-    """Return a view that knows of these roads alone."""
     cells = np.full(evidence.cells.shape, UNKNOWN, dtype=np.uint8)
     if lines and "road_minor" in evidence.classes:
         near = shapely.union_all(lines).buffer(ARM_WIDTH_M / 2)
@@ -261,7 +254,6 @@ def regions_of_interest(evidence: Evidence, shares: NDArray[np.float64], *, budg
     order = sorted(range(len(corners)), key=lambda at: (-worth[at], at))
 
     def message(count: int) -> bytes:
-        """Return the first few squares, each with its number."""
         return b"".join(numbers(np.array([at])) + runs_of(parts[at]) for at in order[:count])
 
     count = most_within(lambda count: length_of(message(count)), len(order), budget_bytes)
@@ -272,7 +264,6 @@ def regions_of_interest(evidence: Evidence, shares: NDArray[np.float64], *, budg
 
 
 def _squares(shape: tuple[int, int]) -> list[tuple[int, int]]:
-    """Return the first row and column of each square."""
     return [(row, col) for row in range(0, shape[0], TILE_CELLS) for col in range(0, shape[1], TILE_CELLS)]
 
 

@@ -64,10 +64,8 @@ class AbsentSuite(Suite):
 
 
 def _feature_poor(shot: Shot) -> Draft:
-    """Draw a place of the same block with hardly any feature, or the site's own view without its features.
-
-    The place is on the map, so an answer may be right; but hardly anything distinguishes it.
-    """
+    """Draw a place of the same block with hardly any feature, or the site's own view without its features."""
+    # The place is on the map, so an answer may be right; but hardly anything distinguishes it.
     poor = _poor_place(shot)
     if poor is None:
         return Draft(evidence=strip(shot.perceived()), density=0.0, measured={"is_real_place": 0.0})
@@ -94,7 +92,6 @@ def _moved(site: Site, point: NDArray[np.float64], density: float) -> Site:
 
 
 def _density(state: State, point: NDArray[np.float64], variant: Variant) -> float:
-    """Return the fraction of drawn cells in a mapped square of the size of a view."""
     half = round(variant.side_m / 2 / state.grid.cell_size_m)
     row, col = state.grid.to_cells(point[None, :])[0].tolist()
     return float(state.drawn[row - half : row + half, col - half : col + half].mean())

@@ -87,7 +87,6 @@ def _room(
 
 
 def _pastes(area: shapely.Polygon, copy_m: tuple[float, float]) -> tuple[Paste, Paste]:
-    """Return the copy of an area, and the copy of its mirror image, both of the same outline."""
     middle_m = _middle_m(area)
     radius_m = float(shapely.hausdorff_distance(shapely.Point(middle_m), area)) + _RIM_M
     target_m = (middle_m[0] + copy_m[0], middle_m[1] + copy_m[1])

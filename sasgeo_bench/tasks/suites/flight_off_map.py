@@ -74,11 +74,9 @@ def _parts_m(inside: NDArray[np.bool_], flown_m: Floats) -> Floats:
 def _hole(
     place_m: Floats, flown_m: Floats, stretch_m: float, ground: Ground, rng: np.random.Generator
 ) -> shapely.Polygon | None:
-    """Return a disc that a flight passes through once for about a given length; None if none is found.
-
-    Of several the one is taken of which the flight sees least at other times. The first and the last view see all of
-    their ground on the map.
-    """
+    """Return a disc that a flight passes through once for about a given length; None if none is found."""
+    # Of several the one is taken of which the flight sees least at other times. The first and the last view see all of
+    # their ground on the map.
     low_m, high_m = (share * flown_m[-1] for share in _MIDDLE)
     middles = np.flatnonzero((flown_m > low_m) & (flown_m < high_m))
     found: list[tuple[float, shapely.Polygon]] = []

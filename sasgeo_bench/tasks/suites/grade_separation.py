@@ -14,7 +14,6 @@ from sasgeo_bench.tasks.twin import ROADS, level_crossings
 
 
 def _overpasses(scene: Scene) -> NDArray[np.float64]:
-    """Return places where two roads cross at different levels."""
     nodes = nodes_of(scene, ["crossing"])
     is_road = nodes["class"].isin(ROADS).to_numpy()
     return places_of(nodes[is_road & (nodes["level_difference"].to_numpy() != 0)])

@@ -19,7 +19,6 @@ _NEAR_M: Final = 70.0
 
 
 def _halls(scene: Scene) -> NDArray[np.float64]:
-    """Return centres of buildings that could be a row of houses, where two or more are near each other."""
     features = scene.map.features
     chosen = features[(features["class"] == "building").to_numpy() & features["is_visible"].to_numpy()]
     shapes = chosen.geometry.to_numpy()

@@ -82,7 +82,7 @@ def perceive_coarsely(
     clipped = shapely.intersection(shapely.make_valid(table.geometry.to_numpy()), outline)
     local = shapely.transform(clipped, inverse(pose).to_map)
     names = table["class"].to_numpy()
-    green = shapely.union_all(local[(names == "green") & (shapely.get_dimensions(local) == 2)])  # noqa: PLR2004 - areas
+    green = shapely.union_all(local[(names == "green") & (shapely.get_dimensions(local) == 2)])  # areas
     things = [
         _Thing(name=name, level=int(level), is_bridge=bool(is_bridge), shape=part)
         for name, level, is_bridge, shape in zip(names, table["level"], table["is_bridge"], local, strict=True)
@@ -140,7 +140,6 @@ def _missed(sizes: NDArray[np.float64], half: float) -> NDArray[np.float64]:
 def _heights(
     points: Sequence[Points], canopy: Callable[[Points], Points], green: shapely.Geometry, under_green: float
 ) -> list[NDArray[np.float64]]:
-    """Return the height of the canopy at the points of each line."""
     if not points:
         return []
     whole = np.concatenate(points)
@@ -232,7 +231,6 @@ def _drives(
 def _sheds(
     areas: Sequence[_Thing], side_m: float, noise: MeasuredVectorNoise, rng: np.random.Generator
 ) -> list[_Thing]:
-    """Return sheds beside buildings that are not there."""
     found = []
     for _ in range(rng.poisson(noise.false_share * len(areas))):
         near = shapely.get_coordinates(areas[int(rng.integers(len(areas)))].shape.centroid)[0]

@@ -185,10 +185,8 @@ def stands_of(shot: Shot, flight: Flight) -> list[Stand]:
 
 
 def _camera(flight: Flight, view: Pose, stop: Pose, tilt_deg: float, roll_deg: float) -> Camera:
-    """Return the camera of a stop, given in the axes of the view's frame; `view` puts that on the map.
-
-    The middle of the view is where the optical axis of the last camera should point.
-    """
+    """Return the camera of a stop, given in the axes of the view's frame; `view` puts that on the map."""
+    # The middle of the view is where the optical axis of the last camera should point.
     ahead_m = flight.height_m * math.tan(math.radians(flight.tilt_deg))
     east_m, north_m = view.to_map(np.array([(stop.easting_m, stop.northing_m - ahead_m)]))[0].tolist()
     return Camera.mounted(

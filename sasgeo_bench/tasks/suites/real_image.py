@@ -108,7 +108,6 @@ def _pose(shot: Shot) -> Pose:
 
 
 def _camera(pixel_m: float, width_px: int) -> Camera:
-    """Return the camera as it is believed, above the middle of the view."""
     focal_px, centre_px = _HEIGHT_M / pixel_m, width_px / 2
     return Camera.mounted(
         intrinsics=Intrinsics(

@@ -29,7 +29,6 @@ class _Sums:
 
     @classmethod
     def of(cls, mask: NDArray[np.bool_]) -> "_Sums":
-        """Build the integral image of a mask."""
         return cls(integral=np.asarray(cv2.integral(mask.view(np.uint8)), dtype=np.int32))
 
     def share(self, row: int, col: int, half: int) -> float:

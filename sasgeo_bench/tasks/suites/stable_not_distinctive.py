@@ -68,7 +68,6 @@ class StableNotDistinctive(Suite):
 
 
 def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], spacing_m: float) -> Places:
-    """Return the first few places that keep their distance from here and from each other."""
     taken = [here]
     for point in points:
         if len(taken) <= MOST_ALIASES and np.hypot(*(np.array(taken) - point).T).min() >= spacing_m:
@@ -110,7 +109,6 @@ def _along(line: shapely.Geometry) -> NDArray[np.float64]:
 
 
 def _is_open(scene: Scene, places: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which places have few buildings within the reach of a view."""
     built, grid = scene.map.has("building"), scene.map.grid
     half = round(_REACH_M / grid.cell_size_m)
     found = []

@@ -69,7 +69,6 @@ def after(ageing: Ageing, years: float) -> Ageing:
 
 
 def _at_most(rates: Rates, most_per_year: float) -> Rates:
-    """Return rates that gain no more than that."""
     ground = rates.ground_gained_per_year
     return replace(
         rates,

@@ -33,7 +33,7 @@ def _near(scene: Scene, site: Site, *, least_degree: int) -> NDArray[np.float64]
 def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
     """Split X-junctions into two T-junctions at half of the sites that have some; open gaps at all others."""
     crossings = _near(scene, site, least_degree=4)
-    if len(crossings) >= _FEWEST_X and rng.random() < 0.5:  # noqa: PLR2004 - half of them
+    if len(crossings) >= _FEWEST_X and rng.random() < 0.5:  # half of them
         return lambda piece: stagger(piece, crossings, offset_m=OFFSET_M, rng=rng)
     near = _near(scene, site, least_degree=3)
     return lambda piece: open_gaps(piece, near, gap_m=GAP_M, rng=rng)
@@ -60,7 +60,7 @@ def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence
     square = np.ones((3, 3), dtype=bool)
     near = scipy.ndimage.binary_dilation(differ, structure=square, iterations=_ONE_PATCH_CELLS // 2)
     patch, count = scipy.ndimage.label(near, structure=square)
-    is_other = np.concatenate(([False], rng.random(count) < 0.5))[patch]  # noqa: PLR2004 - half of them
+    is_other = np.concatenate(([False], rng.random(count) < 0.5))[patch]  # half of them
     return own.replace(np.where(is_other, other.cells, own.cells))
 
 

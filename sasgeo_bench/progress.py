@@ -30,7 +30,6 @@ _MINUTE_S: Final = 60.0
 _HOUR_S: Final = 3600.0
 _CONNECT_S: Final = 10.0
 MOST_PROCESSES: Final = 1000  # at once, of one command
-_DIGITS: Final = 10
 _ADDRESS: Final = re.compile(r"(?:(?:tcp|tls)://)?[^\s/:]+:\d{1,5}|(?:tcp|tls)://\[[0-9a-fA-F:.%]+\]:\d{1,5}")
 
 Tell = Callable[[str], None]
@@ -191,7 +190,7 @@ def connected(address: str) -> Iterator["Client"]:
         raise ConfigError("--dask needs the package distributed: pip install 'sasgeo-bench[dask]'") from error
     kind, _, count = address.partition(":")
     if kind == "local":
-        if not (count.isascii() and count.isdecimal() and len(count) <= _DIGITS and 1 <= int(count) <= MOST_PROCESSES):
+        if not (count.isascii() and count.isdecimal() and len(count) <= 10 and 1 <= int(count) <= MOST_PROCESSES):
             raise ConfigError(
                 f"--dask must be local:N with N from 1 to {MOST_PROCESSES}, or a scheduler's address, got {address!r}"
             )

@@ -35,7 +35,6 @@ _TEX: Final = {
     "†": r"$^\dagger$",
 }
 _LIGATURE: Final = re.compile(r"(?<=[-`'?!,])(?=[-`',])")
-_LAST_LATIN: Final = 0x17F  # of Latin Extended-A
 _NO_GLYPH: Final = frozenset("«»ÐÞðþĄąĐđĘęĦħĮįĸĿŀŉŊŋŦŧŲųſ")  # before it, which pdfTeX stops at as well
 
 
@@ -113,7 +112,7 @@ def tex(text: object) -> str:
 
 
 def _tex_letter(letter: str) -> str:
-    is_known = ord(letter) <= _LAST_LATIN and letter not in _NO_GLYPH
+    is_known = ord(letter) <= 0x17F and letter not in _NO_GLYPH  # the last of Latin Extended-A
     return _TEX.get(letter) or (letter if is_known else f"[U+{ord(letter):04X}]")
 
 

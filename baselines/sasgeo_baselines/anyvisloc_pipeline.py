@@ -33,7 +33,6 @@ from sasgeo_bench import (
 )
 
 TOP: Final = 5  # tiles that are matched
-STEP: Final = 0.5  # of the side of a tile to the next: they overlap by half
 APART_M: Final = 25.0
 GROUND: Final = 128  # grey of what has no class
 # Later classes are drawn over earlier ones; neighbours differ in grey, so that their rims are seen.
@@ -173,7 +172,8 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
 
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses of the best tiles within a disc."""
-        places_m = lattice_m(view.prior, self._grid, step_m=STEP * view.side_m)
+        # 0.5: step of the side of a tile to the next: they overlap by half
+        places_m = lattice_m(view.prior, self._grid, step_m=0.5 * view.side_m)
         tiles = [at_place(place_m, view.prior) for place_m in places_m[disc.holds(places_m)]]
         found = [mode for mode in self._matched(view, tiles, [disc] * len(tiles), most=TOP) if mode is not None]
         return thinned(sorted(found, key=lambda mode: -mode.score), APART_M, count)

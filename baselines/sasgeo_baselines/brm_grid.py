@@ -33,10 +33,7 @@ from sasgeo_bench import (
 SIDE: Final = 4  # parts of the grid along each of its sides
 PART_M: Final = 32.0  # a grid of four lies within a view of 192 m at any heading
 NEAR_M: Final = 20.0  # of a window; neighbours are 24 m apart
-LEAST_KNOWN: Final = 0.25  # of a part of a view; else it is not compared
 LEAST_MAPPED: Final = 0.5  # of the grid around a place, and of a view, that the map must know
-CELL_M: Final = 4.0  # of masks
-LEAST_SPREAD: Final = 0.01  # of a share over a map: where hardly anything is built
 APART_M: Final = 25.0
 
 Floats = NDArray[np.float64]
@@ -62,9 +59,8 @@ class RatioMap:
         present, known = (np.stack([part[at] for part in parts], axis=1) for at in (0, -1))
         shares = np.hstack([present / np.maximum(known, 1), windows.share])
         is_mapped = known.sum(axis=1) >= LEAST_MAPPED * (SIDE * PART_M / region.grid.cell_size_m) ** 2
-        spread = (
-            np.maximum(shares[is_mapped].std(axis=0), LEAST_SPREAD) if is_mapped.any() else np.ones(shares.shape[1])
-        )
+        # 0.01: least spread of a share over a map: where hardly anything is built
+        spread = np.maximum(shares[is_mapped].std(axis=0), 0.01) if is_mapped.any() else np.ones(shares.shape[1])
         return cls(places_m=windows.middle_m[is_mapped], shares=shares[is_mapped], spread=spread)
 
     def best(self, seen: Floats, disc: Disc, *, count: int) -> Floats:
@@ -122,7 +118,8 @@ def grid_shares(evidence: Evidence, yaw_deg: float) -> Floats:
     known = np.bincount(part, weights=states != UNKNOWN, minlength=SIDE * SIDE)
     present = np.bincount(part, weights=states == PRESENT, minlength=SIDE * SIDE)
     full = (PART_M / evidence.cell_size_m) ** 2
-    return np.asarray(np.where(known >= LEAST_KNOWN * full, present / np.maximum(known, 1), np.nan))
+    # 0.25 of a part of a view; else it is not compared
+    return np.asarray(np.where(known >= 0.25 * full, present / np.maximum(known, 1), np.nan))
 
 
 def headings_deg(prior: Prior, step_deg: float) -> list[float]:
@@ -190,7 +187,7 @@ class BrmGrid(PlaceMatcher[Sight]):
         self._is_built = CLASS in region.classes
         if self._is_built:
             self._ratios = RatioMap.of(region)
-            self._overlap = MaskOverlap(coarse_m=CELL_M, least_share=LEAST_MAPPED)
+            self._overlap = MaskOverlap(coarse_m=4.0, least_share=LEAST_MAPPED)  # of masks
             self._overlap.read(region, None)
 
     def look(self, query: Query) -> Sight | None:

@@ -10,13 +10,8 @@ from scipy.spatial import KDTree
 import sasgeo_bench as sgb
 from sasgeo_baselines.buildings import RADIUS_M, Buildings, Floats, Windows, ring_shares
 
-WINDOWS: Final = 50  # most like the view by their rings
 REACH_M: Final = RADIUS_M + 24.0  # around the middle of a window
-CORRELATION: Final = 0.9  # of two shapes that may be the same building
-BANDWIDTH_M: Final = 12.0  # of votes
 YAW_STEP_DEG: Final = 8.0  # between headings that are tried where the heading is not known
-CERTAIN_DEG: Final = 4.0  # standard deviation of a heading that counts as known
-LEAST_SIGMA_M: Final = 8.0  # of a component of the mixture: that of footprints, their middles and the scale
 COMPONENTS: Final = 10
 MOST_VOTES: Final = 1000
 
@@ -46,7 +41,8 @@ class Town:
             mean=buildings.shape.mean(axis=0) if is_built else np.zeros(len(SCALES)),
         )
 
-    def votes(self, seen: "Seen", disc: sgb.Disc, *, yaws_deg: Floats, count: int = WINDOWS) -> Floats:
+    # The 50 that are most like the view by their rings
+    def votes(self, seen: "Seen", disc: sgb.Disc, *, yaws_deg: Floats, count: int = 50) -> Floats:
         """Return votes of the `count` windows in a disc that are most like a view, as `votes_for`."""
         if self.tree is None or not seen.is_judged:
             return np.empty((0, 5))
@@ -117,7 +113,8 @@ def votes_for(
             part = likeness[:, place]
             best = part.argmax(axis=1)
             is_mutual = part.argmax(axis=0)[best] == np.arange(len(seen))
-            for mine in np.flatnonzero(is_mutual & (part.max(axis=1) > CORRELATION)).tolist():
+            # 0.9: correlation of two shapes that may be the same building
+            for mine in np.flatnonzero(is_mutual & (part.max(axis=1) > 0.9)).tolist():
                 other = int(place[best[mine]])
                 at_m = mapped.middle_m[chosen[other]] - turned_m[mine]
                 found[mine, other, yaw_deg] = (*at_m.tolist(), yaw_deg, float(mine), float(likeness[mine, other]))
@@ -128,7 +125,7 @@ def _unit(vectors: Floats) -> Floats:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-9))
 
 
-def mixture_of(votes: Floats, *, bandwidth_m: float = BANDWIDTH_M) -> Mixture:
+def mixture_of(votes: Floats, *, bandwidth_m: float = 12.0) -> Mixture:  # of votes
     """Return the places where votes agree, by mean shift with a flat kernel; a seen building counts once at each.
 
     The height of a component is the number of its votes times their mean correlation; its width is their spread.
@@ -163,7 +160,8 @@ def mixture_of(votes: Floats, *, bandwidth_m: float = BANDWIDTH_M) -> Mixture:
         spread_m = np.sqrt(np.square(own[:, :2] - place_m).sum(axis=1).mean() / 2)
         yaw = np.degrees(np.arctan2(np.sin(np.radians(own[:, 2])).mean(), np.cos(np.radians(own[:, 2])).mean()))
         height = len(set(own[:, 3].tolist())) * own[:, 4].mean()
-        rows.append((*place_m.tolist(), float(yaw), max(float(spread_m), LEAST_SIGMA_M), float(height)))
+        # 8 m: least sigma of a component of the mixture: that of footprints, their middles and the scale
+        rows.append((*place_m.tolist(), float(yaw), max(float(spread_m), 8.0), float(height)))
     best = np.array(sorted(rows, key=lambda row: -row[4])[:COMPONENTS]).reshape(-1, 5)
     return Mixture(place_m=best[:, :2], yaw_deg=best[:, 2], sigma_m=best[:, 3], height=best[:, 4])
 
@@ -174,7 +172,7 @@ def headings(yaw_deg: float, sigma_deg: float) -> Floats:
     >>> headings(10.0, 2.0).tolist(), headings(10.0, 6.0).tolist(), len(headings(0.0, 104.0))
     ([10.0], [2.0, 10.0, 18.0], 45)
     """
-    if sigma_deg <= CERTAIN_DEG:
+    if sigma_deg <= 4.0:  # degrees: standard deviation of a heading that counts as known
         return np.array([yaw_deg])
     steps, every = int(2 * sigma_deg / YAW_STEP_DEG), round(360.0 / YAW_STEP_DEG)
     turns = np.arange(every) if 2 * steps + 1 >= every else np.arange(-steps, steps + 1)

@@ -15,12 +15,9 @@ RINGS: Final = 6
 RADIUS_M: Final = 96.0  # of the outermost ring
 CELL_M: Final = 8.0  # of the map for rings
 STRIDE: Final = 3  # cells between windows: 24 m
-LEAST_M2: Final = 20.0  # smaller patches are no buildings
 NUMBERS: Final = 8  # of a shape: six that do not turn with the view, and its direction as two
 
 _TILE: Final = 2048  # cells a side: buildings of a large map are found tile by tile
-_MARGIN_M: Final = 128.0  # around a tile; a building that is cut by it is wider than that
-_LEAST_KNOWN: Final = 0.25  # of a ring; else it is not compared
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +50,7 @@ class Buildings:
             usable.astype(np.uint8), np.ones((3, 3), np.uint8), borderType=cv2.BORDER_CONSTANT, borderValue=0
         )
         is_cut[np.unique(labels[edge == 0])] = True
-        is_kept = ~is_cut & (stats[:, cv2.CC_STAT_AREA] * cell_m**2 >= LEAST_M2)
+        is_kept = ~is_cut & (stats[:, cv2.CC_STAT_AREA] * cell_m**2 >= 20.0)  # 20 m2: smaller patches are no buildings
         is_kept[0] = False
         number = np.cumsum(is_kept) - 1
         rows, cols = np.nonzero(is_kept[labels])
@@ -106,7 +103,8 @@ class Buildings:
         grid, parts = region.grid, []
         if CLASS not in region.classes:
             return cls(middle_m=np.empty((0, 2)), shape=np.empty((0, NUMBERS)))
-        layer, margin = region.layer(CLASS), int(np.ceil(_MARGIN_M / grid.cell_size_m))
+        # 128 m: margin around a tile; a building that is cut by it is wider than that
+        layer, margin = region.layer(CLASS), int(np.ceil(128.0 / grid.cell_size_m))
         for row, col, tile in grid.windows(_TILE):
             top, left = max(row - margin, 0), max(col - margin, 0)
             part = layer[top : row + tile.rows + margin, left : col + tile.cols + margin]
@@ -206,4 +204,5 @@ def ring_shares(evidence: sgb.Evidence) -> Floats:
     present = np.bincount(ring, weights=layer == sgb.PRESENT, minlength=RINGS)
     area = np.pi * np.square(np.arange(1, RINGS + 1) * RADIUS_M / RINGS)
     cells = np.diff(area, prepend=0.0) / evidence.cell_size_m**2
-    return np.asarray(np.where(known >= _LEAST_KNOWN * cells, present / np.maximum(known, 1), np.nan))
+    # 0.25 of a ring; else it is not compared
+    return np.asarray(np.where(known >= 0.25 * cells, present / np.maximum(known, 1), np.nan))

@@ -48,19 +48,15 @@ from sasgeo_bench import (
 )
 
 STRIDE: Final = 6  # cells between two tiles of a gallery: 24 m, so that no place is farther than 17 m from one
-APART_M: Final = 25.0  # between two places of an answer
 YAW_STEP_DEG: Final = 7.5  # a third of a sector
 NUMBERS: Final = len(GROUPS) * DEPTH  # of a descriptor
 
 OTHERS: Final = 400  # locations of each training map besides those of views
 MOST_ROWS: Final = 120_000  # descriptors of all these: bounds memory (220 MB) and time (a minute)
-MOST_VIEWS: Final = 1200  # of training
 NEAR_M: Final = 12.0  # a made-up view lies so far from its tile, as the middle of a real one from the lattice
 NEAR_DEG: Final = 4.0  # half a step of headings
 _FORMAT: Final = "sasgeo-baselines embedding 2"
-_QUARTERS: Final = 4
 _FULL: Final = 255.0
-_DIGITS: Final = 6  # of a cosine: equal tiles are equal
 _AT_ONCE: Final = 64  # tiles cut together: 16 MB; locations whose lessons are read together
 _SMALL: Final = 0.05  # standard deviation of a number of the descriptor that is noise
 _NOTHING: Final = 1e-6  # of the largest ratio of scatters: a direction in which locations do not differ
@@ -269,7 +265,7 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         for base in turns.bases:
             upright = [view_descriptor(north_up(seen, base.yaw_deg + by_deg)) for by_deg in self.several_deg]
             for quarter in range(turns.quarters):
-                sectors = quarter * SECTORS // _QUARTERS
+                sectors = quarter * SECTORS // 4
                 copies = [turned(descriptor, sectors, yaws=SECTORS) for descriptor in upright]
                 found[base.yaw_deg + 90.0 * quarter] = np.stack(copies)
         if np.isnan(np.stack([*found.values()])).all():
@@ -296,8 +292,9 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         if not len(places_m):
             return []
         cosine = features.astype(np.float32) @ view.features.T
-        which, best = cosine.argmax(axis=1), cosine.max(axis=1).astype(np.float64).round(_DIGITS)
-        chosen = separate(places_m, best, apart_m=APART_M, most=most)
+        # 6 digits of a cosine: equal tiles are equal
+        which, best = cosine.argmax(axis=1), cosine.max(axis=1).astype(np.float64).round(6)
+        chosen = separate(places_m, best, apart_m=25.0, most=most)  # between two places of an answer
         return [
             Mode(
                 pose=Pose(
@@ -313,7 +310,8 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
     def learn(self, training: Training) -> str:
         """Return the embedding of the locations of training, as JSON."""
         pairs = [pair for pair in training.pairs if pair[0].track == "localization" and pair[1].pose is not None]
-        chosen = sorted(pairs[:: -(-len(pairs) // MOST_VIEWS) or 1], key=lambda pair: pair[0].region)
+        # At most 1200 views of training
+        chosen = sorted(pairs[:: -(-len(pairs) // 1200) or 1], key=lambda pair: pair[0].region)
         shown = self.copies + len(self.heights) * self.made_up
         others = min(self.others, MOST_ROWS // (shown * max(1, len({query.region for query, _ in chosen}))))
         lessons: list[Stored] = []

@@ -29,8 +29,6 @@ from sasgeo_bench import (
     ranked_candidates,
 )
 
-_POOLED_M: Final = 4.0  # a cell of the sums; finer ones take memory and add nothing
-
 
 def lattice_m(prior: Prior, grid: Grid, *, step_m: float) -> NDArray[np.float64]:
     """Return places on the map within the disc of a prior, on multiples of a step, north to south, shape (N, 2).
@@ -70,7 +68,8 @@ class Sums:
     @classmethod
     def of(cls, region: Region, classes: tuple[str, ...] | None = None) -> Self:
         """Sum the layers of a region, or of some of its classes."""
-        factor = max(1, round(_POOLED_M / region.grid.cell_size_m))
+        # 4 m a cell of the sums; finer ones take memory and add nothing
+        factor = max(1, round(4.0 / region.grid.cell_size_m))
         names = [name for name in region.classes if classes is None or name in classes]
         known = region.known()
         grid = region.grid.coarsen(factor)
@@ -176,7 +175,6 @@ def shares(cells: NDArray[np.uint8]) -> list[float]:
 BINS: Final = 16  # of distances, from 0 to the longest possible
 LEAST_M2: Final = 9.0  # smaller patches are noise
 MOST_THINGS: Final = 1000  # of a kind, the largest: bounds the number of pairs
-_CENTRE: Final = 0.5  # of a cell: OpenCV counts from the middle of the first one
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -256,4 +254,5 @@ def components(present: NDArray[np.uint8], *, cell_size_m: float) -> NDArray[np.
     areas = stats[1:, cv2.CC_STAT_AREA]
     order = np.argsort(-areas, kind="stable")[:MOST_THINGS]
     kept = order[areas[order] * cell_size_m**2 >= LEAST_M2]
-    return np.asarray((centroids[1:][kept] + _CENTRE) * cell_size_m, dtype=np.float64)
+    # 0.5 of a cell: OpenCV counts from the middle of the first one
+    return np.asarray((centroids[1:][kept] + 0.5) * cell_size_m, dtype=np.float64)

@@ -39,7 +39,6 @@ KINDS: Final = (
     *("intersection", "large intersection", "crossing", "level_crossing"),
     *("road_rail_crossing", "road_water_crossing", "building"),
 )
-_LARGE: Final = 4  # road ends that meet: a crossroads, not a fork
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +53,8 @@ class Nodes:
     def of(cls, graph: MapGraph) -> Self:
         """Return the nodes of a graph that are of `KINDS`."""
         names = graph.nodes["kind"].to_numpy(dtype=object)
-        is_large = (names == "intersection") & (graph.nodes["degree"].to_numpy() >= _LARGE)
+        # 4: road ends that meet: a crossroads, not a fork
+        is_large = (names == "intersection") & (graph.nodes["degree"].to_numpy() >= 4)
         names = np.where(is_large, "large intersection", names)
         kind = np.array([KINDS.index(name) if name in KINDS else -1 for name in names], dtype=np.int64)
         chosen = kind >= 0
@@ -88,12 +88,10 @@ class Nodes:
         return Descriptor.of([places_m[kind == at] for at in range(len(KINDS))], reach_m=2 * radius_m)
 
 
-CELL_M: Final = 2.0  # finer patches cost more and add nothing
 STEP_M: Final = 32.0
 NEAR_M: Final = 16.0  # a candidate may be moved so far, east and north
 APART_M: Final = 25.0
 MOST_TRIED: Final = 1000  # places of a lattice; a larger prior has a wider one
-REFINED: Final = 24
 _AROUND: Final = np.array([(east, north) for north in (1, 0, -1) for east in (-1, 0, 1)], dtype=np.float64)
 
 
@@ -224,7 +222,7 @@ def _searched(view: _ViewOnMap, prior: Prior) -> tuple[NDArray[np.float64], NDAr
     disc = Disc(center_m=prior.center_m, radius_m=prior.radius_m or 0.0)
     while step_m > NEAR_M:
         step_m /= 2
-        best = points_m[separate(points_m, scores, apart_m=APART_M, most=REFINED)]
+        best = points_m[separate(points_m, scores, apart_m=APART_M, most=24)]
         near = (best[:, None] + step_m * _AROUND[_AROUND.any(axis=1)]).reshape(-1, 2)
         on_map = ((near >= (west_m, south_m)) & (near <= (east_m, north_m))).all(axis=1)
         near = near[on_map & disc.holds(near)]
@@ -243,7 +241,7 @@ def _described(layers: list[NDArray[np.uint8]], cell_size_m: float, radius_m: fl
 
 
 def _factor(cell_size_m: float) -> int:
-    return max(1, round(CELL_M / cell_size_m))
+    return max(1, round(2.0 / cell_size_m))  # 2 m: finer patches cost more and add nothing
 
 
 @lru_cache(maxsize=16)

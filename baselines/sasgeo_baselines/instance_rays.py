@@ -16,8 +16,6 @@ REACH_M: Final = 80.0  # of a ray: half the side of most views is 96 m, and rays
 STEP_M: Final = 2.0  # along the rays of a lattice
 
 _NOWHERE: Final = -1  # number of ground of which nothing is known
-_LEAST_STEP: Final = 0.7  # cells: half a diagonal, so that no ray passes a corner by much
-_SLACK: Final = 1.4  # cells: distances are those of middles, and cells touch at a corner before that
 _TILE: Final = 1024  # cells a side: a map is read tile by tile
 
 Floats = NDArray[np.float32]
@@ -88,7 +86,9 @@ def cast(states: NDArray[np.uint8], places_uv: Points, count: int, *, cell_m: fl
         found = numbers[at]
         goes_on = found == 0
         met[left[~goes_on]] = found[~goes_on]
-        step = np.maximum(clear[at] - _SLACK, _LEAST_STEP) * goes_on
+        # 0.7 cells: half a diagonal, so that no ray passes a corner by much
+        # 1.4 cells: distances are those of middles, and cells touch at a corner before that
+        step = np.maximum(clear[at] - 1.4, 0.7) * goes_on
         away[left] += step
         ray[:2] += step * ray[2:]
         goes_on &= away[left] < REACH_M / cell_m

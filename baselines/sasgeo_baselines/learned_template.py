@@ -28,9 +28,6 @@ MARGIN: Final = 2  # cells to each side that an encoder sees of a cell: two kern
 
 _FORMAT: Final = f"{NAME} 1"
 _WIDTH: Final = 24  # channels between two convolutions
-_LEAST_SPREAD: Final = 0.01  # of a class: one that maps hardly hold would count without bounds
-_SHARPNESS: Final = 10.0  # that learning begins with, of a view that knows `_USUAL_M2`
-_POWER: Final = 0.5  # of the known area, that learning begins with
 _USUAL_M2: Final = 16_000.0  # that a view knows
 
 _PLACES: Final = 96  # a side of the square of places that a true one is told from
@@ -40,8 +37,6 @@ _MOST_LOOKS: Final = 600
 _BATCH: Final = 4
 _RATE: Final = 3e-3  # of learning, at its highest
 _DECAY: Final = 1e-2
-_WARM: Final = 0.05  # of all steps, in which the rate rises
-_STEEPEST: Final = 5.0  # norm of a gradient: a longer one is shortened to it
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -154,7 +149,8 @@ def drawn_weights(classes: int) -> Weights:
         straight[:, :classes, 0, 0] = like
     found["view.2.shift"][CHANNELS] = 1.0  # of the confidence, which begins high
     found["usual"][1] = 1.0
-    found["sharpness"][:] = math.log(_SHARPNESS), _POWER
+    # Learning begins with a sharpness of 10, of a view that knows `_USUAL_M2`
+    found["sharpness"][:] = math.log(10.0), 0.5  # 0.5: power of the known area
     return found
 
 
@@ -442,12 +438,13 @@ def fitted(torch: Any, classes: tuple[str, ...], lessons: Sequence[Lesson]) -> W
     looks = _looks(lessons)
     for step in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = _RATE * min((step + 1) / (_WARM * steps + 1), (1 + math.cos(math.pi * step / steps)) / 2)
+            # 0.05 of all steps, in which the rate rises
+            group["lr"] = _RATE * min((step + 1) / (0.05 * steps + 1), (1 + math.cos(math.pi * step / steps)) / 2)
         optimizer.zero_grad(set_to_none=True)
         for _ in range(_BATCH):
             lesson, rng = next(looks)
             (surprise(encoders, lesson.scene(rng), torch.from_numpy(lesson.has), rng) / _BATCH).backward()
-        torch.nn.utils.clip_grad_norm_([*kernels, *others], _STEEPEST)
+        torch.nn.utils.clip_grad_norm_([*kernels, *others], 5.0)  # norm of a gradient: a longer one is shortened to it
         optimizer.step()
     return {name: np.asarray(values.detach().numpy(), dtype=np.float32) for name, values in arrays.items()}
 
@@ -459,7 +456,8 @@ def usual_shares(lessons: Sequence[Lesson]) -> Floats:
         known = shares(lesson.mapped[:-1, lesson.mapped[-1] > 0])
         sums += lesson.has * np.stack([known.sum(axis=1), (known**2).sum(axis=1), np.full(len(known), known.shape[1])])
     mean, square = sums[:2] / np.maximum(sums[2], 1)
-    return np.stack([mean, np.sqrt(np.maximum(square - mean**2, _LEAST_SPREAD**2))]).astype(np.float32)
+    # 0.01: least spread of a class: one that maps hardly hold would count without bounds
+    return np.stack([mean, np.sqrt(np.maximum(square - mean**2, 0.01**2))]).astype(np.float32)
 
 
 def _looks(lessons: Sequence[Lesson]) -> Iterator[tuple[Lesson, np.random.Generator]]:

@@ -27,20 +27,13 @@ from sasgeo_bench import (
     thinned,
 )
 
-YAW_STEP_DEG: Final = 15.0  # an object 90 m away moves by 12 m at most
 APART_M: Final = 25.0
 # Of an edge, as in the source's code: overlap of boxes, same class, cosine of features. They sum to 1.1.
 OVERLAP, SAME, COSINE = 0.6, 0.2, 0.3
 ROUNDS: Final = 3
-SHARPNESS: Final = 10.0  # of the attention: an edge that is heavier by 0.1 counts e times
 MIDDLE_M2, DECADE = 150.0, 2.0  # area of a usual house, and a logarithm that is far from it
-JUNCTION_M: Final = 4.0  # half the side of the box of a junction: a road's width
 NEAR_M: Final = 24.0  # standard deviation of places in a tile: offset of the tile and error of the heading
 MOST_TILES: Final = 1500  # more than a disc of 500 m holds: of more, those with the view's mix of kinds are looked at
-TRIED: Final = 64  # tiles and headings that are matched in full, the best first by their best similarities
-SINKHORN: Final = 20  # iterations
-SOFTNESS: Final = 0.1  # of the assignment
-LEAST_SHARE: Final = 0.1  # of an object that a match must have
 AGREE_M: Final = 8.0
 SAMPLES: Final = 200  # of three matches: with half of them wrong, all fail with a probability below 1e-11
 
@@ -129,7 +122,8 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
     def modes(self, view: Objects, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses of the tiles with the highest scores."""
         found: list[Mode] = []
-        for tile in nlargest(TRIED, self.tiles(view, disc), key=lambda tile: tile.bound):
+        # 64 tiles and headings that are matched in full, the best first by their best similarities
+        for tile in nlargest(64, self.tiles(view, disc), key=lambda tile: tile.bound):
             partners = sinkhorn(tile.likeness, slack=self.numbers["slack"])
             score = float((partners * tile.likeness).sum() / max(tile.likeness.shape))
             pose, inliers = self._posed(view, tile, partners)
@@ -147,7 +141,7 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
     def tiles(self, view: Objects, disc: Disc) -> Iterator[Tile]:
         """Yield the tiles of a disc at all headings, without those that hold less than the view needs to show."""
         mine = node_features(view.nodes)
-        yaws_deg = view.yaws_deg(YAW_STEP_DEG)
+        yaws_deg = view.yaws_deg(15.0)  # degrees: an object 90 m away moves by 12 m at most
         for middle_m, rows in self._places(view, disc):
             nodes = _taken(self.mapped.nodes, rows)
             cosine = mine @ node_features(nodes).T
@@ -182,7 +176,7 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
     def _posed(self, view: Objects, tile: Tile, partners: Floats) -> tuple[Pose | None, int]:
         best = partners.argmax(axis=1)
         share = partners[np.arange(len(best)), best]
-        kept = np.flatnonzero(share >= LEAST_SHARE)
+        kept = np.flatnonzero(share >= 0.1)  # least share of an object that a match must have
         mapped_m = self.mapped.nodes.places_m[tile.rows[best[kept]]]
         return posed(view.nodes.places_m[kept], mapped_m, share[kept])
 
@@ -201,7 +195,8 @@ def node_features(nodes: Nodes) -> Floats:
     features = local_features(nodes)
     rounds = [features]
     edges = edge_weights(nodes, features)
-    attention = np.exp(SHARPNESS * (edges - edges.max(axis=1, keepdims=True)))
+    # 10: sharpness of the attention: an edge that is heavier by 0.1 counts e times
+    attention = np.exp(10.0 * (edges - edges.max(axis=1, keepdims=True)))
     np.fill_diagonal(attention, 0.0)
     attention /= np.maximum(attention.sum(axis=1, keepdims=True), np.finfo(np.float64).tiny)
     for _ in range(ROUNDS):
@@ -224,7 +219,8 @@ def _unit(rows: Floats) -> Floats:
 def edge_weights(nodes: Nodes, features: Floats) -> Floats:
     """Return the weights of the complete graph, shape (N, N), zero on the diagonal."""
     apart_m = np.linalg.norm(nodes.places_m[:, None] - nodes.places_m[None, :], axis=2)
-    half_m = np.where(nodes.area_m2 > 0, np.sqrt(np.nan_to_num(nodes.area_m2)) / 2, JUNCTION_M)
+    # 4 m: half the side of the box of a junction: a road's width
+    half_m = np.where(nodes.area_m2 > 0, np.sqrt(np.nan_to_num(nodes.area_m2)) / 2, 4.0)
     is_same = nodes.kind[:, None] == nodes.kind[None, :]
     edges = OVERLAP * complete_iou(apart_m, half_m) + SAME * is_same + COSINE * (features @ features.T)
     np.fill_diagonal(edges, 0.0)
@@ -257,11 +253,11 @@ def sinkhorn(likeness: Floats, *, slack: float) -> Floats:
     rows, cols = likeness.shape
     padded = np.full((rows + 1, cols + 1), slack)
     padded[:rows, :cols] = likeness
-    kernel = np.exp((padded - max(slack, float(likeness.max(initial=0.0)))) / SOFTNESS)
+    kernel = np.exp((padded - max(slack, float(likeness.max(initial=0.0)))) / 0.1)  # 0.1: softness of the assignment
     mine, theirs = np.ones(rows + 1), np.ones(cols + 1)
     mine[-1], theirs[-1] = cols, rows
     down, right = np.ones(rows + 1), np.ones(cols + 1)
-    for _ in range(SINKHORN):
+    for _ in range(20):  # iterations
         down = mine / (kernel @ right)
         right = theirs / (down @ kernel)
     return np.asarray((down[:, None] * kernel * right)[:rows, :cols])

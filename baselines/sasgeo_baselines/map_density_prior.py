@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """`map_density_prior`: control that answers with the fullest places of the map and ignores the view."""
 
-from typing import Final
-
 import numpy as np
 
 from sasgeo_baselines.global_descriptor import Sums, lattice_m, separate
@@ -18,9 +16,6 @@ from sasgeo_bench import (
     points_of,
     ranked_candidates,
 )
-
-STEP_M: Final = 16.0
-APART_M: Final = 25.0
 
 
 class MapDensityPrior:
@@ -59,8 +54,8 @@ class MapDensityPrior:
         if query.track == "retrieval":
             drawn = self._sums.squares(points_of(query.candidates), side_m)[:-1].sum(axis=0)
             return ranked_candidates(query, drawn.astype(np.float64).tolist(), top_k=top_k)
-        points_m = lattice_m(query.prior, self._grid, step_m=STEP_M)
+        points_m = lattice_m(query.prior, self._grid, step_m=16.0)
         drawn = self._sums.squares(points_m, side_m)[:-1].sum(axis=0).astype(np.float64)
-        chosen = separate(points_m, drawn, apart_m=APART_M, most=top_k)
+        chosen = separate(points_m, drawn, apart_m=25.0, most=top_k)
         poses = [at_place(points_m[at], query.prior) for at in chosen]
         return Match(poses=poses, scores=[float(drawn[at]) for at in chosen])

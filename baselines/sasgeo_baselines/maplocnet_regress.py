@@ -40,7 +40,6 @@ COARSE_M: Final = 16.0  # of a cell of the surface: leaves a residual that a fin
 YAW_STEP_DEG: Final = 10.0  # moves the rim of a view by a cell of the surface
 LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 REACH: Final = 2  # cells to each side of the highest one whose scores are read, and one heading
-MOST_OFF: Final = 1.5  # cells or steps: a larger residual belongs to another peak, of which the part does not tell
 MOST_LESSONS: Final = 400
 
 _FULL: Final = 255
@@ -181,7 +180,8 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
                 peak = self.peak(view, Disc(center_m=place_m, radius_m=REACH * COARSE_M))
                 if peak is not None:
                     turned, missed = lessons(peak, truth.pose)
-                    if np.abs(missed).max() <= MOST_OFF:
+                    # 1.5 cells or steps: a larger residual belongs to another peak, of which the part does not tell
+                    if np.abs(missed).max() <= 1.5:
                         parts.append(turned)
                         residuals.append(missed)
         table, wanted = np.concatenate(parts), np.concatenate(residuals)

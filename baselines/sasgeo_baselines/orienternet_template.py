@@ -56,7 +56,6 @@ from sasgeo_bench import (
 )
 
 APART_M: Final = 25.0  # between two modes; and the mass of a mode lies within
-LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 MOST_LESSONS: Final = 200
 
 _TILE: Final = 256  # places a side of a tile: bounds the memory of the transforms
@@ -64,7 +63,6 @@ _ENCODED: Final = 256  # cells a side of a piece of map that is encoded at a tim
 _HEADINGS_KEPT: Final = 12  # whose transforms are held at a time
 _HEADINGS_AT_ONCE: Final = 4
 _CUT_AT_ONCE: Final = 20  # parts of a map, in all its classes
-_TAUGHT_M: Final = 400.0  # around a view and its true place that the map is kept for learning
 _LOW: Final = -np.inf
 
 Planes = NDArray[np.uint8]
@@ -372,7 +370,8 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         half, places = half_of(view.template.shape[1:], view.cells_m, step_m), squares[0].grid.rows
         side = places + 2 * half
         area_m2 = known_m2(view.template, view.cells_m)
-        sharpness, least = self._encoders.sharpness(area_m2), LEAST_SHARE * area_m2 / step_m**2
+        # 0.5: least share of the view's known cells that the map must know
+        sharpness, least = self._encoders.sharpness(area_m2), 0.5 * area_m2 / step_m**2
         laid = turned(torch, view.template, view.cells_m, yaws_deg, step_m=step_m)
         seen, cells = transformed(torch, laid, side), laid[:, CHANNELS].sum(dim=(1, 2))[:, None, None]
         for square in squares:
@@ -484,7 +483,8 @@ def _box(query: Query, truth: Truth, grid: Grid) -> tuple[int, int, int, int]:
     """Return the cells that learning may look at around a view: row, column, rows, columns."""
     pose = _pose(truth)
     row, col = grid.to_cells(np.array([(pose.easting_m, pose.northing_m)]))[0].tolist()
-    reach = math.ceil((math.hypot(*query.evidence.size_m) / 2 + _TAUGHT_M) / grid.cell_size_m)
+    # 400 m around a view and its true place that the map is kept for learning
+    reach = math.ceil((math.hypot(*query.evidence.size_m) / 2 + 400.0) / grid.cell_size_m)
     unit = max(1, round(CELL_M / grid.cell_size_m))
     top, left = (row - reach) // unit * unit, (col - reach) // unit * unit
     return top, left, 2 * reach, 2 * reach

@@ -12,7 +12,6 @@ from sasgeo_baselines.place_matcher import PlaceMatcher
 from sasgeo_bench import Disc, MatcherCard, Mode, Pose, Prior, Query, Region, thinned
 
 APART_M: Final = 25.0
-_ANY_DEG: Final = 180.0  # standard deviation of a heading of which nothing is known
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,7 +76,8 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the highest components of the mixture of the votes in a disc."""
         prior = view.prior
-        sigma_deg = _ANY_DEG if prior.yaw_sigma_deg is None else prior.yaw_sigma_deg
+        # 180 degrees: standard deviation of a heading of which nothing is known
+        sigma_deg = 180.0 if prior.yaw_sigma_deg is None else prior.yaw_sigma_deg
         yaws_deg, bandwidth_m = headings(prior.yaw_deg or 0.0, sigma_deg), self.numbers["bandwidth_m"]
         votes = self._town.votes(view.seen, disc, yaws_deg=yaws_deg, count=int(self.numbers["windows"]))
         votes = votes[disc.wider(bandwidth_m).holds(votes[:, :2])]

@@ -28,9 +28,7 @@ DISTANCES_M: Final = (4.0, 12.0, 36.0)  # shares of the disc so near to each gro
 DEPTH: Final = RINGS * SECTORS + len(DISTANCES_M)  # numbers of a group
 
 _FINE: Final = 4  # points a side of a cell, for its share in each sector
-_PRESENT: Final = 0.25  # occupancy from which a cell counts for distances
 _LEAST_KNOWN: Final = 0.25  # of a sector; else it is unknown
-_BAND: Final = 256  # rows of cells whose distances are measured together
 
 # Of shape (len(GROUPS) * (1 + len(DISTANCES_M)), rows, cols): occupancies, then nearness by distance.
 Planes = NDArray[np.float32]
@@ -61,7 +59,8 @@ def _disc() -> NDArray[np.float32]:
 
 def planes_of(occupancy: NDArray[np.float32]) -> Planes:
     """Return occupancies, shape (groups, rows, cols), and whether each cell is near to each group, by distance."""
-    near = [_away_m(layer >= _PRESENT) <= distance_m for distance_m in DISTANCES_M for layer in occupancy]
+    # 0.25: occupancy from which a cell counts for distances
+    near = [_away_m(layer >= 0.25) <= distance_m for distance_m in DISTANCES_M for layer in occupancy]
     return np.concatenate([occupancy, np.array(near, dtype=np.float32)])
 
 
@@ -124,7 +123,8 @@ def padded_strips(region: sgb.Region, *, stride: int) -> Iterator[Planes]:
     """
     reach = round(max(DISTANCES_M) / CELL_M)
     padded = coarse_groups(region, above=SIDE // 2 + reach, beside=SIDE // 2)
-    count, together = (padded.shape[1] - SIDE - 2 * reach) // stride + 1, max(1, _BAND // stride)
+    # 256 rows of cells whose distances are measured together
+    count, together = (padded.shape[1] - SIDE - 2 * reach) // stride + 1, max(1, 256 // stride)
     for first in range(0, count, together):
         tops = [row * stride for row in range(first, min(first + together, count))]
         band = padded[:, tops[0] : tops[-1] + SIDE + 2 * reach].astype(np.float32) / np.float32(255)

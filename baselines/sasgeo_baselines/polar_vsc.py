@@ -18,10 +18,7 @@ from sasgeo_baselines.polar import CELL_M
 from sasgeo_baselines.visual_context import AREAS_M2, SECTORS, STRIDE, Context, ContextMap, Floats, Shares
 from sasgeo_bench import Disc, MatcherCard, Mode, Pose, Prior, Query, Region, points_of, thinned
 
-SHORTLIST: Final = 200  # places whose sectors are compared
-REFINED: Final = 16  # places around which the best one is searched
 AROUND: Final = 2  # cells to each side: halfway to the next place
-LEAST_SHARED: Final = 0.5  # of what is known of a view, that the map must know
 STEP_DEG: Final = 360.0 / SECTORS
 APART_M: Final = 25.0
 _BLOCK: Final = 50_000  # places that are tested together: bounds the memory
@@ -104,7 +101,8 @@ def correlations(seen: Shares, mapped: Shares, mean: Floats) -> NDArray[np.float
     known = np.broadcast_to(mapped.known, mapped.value.shape)
     both = _turned_sums(weight * mine, known * theirs)
     squares = _turned_sums(weight * mine**2, known) * _turned_sums(weight, known * theirs**2)
-    shared = _turned_sums(weight, known) >= LEAST_SHARED * weight.sum()
+    # 0.5 of what is known of a view, that the map must know
+    shared = _turned_sums(weight, known) >= 0.5 * weight.sum()
     return np.where(shared & (squares > 0), both / np.sqrt(np.maximum(squares, 1e-12)), -np.inf)
 
 
@@ -189,7 +187,8 @@ class PolarVsc(PlaceMatcher[Sight]):
     def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the best correlations of sectors around the places whose rings are alike."""
         start = self._turned(view, self._map.places_m[self._shortlist(view, disc)])
-        best = points_of([mode.pose for mode in thinned(start, APART_M, max(REFINED, count))])
+        # 16 places around which the best one is searched
+        best = points_of([mode.pose for mode in thinned(start, APART_M, max(16, count))])
         steps_m = CELL_M * np.array(list(product(range(-AROUND, AROUND + 1), repeat=2)))
         found = self._turned(view, (best[:, None] + steps_m).reshape(-1, 2))
         wide = disc.wider(CELL_M)
@@ -219,7 +218,7 @@ class PolarVsc(PlaceMatcher[Sight]):
             squares = (both * np.square(seen.value - mapped.value)).sum(axis=(1, 2))
             away[part] = squares / np.maximum(both.sum(axis=(1, 2)), 1.0)
         passing = np.flatnonzero(share == share.max(initial=0.0))
-        return near[passing[np.argsort(away[passing], kind="stable")[:SHORTLIST]]]
+        return near[passing[np.argsort(away[passing], kind="stable")[:200]]]  # places whose sectors are compared
 
     def _turned(self, view: Sight, places_m: NDArray[np.float64]) -> list[Mode]:
         """Return places with their best headings, best first; without those of which the map knows too little."""

@@ -10,12 +10,7 @@ from scipy.spatial import cKDTree
 
 from sasgeo_bench import Disc, Mode, Pose, Prior, wrap_deg
 
-NEAR_M: Final = 12.0  # two poses this far apart, or
-NEAR_DEG: Final = 8.0  # turned by so much, no longer agree
 SLACK_M: Final = 8.0  # beyond the disc of the prior: a pose moves when it is fitted to more objects
-MOST_OFF: Final = 3.0  # standard deviations of the prior's heading
-MOST: Final = 30_000  # poses whose neighbours are counted: bounds the time
-_TRIED: Final = 8  # crowded poses for each that is asked for: neighbours of one crowd are dropped
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -56,7 +51,8 @@ def allowed(poses: Floats, prior: Prior, disc: Disc) -> Bools:
     """Return which poses, shape (V, 3), lie in a disc and head within three standard deviations of the prior."""
     fits = disc.wider(SLACK_M).holds(poses[:, :2])
     if prior.yaw_deg is not None and prior.yaw_sigma_deg is not None:
-        fits = fits & (np.abs(wrap_deg(poses[:, 2] - prior.yaw_deg)) <= MOST_OFF * prior.yaw_sigma_deg)
+        # 3: standard deviations of the prior's heading
+        fits = fits & (np.abs(wrap_deg(poses[:, 2] - prior.yaw_deg)) <= 3.0 * prior.yaw_sigma_deg)
     return np.asarray(fits)
 
 
@@ -83,7 +79,8 @@ class Votes:
     @classmethod
     def of(cls, poses: Floats, weight: Floats) -> Self:
         """Keep the heaviest poses, if there are too many; of equal ones the first."""
-        kept = np.sort(np.argsort(-weight, kind="stable")[:MOST])
+        # 30_000 poses whose neighbours are counted: bounds the time
+        kept = np.sort(np.argsort(-weight, kind="stable")[:30_000])
         return cls(poses=poses[kept], weight=weight[kept])
 
     def crowds(self, *, count: int) -> list[Crowd]:
@@ -101,8 +98,9 @@ class Votes:
         if not len(self.poses):
             return []
         yaw = np.radians(self.poses[:, 2:])
-        ahead = np.hstack([np.cos(yaw), np.sin(yaw)]) / np.radians(NEAR_DEG)
-        at = np.hstack([self.poses[:, :2] / NEAR_M, ahead])  # poses that agree lie within 1
+        ahead = np.hstack([np.cos(yaw), np.sin(yaw)]) / np.radians(8.0)  # turned by 8 degrees
+        # Two poses no longer agree that are 12 m apart, or
+        at = np.hstack([self.poses[:, :2] / 12.0, ahead])  # poses that agree lie within 1
         tree = cKDTree(at)
         lists = tree.query_ball_point(at, 1.0)
         starts = np.cumsum([0, *(len(rows) for rows in lists[:-1])])
@@ -110,7 +108,8 @@ class Votes:
         total = total.round(9)  # equal sums of unequal order tie
         kept: list[Crowd] = []
         middles: list[Floats] = []
-        for first in np.argsort(-total, kind="stable")[: _TRIED * count].tolist():
+        # 8: crowded poses for each that is asked for: neighbours of one crowd are dropped
+        for first in np.argsort(-total, kind="stable")[: 8 * count].tolist():
             if all(np.linalg.norm(at[first] - other) > 1.0 for other in middles):
                 rows = np.array(sorted(lists[first]), dtype=np.int64)
                 kept.append(Crowd(mode=self._mean(rows, score=float(total[first])), rows=rows))

@@ -33,7 +33,6 @@ from sasgeo_bench import (
 # the raster and all others are equal, it leads by N / sqrt(N - 1) > sqrt(N) standard deviations, and no two graph terms
 # differ by more than sqrt(2 N): below 1 / sqrt(2) = 0.71 the graph never overturns it.
 BETA: Final = 0.5
-_EQUAL: Final = 1e-9  # smaller differences of distances are rounding
 
 
 def blended(scores: NDArray[np.float64], distances: NDArray[np.float64], *, beta: float = BETA) -> NDArray[np.float64]:
@@ -49,7 +48,7 @@ def blended(scores: NDArray[np.float64], distances: NDArray[np.float64], *, beta
     >>> blended(np.array([1.0, 3.0]), np.array([0.5, 0.5])).tolist()
     [1.0, 3.0]
     """
-    if len(scores) == 0 or not np.ptp(distances) > _EQUAL:
+    if len(scores) == 0 or not np.ptp(distances) > 1e-9:  # 1e-9: smaller differences of distances are rounding
         return scores
     unit = scores.std() if np.ptp(scores) > 0 else 1.0
     return np.asarray(scores - beta * unit * (distances - distances.mean()) / distances.std())

@@ -27,16 +27,8 @@ from sasgeo_bench import (
 )
 
 LENGTH_M: Final = (20.0, 230.0)  # of a pair: past one junction, and as far as two of a view of 192 m usually lie
-LONGER_M: Final = 8.0  # of a length, or two standard deviations of the scale if that is more
-MOST_PAIRS: Final = 150  # of a view, the longest first: they give the best heading
-FIRST_POINTS: Final = 60  # seen points of the first test
-TESTED: Final = 600  # poses of the second test: all seen points, and the mapped ones
-SETTLED: Final = 24  # poses that are fitted to the roads
-TWICE_M: Final = 6.0  # of poses this near to each other only the best is fitted
 APART_M: Final = 25.0
 JUNCTIONS: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.name.endswith("intersection"))
-_ARMS: Final = 3  # of a junction, at least
-_LEAST_POINTS: Final = 20  # along roads of a view
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -67,7 +59,8 @@ class Tuples:
         >>> found.length_m.round().tolist(), np.sort(found.arms_deg).round(-1)[0, :, :3].tolist()
         ([50.0], [[0.0, 180.0, 270.0], [0.0, 90.0, 180.0]])
         """
-        chosen = np.flatnonzero((nodes.kind == kind) & (np.isfinite(nodes.arms_deg).sum(axis=1) >= _ARMS))
+        # At least 3 arms of a junction
+        chosen = np.flatnonzero((nodes.kind == kind) & (np.isfinite(nodes.arms_deg).sum(axis=1) >= 3))
         places_m = nodes.places_m[chosen]
         pairs = np.zeros((0, 2), dtype=np.int64)
         if len(chosen):
@@ -177,7 +170,8 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         seen = ObservedGraph.of(query)
         nodes, roads = seen.nodes.taken(~seen.is_cut), SeenRoads.of(query)
         pairs = {kind: Tuples.of(nodes, kind) for kind in JUNCTIONS}
-        if not any(len(found.length_m) for found in pairs.values()) or len(roads.points_m) < _LEAST_POINTS:
+        # At least 20 points along roads of a view
+        if not any(len(found.length_m) for found in pairs.values()) or len(roads.points_m) < 20:
             return None
         return RoadSight(pairs=pairs, roads=roads, prior=query.prior)
 
@@ -199,8 +193,10 @@ class Road2Rit(PlaceMatcher[RoadSight]):
     def _hypotheses(self, view: RoadSight, disc: Disc) -> Iterator[Floats]:
         turn_deg, bearings = self.numbers["turn_deg"], int(self.numbers["bearings"])
         for kind, ours in view.pairs.items():
-            slack_m = np.maximum(LONGER_M, 2.0 * view.prior.scale_sigma * ours.length_m)
-            for row in range(len(ours.length_m))[: -MOST_PAIRS - 1 : -1]:
+            # 8 m of a length, or two standard deviations of the scale if that is more
+            slack_m = np.maximum(8.0, 2.0 * view.prior.scale_sigma * ours.length_m)
+            # At most 150 pairs of a view, the longest first: they give the best heading
+            for row in range(len(ours.length_m))[: -150 - 1 : -1]:
                 low, high = ours.length_m[row] - slack_m[row], ours.length_m[row] + slack_m[row]
                 once = self._pairs[kind].some(slice(*np.searchsorted(self._pairs[kind].length_m, [low, high])))
                 for theirs in (once, once.turned()):
@@ -214,10 +210,12 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         if not len(poses):
             return []
         points_m = view.roads.points_m
-        few_m = points_m[:: max(1, len(points_m) // FIRST_POINTS)]
-        first = np.argsort(-self._roads.hits(few_m, poses), kind="stable")[:TESTED]
+        few_m = points_m[:: max(1, len(points_m) // 60)]  # 60: seen points of the first test
+        # 600 poses of the second test: all seen points, and the mapped ones
+        first = np.argsort(-self._roads.hits(few_m, poses), kind="stable")[:600]
         modes = self._judged(view, [pose_of(row) for row in poses[first]])
-        best = thinned(modes, TWICE_M, SETTLED)
+        # 6 m: of poses this near to each other only the best is fitted
+        best = thinned(modes, 6.0, 24)  # poses that are fitted to the roads
         settled = [self._roads.settled(view.roads, mode.pose, disc.wider(SLACK_M)) for mode in best]
         return thinned(self._judged(view, settled), APART_M)
 

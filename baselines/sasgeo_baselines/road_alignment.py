@@ -32,22 +32,12 @@ from sasgeo_bench import (
 )
 
 STARTS: Final = 3  # first answers that are tried
-MOST_POINTS: Final = 500  # along the borders of a view; of more, every n-th is taken
-NEAR_M: Final = 3.0  # a seen border this near to a mapped one lies on it
-PULL_M: Final = (20.0, 4.0)  # a seen border is drawn to a mapped one within this, in the first round and in the last
-TURN_M: Final = 30.0  # two borders that face opposite ways seem twice this farther apart: the other side of a road
 ROUNDS: Final = 24
-BORDER_M: Final = 10.0  # standard deviation of the place of a border: of one among many that err alike
 # Standard deviations of what a homography does at the edge of a view, in halves of the view: a similarity leaves the
 # place, heading and scale of the start open; shear is small; a perspective of 0.2 is a tilt of 15 degrees from 137 m.
 SIMILARITY, SHEAR, PERSPECTIVE = 0.15, 0.05, 0.2
-LEAST_POINTS: Final = 60  # of borders, for eight unknowns
-AROUND_DEG: Final = 5.0  # standard deviation of the heading of a first answer
 APART_M: Final = 25.0
-_MARGIN_M: Final = 40.0  # of the map around a view
 _HORIZON: Final = 0.1  # least denominator of a homography: 0 is the horizon
-_DECIMALS: Final = 7  # of a homography: far less than a cell, and more than what the last bits of a sum change
-_SMOOTH_CELLS: Final = 1.5  # for the direction of a border
 
 # What the eight parameters (see `matrix_of`) are likely to be: each row is one that is 0, give or take 1.
 _PRIOR: Final = (
@@ -89,7 +79,8 @@ class Borders:
         >>> np.unique(found.places_m[:, 0]).tolist(), np.unique(found.outward[:, 0].round(3)).tolist()
         ([-5.0, 5.0], [-1.0, 1.0])
         """
-        blurred = cv2.GaussianBlur(present.astype(np.float32), (0, 0), _SMOOTH_CELLS)
+        # 1.5 cells, for the direction of a border
+        blurred = cv2.GaussianBlur(present.astype(np.float32), (0, 0), 1.5)
         right, down = (cv2.Sobel(blurred, cv2.CV_32F, *order, ksize=3) for order in ((1, 0), (0, 1)))
         steep = np.hypot(right, down)
         core = cv2.erode(present.astype(np.uint8), np.ones((3, 3), np.uint8), borderValue=1)
@@ -106,7 +97,8 @@ class Borders:
 
     def embedded(self) -> Floats:
         """Return points in which distance means place and direction, shape (N, 4)."""
-        return np.hstack([self.places_m, TURN_M * self.outward])
+        # 30 m: two borders that face opposite ways seem twice this farther apart: the other side of a road
+        return np.hstack([self.places_m, 30.0 * self.outward])
 
 
 def matrix_of(parameters: Floats) -> Floats:
@@ -176,14 +168,18 @@ class Alignment:
             return (mapped.places_m[row] - there_m) @ turn, mapped.outward[row] @ turn
 
         def share(parameters: Floats) -> float:
-            return float((np.linalg.norm(nearest(parameters)[0], axis=1) <= NEAR_M).mean())
+            # 3 m: a seen border this near to a mapped one lies on it
+            return float((np.linalg.norm(nearest(parameters)[0], axis=1) <= 3.0).mean())
 
         found = np.zeros(8)
-        for pull_m in np.linspace(*PULL_M, ROUNDS):
+        # A seen border is drawn to a mapped one within this, in the first round and in the last
+        for pull_m in np.linspace(*(20.0, 4.0), ROUNDS):
             way_m, normal = nearest(found)
-            weight = np.maximum(1.0 - np.square(way_m).sum(axis=1) / pull_m**2, 0.0) / BORDER_M**2
+            # 10 m: standard deviation of the place of a border: of one among many that err alike
+            weight = np.maximum(1.0 - np.square(way_m).sum(axis=1) / pull_m**2, 0.0) / 10.0**2
             found = found + _step(found, at, normal * half_m, (way_m * normal).sum(axis=1), weight)
-        matrix = upright(matrix_of(found)).round(_DECIMALS)
+        # 7 decimals of a homography: far less than a cell, and more than what the last bits of a sum change
+        matrix = upright(matrix_of(found)).round(7)
         return cls(pose=pose, matrix=matrix, share=share(found), before=share(np.zeros(8)))
 
 
@@ -307,7 +303,7 @@ class PopovRoadplane(Tunable):
             center_m=place_m,
             radius_m=AROUND_M,
             yaw_deg=found.pose.yaw_deg,
-            yaw_sigma_deg=AROUND_DEG,
+            yaw_sigma_deg=5.0,  # standard deviation of the heading of a first answer
             scale_sigma=query.prior.scale_sigma,
         )
         return replace(seen, prior=near)
@@ -315,11 +311,13 @@ class PopovRoadplane(Tunable):
     def alignment(self, query: Query, starts: Sequence[Pose]) -> Alignment | None:
         """Return the best alignment from some poses; None where too few borders are seen."""
         cells, grid = road_cells(query.evidence), view_grid(query.evidence)
-        seen = Borders.of(cells == PRESENT, cells != UNKNOWN, grid).some(MOST_POINTS)
-        if len(seen.places_m) < LEAST_POINTS:
+        # At most 500 points along the borders of a view; of more, every n-th is taken
+        seen = Borders.of(cells == PRESENT, cells != UNKNOWN, grid).some(500)
+        if len(seen.places_m) < 60:  # at least 60 points of borders, for eight unknowns
             return None
         half_m = max(query.evidence.size_m) / 2
-        around = [(self._around(pose, np.sqrt(2) * half_m + _MARGIN_M), pose) for pose in starts]
+        # 40 m: margin of the map around a view
+        around = [(self._around(pose, np.sqrt(2) * half_m + 40.0), pose) for pose in starts]
         found = [Alignment.of(seen, mapped, pose, half_m) for mapped, pose in around if len(mapped.places_m)]
         flat = [alignment for alignment in found if np.abs(alignment.matrix[2, :2]).sum() < 1.0 - _HORIZON]
         return max(flat, key=lambda alignment: alignment.share, default=None)

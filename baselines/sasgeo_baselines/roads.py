@@ -16,16 +16,10 @@ from sasgeo_bench import ABSENT, PRESENT, UNKNOWN, Disc, Evidence, Grid, Pose, Q
 
 ROADS: Final = load_taxonomy().of_graph("road")
 NEAR_M: Final = 5.0  # of a road: a point this near lies on it
-STEP_M: Final = 3.0  # between points of vectors
-MOST_SEEN: Final = 400  # points of a view; of more, every n-th is taken
 FAR, ON, UNSURE = 0, 1, 2  # of cells of a map: whether a road is near
 _TILE: Final = 2048  # cells a side
 _MARGIN: Final = 64  # around a tile, so that lines go on from one to the next
-_LEAST_KNOWN: Final = 0.5  # of the seen points that must lie where the map is known
 _CHUNK: Final = 2048  # poses at a time
-_ROUNDS: Final = 8  # of the fit; it stands still before
-_PULL_M: Final = 10.0  # a seen point is drawn to a mapped one within this, at first
-_LEAST_PAIRS: Final = 10  # of points, for a fit
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -127,7 +121,7 @@ class SeenRoads:
         inside = (near >= 0).all(axis=1) & (near < grid.shape).all(axis=1)
         is_near = beside(near[inside], grid.shape, grid.cell_size_m)
         state = np.where(is_near, ON, np.where(cells == UNKNOWN, UNSURE, FAR)).astype(np.uint8)
-        every = max(1, -(-len(points_m) // MOST_SEEN))
+        every = max(1, -(-len(points_m) // 400))  # 400 points of a view; of more, every n-th is taken
         return cls(points_m=points_m[inside][::every], grid=grid, state=state)
 
     @property
@@ -143,7 +137,8 @@ def _points_of_vectors(query: Query) -> Floats | None:
         return None
     lines = vectors.geometry.to_numpy()[vectors["class"].isin(ROADS).to_numpy()]
     lines = lines[shapely.length(lines) > 0]  # a line between equal points cannot be cut
-    return np.asarray(shapely.get_coordinates(shapely.segmentize(lines, STEP_M)), dtype=np.float64)
+    # 3 m: step between points of vectors
+    return np.asarray(shapely.get_coordinates(shapely.segmentize(lines, 3.0)), dtype=np.float64)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -185,7 +180,8 @@ class MappedRoads:
         state = looked_up(self.grid, self.state, np.stack([east_m, north_m], axis=-1), beyond=UNSURE)
         known = (state != UNSURE).sum(axis=1)
         share = (state == ON).sum(axis=1) / np.maximum(known, 1)
-        return np.where(known >= _LEAST_KNOWN * len(points_m), share, 0.0)
+        # 0.5 of the seen points that must lie where the map is known
+        return np.where(known >= 0.5 * len(points_m), share, 0.0)
 
     def missed(self, seen: SeenRoads, pose: Pose) -> float:
         """Return the share of mapped points within the known part of a view that lie on no road it shows."""
@@ -206,12 +202,12 @@ class MappedRoads:
 
     def settled(self, seen: SeenRoads, pose: Pose, disc: Disc) -> Pose:
         """Return the rigid pose nearby that draws seen points to the nearest mapped ones (ICP), within a disc."""
-        pull_m = _PULL_M
-        for _ in range(_ROUNDS):
+        pull_m = 10.0  # m: a seen point is drawn to a mapped one within this, at first
+        for _ in range(8):  # rounds of the fit; it stands still before
             at_m = pose.to_map(seen.points_m)
             away_m, nearest = (np.asarray(part) for part in self.tree.query(at_m, distance_upper_bound=pull_m))
             pairs = np.isfinite(away_m)
-            if pairs.sum() < _LEAST_PAIRS:
+            if pairs.sum() < 10:  # of points, for a fit
                 break
             moved, _ = fitted(seen.points_m[pairs], self.points_m[nearest[pairs]])
             if not disc.has(moved):

@@ -11,9 +11,6 @@ from sasgeo_baselines.object_matcher import Floats, Ints, ObjectMatcher, Pairs, 
 from sasgeo_bench import Disc, MatcherCard, Mode, Pose, thinned
 
 YAW_STEP_DEG: Final = 5.0
-TRIED: Final = 24  # peaks
-MOST_PAIRS: Final = 60  # of one peak, the nearest first: bounds the search for a clique
-FEWEST: Final = 3  # of a clique: two pairs always agree with something
 APART_M: Final = 25.0
 
 
@@ -58,7 +55,7 @@ class SpatialGraphClique(ObjectMatcher):
         """Return the poses of the largest cliques."""
         pairs = Pairs.of_kind(view, self.mapped.nodes, self.within(view, disc))
         found = []
-        for peak in pairs.peaks(disc, view.yaws_deg(YAW_STEP_DEG), count=TRIED):
+        for peak in pairs.peaks(disc, view.yaws_deg(YAW_STEP_DEG), count=24):  # peaks
             mode = self._at(pairs, peak.pose)
             mode = mode and self._at(pairs, mode.pose)  # once more: a peak is up to half a step of the heading off
             if mode is not None and view.allows(mode.pose, disc):
@@ -70,7 +67,7 @@ class SpatialGraphClique(ObjectMatcher):
         near = _around(pairs, pose, self.numbers["near_m"])
         places_m, owner = (pairs.seen_m[near], pairs.mapped_m[near]), owners(pairs, near)
         clique = near[largest_clique(*places_m, owner, agree_m=self.numbers["agree_m"])]
-        if len(clique) < FEWEST:
+        if len(clique) < 3:  # at least 3 of a clique: two pairs always agree with something
             return None
         fit, error_m = fitted(pairs.seen_m[clique], pairs.mapped_m[clique])
         return Mode(pose=fit, score=len(clique) + 0.5 / (1.0 + error_m))
@@ -84,7 +81,8 @@ class SpatialGraphClique(ObjectMatcher):
 def _around(pairs: Pairs, pose: Pose, near_m: float) -> Ints:
     away_m = np.hypot(*(pairs.places_m(pose.yaw_deg) - (pose.easting_m, pose.northing_m)).T)
     near = np.flatnonzero(away_m <= near_m)
-    return np.asarray(near[np.argsort(away_m[near], kind="stable")[:MOST_PAIRS]], dtype=np.int64)
+    # At most 60 pairs of one peak, the nearest first: bounds the search for a clique
+    return np.asarray(near[np.argsort(away_m[near], kind="stable")[:60]], dtype=np.int64)
 
 
 def owners(pairs: Pairs, chosen: Ints) -> Ints:

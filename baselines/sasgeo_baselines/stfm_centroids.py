@@ -28,8 +28,6 @@ from sasgeo_bench import (
     thinned,
 )
 
-WIDEST_M: Final = 30.0  # radius of an object: a view cuts wider ones
-TRIED: Final = 24  # poses that most matches vote for
 APART_M: Final = 25.0
 OF_OBJECTS: Final = frozenset(name for kind in NODE_KINDS for name in kind.classes)  # classes
 _LABEL: Final = float(np.sqrt(0.5))  # so that two labels that differ are 1 apart, as the greatest ratio and 0 are
@@ -114,7 +112,8 @@ def clear_m(evidence: Evidence, places_m: Floats) -> Floats:
 
 def objects_of(nodes: Nodes) -> Nodes:
     """Return the nodes that are objects here: no ends of roads and bends of rivers, and nothing wide."""
-    return nodes.taken(~np.isin(nodes.kind, LEFT_OUT) & (nodes.radius_m <= WIDEST_M))
+    # 30 m: radius of an object: a view cuts wider ones
+    return nodes.taken(~np.isin(nodes.kind, LEFT_OUT) & (nodes.radius_m <= 30.0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,7 +188,7 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
 
     def modes(self, view: PatternSight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses that most matches vote for."""
-        crowds = self.votes(view, disc).crowds(count=TRIED)
+        crowds = self.votes(view, disc).crowds(count=24)  # poses that most matches vote for
         return thinned((crowd.mode for crowd in crowds), APART_M, count)
 
     def votes(self, view: PatternSight, disc: Disc) -> Votes:

@@ -32,15 +32,9 @@ from sasgeo_bench import (
 )
 
 CLASS: Final = "building"
-NEAREST: Final = 5  # buildings around each, any two of which make a triangle with it
-LONGEST_M: Final = 150.0  # side of a triangle: longer ones seldom fit into a view
-LOG_SIZE: Final = 0.15  # difference of two logarithms of the longest side, alone, that may be
-TRIED: Final = 24  # poses that most triangles vote for
 SAME_M: Final = 10.0  # a seen and a mapped building this near are one, for the fit
 APART_M: Final = 25.0
 FULL: Final = 255  # of a map's degrees
-_SENSE: Final = 0.5  # a triangle and its mirror image differ by 2: more than all that may differ
-_EACH: Final = 100  # triangles of a map for one of a view, the most alike first
 
 KINDS: Final = tuple(at for at, kind in enumerate(NODE_KINDS) if kind.classes == (CLASS,))
 
@@ -69,7 +63,8 @@ class Triangles:
         """
         corners = _neighbours(places_m)
         sides_m = _sides_m(places_m, corners)
-        is_small = (sides_m.max(axis=1) <= LONGEST_M) & (sides_m.min(axis=1) > 0)
+        # 150 m: side of a triangle: longer ones seldom fit into a view
+        is_small = (sides_m.max(axis=1) <= 150.0) & (sides_m.min(axis=1) > 0)
         corners, sides_m = corners[is_small], sides_m[is_small]
         corners = np.take_along_axis(corners, np.argsort(sides_m, axis=1, kind="stable"), axis=1)
         return cls(corners=corners, shape=shapes_of(places_m, area_m2, corners))
@@ -81,7 +76,8 @@ def _neighbours(places_m: Floats) -> Ints:
     found = [np.zeros((0, 3), dtype=np.int64)]
     if count >= FEWEST:
         tree = cKDTree(places_m)
-        near = np.asarray(tree.query(places_m, k=min(NEAREST + 1, count))[1])  # each is nearest to itself
+        # 5 buildings around each, any two of which make a triangle with it
+        near = np.asarray(tree.query(places_m, k=min(5 + 1, count))[1])  # each is nearest to itself
         found += [
             np.column_stack([near[:, 0], near[:, one], near[:, two]])
             for one, two in combinations(range(1, near.shape[1]), 2)
@@ -118,7 +114,9 @@ def shapes_of(places_m: Floats, area_m2: Floats, corners: Ints) -> Floats:
 
 def differences(ratio: float, log_area: float) -> Floats:
     """Return by how much each number of the shape of like triangles may differ alone, shape (6,)."""
-    return np.array([ratio, ratio, LOG_SIZE, log_area, log_area, _SENSE])
+    # 0.15: difference of two logarithms of the longest side, alone, that may be
+    # 0.5: a triangle and its mirror image differ by 2: more than all that may differ
+    return np.array([ratio, ratio, 0.15, log_area, log_area, 0.5])
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -196,7 +194,7 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
 
     def modes(self, view: BuildingSight, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses with most votes by the overlap of their buildings."""
-        crowds = self.votes(view, disc).crowds(count=TRIED)
+        crowds = self.votes(view, disc).crowds(count=24)  # poses that most triangles vote for
         settled = (self._settled(view, crowd.mode.pose) for crowd in crowds)
         poses = [pose for pose in settled if view.allows(pose, disc)]
         modes = [Mode(pose=pose, score=round(view.check.agreement(pose), 9)) for pose in poses]
@@ -219,7 +217,8 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
         for order in permutations(range(3)):  # nearly equal sides come in any order
             corners = ours.corners[:, order]
             shape = shapes_of(view.nodes.places_m, view.nodes.area_m2, corners)
-            found = tree.query(shape / may_differ, k=_EACH, distance_upper_bound=1.0)
+            # 100 triangles of a map for one of a view, the most alike first
+            found = tree.query(shape / may_differ, k=100, distance_upper_bound=1.0)
             away, near = (np.asarray(part) for part in found)
             row, at = np.nonzero(np.isfinite(away))
             hits = within[near[row, at]]

@@ -13,7 +13,6 @@ from sasgeo_bench import PRESENT, UNKNOWN, Evidence, MatcherCard, Overlaps
 TALL: Final = "building"  # the class that stands up from the ground
 # Of a roof over that of the camera. A view of 192 m is taken from about 160 m: 0, 8 (houses) and 24 m (blocks).
 HEIGHTS: Final = (0.0, 0.05, 0.15)
-YAW_STEP_DEG: Final = 4.0  # half of it moves the rim of a view by less than a cell of 4 m: more layers, fewer headings
 LEAST_CELLS: Final = 1.0  # of a union: less is rounding of the transform
 
 
@@ -54,7 +53,8 @@ class UbevTemplate(ShiftMatcher):
         ),
     )
 
-    yaw_step_deg = YAW_STEP_DEG
+    # 4 degrees: half of it moves the rim of a view by less than a cell of 4 m: more layers, fewer headings
+    yaw_step_deg = 4.0
 
     def channels(self, evidence: Evidence, names: tuple[str, ...]) -> NDArray[np.float32]:
         """Return the presence of each layer, then where each is known, then where any class is."""

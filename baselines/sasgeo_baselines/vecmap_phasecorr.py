@@ -17,7 +17,6 @@ from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlap
 
 FULL: Final = 255
 SHARP_CELLS: Final = 1.0  # standard deviation of the low-pass, in cells
-LEARNED_AROUND_M: Final = 150.0  # places that a class is held against while weights are learned
 MOST_LESSONS: Final = 120
 _NOTHING: Final = 1e-12
 
@@ -130,7 +129,7 @@ class VecmapPhasecorr(ShiftMatcher):
         search = self.look(replace(query, prior=known))
         if search is not None:
             names = tuple(search.chart.classes[band] for band in search.bands.tolist())
-            plan = replace(search.plan, around_m=LEARNED_AROUND_M)
+            plan = replace(search.plan, around_m=150.0)  # places that a class is held against while weights are learned
             replace(search, plan=plan, score=lambda overlaps: note(overlaps, names)).candidates([pose])
         return found
 

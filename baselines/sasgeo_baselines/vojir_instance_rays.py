@@ -33,15 +33,9 @@ RAYS: Final = 360
 INDEXED: Final = 120  # rays of places of the index: three times as fast, and enough for the waves
 WAVES: Final = 32  # of each signal
 STEP_M: Final = 10.0  # between places
-MOST_PLACES: Final = 400_000  # on a larger map they lie further apart
-BLUR: Final = 5  # rays over which a boundary is spread: a degree off, it still overlaps
-REFINED: Final = 12  # places that are refined
 STEPS_M: Final = (5.0, 2.5)  # of a place, one after the other
-WEIGHTS: Final = (1.0, 1.0, 1.0)  # of range, boundary and hit
-LEAST_JUDGED: Final = 0.5  # of the rays, where some are left out
 LEAST_SPREAD: Final = 1e-3
 APART_M: Final = 25.0
-SAMPLED_M: Final = 50.0  # between places of a training map
 
 Bools = NDArray[np.bool_]
 
@@ -78,7 +72,7 @@ class Profiles:
         """Return the signals as they are compared: boundaries are spread over `blur` rays, all are weighed."""
         values = self.values.copy()
         values[:, 1] = ndimage.maximum_filter1d(values[:, 1], blur, axis=-1, mode="wrap")
-        return values * np.array(WEIGHTS, dtype=np.float32)[:, None]
+        return values * np.array((1.0, 1.0, 1.0), dtype=np.float32)[:, None]  # of range, boundary and hit
 
     def magnitudes(self) -> Floats:
         """Return magnitudes of the first waves, shape (N, 3 * WAVES): they do not turn with the view.
@@ -117,7 +111,8 @@ def differences(seen: Profiles, mapped: Profiles, turns: NDArray[np.int64], *, b
         judged = mapped.is_judged & np.roll(seen.is_judged, turn, axis=-1)
         off = (np.abs(theirs - np.roll(mine, turn, axis=-1)).sum(axis=1) * judged).sum(axis=1)
         count = judged.sum(axis=1)
-        np.divide(off, count, out=found[:, at], where=count >= LEAST_JUDGED * judged.shape[1])
+        # 0.5 of the rays, where some are left out
+        np.divide(off, count, out=found[:, at], where=count >= 0.5 * judged.shape[1])
     return found
 
 
@@ -207,7 +202,8 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         """Return the spread of the magnitudes over places of training maps."""
         parts = []
         for name in dict.fromkeys(query.region for query, _ in training.pairs):
-            parts += [waves for _, waves in self._described(BuildingMap.of(training.regions[name]), SAMPLED_M)]
+            # 50 m between places of a training map
+            parts += [waves for _, waves in self._described(BuildingMap.of(training.regions[name]), 50.0)]
         return json.dumps({"spread": [round(value, 6) for value in spread_of(parts).tolist()]})
 
     def read(self, region: Region, learned: str | None) -> None:
@@ -215,7 +211,8 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         taught = None if learned is None else read_learned(self.card.name, learned, _spread)
         self._map = BuildingMap.of(region)
         grid = region.grid
-        least_m = float(np.sqrt(grid.rows * grid.cols / MOST_PLACES)) * grid.cell_size_m
+        # At most 400_000 places: on a larger map they lie further apart
+        least_m = float(np.sqrt(grid.rows * grid.cols / 400_000)) * grid.cell_size_m
         places_m, waves = zip(*self._described(self._map, max(STEP_M, least_m)), strict=True)
         self._places_m = np.concatenate(places_m)
         self._spread = spread_of(waves) if taught is None else taught
@@ -244,7 +241,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         away = np.square(self._waves[near] - view.waves / self._spread).sum(axis=1)
         shortlist = near[np.argsort(away, kind="stable")[: int(self.numbers["shortlist"])]]
         best = thinned(_ranked(self._turned(view, self._places_m[shortlist]), disc.wider(STEP_M)), APART_M)
-        refined = self._refined(view, best[: max(REFINED, count)])
+        refined = self._refined(view, best[: max(12, count)])  # places that are refined
         return thinned(_ranked(refined, disc.wider(STEPS_M[0])), APART_M, count)
 
     def _described(self, buildings: BuildingMap, step_m: float) -> Iterator[tuple[Points, Floats]]:
@@ -257,7 +254,8 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         """Return the best pose whose rays begin at each place; minus infinity is the score of one that is not known."""
         turns = turns_within(view.prior, RAYS)
         mapped = Profiles.of(self._map.rays(places_m, RAYS), censors=self.censors)
-        found = differences(view.profile, mapped, turns, blur=BLUR)
+        # 5 rays over which a boundary is spread: a degree off, it still overlaps
+        found = differences(view.profile, mapped, turns, blur=5)
         best = found.argmin(axis=1)
         yaws_deg, least = turns[best] * (360.0 / RAYS), found[np.arange(len(found)), best]
         modes = []

@@ -38,17 +38,10 @@ from sasgeo_bench import (
     wrap_deg,
 )
 
-MARGIN_M: Final = 48.0  # of a crop around a view: twice that, so that turned views fit, too
-CROPS_APART_M: Final = 48.0  # nearer ones show the same ground
-APART_M: Final = 25.0  # two answers
-ROUNDS: Final = 2  # of consensus: a patch hears of those two patches away
 SLACK_M: Final = 8.0  # beyond the disc of the prior: the side of a patch, as places are middles of them
 LEAST: Final = 4  # matches that agree: two make a similarity
 MOST_OFF: Final = 3.0  # standard deviations of the prior, of a heading or scale that is found
-ALIGNED: Final = 5  # candidates of a retrieval query whose patches are matched, the best first
 _STEP_DEG: Final = 360.0 / SECTORS
-_TRIES: Final = 2000  # of RANSAC
-_LEAST_SPREAD: Final = 0.02  # of a number of the descriptor over the map
 
 Floats = NDArray[np.float32]
 
@@ -68,7 +61,7 @@ class Crops:
         rows = list(described(region, stride=stride))
         values = np.concatenate(rows)
         mean, spread = _alike(values.mean(axis=0)), np.sqrt(_alike(values.var(axis=0)))
-        spread = np.maximum(spread, np.float32(_LEAST_SPREAD))
+        spread = np.maximum(spread, np.float32(0.02))  # least spread of a number of the descriptor over the map
         np.subtract(values, mean, out=values)
         np.divide(values, spread, out=values)
         middles_m = places_m(region.grid, (len(rows), len(rows[0])), stride=stride)
@@ -188,14 +181,15 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
     def modes(self, view: Seen, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses of the best crops, in their order."""
         found = [self.aligned(view, mode, disc) for mode in self.crops(view, disc, count=count)]
-        return list(thinned(found, APART_M))
+        return list(thinned(found, 25.0))  # m: two answers
 
     def near(self, view: Seen, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best crop near each candidate; the best of these with the pose of their patches."""
         discs = [Disc(center_m=(pose.easting_m, pose.northing_m), radius_m=AROUND_M) for pose in poses]
         found: list[Mode | None] = [next(iter(self.crops(view, disc, count=1)), None) for disc in discs]
         there = [(at, mode) for at, mode in enumerate(found) if mode is not None]
-        for at, mode in sorted(there, key=lambda pair: -pair[1].score)[:ALIGNED]:
+        # 5 candidates of a retrieval query whose patches are matched, the best first
+        for at, mode in sorted(there, key=lambda pair: -pair[1].score)[:5]:
             found[at] = self.aligned(view, mode, discs[at])
         return found
 
@@ -216,7 +210,7 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
         likeness = self._crops.likeness(view.descriptor, rows, turns)
         turn, best = likeness.argmax(axis=1), likeness.max(axis=1)
         middles_m = self._crops.middles_m[rows]
-        chosen = separate(middles_m, best, apart_m=CROPS_APART_M, most=count)
+        chosen = separate(middles_m, best, apart_m=48.0, most=count)  # nearer ones show the same ground
         return [
             Mode(
                 pose=Pose(
@@ -232,12 +226,14 @@ class ZhangHierConsensus(PlaceMatcher[Seen]):
     def aligned(self, view: Seen, crop: Mode, disc: Disc) -> Agreed:
         """Return the pose that the patches of a view and a crop agree on, or else that of the crop."""
         cell_m = view.evidence.cell_size_m
-        margin = math.ceil(MARGIN_M / cell_m / SIDE) * SIDE
+        # 48 m: margin of a crop around a view: twice that, so that turned views fit, too
+        margin = math.ceil(48.0 / cell_m / SIDE) * SIDE
         rows, cols = (count // SIDE * SIDE + 2 * margin for count in view.evidence.shape)
         town = self._chart.under(crop.pose, (rows, cols), view.bands, cell_size_m=cell_m)
         if (town == UNKNOWN).all():
             return Agreed(pose=crop.pose, score=crop.score, inliers=0, matched=0)
-        seen_m, mapped_m = matches(view.patches, Patches.of(town, cell_m), rounds=ROUNDS)
+        # 2 rounds of consensus: a patch hears of those two patches away
+        seen_m, mapped_m = matches(view.patches, Patches.of(town, cell_m), rounds=2)
         pose, inliers = similarity(seen_m, mapped_m, crop.pose, near_m=self.numbers["near_m"])
         if pose is None or not view.allows(pose, disc):
             pose, inliers = crop.pose, 0
@@ -259,8 +255,9 @@ def similarity(
     """
     if len(seen_m) < LEAST:
         return None, 0
+    # 2000 tries of RANSAC
     matrix, agrees = cv2.estimateAffinePartial2D(
-        seen_m, mapped_m, method=cv2.RANSAC, ransacReprojThreshold=near_m, maxIters=_TRIES, confidence=0.999
+        seen_m, mapped_m, method=cv2.RANSAC, ransacReprojThreshold=near_m, maxIters=2000, confidence=0.999
     )
     inliers = 0 if matrix is None else int(np.count_nonzero(agrees))
     if inliers < LEAST:

@@ -19,8 +19,7 @@ LABELS: Final = (
     _OF["water"],
     (*_OF["green"], *_OF["field"]),
 )
-REST: Final = "rest"  # known cells without a label
-NAMES: Final = (*(group[0] for group in LABELS), REST)
+NAMES: Final = (*(group[0] for group in LABELS), "rest")  # known cells without a label
 _NOTHING: Final = 1e-9
 
 

@@ -21,8 +21,6 @@ from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import markdown, markdown_item, quoted
 
 TABLE: Final = "ageing.parquet"
-TEXT: Final = "ageing.md"
-PLOT: Final = "ageing.svg"
 
 _READING: Final = f"""\
 Things are paired by geometry, never by id: areas by an IoU above {MATCH_IOU:g}, or by the ground they share if split or
@@ -54,8 +52,8 @@ def write_ageing(folder: Path, ageing: Ageing) -> tuple[Path, ...]:
     }
     writers: dict[str, Callable[[Path], object]] = {
         TABLE: lambda path: write_frame(ageing.table, path, attrs=attrs),
-        TEXT: lambda path: path.write_text(ageing_text(ageing), encoding="utf-8"),
-        PLOT: lambda path: draw_ageing(path, ageing),
+        "ageing.md": lambda path: path.write_text(ageing_text(ageing), encoding="utf-8"),
+        "ageing.svg": lambda path: draw_ageing(path, ageing),
     }
     return tuple(replace_file(folder / name, write) for name, write in writers.items())
 

@@ -41,7 +41,6 @@ from sasgeo_bench.osm.taxonomy import Kind, load_taxonomy
 DRAWS: Final = 1000
 LEVEL: Final = 0.95
 _NEWTON_STEPS: Final = 60
-_NEVER_SEEN: Final = 0.05  # probability of no loss at the upper end of a zero rate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -114,7 +113,8 @@ def bootstrap_rate(lost: Floats, total: Floats, years: Floats, *, things: int, r
     if math.isnan(best):
         return Rate(per_year=best, lo=best, hi=best)
     if best == 0.0:
-        return Rate(per_year=0.0, lo=0.0, hi=float(-np.log(_NEVER_SEEN) / (max(things, 1) * years.mean())))
+        # 0.05: probability of no loss at the upper end of a zero rate
+        return Rate(per_year=0.0, lo=0.0, hi=float(-np.log(0.05) / (max(things, 1) * years.mean())))
     blocks = len(total)
     if blocks < 2:  # one block cannot differ from itself
         return Rate(per_year=best, lo=math.nan, hi=math.nan)
@@ -130,7 +130,6 @@ BLOCK_M: Final = 1000.0
 DAYS_PER_YEAR: Final = 365.25
 LEAST_DAYS: Final = 30  # a yearly rate from a shorter time would multiply the events of single days
 UNITS: Final[dict[Kind, str]] = {"area": "m2", "line": "m"}
-_DECIMALS: Final = 6
 _REASONS: Final = ("world", "catch_up", "retagged")
 
 # Column -> pandas dtype. Shares lie within 0..1 and are NaN of an empty whole.
@@ -233,7 +232,7 @@ def measure_ageing(history: History, *, place: str) -> Ageing:
         rows.append(common | _pooled_row(of_class[:-1], place=place, name=name))
     table = pd.DataFrame(rows, columns=list(DTYPES)).astype(dict(DTYPES))
     numbers_only = [column for column, kind in DTYPES.items() if kind == "float64"]
-    table[numbers_only] = table[numbers_only].round(_DECIMALS)
+    table[numbers_only] = table[numbers_only].round(6)
     return Ageing(
         place=place,
         sources=tuple(f"{state.source} of {state.on}" for state in history.states),

@@ -36,7 +36,6 @@ Tensor = Any  # PyTorch is an extra: it is read as untyped wherever it is instal
 Item = dict[str, Any]
 Cells = NDArray[np.uint8]
 
-_NO_TORCH: Final = "datasets need PyTorch: pip install 'sasgeo-bench[torch]'"
 _NOWHERE_M: Final = (float("nan"), float("nan"))
 _TURNS: Final = 4
 
@@ -278,7 +277,7 @@ class _Pictures(Sequence[LabelledImage]):
 
 def _check_torch() -> None:
     if torch is None:
-        raise ConfigError(_NO_TORCH)
+        raise ConfigError("datasets need PyTorch: pip install 'sasgeo-bench[torch]'")
 
 
 def _numbers(values: Sequence[float | None]) -> Tensor:

@@ -33,12 +33,9 @@ from sasgeo_bench.files.plugins import CARD_FILE, code_of
 _PACKAGE: Final = Path(__file__).resolve().parents[1]
 _OURS: Final = _PACKAGE.name
 MOST_FILES: Final = 20_000  # of a plugin
-_MOST_STEPS: Final = 20  # from a name to where its class is
 _CACHES: Final = ("__pycache__",)
 _WORDS: Final = (CARD_FILE,)  # its version and places are told apart by themselves; all else in it is for readers
 _PYTHON: Final = ".py"
-_COMPILED: Final = ".pyc"
-_NO_CODE: Final = ("kind", "type_comment")  # fields of a syntax tree that change nothing
 _MOST_BITS: Final = 2000  # of a number that Python writes in decimal digits, however it is set up
 _IMPORTERS: Final = ("import_module", "__import__")
 
@@ -145,7 +142,12 @@ def _shape(tree: ast.AST) -> str:
             left.append(")")
             for field in reversed(item._fields):
                 value = getattr(item, field, None)
-                if field in _NO_CODE or value == [] or (value is None and not isinstance(item, ast.Constant)):
+                # Fields of a syntax tree that change nothing
+                if (
+                    field in ("kind", "type_comment")
+                    or value == []
+                    or (value is None and not isinstance(item, ast.Constant))
+                ):
                     continue
                 if field == "body" and isinstance(value, list) and _has_docstring(item):
                     value = value[1:]
@@ -188,7 +190,7 @@ def _own_files(spec: str, module: str, name: str, paths: Sequence[str]) -> dict[
 def _ways(module: str, name: str, paths: Sequence[str]) -> list[str]:
     """Return the module of a class, and those that it is handed on from by `from ... import`."""
     ways, wanted = [module], name.partition(".")[0]
-    for _ in range(_MOST_STEPS):
+    for _ in range(20):  # at most 20 steps from a name to where its class is
         path = file_of(find_module(ways[-1], paths))
         tree = None if path is None or path.suffix != _PYTHON else _tree(plain_file(path).read_bytes())
         found = next(
@@ -224,7 +226,7 @@ def _named(label: str, path: Path) -> dict[str, Path]:
         folders[:] = sorted(one for one in folders if one not in _CACHES and not one.startswith("."))
         for one in files:
             inner = Path(parent, one)
-            is_compiled = one.endswith(_COMPILED) and one[:-1] in files  # one without its source is what runs
+            is_compiled = one.endswith(".pyc") and one[:-1] in files  # one without its source is what runs
             if not one.startswith(".") and not is_compiled and one not in _WORDS and inner.is_file():
                 found[f"{label}/{inner.relative_to(path).as_posix()}"] = inner
         if len(found) > MOST_FILES:

@@ -31,7 +31,6 @@ MOST_VALUES: Final = 100_000_000  # of all columns together, with the items of l
 _MOST_UNPACKED: Final = 2_000_000_000  # bytes
 MOST_TEXT_BYTES: Final = 32_000_000  # of one text
 _TEXTS_AT_ONCE: Final = 65_536
-_LEAST_BYTES: Final = 1_000_000  # that a column of texts may have, with the headers of its pages
 _ATTRS: Final = b"PANDAS_ATTRS"  # where pandas itself looks for them
 _SEAL: Final = b"sasgeo_footer_crc32"
 _DIGITS: Final = 8  # of a CRC-32, hexadecimal
@@ -181,7 +180,8 @@ def _texts_fault(about: "pq.FileMetaData", texts: Collection[str], text_bytes: i
     """Describe a column of texts that are too long on the average, by the footer, or return None."""
     for group in map(about.row_group, range(about.num_row_groups)):
         for chunk in map(group.column, range(about.num_columns)):
-            size, most = chunk.total_uncompressed_size, text_bytes * chunk.num_values + _LEAST_BYTES
+            # A million bytes that a column of texts may have, with the headers of its pages
+            size, most = chunk.total_uncompressed_size, text_bytes * chunk.num_values + 1_000_000
             if chunk.path_in_schema in texts and size > most:
                 return f"{size} bytes of texts in {_column_of(chunk.path_in_schema)}, {most} at most"
     return None

@@ -41,9 +41,7 @@ _SENDING: Final = "sending.json"  # the same of the files so far, while others a
 _MADE_BY: Final = "sasgeo-bench send"
 _MOST_LIST_BYTES: Final = 500_000_000
 _FILES_AT_ONCE: Final = 64  # sent before the list of those so far is written again
-_MOST_PART_BYTES: Final = 255  # of a name of a file or folder
 _CONTENT: Final = {"region.json": ("id",), "task.json": ("suite", "region"), "run.json": ("hash", "suite", "region")}
-_MARKERS: Final = ("/", "_$folder$")  # ends of keys without bytes that consoles and Hadoop make for a folder
 _SECRET: Final = re.compile(r"(?<=://)[^/@]*@|\?.*$", re.DOTALL)
 
 
@@ -270,7 +268,8 @@ def _place(url: str, root: str) -> str:
 def _found(system: "AbstractFileSystem", root: str) -> dict[str, Any]:
     """Return all files below a place, with their sizes; a marker of a folder holds nothing, and is none."""
     found = dict(system.find(root, detail=True)) if system.exists(root) else {}
-    return {path: about for path, about in found.items() if about["size"] or not path.endswith(_MARKERS)}
+    # Ends of keys without bytes that consoles and Hadoop make for a folder
+    return {path: about for path, about in found.items() if about["size"] or not path.endswith(("/", "_$folder$"))}
 
 
 def _put(system: "AbstractFileSystem", path: Path, there: str) -> None:
@@ -318,8 +317,9 @@ def _is_within(name: str) -> bool:
     is_plain = "\\" not in name and "\0" not in name and name not in {LIST, _SENDING}
     parts = name.split("/")
     sizes = (len(part.encode(errors="replace")) for part in parts)
+    # 255 bytes of a name of a file or folder
     return is_plain and all(
-        part and not part.startswith(".") and size <= _MOST_PART_BYTES for part, size in zip(parts, sizes, strict=True)
+        part and not part.startswith(".") and size <= 255 for part, size in zip(parts, sizes, strict=True)
     )
 
 

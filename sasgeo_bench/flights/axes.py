@@ -16,27 +16,18 @@ from sasgeo_bench.texts import plain
 Axes = Literal["up", "camera"]
 
 AXES: Final = ("up", "camera")
-_LEAST_POSES: Final = 10  # of fewer nothing is told
 # East, north, up out of a first camera's right, down, ahead; forward, right, down of a body in its camera's axes.
 _FRAME: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
 _BODY: Final = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
 _ALONG: Final = 0.3  # share of the third axis in the spread of a path that does not lie across it
-_FLAT: Final = 0.1  # share of the second axis in the spread of a path before a front, or level for a camera
-_STILL: Final = 0.9  # of a body that does not turn
 _AHEAD: Final = 0.7  # mean cosine between the way and the body's axis that looks along it
-_LEVEL: Final = 0.9  # cosine of an axis of turning with the second axis
 _LOOKING: Final = 0.01  # a camera looks along its way, and turns by 8 degrees about its second axis (rms)
-_TURNED: Final = 0.2  # any body turns by 40 degrees (rms) about another axis than the third
-_AROUND: Final = 0.7  # a body that turns by 45 degrees (rms): its axis is known well, and may lie less off, 18 degrees
 _TILTED: Final = 0.05
 # A camera that looks ahead and down: the body turns about an axis off the third, and the path lies across that axis.
 _PITCHED_DEG: Final = (
     10.0,
     80.0,
 )  # beyond: the third axis itself, or a level one
-_ACROSS_DEG: Final = 10.0  # between that axis and the normal of the path's plane
-_THIN: Final = 0.2  # thickness of the path's plane, in its width
-_WIDE: Final = 0.05  # width of the path, in its spread
 
 
 def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
@@ -80,7 +71,7 @@ def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
         raise FlightError(f"axes must be one of {', '.join(AXES)}, got {axes!r}")
     if axes == "camera":
         flown = _out_of_camera(flown)
-    if axes != "up" and len(flown) >= _LEAST_POSES:
+    if axes != "up" and len(flown) >= 10:  # of fewer nothing can be said
         _check_upright(flown, axes, plain(str(path)))
     return flown
 
@@ -100,8 +91,10 @@ def _between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> flo
 
 def _lies_across(position_m: NDArray[np.float64], axis: NDArray[np.float64]) -> bool:
     _, spread, normals = np.linalg.svd(position_m - position_m.mean(axis=0), full_matrices=False)
-    is_plane = spread[1] > _WIDE * spread[0] and spread[2] < _THIN * spread[1]
-    return bool(is_plane) and _between_deg(normals[2], axis) < _ACROSS_DEG
+    # 0.2: thickness of the path's plane, in its width
+    is_plane = spread[1] > 0.05 * spread[0] and spread[2] < 0.2 * spread[1]  # 0.05: width of the path, in its spread
+    # 10 degrees between that axis and the normal of the path's plane
+    return bool(is_plane) and _between_deg(normals[2], axis) < 10.0
 
 
 def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
@@ -119,8 +112,10 @@ def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
     share = float(spread_m[2] / np.linalg.norm(spread_m))
     looks = share >= _ALONG and ahead[2] >= _AHEAD
     loops = share >= _ALONG and ahead[0] >= _AHEAD
-    is_around = strength[1] < _AROUND
-    is_tilted = strength[0] - kept[2] > (_TILTED if is_around else _TURNED)
+    # 0.7: a body that turns by 45 degrees (rms): its axis is known well, and may lie less off, 18 degrees
+    is_around = strength[1] < 0.7
+    # 0.2: any body turns by 40 degrees (rms) about another axis than the third
+    is_tilted = strength[0] - kept[2] > (_TILTED if is_around else 0.2)
     off_deg = _between_deg(axes_of_turn[:, 0], np.array([0.0, 0.0, 1.0]))
     is_pitched = (
         _PITCHED_DEG[0] < off_deg < _PITCHED_DEG[1]
@@ -128,7 +123,8 @@ def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
         and _lies_across(flown.position_m, axes_of_turn[:, 0])
     )
     if (looks and kept[1] - kept[2] > _LOOKING) or (is_tilted and not loops) or is_pitched:
-        is_second = not is_pitched and (abs(float(axes_of_turn[1, 0])) > _LEVEL or (looks and not is_around))
+        # 0.9: cosine of an axis of turning with the second axis
+        is_second = not is_pitched and (abs(float(axes_of_turn[1, 0])) > 0.9 or (looks and not is_around))
         mend = "turn the frame first, or say --axes up if it is right"
         if is_second and axes is None:
             mend = "say --axes camera (as of ORB-SLAM)"
@@ -137,8 +133,10 @@ def _check_upright(flown: Trajectory, axes: Axes | None, name: str) -> None:
             f"{name}: the body turns about {about} of the frame, so its third axis does not point up: {mend}; "
             "quaternions are in the order qx qy qz qw"
         )
-    is_flat = share >= _ALONG and spread_m[1] < _FLAT * np.linalg.norm(spread_m)
-    if axes is None and ((is_flat and strength[2] > _STILL) or (loops and (is_flat or is_tilted))):
+    # 0.1: share of the second axis in the spread of a path before a front, or level for a camera
+    is_flat = share >= _ALONG and spread_m[1] < 0.1 * np.linalg.norm(spread_m)
+    # 0.9 of a body that does not turn
+    if axes is None and ((is_flat and strength[2] > 0.9) or (loops and (is_flat or is_tilted))):
         message = (
             f"{name}: the path lies along the third axis, which is read as up, since the body does not turn or loops; "
             "if that axis points ahead, as in the axes of a camera, say --axes camera"

@@ -29,14 +29,8 @@ _PASSING_DEGREE: Final = 2
 _STEP_M: Final = 2.0  # between points of a corridor
 _TURN_STEP_M: Final = 10.0  # by which turns along a way are measured
 _SMOOTHING_M: Final = 15.0  # standard deviation: a drone follows a road's course, not its every vertex
-_AHEAD_M: Final = 30.0  # over which the direction at a junction is measured
 _SHARPEST_DEG: Final = 120.0  # at a junction; sharper ones are U-turns
 _LINK_M: Final = 60.0  # nearer turns count as one: over a link between carriageways there is no way back
-_BACK_DEG: Final = 150.0  # within that length, on one way: turning loops and hairpins are not followed
-_STRAIGHT_DEG: Final = 40.0  # by which a turn is e times less likely
-_AGAIN: Final = 0.2  # of the chance of a way that was flown before
-_SPARE: Final = 1.3  # of the length, before it is smoothed, which shortens it
-_MOST_STEPS: Final = 3000  # of a search, dead ends included
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -106,7 +100,7 @@ class Corridors:
         first = int(rng.integers(len(self)))
         walk, rests = [first], [self._choices(leaving, [first], rng)]
         total_m = float(self.length_m[first])
-        for _ in range(_MOST_STEPS):
+        for _ in range(3000):  # at most 3000 steps of a search, dead ends included
             if not walk:
                 return None
             if total_m >= length_m:
@@ -132,7 +126,9 @@ class Corridors:
         both = np.abs(wrap_deg(np.degrees(self.heading[ways, 0] - self._course_before(walk))))
         times = np.array([sum(way in (past, past ^ 1) for past in walk) for way in ways])
         # The largest of these is each way in proportion to its weight (exponential clocks).
-        clocks = np.log(rng.random(len(ways))) * np.exp(turns / _STRAIGHT_DEG) * _AGAIN ** -times.astype(np.float64)
+        # 40 degrees by which a turn is e times less likely
+        # 0.2 of the chance of a way that was flown before
+        clocks = np.log(rng.random(len(ways))) * np.exp(turns / 40.0) * 0.2 ** -times.astype(np.float64)
         return [ways[at] for at in np.argsort(clocks, kind="stable") if max(turns[at], both[at]) <= _SHARPEST_DEG]
 
     def _course_before(self, walk: list[int]) -> float:
@@ -147,7 +143,8 @@ class Corridors:
         """Return the smoothed line of a walk if it is long enough."""
         line_m = np.concatenate([self.lines_m[way] for way in walk])
         along_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
-        even_m = np.arange(0.0, min(float(along_m[-1]), _SPARE * length_m), _STEP_M)
+        # 1.3 of the length, before it is smoothed, which shortens it
+        even_m = np.arange(0.0, min(float(along_m[-1]), 1.3 * length_m), _STEP_M)
         even = np.stack([np.interp(even_m, along_m, axis) for axis in line_m.T], axis=1)
         smooth = gaussian_filter1d(even, _SMOOTHING_M / _STEP_M, axis=0, mode="nearest")
         return smooth if np.hypot(*np.diff(smooth, axis=0).T).sum() >= length_m else None
@@ -165,11 +162,13 @@ def _turns_back(line_m: Floats) -> bool:
     course_deg = np.degrees(np.unwrap(np.arctan2(*sides.T)))
     reach = round(_LINK_M / _TURN_STEP_M)
     first, last = course_deg[: max(1, len(course_deg) - reach)], course_deg[min(reach, len(course_deg) - 1) :]
-    return len(course_deg) > 1 and float(np.abs(last - first[: len(last)]).max()) > _BACK_DEG
+    # 150 degrees within that length, on one way: turning loops and hairpins are not followed
+    return len(course_deg) > 1 and float(np.abs(last - first[: len(last)]).max()) > 150.0
 
 
 def _heading(line_m: Floats) -> float:
     """Return the direction in which a line begins, radians."""
     along_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(line_m, axis=0).T)))
-    east, north = (np.interp(_AHEAD_M, along_m, axis) for axis in (line_m - line_m[0]).T)
+    # 30 m over which the direction at a junction is measured
+    east, north = (np.interp(30.0, along_m, axis) for axis in (line_m - line_m[0]).T)
     return math.atan2(north, east)

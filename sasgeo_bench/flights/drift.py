@@ -28,12 +28,10 @@ LEVEL: Final = 0.95
 FIGURES: Final = ("position_pct", "yaw_deg", "scale_pct")
 RATES: Final = ("resets_per_km", "lost_per_km")
 
-_LOST_M: Final = 1.0  # path in a gap below which nothing was lost: a hover, or a pose left out
 _JUMP_M: Final = 1.0
 _JUMP_SHARE: Final = 0.1
 _JUMP_DEG: Final = 10.0
 _MOST_TILT_DEG: Final = 10.0
-_MOST_JUMPS: Final = 10  # of a short run; of a longer one, half of its steps
 _NODES: Final = 10  # of the shortest segment
 _MOST_NODES: Final = 1_000_000  # of a path
 LEAST_SPREAD: Final = 0.02  # of points around their mean, in segment lengths, to tell a scale from
@@ -320,11 +318,11 @@ def _plane(position_m: Floats) -> Plane:
 def _cut(whole: Stretch, is_long: NDArray[np.bool_], sequence: str) -> PairedRun:
     """Cut a run at its gaps and jumps; `is_long` tells the steps that took too long."""
     path_m = np.diff(whole.path_m)
-    is_lost = is_long & (path_m > _LOST_M)
+    is_lost = is_long & (path_m > 1.0)  # m: path in a gap below which nothing was lost: a hover, or a pose left out
     error_m = np.abs(np.diff(whole.believed) * np.exp(-1j * whole.turn_rad[:-1]) - np.diff(whole.flown))
     is_jump = error_m > _JUMP_M + _JUMP_SHARE * path_m
     is_jump |= np.abs(np.diff(whole.turn_rad)) > math.radians(_JUMP_DEG)
-    if is_jump.sum() > max(_MOST_JUMPS, len(is_jump) / 2):
+    if is_jump.sum() > max(10, len(is_jump) / 2):  # 10 of a short run; of a longer one, half of its steps
         raise FlightError(
             f"{is_jump.sum()} of {len(is_jump)} steps are off by more than {_JUMP_M:g} m and a tenth of their length, "
             f"or {_JUMP_DEG:g} degrees: check that both files are of one flight, and positions are in metres"

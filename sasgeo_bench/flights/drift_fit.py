@@ -40,11 +40,9 @@ PARTS: Final = ("slip.sigma_pct", "scale.bias_pct", "heading.walk_deg_at_100m", 
 _RATE: Final = 3  # of PARTS
 _SLIP_M: Final = (1.0, 2.0, 5.0, 10.0, 20.0)
 _HEADING_M: Final = (None, 50.0, 100.0, 200.0)
-_MOST_SEGMENTS: Final = 60  # of a stretch, evenly: neighbours overlap
 _MOST_SPREAD: Final = 2.0
 _PERCENT: Final = 100.0
 _SCALE_M: Final = 100.0  # distance at which a profile gives its drift of heading
-_GAIN: Final = 0.9  # of the misfit, for a heading that saturates to be preferred to one that walks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -230,7 +228,8 @@ def _unit_law(count: int, spacing_m: float, lengths: _Lengths) -> _UnitLaw:
 
 def _segment_design(part: Stretch, count: int, law: _UnitLaw, spacing_m: float) -> Floats:
     """Return the squares of each segment for unit variances, shape (S, 3, P)."""
-    begins = np.unique(np.linspace(0, len(part.path_m) - count - 1, _MOST_SEGMENTS).astype(int))
+    # At most 60 segments of a stretch, evenly: neighbours overlap
+    begins = np.unique(np.linspace(0, len(part.path_m) - count - 1, 60).astype(int))
     windows = part.flown[begins[:, None] + np.arange(count + 1)]
     steps = np.diff(windows, axis=1)
     end = _PERCENT**2 / (count * spacing_m) ** 2
@@ -261,8 +260,9 @@ def _solved(design: Floats, target: Floats, columns: NDArray[np.int64] | NDArray
 
 
 def _best_lengths(designs: Mapping[_Choice, Floats], target: Floats) -> tuple[_Choice, Floats]:
+    # 0.9: gain of the misfit, for a heading that saturates to be preferred to one that walks
     misfits = {
-        choice: _misfit(_mean(design), target) * (_GAIN if choice[1] is None else 1.0)
+        choice: _misfit(_mean(design), target) * (0.9 if choice[1] is None else 1.0)
         for choice, design in designs.items()
     }
     best = min(misfits, key=lambda choice: misfits[choice])

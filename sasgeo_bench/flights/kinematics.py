@@ -30,12 +30,8 @@ MOST_POINTS: Final = 1_000_000  # of a path, after it is sampled
 _STEP_M: Final = 0.5  # between samples of a path
 _EASING_M: Final = 1.5  # standard deviation of the smoothing of a path: curvature begins and ends gradually
 _EASING_S: Final = 0.4  # the same of attitudes: a drone does not lean at once
-_SLIGHT_DEG: Final = 15.0  # a smaller turn at a vertex belongs to a curve, and the smoothing takes it
 _SHARPEST_DEG: Final = 170.0  # a sharper turn is a way back
-_SLOWEST_MPS: Final = 0.5  # a path with a sharper bend than any drone flies is crept round
 _STRAIGHT: Final = 1e-9  # curvature, 1/m: less is none
-_SMALLEST_M: Final = 1e-3  # between vertices
-_SETTLING: Final = 12.0  # time constants before the start, after which a process is stationary
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,7 +216,8 @@ def round_corners(polyline: ArrayLike, radius_m: float) -> Floats:
     parts = [line_m[:1]]
     for at, turn in enumerate(turns):
         corner_m, half_m = line_m[at + 1], min(lengths_m[at], lengths_m[at + 1]) / 2
-        if abs(turn) < math.radians(_SLIGHT_DEG):
+        # 15 degrees: a smaller turn at a vertex belongs to a curve, and the smoothing takes it
+        if abs(turn) < math.radians(15.0):
             parts.append(corner_m[None])
             continue
         tangent = math.tan(abs(turn) / 2)
@@ -265,7 +262,8 @@ def _checked(polyline: ArrayLike) -> Floats:
     line_m = np.asarray(polyline, dtype=np.float64)
     if line_m.ndim != 2 or line_m.shape[1:] != (2,) or not np.isfinite(line_m).all():  # a table of pairs
         raise FlightError(f"a path has finite eastings and northings, shape (N, 2), got shape {line_m.shape}")
-    kept = np.append(True, np.hypot(*np.diff(line_m, axis=0).T) > _SMALLEST_M)[: len(line_m)]
+    # 1e-3 m, at least, between vertices
+    kept = np.append(True, np.hypot(*np.diff(line_m, axis=0).T) > 1e-3)[: len(line_m)]
     line_m = np.asarray(line_m[kept])
     if len(line_m) < 2:  # a side
         raise FlightError(f"a path has two distinct points at least, got {len(line_m)}")
@@ -296,7 +294,8 @@ def _move(path_m: Floats, cruise_mps: float, limits: Limits, step_s: float) -> _
     first, second = curve(along_m, 1), curve(along_m, 2)
     bend = np.maximum(np.abs(_cross(first, second)), _STRAIGHT)
     speed_mps = np.minimum(math.radians(limits.turn_rate_deg_s) / bend, np.sqrt(limits.side_mps2 / bend))
-    speed_mps = np.clip(speed_mps, _SLOWEST_MPS, cruise_mps)
+    # 0.5 m/s: a path with a sharper bend than any drone flies is crept round
+    speed_mps = np.clip(speed_mps, 0.5, cruise_mps)
     speed_mps = _within(speed_mps, np.diff(along_m), limits.acceleration_mps2)
     spent_s = np.append(0.0, np.cumsum(2 * np.diff(along_m) / (speed_mps[1:] + speed_mps[:-1])))
     count = max(2, math.floor(spent_s[-1] / step_s) + 1)
@@ -376,7 +375,7 @@ def _wander(rng: np.random.Generator, count: int, step_s: float, tau_s: float) -
     from scipy.signal import lfilter  # noqa: PLC0415 - slow to import, and most processes fly nothing
 
     keep = math.exp(-step_s / tau_s)
-    before = math.ceil(_SETTLING * tau_s / step_s)
+    before = math.ceil(12.0 * tau_s / step_s)  # time constants before the start, after which a process is stationary
     gain = math.sqrt((1 - keep**2) ** 3 / (1 + keep**2))
     noise = gain * rng.standard_normal(before + count)
     return np.asarray(lfilter([1.0], [1.0, -2 * keep, keep**2], noise)[before:])

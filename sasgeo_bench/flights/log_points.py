@@ -24,7 +24,6 @@ MOST_BYTES: Final = 64 * 2**20  # of a log
 MOST_POINTS: Final = 1_000_000
 BEFORE_FIX: Final = "at 0, 0 before the first fix"
 
-_LARGEST: Final = 1e30  # a number beyond is a fault; times in ns are 2e18
 _MOST_SHOWN: Final = 40  # characters of a text out of a file
 _ANGLES: Final = {"yaw_deg": 360.0, "pitch_deg": 90.0, "roll_deg": 180.0}
 _MOST_NAMES: Final = 12  # in a message
@@ -57,7 +56,7 @@ class LogSource:
             value = math.nan if "_" in text else float(text)
         except ValueError:
             value = math.nan
-        if not abs(value) < _LARGEST:
+        if not abs(value) < 1e30:  # a number beyond is a fault; times in ns are 2e18
             message = f"{name} is no number, {shown(text)}: mend the value (decimals with a point), or delete the point"
             raise self.fault(message, number)
         return value

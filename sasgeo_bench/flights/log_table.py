@@ -32,7 +32,6 @@ _UNKNOWN: Final = frozenset({"", "nan", "null", "none", "na", "n/a", "-", "--", 
 _LETTERED: Final = re.compile(
     r"(\d+(?:\.\d+)?)\s*(?:deg|°)?\s*(?:([0-5]?\d(?:\.\d+)?)\s*['\u2032]\s*)?(?:([0-5]?\d(?:\.\d+)?)\s*[\"\u2033]\s*)?([NSEW])"
 )
-_LAST_BOOT_US: Final = 1e14  # three years: no PX4 runs for longer, so later times count from 1970
 _SIGNS: Final = MappingProxyType(
     {
         "latitude": {"N": 1, "NORTH": 1, "S": -1, "SOUTH": -1},
@@ -265,7 +264,8 @@ def _as_px4(layout: Layout, values: dict[str, Floats]) -> Layout:
     time = layout.fields.get("time")
     if time is None:
         return layout
-    is_boot_time = float(values["time"].max(initial=0)) < _LAST_BOOT_US
+    # 1e14: three years: no PX4 runs for longer, so later times count from 1970
+    is_boot_time = float(values["time"].max(initial=0)) < 1e14
     if layout.format is PX4 and not is_boot_time:
         return replace(layout, fields={**layout.fields, "time": replace(time, unit=None)})
     is_px4 = (

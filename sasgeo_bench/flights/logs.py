@@ -32,8 +32,6 @@ SUFFIXES: Final = (".gpx", ".kml", ".csv", ".pos", ".tum", ".txt", ".tum.gz", ".
 MOST_GAP_S: Final = 10.0  # between points of a log: over longer ones nobody knows where the drone was
 
 _TUM: Final = SUFFIXES[4:]
-_COURSE_S: Final = 1.0  # before and after a pose, over which its course is measured
-_HOVER_M: Final = 1.0  # a shorter way has no course
 _FAR_M: Final = 1e9  # where a projection ends: outside of every region
 
 
@@ -244,11 +242,11 @@ def _resampled(flown: Trajectory, path: Path, step_s: float) -> Trajectory:
 
 def _along_course(flown: Trajectory, step_s: float) -> Trajectory:
     """Return a trajectory that is level and points where it flies; while it hovers, where it flew before."""
-    reach = max(1, round(_COURSE_S / step_s))
+    reach = max(1, round(1.0 / step_s))  # 1 s before and after a pose, over which its course is measured
     at = np.arange(len(flown))
     before, after = np.maximum(at - reach, 0), np.minimum(at + reach, len(flown) - 1)
     way_m = flown.position_m[after, :2] - flown.position_m[before, :2]
-    moves = np.flatnonzero(np.hypot(*way_m.T) >= _HOVER_M)
+    moves = np.flatnonzero(np.hypot(*way_m.T) >= 1.0)  # m: a shorter way has no course
     yaw_deg = np.zeros(len(flown))
     if len(moves):
         held = moves[np.maximum(np.searchsorted(moves, at, side="right") - 1, 0)]

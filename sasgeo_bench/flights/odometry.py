@@ -23,7 +23,6 @@ Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Belief = Literal["honest", "optimistic"]
 
-OPTIMISM: Final = 3.0  # an optimistic odometer believes a third of its standard deviations
 LOST_M: Final = 1e4  # standard deviations of a lost increment
 LOST_DEG: Final = 180.0
 _FLOOR_M: Final = 1e-3  # believed of any increment, drifting or not, so that a covariance can be inverted
@@ -137,7 +136,8 @@ def draw_odometry(
     moved = step * np.exp(drift.log_length - 1j * drift.course_rad) + drift.jump_m
     # Of what the odometer takes for its way: covariances of the true steps would tell their length.
     believed = _Law(profile=profile, steps_m=np.abs(moved))
-    covariance = believed.covariance(moved, drift.resets) / (OPTIMISM**2 if belief == "optimistic" else 1.0)
+    # 3: an optimistic odometer believes a third of its standard deviations
+    covariance = believed.covariance(moved, drift.resets) / (3.0**2 if belief == "optimistic" else 1.0)
     covariance[is_lost] = np.diag([LOST_M**2, LOST_M**2, LOST_DEG**2])
     yaw_deg = wrap_deg(_turns_deg(flown) + np.degrees(drift.turn_rad) + drift.jump_deg)
     return Odometry(

@@ -26,17 +26,10 @@ MARGIN_M: Final = 100.0  # from the edge of what is mapped: about what a camera 
 _ASKED_M: Final = 100.0  # to which lengths are rounded down where an error names one
 _DRAWS: Final = 40  # of a path, before there is none
 _PLACES: Final = 24  # tried for the shape of each draw
-_SPACING_M: Final = (40.0, 80.0)  # between legs of a survey: pictures from 120 m overlap by half or more
 _LEAST_LEGS: Final = 3
 _RADIUS_M: Final = (50.0, 200.0)  # of a loiter
-_LONG_SIDE: Final = (1.5, 3.0)  # length over width of an oval
-_OFFSET: Final = (0.04, 0.15)  # of a transit's waypoints from the straight line, in its lengths
-_LEG_M: Final = (150.0, 800.0)  # between waypoints
-_SHARPEST_DEG: Final = 130.0  # at a waypoint
 _NEXT: Final = 24  # places drawn for the next waypoint
 _CURVE_M: Final = 2.0  # between points of a curve
-_SQUARE: Final = 1.05  # sides as like as these have no longer one
-_ROUNDING_M: Final = 1e-6  # by which a place may lie outside
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -158,7 +151,8 @@ def _survey(wish: _Wish, rng: np.random.Generator) -> Floats | None:
     radius_m = wish.limits.turn_radius_m
     saved_m = (4 - math.pi) * radius_m  # by the two rounded corners of each turn
     for draw in range(_DRAWS):
-        spacing_m = max(rng.uniform(*_SPACING_M), 2 * radius_m)
+        # Between legs of a survey: pictures from 120 m overlap by half or more
+        spacing_m = max(rng.uniform(40.0, 80.0), 2 * radius_m)
         most = int(math.sqrt(wish.length_m / spacing_m)) + 1
         for legs in rng.permutation(np.arange(_LEAST_LEGS, most + 1)).tolist():
             leg_m = (wish.length_m - (legs - 1) * (spacing_m - saved_m)) / legs
@@ -193,7 +187,8 @@ def _transit(wish: _Wish, rng: np.random.Generator) -> Floats | None:
     for _ in range(_DRAWS):
         count = int(rng.integers(1, 3))
         at = np.array([0.0, *(np.arange(1, count + 1) + rng.uniform(-0.2, 0.2, count)) / (count + 1), 1.0])
-        off = np.array([0.0, *(rng.uniform(*_OFFSET, count) * rng.choice([-1, 1], count)), 0.0])
+        # Of a transit's waypoints from the straight line, in its lengths
+        off = np.array([0.0, *(rng.uniform(0.04, 0.15, count) * rng.choice([-1, 1], count)), 0.0])
         curve = CubicSpline(at, np.column_stack([off, at]), bc_type="natural")
         shape_m = curve(np.linspace(0.0, 1.0, math.ceil(wish.length_m / _CURVE_M) + 1))
         shape_m *= wish.length_m / length_m(shape_m)
@@ -247,14 +242,14 @@ _MAKERS: Final[MappingProxyType[str, Callable[[_Wish, np.random.Generator], Floa
 
 def _next_place(places_m: Floats, area: shapely.Geometry, rng: np.random.Generator) -> Floats | None:
     here_m = places_m[-1]
-    low_m, high_m = _LEG_M
+    low_m, high_m = 150.0, 800.0  # between waypoints
     reach_m, turn = rng.uniform(low_m, high_m, _NEXT), rng.uniform(0.0, 2 * np.pi, _NEXT)
     legs_m = reach_m[:, None] * np.stack([np.sin(turn), np.cos(turn)], axis=1)
     is_open = shapely.contains_xy(area, here_m + legs_m)
     if len(places_m) > 1:
         before_m = here_m - places_m[-2]
         ahead = legs_m @ before_m / reach_m / np.hypot(*before_m)
-        is_open &= ahead >= math.cos(math.radians(_SHARPEST_DEG))
+        is_open &= ahead >= math.cos(math.radians(130.0))  # degrees: the sharpest turn at a waypoint
     for leg_m in legs_m[is_open]:
         if _fits(np.stack([here_m, here_m + leg_m]), area):
             return np.asarray(here_m + leg_m)
@@ -294,7 +289,7 @@ def _cut(line_m: Floats, most_m: float) -> Floats | None:
     if along_m[-1] < most_m:
         return None
     end_m = [np.interp(most_m, along_m, axis) for axis in line_m.T]
-    return np.vstack([line_m[along_m < most_m - _ROUNDING_M], end_m])
+    return np.vstack([line_m[along_m < most_m - 1e-6], end_m])  # m by which a place may lie outside
 
 
 def _longer_side_deg(area: shapely.Geometry, rng: np.random.Generator) -> float:
@@ -302,7 +297,7 @@ def _longer_side_deg(area: shapely.Geometry, rng: np.random.Generator) -> float:
     corners_m = shapely.get_coordinates(shapely.oriented_envelope(area))[:3]
     sides = np.diff(corners_m, axis=0)
     lengths = np.hypot(*sides.T)
-    is_square = lengths.max() < _SQUARE * lengths.min()
+    is_square = lengths.max() < 1.05 * lengths.min()  # sides as like as these have no longer one
     at = int(rng.integers(2)) if is_square else int(np.argmax(lengths))
     return math.degrees(math.atan2(sides[at, 0], sides[at, 1]))
 
@@ -314,7 +309,7 @@ def _circle(radius_m: float, _: np.random.Generator) -> Floats:
 def _oval(radius_m: float, rng: np.random.Generator) -> Floats:
     """Return a racetrack: two straights, and two halves of a circle."""
     radius_m /= 2
-    half_m = radius_m * (rng.uniform(*_LONG_SIDE) - 1)
+    half_m = radius_m * (rng.uniform(1.5, 3.0) - 1)  # length over width of an oval
     up_m = np.array([0.0, half_m])
     top, bottom = _arc(radius_m, 0.0, math.pi) + up_m, _arc(radius_m, math.pi, 2 * math.pi) - up_m
     return np.vstack([top, bottom, top[:1]])

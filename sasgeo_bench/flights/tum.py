@@ -21,10 +21,8 @@ MOST_BYTES: Final = 300_000_000  # of text, unpacked
 MOST_POSES: Final = 2_000_000
 _COLUMNS: Final = 8
 _KITTI: Final = 12  # numbers of a 3 x 4 matrix
-_LARGEST: Final = 1e12  # seconds or metres: what is larger has another unit
 _GZIP: Final = b"\x1f\x8b"
 _FORM: Final = "a line is 'time_s x y z qx qy qz qw', 8 numbers with spaces between"
-_UNIT: Final = 1e-3  # as in trajectory.py, which names the pose; here the line is named
 
 
 def read_tum(path: Path, *, axes: Axes | None = None) -> Trajectory:
@@ -131,9 +129,9 @@ def _pose(line: str, where: str) -> list[float]:
             count = "12 numbers, a pose of KITTI without its time (join times.txt, then --axes camera)"
         found = count if len(words) != _COLUMNS else "words that are no finite numbers"
         raise FlightError(f"{where}: {found}: {_FORM}")
-    if max(map(abs, values)) >= _LARGEST:
+    if max(map(abs, values)) >= 1e12:  # seconds or metres: what is larger has another unit
         raise FlightError(f"{where}: a number of {max(map(abs, values)):g}: give times in seconds, positions in metres")
     length = math.hypot(*values[4:])
-    if abs(length - 1) > _UNIT:
+    if abs(length - 1) > 1e-3:  # 1e-3: as in trajectory.py, which names the pose; here the line is named
         raise FlightError(f"{where}: the quaternion has length {length:g}, not 1: the order is qx qy qz qw")
     return values

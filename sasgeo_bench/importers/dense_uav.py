@@ -24,7 +24,6 @@ LAYOUT: Final = (
 )
 
 _TEST: Final = ("query_drone", "query_satellite", "gallery_drone", "gallery_satellite")
-_DIGITS: Final = 6
 _LINE: Final = re.compile(r"(?P<path>\S.*?)\s+E(?P<longitude>\S+)\s+N(?P<latitude>\S+)(\s+(?P<height>[^\sEN]\S*))?\s*")
 _HEIGHT: Final = re.compile(r"H([0-9]{1,4})(_old)?\.\w+")
 _SAME_M: Final = 1.0
@@ -39,7 +38,7 @@ def read_dense_uav(reader: FolderReader) -> Dataset:
     ]
     training = [LabelFolder(relative=f"train/{view}", role="train", view=view) for view in ("drone", "satellite")]
     folders += [folder for folder in training if reader.has(folder.relative)]
-    items = [item for folder in folders for item in read_labels(reader, folder, digits=_DIGITS)]
+    items = [item for folder in folders for item in read_labels(reader, folder, digits=6)]
     return Dataset(card=CARD, items=tuple(_placed(item, positions) for item in items), notes=(*notes, *reader.notes()))
 
 

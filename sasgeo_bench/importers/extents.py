@@ -21,7 +21,6 @@ from sasgeo_bench.importers.items import Box, Dataset, Item
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 
 GAP_M: Final = 5_000.0  # items farther apart than this lie in different areas
-MARGIN_M: Final = 500.0  # a view reaches beyond its centre
 _RADIUS_M: Final = 6_371_000.0
 _M_PER_DEG: Final = 111_320.0
 _STEP_DEG: Final = 0.001  # items within such a cell count once when areas are formed
@@ -122,7 +121,7 @@ def _clusters(items: Sequence[Item]) -> list[list[Item]]:
 def _box_of(items: Sequence[Item]) -> Box:
     places = [item.position for item in items if item.position is not None]
     longitudes, latitudes = [place.longitude_deg for place in places], [place.latitude_deg for place in places]
-    north_deg = MARGIN_M / _M_PER_DEG
+    north_deg = 500.0 / _M_PER_DEG  # m: a view reaches beyond its centre
     east_deg = north_deg / math.cos(math.radians(sum(latitudes) / len(latitudes)))
     return Box(
         west_deg=min(longitudes) - east_deg,

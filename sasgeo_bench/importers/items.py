@@ -19,7 +19,6 @@ Role = Literal["query", "gallery", "train", "unsplit"]
 MOST_ITEMS: Final = 1_000_000
 _LOWEST_M: Final = -1_000.0
 _HIGHEST_M: Final = 30_000.0
-_MAX_LATITUDE_DEG: Final = (-80.0, 84.0)  # of UTM
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +37,7 @@ class Position:
 
     def __post_init__(self) -> None:
         """Refuse what lies on no map of ours."""
-        low, high = _MAX_LATITUDE_DEG
+        low, high = -80.0, 84.0  # of UTM
         if -180 <= self.longitude_deg <= 180 and low <= self.latitude_deg <= high:  # degrees of longitude
             return
         is_swapped = low <= self.longitude_deg <= high < abs(self.latitude_deg) <= 180  # as above

@@ -16,7 +16,6 @@ from sasgeo_bench.files.parquet import open_table, read_schema
 from sasgeo_bench.importers.items import Item
 
 COLUMNS: Final = ("query_id", "gallery_id", "rank")
-MOST_ROWS: Final = 33_000_000  # of one file
 _MEND: Final = f"write a Parquet file with the columns {', '.join(COLUMNS)}, ranks from 1"
 
 Ints = NDArray[np.int64]
@@ -68,7 +67,8 @@ def read_ranking(paths: Sequence[Path], items: Sequence[Item]) -> Ranking:
 
 def _read_columns(path: Path, items: Sequence[Item]) -> tuple[Ints, Ints, Ints]:
     _check_columns(path, read_schema(path, mend=_MEND))
-    with open_table(path, mend=_MEND, most_rows=MOST_ROWS, read_dictionary=list(COLUMNS[:2])) as source:
+    # At most 33 million rows of one file
+    with open_table(path, mend=_MEND, most_rows=33_000_000, read_dictionary=list(COLUMNS[:2])) as source:
         table = source.read(columns=list(COLUMNS))
     if table.num_rows == 0:
         raise DatasetError(f"{path} has no row: {_MEND}")

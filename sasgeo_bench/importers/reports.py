@@ -42,11 +42,9 @@ _ACCURACY_M: Final = (20, 40, 80, 100, 200)
 _DENOMINATOR: Final = "over all queries / those with a positive"
 _RANK: Final = f"one rank too far; {_DENOMINATOR}"
 _TRAPEZOID: Final = f"trapezoids / steps; {_DENOMINATOR}"
-_DEGREES: Final = "single-precision degrees / metres"
 _OTHER: Final = "SDM of another paper: not comparable"
 _STRICT: Final = "below the limit / up to it"
 _SPHERE: Final = f"{_STRICT}; sphere / ellipsoid"
-_LONGITUDE: Final = "longitudes alone / both"
 _SAME: Final = ""
 
 
@@ -307,7 +305,7 @@ def _dense_scores(scope: _Scope) -> Iterator[Score]:
     for count in _SDM:
         places = scope.places(count)
         released = None if places is None else np.exp(-float32_degrees(*places) * np.float32(PER_DEGREE))
-        yield _sdm(scope, DENSE_PER_M, count, released=released, difference=_DEGREES)
+        yield _sdm(scope, DENSE_PER_M, count, released=released, difference="single-precision degrees / metres")
     yield from (_sdm(scope, GTA_PER_M, count, released=None, difference=_OTHER) for count in _SDM)
     places = scope.places(1)
     if places is not None:
@@ -344,7 +342,7 @@ def _game4loc_scores(scope: _Scope) -> Iterator[Score]:
             unit="m",
             released=logged_m,
             corrected=float(distance_m.mean()),
-            difference=_LONGITUDE,
+            difference="longitudes alone / both",
         )
     for count in _DIS:
         places = scope.places(count)

@@ -16,7 +16,6 @@ from sasgeo_bench.importers.items import Dataset, Item, Position, UtmPlaces
 from sasgeo_bench.importers.reports import Report
 from sasgeo_bench.texts import json_text
 
-ITEMS: Final = "items.parquet"
 METRICS: Final = "metrics.parquet"
 _MEND: Final = "check the free space and your rights, or name another --out"
 _NAMES: Final = pa.dictionary(pa.int32(), pa.string())
@@ -130,7 +129,7 @@ def import_folder(out: Path, dataset: Dataset, *, source: Path) -> Path:
 
 def write_items(folder: Path, dataset: Dataset) -> Path:
     """Write `items.parquet`, replaced whole; raise `StoreError` if it cannot be written."""
-    table, path = items_table(dataset), folder / ITEMS
+    table, path = items_table(dataset), folder / "items.parquet"
     with fresh_file(path, mend=_MEND) as scratch:
         write_table(table, scratch)
     return path

@@ -19,7 +19,6 @@ _NEEDED: Final = ("query_drone", "gallery_satellite", "query_satellite", "galler
 _OPTIONAL: Final = ("query_street", "gallery_street")
 _TRAINING: Final = ("drone", "satellite", "street", "google")
 _LARGE: Final = "4K_drone"  # further queries of the same labels, at 4,096 pixels
-_DIGITS: Final = 4
 
 
 def read_university(reader: FolderReader) -> Dataset:
@@ -33,7 +32,7 @@ def read_university(reader: FolderReader) -> Dataset:
         for view in _TRAINING
         if reader.has(f"train/{view}")
     ]
-    items = [item for folder in found for item in read_labels(reader, folder, digits=_DIGITS)]
+    items = [item for folder in found for item in read_labels(reader, folder, digits=4)]
     return Dataset(card=CARD, items=tuple(items), notes=reader.notes())
 
 

@@ -24,10 +24,8 @@ LAYOUT: Final = f"UAV-VisLoc has {MAPS} and for each flight NN/NN.csv, NN/drone 
 
 _SPACED: Final = "satellite_ coordinates_range.csv"  # the name in some copies of the set
 _MAP_COLUMNS: Final = ("mapname", "LT_lat_map", "LT_lon_map", "RB_lat_map", "RB_lon_map")
-_FRAME_COLUMNS: Final = ("filename", "lat", "lon", "height")
 _ANGLES: Final = {"heading_deg": "Phi1", "pitch_deg": "Omega", "roll_deg": "Kappa"}
 _MAP: Final = re.compile(r"satellite(([0-9]{2})(_[0-9]{2}-[0-9]{2})?)\.tif")
-_FIRST: Final = "01"
 _FLIGHT: Final = re.compile(r"[0-9]{2}")
 
 
@@ -40,7 +38,7 @@ def read_visloc(reader: FolderReader) -> Dataset:
     flights = [name for name in reader.folders(".") if _FLIGHT.fullmatch(name)]
     sheets = list(_read_sheets(reader))
     if not flights:
-        raise reader.missing(_FIRST)
+        raise reader.missing("01")
     frames = [frame for flight in flights for frame in _read_frames(reader, flight)]
     there = [sheet for sheet in sheets if sheet.flight in flights]
     tiles = [tile for sheet in there for tile in cut_tiles(_measured(reader, sheet))]
@@ -87,7 +85,7 @@ def _position(row: TableRow, longitude_deg: float, latitude_deg: float) -> Posit
 def _read_frames(reader: FolderReader, flight: str) -> Iterator[Item]:
     """Yield the frames of a flight; columns are found by name, for flights differ in how many they have."""
     table = f"{flight}/{flight}.csv"
-    rows = list(reader.rows(table, columns=_FRAME_COLUMNS))
+    rows = list(reader.rows(table, columns=("filename", "lat", "lon", "height")))
     there, named_rows = set(reader.images(f"{flight}/drone")), set()
     for row in rows:
         name = row.cells["filename"]

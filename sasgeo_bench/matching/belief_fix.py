@@ -14,10 +14,8 @@ from sasgeo_bench.search.belief_motion import moved
 from sasgeo_bench.tasks.query import Step
 
 NEAR_M: Final = 25.0  # the confidence of a fix is the mass so near to it
-APART_M: Final = 50.0  # of two modes
 MODES: Final = 4
 LEAST_MODE: Final = 0.01
-_ROUNDS: Final = 3  # of moving to the mean of what is near
 _EVEN: Final = 1 / 12  # variance of an even spread over a unit
 
 
@@ -73,7 +71,7 @@ def _peaks(around: Floats, belief: GridBelief) -> list[tuple[float, float]]:
             break
         place = places_m[at]
         found.append((float(place[0]), float(place[1])))
-        left.reshape(-1)[np.hypot(*(places_m - place).T) < APART_M] = -1.0
+        left.reshape(-1)[np.hypot(*(places_m - place).T) < 50.0] = -1.0  # 50 m between two modes
     return found
 
 
@@ -81,7 +79,7 @@ def _refined(belief: GridBelief, plane: Floats, place_m: tuple[float, float]) ->
     """Return the mean pose of the mass near a place, and how much mass lies near it."""
     at_m = np.array(place_m)
     flat = plane.reshape(-1)
-    for _ in range(_ROUNDS):
+    for _ in range(3):  # rounds of moving to the mean of what is near
         near = np.hypot(*(belief.places_m - at_m).T) <= max(NEAR_M, belief.grid.cell_size_m)
         weight = flat[near].astype(np.float64)
         if weight.sum() > 0:

@@ -23,9 +23,6 @@ from sasgeo_bench.tasks.query import Query, Step
 from sasgeo_bench.texts import MOST_DIAGNOSTICS
 
 _VERSION: Final = 2
-_ANY_DEG: Final = 90.0  # standard deviation of a heading of which nothing is left
-_NO_MORE_M: Final = 1e5  # standard deviation of a place, at most
-_SHARE: Final = 1e-9  # of its trace, which the least eigenvalue of a covariance exceeds
 _SAID: Final = (
     "on flights, of sasgeo-bench (Follower): each view is asked alone within {sigmas:g} sigma of what is believed, the "
     "first pose is taken up with {sigma_m:g} m and {sigma_yaw_deg:g} deg if its confidence, where there is one, is "
@@ -214,7 +211,8 @@ class Follower:
         if radius_m >= whole_m and grid is not None:
             center_m, radius_m = middle_m(replace(given, center_m=None, radius_m=None), grid), whole_m
         is_anywhere = radius_m >= whole_m and "position" not in needs
-        is_any_yaw = belief.yaw_sigma_deg >= _ANY_DEG and "yaw" not in needs
+        # 90 degrees: standard deviation of a heading of which nothing is left
+        is_any_yaw = belief.yaw_sigma_deg >= 90.0 and "yaw" not in needs
         return Prior(
             center_m=None if is_anywhere else center_m,
             radius_m=None if is_anywhere else radius_m,
@@ -245,10 +243,11 @@ def _sound(belief: Belief) -> Belief:
     """Make a covariance symmetric, invertible and of finite size, however long odometry was added."""
     covariance = (belief.covariance + belief.covariance.T) / 2
     spread_m, spread_deg = math.sqrt(max(covariance[0, 0], covariance[1, 1], 0.0)), belief.yaw_sigma_deg
-    place, yaw = min(1.0, _NO_MORE_M / max(spread_m, 1.0)), min(1.0, reckoning.ANY_YAW_DEG / max(spread_deg, 1.0))
+    # 1e5 m: standard deviation of a place, at most
+    place, yaw = min(1.0, 1e5 / max(spread_m, 1.0)), min(1.0, reckoning.ANY_YAW_DEG / max(spread_deg, 1.0))
     factors = np.diag([place, place, yaw])
     found = factors @ covariance @ factors
-    floor = _SHARE * float(np.trace(found))
+    floor = 1e-9 * float(np.trace(found))  # of its trace, which the least eigenvalue of a covariance exceeds
     is_low = np.linalg.eigvalsh(found)[0] <= floor
     return replace(belief, covariance=found + floor * np.eye(SIDE) if is_low else found)
 

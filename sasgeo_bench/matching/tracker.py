@@ -16,7 +16,6 @@ from sasgeo_bench.tasks.query import Query
 
 SIDE: Final = 3  # of a covariance: east, north, yaw
 MOST_VARIANCE: Final = 1e12  # m2 or deg2
-_LEAST_RATIO: Final = 1e-12  # of the smallest to the largest eigenvalue, with yaw in degrees
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,7 +125,8 @@ def are_covariances(matrices: NDArray[np.float64]) -> NDArray[np.bool_]:
     turned = matrices.transpose(0, 2, 1)
     is_even = np.isclose(matrices, turned, rtol=1e-6, atol=1e-9).all(axis=(1, 2))
     values = np.linalg.eigvalsh((matrices + turned) / 2)
-    return np.asarray(is_even & (values[:, 0] > _LEAST_RATIO * values[:, -1]) & (values[:, -1] > 0))
+    # 1e-12: least ratio of the smallest to the largest eigenvalue, with yaw in degrees
+    return np.asarray(is_even & (values[:, 0] > 1e-12 * values[:, -1]) & (values[:, -1] > 0))
 
 
 def check_covariance(given: object) -> NDArray[np.float64]:

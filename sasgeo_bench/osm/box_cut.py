@@ -25,8 +25,6 @@ _MOST_ENDS: Final = 0.3
 # The box around a country or a town is crossed far less often than lines a little further inside.
 _INSIDE: Final = 0.1  # of the box's width and height
 _LEAST_CROSSED: Final = 0.3
-_LEAST_LINES: Final = 30  # crossings further inside: fewer are too few to compare
-_LEAST_SHOWN: Final = 0.25  # of the box: around a small island in a large box there may be others, cut away
 _PROBES: Final = 64  # along each side of the box
 
 Geometries = NDArray[np.object_]
@@ -52,7 +50,8 @@ def cuts_by_box(path: Path, scan: Scan, objects: Geometries) -> Callable[[shapel
             return False
         coast = flat(shapely.from_wkb(np.array(scan.coast, dtype=object)))
         sea = shapely.union_all(find_shore(coast, box).sea)
-        is_shown = shapely.area(shapely.intersection(area, box)) >= _LEAST_SHOWN * shapely.area(box)
+        # 0.25 of the box: around a small island in a large box there may be others, cut away
+        is_shown = shapely.area(shapely.intersection(area, box)) >= 0.25 * shapely.area(box)
         if is_shown and _filled_share(things, area, box, sea) >= FULL_SHARE:
             return True
         tips = [mark for marks in scan.gaps.values() for mark in marks]
@@ -133,4 +132,5 @@ def _is_crossed_all_round(objects: Geometries, tips: Geometries, box: shapely.Ge
     outer += np.array([(shapely.distance(tips, side) <= LONGEST_M).sum() for side in sides])
     if not outer.any() or not ((outer > 0) | shapely.intersects(sides, sea)).all():
         return False
-    return bool(inner.sum() < _LEAST_LINES or outer.sum() >= _LEAST_CROSSED * inner.sum())
+    # 30 crossings further inside: fewer are too few to compare
+    return bool(inner.sum() < 30 or outer.sum() >= _LEAST_CROSSED * inner.sum())

@@ -16,8 +16,6 @@ from sasgeo_bench.osm.locate import CoverageSource
 
 CELL_M: Final = 100.0
 CLOSE_M: Final = 600.0  # villages, woods and pastures of one mapped country lie closer together than this
-OPEN_M: Final = 150.0  # half the width of what is cut off: a road or stream kept whole beyond the edge
-MIN_SHARE: Final = 0.02  # of the largest piece: smaller ones are leftovers of relations that cross the edge
 FULL_SHARE: Final = 0.85  # data that fills this much of the header's box was cut by that box
 _HALF_ROUND_DEG: Final = 180.0
 M_PER_DEG: Final = 111_320.0  # of latitude; a coverage cell is 100 m, so the sphere is near enough
@@ -68,7 +66,8 @@ def _closed(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _opened(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    opened = np.asarray(ndimage.binary_opening(cells, _disc(OPEN_M)))
+    # 150 m: half the width of what is cut off: a road or stream kept whole beyond the edge
+    opened = np.asarray(ndimage.binary_opening(cells, _disc(150.0)))
     return opened if opened.any() else cells
 
 
@@ -77,7 +76,8 @@ def _largest(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if count == 0:
         return cells
     sizes = np.bincount(labels.ravel())[1:]
-    return np.asarray(np.isin(labels, np.flatnonzero(sizes >= MIN_SHARE * sizes.max()) + 1))
+    # 0.02 of the largest piece: smaller ones are leftovers of relations that cross the edge
+    return np.asarray(np.isin(labels, np.flatnonzero(sizes >= 0.02 * sizes.max()) + 1))
 
 
 def choose_coverage(

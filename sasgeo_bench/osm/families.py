@@ -16,11 +16,6 @@ FAMILIES: Final = {
     "buildings": load_taxonomy().of_graph("building"),
     "land cover": load_taxonomy().of_graph("area"),
 }
-_ROAD_KM: Final = 5.0  # of roads a square kilometre: villages have more, fields and mountains less
-_HOUSES: Final = 50  # buildings a square kilometre
-_RAIL_KM: Final = 1.0  # of railways a square kilometre: there is a station, and nowhere are rails without a way to them
-_LAND: Final = 0.1  # of the ground, where people live or work
-_LEAST_KM2: Final = 0.1  # a smaller place may well be all street
 
 
 def missing_families(
@@ -40,14 +35,17 @@ def missing_families(
     there = {name: features.geometry.array[(features["class"] == name).to_numpy()] for name in classes}
     wanted = [[name for name in family if name in there] for family in FAMILIES.values()]
     missing = [name for family in wanted if not any(len(there[name]) for name in family) for name in family]
-    if km2 < _LEAST_KM2 or not missing:
+    if km2 < 0.1 or not missing:  # a smaller place may well be all street
         return ""
     road_km = sum(_km(there.get(name, ()), coverage) for name in FAMILIES["roads"])
     rail_km = _km(there.get("railway", ()), coverage)
     houses = int(shapely.intersects(there.get("building", ()), coverage).sum())
     land = shapely.make_valid(np.asarray(built_up, dtype=object))
     land_km2 = float(shapely.area(shapely.intersection(land, coverage)).sum()) / 1e6
-    limits = ((road_km, _ROAD_KM), (rail_km, _RAIL_KM), (houses, _HOUSES), (land_km2, _LAND))
+    # 5 km of roads a square kilometre: villages have more, fields and mountains less
+    # 1 km of railways a square kilometre: there is a station, and nowhere are rails without a way to them
+    # 0.1 of the ground, where people live or work
+    limits = ((road_km, 5.0), (rail_km, 1.0), (houses, 50), (land_km2, 0.1))  # 50 buildings a square kilometre
     if all(found < limit * km2 for found, limit in limits):
         return ""
     return (

@@ -39,7 +39,6 @@ _SWITCHES: Final = (
 _YES: Final = ("yes", "true", "t", "y", "1")
 _NO: Final = ("no", "false", "f", "n", "0")
 _WHOLE: Final = re.compile(r"([-+]?[0-9]+)\.0*")
-_NOTHING: Final = ("", "none", "null", "<null>", "nan")  # how tables write that there is no value
 _HSTORE: Final = re.compile(r'"((?:[^"\\]|\\.)*)"\s*=>\s*"((?:[^"\\]|\\.)*)"')
 _NAMED_ID: Final = re.compile(r"(n|w|r|a|node|way|relation)/?([0-9]{1,12})")
 _TYPES: Final = ("osm_type", "@type", "element", "element_type", "type")
@@ -51,7 +50,6 @@ _OTHER: Final = " with the tags of a line or an area"
 _UNREAD: Final = (_CLASSLESS, _CLOSED, _OTHER)  # how the reasons end for which a feature in the region is no object
 _ASK: Final = "are they tags of OpenStreetMap, are areas polygons, and does `tags` say what all of them have?"
 _MOST_NAMED: Final = 8
-_MOST_NAME: Final = 40  # characters
 _LEAST_CLASSED: Final = 0.05
 _AREAS: Final = ("Polygon", "MultiPolygon")
 _LINES: Final = ("LineString", "MultiLineString")
@@ -120,7 +118,7 @@ def _check_classed(scan: Scan, files: Sequence[Path], keys: Counter[str]) -> Non
     unread = _unread(scan)
     if scan.rows or not unread:
         return
-    names = ", ".join(key[:_MOST_NAME] for key, _ in keys.most_common(_MOST_NAMED)) or "none"
+    names = ", ".join(key[:40] for key, _ in keys.most_common(_MOST_NAMED)) or "none"  # characters
     more = ", ..." if len(keys) > _MOST_NAMED else ""
     raise ExtractError(
         f"{named([path.name for path in files], 'file')}: none of {counted(unread.total(), 'feature')} in the region "
@@ -273,7 +271,7 @@ def _text(key: str, value: Any) -> str:  # noqa: ANN401 - any JSON
     if not isinstance(value, str | int | float):
         return ""
     text = str(value).strip()
-    if text.lower() in _NOTHING:
+    if text.lower() in ("", "none", "null", "<null>", "nan"):  # how tables write that there is no value
         return ""
     if key not in _NUMBERS and key not in _SWITCHES:
         return text

@@ -193,8 +193,6 @@ def _moved(day: dt.date, years: int) -> dt.date:
 
 
 MARGIN_M: Final = CLOSE_M / 2  # an estimated coverage reaches this far beyond the edge of the cut
-CELL_M: Final = 10.0  # of the grid that frames the reading; nothing is burnt into it
-_EDGE_DEG: Final = 0.01  # spacing of corners: a box's straight sides in degrees bend when projected
 _LEAST_STATES: Final = 2
 _NAMED_DATE: Final = re.compile(r"(?<!\d)(\d{4}-\d{2}-\d{2})(?!\d)")
 
@@ -383,9 +381,11 @@ def _common_frame(boxes: dict[Path, Box], bounds: Box | None) -> Box:
 
 
 def _projected_box(frame: Box, epsg: int) -> shapely.Geometry:
-    return project(shapely.segmentize(shapely.box(*frame), _EDGE_DEG), epsg)
+    # 0.01 degrees: spacing of corners: a box's straight sides in degrees bend when projected
+    return project(shapely.segmentize(shapely.box(*frame), 0.01), epsg)
 
 
 def _grid_around(frame: Box, epsg: int) -> Grid:
     west_m, south_m, east_m, north_m = from_lonlat(epsg).transform_bounds(*frame, densify_pts=21)
-    return Grid.from_bounds(west_m, south_m, east_m, north_m, cell_size_m=CELL_M, epsg=epsg)
+    # 10 m: cell of the grid that frames the reading; nothing is burnt into it
+    return Grid.from_bounds(west_m, south_m, east_m, north_m, cell_size_m=10.0, epsg=epsg)

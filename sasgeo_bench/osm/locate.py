@@ -29,7 +29,6 @@ from sasgeo_bench.progress import QUIET
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"
 IMAGERY_VARIABLE: Final = "SASGEO_IMAGERY"
-_SILENT_S: Final = 30.0  # between two parts of a download
 ANSWER_S: Final = 3.0  # a server silent for longer counts as unreachable
 
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
@@ -205,7 +204,8 @@ def _download(extract: Extract, url: str) -> Path:
     if not answers(url):
         raise ExtractError(f"{url} cannot be reached")
     folder = cache_folder()
-    load = pooch.HTTPDownloader(timeout=_SILENT_S, progressbar=sys.stderr.isatty() and QUIET not in os.environ)
+    # 30 s between two parts of a download
+    load = pooch.HTTPDownloader(timeout=30.0, progressbar=sys.stderr.isatty() and QUIET not in os.environ)
     pooch.get_logger().setLevel("WARNING")  # else it prints the path of its temporary file
     try:
         folder.mkdir(parents=True, exist_ok=True)

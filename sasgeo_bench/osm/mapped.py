@@ -17,9 +17,7 @@ from sasgeo_bench.osm.scan import Box
 
 OPEN: Final = "near a gap in the coastline"
 CONTRARY: Final = "between coastlines that contradict each other"
-_STEP_M: Final = 25.0  # the sides of a coastline are sampled once in each straight piece of at most this length
 _OFFSET_M: Final = 0.01  # to the side of the line; also the resolution of OSM nodes
-_SLIP_SHARE: Final = 0.01  # of a face's coast: less of the other side is a loop of a badly drawn line
 
 Floats = NDArray[np.float64]
 Geometries = NDArray[np.object_]
@@ -54,7 +52,8 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
     faces = shapely.get_parts(shapely.polygonize([shapely.unary_union([*lines, *links, edge])]))
     faces = faces[shapely.intersects(shapely.point_on_surface(faces), mapped)]
     right_m, left_m = _coast_m(lines, faces, edge)
-    slip_m = _SLIP_SHARE * (right_m + left_m)
+    # 0.01 of a face's coast: less of the other side is a loop of a badly drawn line
+    slip_m = 0.01 * (right_m + left_m)
     is_wet, is_dry = right_m > slip_m, left_m > slip_m
     ground = {
         OPEN: shapely.union_all(
@@ -142,7 +141,8 @@ def _length_in(faces: Geometries, points: Floats, length_m: Floats) -> Floats:
 
 def _segments(lines: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats]:
     """Return beginnings and ends, shape (N, 2), of short straight pieces, none of which crosses the edge."""
-    points, line = shapely.get_coordinates(shapely.segmentize(lines, _STEP_M), return_index=True)
+    # 25 m: the sides of a coastline are sampled once in each straight piece of at most this length
+    points, line = shapely.get_coordinates(shapely.segmentize(lines, 25.0), return_index=True)
     joined = (line[1:] == line[:-1]) & (points[1:] != points[:-1]).any(axis=1)
     start, end = points[:-1][joined], points[1:][joined]
     straight = np.asarray(shapely.linestrings(np.stack((start, end), axis=1)))
@@ -159,13 +159,8 @@ def _segments(lines: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats
 
 
 CUT: Final = "within reach of ways cut at the edge of the extract"
-OFFSHORE_M: Final = 1000.0  # sea mapped around whole islands: no view is wider, no strait much narrower
 _ANTIMERIDIAN_DEG: Final = 180.0
-_EDGE_POINTS: Final = 21  # along each edge of a box: its sides bend when projected
-_DECIMALS: Final = 3  # OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
 _AROUND_DEG: Final = 0.5  # coast further away has no effect, and a projection holds this far
-_COARSE_M: Final = 20.0  # simplification of islands, of which a buffer of a kilometre is taken
-_AREA: Final = 2  # dimensions of a polygon
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,7 +219,7 @@ def _less(ground: shapely.Geometry, unknown: dict[str, shapely.Geometry]) -> sha
     if all(part.is_empty for part in unknown.values()):
         return ground
     parts = shapely.get_parts(shapely.difference(ground, shapely.union_all(list(unknown.values()))))
-    return shapely.multipolygons(parts[shapely.get_dimensions(parts) == _AREA])
+    return shapely.multipolygons(parts[shapely.get_dimensions(parts) == 2])  # dimensions of a polygon
 
 
 def _islands(coast: Geometries, frame: shapely.Geometry) -> shapely.Geometry:
@@ -235,7 +230,9 @@ def _islands(coast: Geometries, frame: shapely.Geometry) -> shapely.Geometry:
         return shapely.Polygon()
     islands = shapely.union_all(shore.land[is_whole])
     around = shapely.union_all([islands, *shore.sea])
-    return shapely.intersection(around, shapely.buffer(shapely.simplify(islands, _COARSE_M), OFFSHORE_M))
+    # 1000 m: sea mapped around whole islands: no view is wider, no strait much narrower
+    # 20 m: simplification of islands, of which a buffer of a kilometre is taken
+    return shapely.intersection(around, shapely.buffer(shapely.simplify(islands, 20.0), 1000.0))
 
 
 def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
@@ -244,7 +241,8 @@ def project(geometry: shapely.Geometry, epsg: int) -> shapely.Geometry:
 
     def projected(points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Coordinates of shape (N, 2), degrees -> metres."""
-        return np.column_stack(to_grid.transform(points[:, 0], points[:, 1])).round(_DECIMALS) + 0.0
+        # 3: OSM itself is rounded to about a centimetre; a millimetre keeps shared nodes equal
+        return np.column_stack(to_grid.transform(points[:, 0], points[:, 1])).round(3) + 0.0
 
     return shapely.transform(geometry, projected)
 
@@ -255,7 +253,8 @@ def lonlat_box(grid: Grid) -> Box:
     Of a grid with an edge at the antimeridian, a bent corner may lie beyond: the box ends there.
     """
     change = to_lonlat(grid.epsg)
-    bounds = change.transform_bounds(*grid.bounds_m, densify_pts=_EDGE_POINTS)
+    # 21 edge points along each edge of a box: its sides bend when projected
+    bounds = change.transform_bounds(*grid.bounds_m, densify_pts=21)
     west, south, east, north = map(float, bounds)
     if west > east:
         left, low, right, high = grid.bounds_m

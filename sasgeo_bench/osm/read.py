@@ -28,10 +28,6 @@ from sasgeo_bench.osm.snapshot import Snapshot, open_snapshot, own_id
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
 
 _EPOCH: Final = dt.datetime(1970, 1, 2, tzinfo=dt.UTC)  # osmium returns 1970-01-01 if a file has no timestamps
-_LATE_DAYS: Final = 2  # a file may hold objects that are so much younger than its date: zones, slow downloads
-_STALE_DAYS: Final = 366  # where so many features stand, some change within a year
-_ENOUGH: Final = 300  # objects; of 201 dated maps of all sizes the newest object is at most 61 days older than the date
-MOST_LOST: Final = 0.5  # of the ways, may lack their nodes; of 198 real extracts the most is 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -130,10 +126,13 @@ def misdated(
     >>> misdated("a.osm.pbf", dt.date(2013, 7, 19), newest=dt.date(2013, 7, 19))
     """
     mend = "state the day that it is of"
-    if newest is not None and (newest - at).days > _LATE_DAYS:
+    # 2 days: a file may hold objects that are so much younger than its date: zones, slow downloads
+    if newest is not None and (newest - at).days > 2:
         return f"{name} is dated {at}, and holds an object of {newest}: {mend}"
     last = max(filter(None, (newest, header)), default=None)
-    if last is not None and count >= _ENOUGH and (at - last).days > _STALE_DAYS:
+    # 366 days: where so many features stand, some change within a year
+    # 300 objects; of 201 dated maps of all sizes the newest object is at most 61 days older than the date
+    if last is not None and count >= 300 and (at - last).days > 366:
         return f"{name} is dated {at}, and nothing in it is younger than {last}: {mend}"
     return None
 
@@ -235,7 +234,7 @@ def _check_nodes(name: str, scan: Scan) -> None:
     """Refuse a file of which most ways lack their nodes: a filter has left them out."""
     lost = len(scan.gaps.keys() - {row.osm_id for row in scan.rows if not row.is_relation})
     ways = lost + len(scan.rows) + len(scan.far)
-    if lost > MOST_LOST * ways:
+    if lost > 0.5 * ways:  # of the ways may lack their nodes; of 198 real extracts the most is 0.3
         raise ExtractError(
             f"{name} lacks the nodes of {lost} of its {ways} ways: they were filtered away; filter again and keep the "
             "nodes that ways refer to (osmium tags-filter without -R; Overpass: (._;>;); out;)"

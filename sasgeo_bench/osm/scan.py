@@ -15,7 +15,6 @@ import shapely
 from sasgeo_bench.osm.multipolygons import Kind, Tags, kind_keys
 from sasgeo_bench.osm.taxonomy import Classification, Label, Taxonomy, classify, load_taxonomy
 
-LANE_WIDTH_M: Final = 3.25  # between the 2.75 m and 3.75 m lanes of the German RAS-Q 96 cross sections
 DEFAULT_BRIDGE_WIDTH_M: Final = 4.0
 WIDTH_RANGE_M: Final = (0.3, 80.0)
 _OF_YARDS: Final = ("landuse", "amenity", "leisure", "name")  # a barrier that has one of these goes around something
@@ -205,7 +204,8 @@ def tagged_width_m(width: str | None, lanes: str | None) -> float | None:
     (6.5, 6.5, None)
     """
     low, high = WIDTH_RANGE_M
-    for text, unit_m in ((width, 1.0), (lanes, LANE_WIDTH_M)):
+    # 3.25 m: lane width between the 2.75 m and 3.75 m lanes of the German RAS-Q 96 cross sections
+    for text, unit_m in ((width, 1.0), (lanes, 3.25)):
         try:
             value = float((text or "").removesuffix("m").strip().replace(",", ".")) * unit_m
         except ValueError:

@@ -28,7 +28,6 @@ _MOST_QUOTED: Final = 200  # characters of an error of osmium, which quotes a va
 _GZIP_MARK: Final = b"\x1f\x8b"
 _BZIP2_MARK: Final = b"BZh"
 OBJECTS: Final = osmium.osm.NODE | osmium.osm.WAY | osmium.osm.RELATION  # changesets have no versions
-_TYPES: Final = ("n", "w", "r")  # in osmium's order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,7 +282,7 @@ def _survey(path: Path) -> _Survey:
     deleted, has_places = 0, False
     wanted = osmium.osm.WAY | osmium.osm.RELATION if header.get("sorting") == "Type_then_ID" else OBJECTS
     for item in elements(osmium.FileProcessor(str(path), wanted)):
-        kinds.append(_TYPES.index(item.type_str()))
+        kinds.append(("n", "w", "r").index(item.type_str()))  # in osmium's order
         ids.append(item.id)
         versions.append(item.version)
         deleted += not item.visible

@@ -23,7 +23,6 @@ _CHUNK: Final = 1 << 20
 _OVERLAP: Final = 1 << 12  # no start tag of interest is longer
 # What osmium passes over or refuses: objects deleted in an editor, and what Overpass adds.
 _MARKS: Final = re.compile(rb"""\baction\s*=\s*["']delete|<(center|area|remark)\b|<member\b[^<>]*[^/<>]>\s*<nd\b""")
-_FAILED: Final = ("error", "timed out")  # in a remark of Overpass: what came until then stands before it
 _STREAM: Final = re.compile(rb"BZh[1-9]1AY&SY")  # how the packed text of a stream of bzip2 begins
 _OBJECT: Final = re.compile(rb"<(node|way|relation|changeset)\b")
 _BOX: Final = re.compile(rb"<(bounds?)\s([^<>]*)>")
@@ -164,7 +163,8 @@ class _Cleaner:
             self._out.write(f"</{name}>\n")
 
     def _read_remark(self, text: str) -> None:
-        if self._open[-1:] == ["remark"] and any(word in text for word in _FAILED):
+        # In a remark of Overpass: what came until then stands before it
+        if self._open[-1:] == ["remark"] and any(word in text for word in ("error", "timed out")):
             raise RuntimeError(f"its last line says: {text.strip()}")
 
     def _write_described(self) -> None:

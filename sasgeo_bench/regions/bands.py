@@ -23,9 +23,6 @@ _LETTERS: Final[dict[str, str]] = {item.name[0]: item.name for item in _COLOURS}
 _BITS: Final = 8
 _SAMPLES: Final = 8  # blocks along each side of a picture that are looked at
 _SAMPLE_PX: Final = 1024  # of a block, where it is larger
-_BETWEEN: Final = (2, 249)  # levels of an alpha that are neither transparent nor opaque; 1 is, in masks of 0 and 1
-_MOST_BETWEEN: Final = 0.1  # of the pixels of a mask, at its edges, are neither opaque nor transparent
-_FEW: Final = 8  # levels of a mask of any shares, of which one is opaque
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,15 +128,17 @@ def _is_mask(source: rasterio.io.DatasetReader, band: int) -> bool:
     tall, wide = source.block_shapes[band - 1]
     tops = np.unique(np.linspace(0, (source.height - 1) // tall, _SAMPLES).astype(int)) * tall
     lefts = np.unique(np.linspace(0, (source.width - 1) // wide, _SAMPLES).astype(int)) * wide
-    low, high = _BETWEEN
+    low, high = 2, 249  # levels of an alpha that are neither transparent nor opaque; 1 is, in masks of 0 and 1
     counts = np.zeros(2**_BITS, dtype=np.int64)
     for top in tops.tolist():
         for left in lefts.tolist():
             rows, cols = min(tall, _SAMPLE_PX, source.height - top), min(wide, _SAMPLE_PX, source.width - left)
             alpha = source.read(band, window=Window(left, top, cols, rows))
             counts += np.bincount(alpha.ravel(), minlength=len(counts))
-    is_of_few = np.count_nonzero(counts) <= _FEW and counts[high + 1 :].any()
-    return bool(is_of_few) or counts[low : high + 1].sum() <= _MOST_BETWEEN * counts.sum()
+    # 8 levels of a mask of any shares, of which one is opaque
+    is_of_few = np.count_nonzero(counts) <= 8 and counts[high + 1 :].any()
+    # 0.1 of the pixels of a mask, at its edges, are neither opaque nor transparent
+    return bool(is_of_few) or counts[low : high + 1].sum() <= 0.1 * counts.sum()
 
 
 def selected(source: rasterio.io.DatasetReader, bands: Bands) -> str | None:

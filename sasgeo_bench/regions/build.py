@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib import metadata
 from pathlib import Path
-from typing import Final
 
 import geopandas as gpd
 import numpy as np
@@ -46,9 +45,6 @@ from sasgeo_bench.regions.region import (
     Region,
 )
 from sasgeo_bench.regions.region_spec import RegionFile
-
-CUT_AWAY: Final = "cut away"  # reason why ground of an edited map is unknown
-_OFFSET_SEED: Final = 0  # of the tiles drawn anew for an interval: the same pictures give the same bytes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -241,9 +237,8 @@ def _write_imagery(scratch: Path, plan: BuildPlan, reading: Reading) -> OrthoRec
     record = OrthoRecord.unmeasured(tuple(item.record() for item in plan.pictures), grid)
     imagery = Imagery(path=path, file=file_record(path), record=record, epsg=grid.epsg)
     houses = reading.features[((reading.features["class"] == "building") & reading.features["is_visible"]).to_numpy()]
-    offset = measure_offset(
-        imagery, houses.geometry.to_numpy(), reading.coverage, rng=np.random.default_rng(_OFFSET_SEED)
-    )
+    # 0: seed of the tiles drawn anew for an interval: the same pictures give the same bytes
+    offset = measure_offset(imagery, houses.geometry.to_numpy(), reading.coverage, rng=np.random.default_rng(0))
     share = share_shown(imagery, reading.coverage, plan.grid.cell_size_m)
     shown = f"{name}: imagery shows {share:.1%} of the mapped ground"
     tell(f"{shown}, off the map by {offset.to_text()}" if offset else f"{shown}; its offset could not be measured")
@@ -314,6 +309,7 @@ def build_edited(
     folder = plan.folder.parent / name
     edited = replace(plan, spec=spec, folder=folder, inputs_sha256=inputs, pictures=(), with_preview=False)
     record = base.manifest
+    # Reason why ground of an edited map is unknown
     reading = Reading(
         features=features,
         coverage=base.coverage if coverage is None else coverage,
@@ -324,7 +320,7 @@ def build_edited(
         notes=record.notes,
         warnings=(*record.warnings, note),
         unknown_m2=record.coverage.unknown_m2
-        | ({} if coverage is None else {CUT_AWAY: base.coverage.area - coverage.area}),
+        | ({} if coverage is None else {"cut away": base.coverage.area - coverage.area}),
         cuts=record.coverage.cuts,
     )
     _write_unless_current(edited, lambda scratch: _write_into(scratch, edited, record.extract, reading))

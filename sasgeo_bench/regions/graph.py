@@ -66,9 +66,6 @@ FULL_TURN_DEG, HALF_TURN_DEG = 360.0, 180.0
 SEVERAL: Final = -1
 
 
-CLUSTER_GAP_M: Final = 15.0  # more than between neighbours, less than a street with two front gardens (20 m and more)
-CLUSTER_MEMBERS: Final = 3  # two houses are a pair, and are nodes anyway
-BUILDING_ADJACENCY_M: Final = 60.0  # between centres: across one street, not across a block
 # Waterways: spacing of samples (about the width of a stream with its banks), length of the moving average that hides
 # the digitizing noise, length within which a bend must turn (also the least distance between two bends), least turn.
 BEND_STEP_M, BEND_SMOOTHING_M, BEND_WINDOW_M, BEND_TURN_DEG = 10.0, 60.0, 120.0, 45.0
@@ -352,12 +349,13 @@ def _draw_buildings(draft: _Draft, buildings: gpd.GeoDataFrame, bounds_m: Bounds
     bearing = _wrapped(bearing_deg(*long_sides(shapes).T), HALF_TURN_DEG)
     about = {"class": "building"}
     nodes = draft.add_nodes("building", en_m, osm_id=osm_id, area_m2=area_m2, bearing_deg=bearing, **about)
-    pairs = delaunay_pairs(en_m, BUILDING_ADJACENCY_M)
+    pairs = delaunay_pairs(en_m, 60.0)  # m between centres: across one street, not across a block
     draft.add_edges("adjacency", *nodes[pairs].T)
 
-    group = groups_within(shapes, CLUSTER_GAP_M)
+    # 15 m: more than between neighbours, less than a street with two front gardens (20 m and more)
+    group = groups_within(shapes, 15.0)
     size = np.bincount(group)
-    chosen = np.flatnonzero(size >= CLUSTER_MEMBERS)
+    chosen = np.flatnonzero(size >= 3)  # two houses are a pair, and are nodes anyway
     area = np.bincount(group, weights=area_m2)
     weight = area_m2 / area[group]
     centre: Floats = np.column_stack(

@@ -35,7 +35,6 @@ PRESENT: Final = 1
 OUTSIDE: Final = 255  # unknown: beyond the mapped area
 
 _NO_AREAS: Final = np.array([], dtype=object)
-_ARC_SEGMENTS: Final = 2  # per quarter circle at line ends and bends: 3 % of the radius, a few centimetres on a road
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -81,7 +80,8 @@ def make_paint(
     half_m = np.maximum(width_m[is_line], least_width_m) / 2
     is_coarse = least_width_m > 0
     lines = shapely.simplify(shape[is_line], least_width_m / 8) if is_coarse else shape[is_line]
-    shape[is_line] = shapely.buffer(lines, half_m, quad_segs=1 if is_coarse else _ARC_SEGMENTS)
+    # 2 arc segments per quarter circle at line ends and bends: 3 % of the radius, a few centimetres on a road
+    shape[is_line] = shapely.buffer(lines, half_m, quad_segs=1 if is_coarse else 2)
     names, on_bridge = seen["class"].to_numpy(), seen["is_bridge"].to_numpy()
     return Paint(
         classes=classes,

@@ -27,7 +27,6 @@ LAYERS: Final = {
 
 # Ways that share an OSM node share equal coordinates; a millimetre absorbs what a rotation does to the last bits.
 VERTEX_M: Final = 0.001
-LINE_TYPE: Final = 1  # of shapely.get_type_id
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,7 +73,7 @@ def make_network(ways: gpd.GeoDataFrame) -> Network:
     [1, 3, 1, 1]
     """
     lines, row = shapely.get_parts(np.asarray(ways.geometry.array), return_index=True)
-    is_line = shapely.get_type_id(lines) == LINE_TYPE
+    is_line = shapely.get_type_id(lines) == 1  # line type of shapely.get_type_id
     lines, row = lines[is_line], row[is_line].astype(np.int64)
     en_m, line = shapely.get_coordinates(lines, return_index=True)
     origin = en_m.min(axis=0) if len(en_m) else np.zeros(2)

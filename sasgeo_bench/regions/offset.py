@@ -15,15 +15,10 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.imagery import Imagery, OffsetRecord
 from sasgeo_bench.regions.layers import burn
 
-STEP_M: Final = 0.25  # of the correlation, or the pixel of a coarser picture
 TILE_M: Final = 64.0
 REACH_M: Final = 6.0  # offsets up to this one are found
-LEAST_EDGE_M: Final = 40.0  # of walls in a tile: with fewer its own offset says little
-LEAST_KNOWN: Final = 0.9  # of a tile that the picture shows
 LEAST_TILES: Final = 4
-LEAST_SHARPNESS: Final = 5.0  # in standard deviations: chance alone reaches about 4 in so many offsets
 _SMOOTH_M: Final = 0.5
-_DRAWS: Final = 500
 _LEVEL_PERCENT: Final = 95.0
 
 Complex = NDArray[np.complex128]
@@ -42,7 +37,7 @@ def measure_offset(
 
     Roofs lean away from the middle of a photo: in a mosaic that is not a true orthophoto the offset is that of roofs.
     """
-    step_m = max(STEP_M, imagery.record.gsd_m)
+    step_m = max(0.25, imagery.record.gsd_m)  # m: step of the correlation, or the pixel of a coarser picture
     parts = shapely.get_parts(buildings)
     outlines = shapely.orient_polygons(parts[~shapely.is_empty(parts)], exterior_cw=False)
     surfaces = np.array(list(_surfaces(imagery, outlines, mapped, step_m)))
@@ -51,9 +46,10 @@ def measure_offset(
     total = surfaces.sum(axis=0)
     sharpness = float((total.max() - total.mean()) / max(float(total.std()), 1e-12))
     east_m, north_m = _peak_m(total, step_m)
-    if sharpness < LEAST_SHARPNESS or max(abs(east_m), abs(north_m)) > REACH_M - step_m:
+    # 5: sharpness in standard deviations: chance alone reaches about 4 in so many offsets
+    if sharpness < 5.0 or max(abs(east_m), abs(north_m)) > REACH_M - step_m:
         return None
-    weights = rng.multinomial(len(surfaces), np.full(len(surfaces), 1 / len(surfaces)), size=_DRAWS)
+    weights = rng.multinomial(len(surfaces), np.full(len(surfaces), 1 / len(surfaces)), size=500)
     drawn = np.array([_peak_m(np.tensordot(weight, surfaces, axes=1), step_m) for weight in weights])
     tail = (100 - _LEVEL_PERCENT) / 2
     low, high = np.percentile(drawn, (tail, 100 - tail), axis=0).round(3).tolist()
@@ -83,11 +79,12 @@ def _surfaces(
         near = tree.query(box)
         if tile.shape != (side, side) or not shapely.contains(mapped, box) or len(near) == 0:
             continue
-        if shapely.length(shapely.intersection(walls[near], box)).sum() < LEAST_EDGE_M:
+        # 40 m of walls in a tile: with fewer its own offset says little
+        if shapely.length(shapely.intersection(walls[near], box)).sum() < 40.0:
             continue
         around = tile.window(-reach, -reach, side + 2 * reach, side + 2 * reach)
         view = imagery.read(around.bounds_m, gsd_m=step_m)
-        if view.is_known.mean() >= LEAST_KNOWN:
+        if view.is_known.mean() >= 0.9:  # of a tile that the picture shows
             yield _correlation(_Edges.of_map(outlines[near], tile), _Edges.of_picture(view.rgb, view.is_known, step_m))
 
 

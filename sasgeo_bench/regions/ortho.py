@@ -36,10 +36,6 @@ COARSEST_M: Final = 30.0
 _WINDOW_PIXELS: Final = 1024
 _BLOCK_PIXELS: Final = 512
 _CACHE_BYTES: Final = 64 * 2**20
-_JPEG_QUALITY: Final = 90
-_EMPTY_M: Final = 10.0  # a disc of one colour this wide is no roof, but a hole in a mosaic
-_EMPTY_LEVELS: Final = 4  # by which JPEG changes that colour
-_EDGE_POINTS: Final = 21
 _SNAP: Final = 0.05  # of a pixel: a little coarser will do, rather than a third finer
 
 
@@ -81,7 +77,7 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
         with _opened(path) as source:
             _check_kind(path, source)
             to_grid = Transformer.from_crs(source.crs.to_wkt(), grid.epsg, always_xy=True)
-            bounds_m = to_grid.transform_bounds(*_box(source), densify_pts=_EDGE_POINTS, errcheck=True)
+            bounds_m = to_grid.transform_bounds(*_box(source), densify_pts=21, errcheck=True)
             bands = find_bands(path, source)
             gsd_m = max(_ground_resolution_m(source, to_grid), entry.gsd_m or 0.0)
     except (CRSError, ProjError) as error:
@@ -231,7 +227,7 @@ def write_tiles(path: Path, grid: Grid, tiles: Generator[OrthoTile], *, attribut
                 path,
                 driver="COG",
                 compress="JPEG",
-                quality=_JPEG_QUALITY,
+                quality=90,
                 blocksize=_BLOCK_PIXELS,
                 overview_resampling="AVERAGE",
                 sparse_ok=True,
@@ -328,7 +324,8 @@ class _Warped:
             return
         empty, margin = self._picture.entry.empty_rgb, 0
         if empty is not None:
-            margin = math.ceil(_EMPTY_M / part.cell_size_m)
+            # 10 m: a disc of one colour this wide is no roof, but a hole in a mosaic
+            margin = math.ceil(10.0 / part.cell_size_m)
         top, left = min(margin, int(window.row_off)), min(margin, int(window.col_off))
         wide = Window(
             window.col_off - left,
@@ -362,7 +359,8 @@ def is_empty(rgb: NDArray[np.uint8], colour: Sequence[int], *, diameter_px: int)
     import cv2  # noqa: PLC0415 - 25 MB that few regions need: most have no imagery
 
     target = np.array(colour, dtype=np.int16)[:, None, None]
-    is_near = (np.abs(rgb.astype(np.int16) - target) <= _EMPTY_LEVELS).all(axis=0)
+    # 4 empty levels by which JPEG changes that colour
+    is_near = (np.abs(rgb.astype(np.int16) - target) <= 4).all(axis=0)
     odd_px = diameter_px | 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (odd_px, odd_px))
     opened = cv2.morphologyEx(is_near.view(np.uint8), cv2.MORPH_OPEN, kernel, borderType=cv2.BORDER_REPLICATE)

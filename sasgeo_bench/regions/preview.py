@@ -33,7 +33,6 @@ _MOST_CELLS: Final = 1024  # of a figure, along a side: more are no more to see
 _LEGEND_INCHES: Final = 2.9
 _MAP_INCHES: Final = 9.6
 _LEAST_INCHES: Final = 4.6
-_LEAST_WIDTH_INCHES: Final = 7.4  # the line of facts is about as long
 _TITLE_INCHES: Final = 0.85
 _LEFT_INCHES: Final = 0.65  # northings
 _FOOT_INCHES: Final = 1.35  # eastings, scale and attribution
@@ -105,7 +104,7 @@ def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     scale = _MAP_INCHES / max(rows, cols)
     width, height = max(cols * scale, 2.0), max(rows * scale, _LEAST_INCHES)
     across = _LEFT_INCHES + width + _LEGEND_INCHES + 0.3
-    total = (max(across, _LEAST_WIDTH_INCHES), height + _TITLE_INCHES + _FOOT_INCHES)
+    total = (max(across, 7.4), height + _TITLE_INCHES + _FOOT_INCHES)  # the line of facts is about as long
     figure = PlainFigure(figsize=total, dpi=_DPI, facecolor="white")
     FigureCanvasAgg(figure)
     chart = figure.add_axes((_LEFT_INCHES / total[0], _FOOT_INCHES / total[1], width / total[0], height / total[1]))

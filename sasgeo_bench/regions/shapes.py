@@ -20,7 +20,6 @@ Shapes = NDArray[np.object_]
 PLANE: Final = 2
 RING_CORNERS: Final = 5  # of a closed rectangle
 TRIANGLE: Final = 3
-CO_CIRCULAR: Final = 1e-6  # sum of two cotangents that counts as 0, dimensionless
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,5 +174,5 @@ def _strict_pairs(en_m: Floats) -> Ints:
         base[:, 0] * len(en_m) + base[:, 1], return_index=True, return_inverse=True, return_counts=True
     )
     is_hull = uses == 1
-    is_strict = np.bincount(edge, weights=cotangent) > CO_CIRCULAR
+    is_strict = np.bincount(edge, weights=cotangent) > 1e-6  # sum of two cotangents that counts as 0, dimensionless
     return np.asarray(base[first][is_hull | is_strict])

@@ -11,7 +11,6 @@ TOOLS: Final = (
     *("matching.controls", "matching.follower", "osm.taxonomy", "regions.evidence", "regions.graph", "regions.network"),
     *("search", "sasgeo", "tasks.vectors"),
 )
-_ALWAYS: Final = ("regions.evidence",)  # what every query is made of
 # The same of segmentations; whoever segments looks at pictures by all of them.
 SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera", "sensing.intrinsics")
 
@@ -22,7 +21,8 @@ def matcher_code(spec: str) -> str:
     >>> len(matcher_code("random")), matcher_code("random") == matcher_code("prior_centre")
     (64, True)
     """
-    return plugin_code(spec, MATCHERS, TRACKERS, tools=TOOLS, always=_ALWAYS)
+    # What every query is made of
+    return plugin_code(spec, MATCHERS, TRACKERS, tools=TOOLS, always=("regions.evidence",))
 
 
 def segmenter_code(spec: str) -> str:

@@ -14,7 +14,6 @@ from sasgeo_bench.texts import message_of, one_line
 
 LOG: Final = "failures.log"  # in the folder of a run; next to that of a board
 _DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
-_MOST_LOGGED: Final = 100_000  # characters of one traceback
 
 Item = TypeVar("Item")
 
@@ -53,7 +52,7 @@ def our_failure(log: Path, name: str, error: Exception) -> str:
 
 def write_log(log: Path, name: str, error: BaseException) -> None:
     """Append the traceback of an error to a log, if that can be written."""
-    text = "".join(traceback.format_exception(error))[-_MOST_LOGGED:]
+    text = "".join(traceback.format_exception(error))[-100_000:]  # characters of one traceback
     with suppress(OSError):
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("a", encoding="utf-8", errors="backslashreplace") as target:

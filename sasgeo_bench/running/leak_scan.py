@@ -21,10 +21,6 @@ from sasgeo_bench.running.root import SYSTEM
 from sasgeo_bench.sensing.packing import LABELLED
 from sasgeo_bench.tasks.private_seed import SUFFIX as SEED
 
-MOST_ENTRIES: Final = 200_000  # names: about a second of a fast disk
-MOST_DEPTH: Final = 12
-_FRESH_S: Final = 60.0  # a walk is valid so long: a run starts many processes, and others store results meanwhile
-
 # A folder that holds all names of one of these reveals answers.
 _SIGNS: Final = tuple(
     frozenset(names)
@@ -41,7 +37,6 @@ _SIGNS: Final = tuple(
         ("region.json", "layers.tif"),
     )
 )
-_SIGN_STARTS: Final = ("truth-", "part-")  # truths of one part of a task in a release; answers of a run
 # Parts that are hidden of a folder that holds code or the map in question, too, and cannot be hidden as a whole.
 _TELLING: Final = frozenset(
     {
@@ -96,7 +91,8 @@ def walk_code(code: Iterable[Path]) -> Walk:
     """Walk the folders that code is imported from, except those of the interpreter; walk again after a minute."""
     roots = dict.fromkeys(os.path.realpath(path) for path in code)
     own = tuple(root for root in roots if os.path.isdir(root) and not _is_installed(root))  # noqa: PTH112 - text
-    return _walked(own, int(time.monotonic() // _FRESH_S))
+    # 60 s: a walk is valid so long: a run starts many processes, and others store results meanwhile
+    return _walked(own, int(time.monotonic() // 60.0))
 
 
 @lru_cache(maxsize=4)
@@ -105,7 +101,8 @@ def _walked(roots: tuple[str, ...], minute: int) -> Walk:
     return walk(roots)
 
 
-def walk(roots: Sequence[str], *, most_entries: int = MOST_ENTRIES, most_depth: int = MOST_DEPTH) -> Walk:
+# 200_000 names: about a second of a fast disk
+def walk(roots: Sequence[str], *, most_entries: int = 200_000, most_depth: int = 12) -> Walk:
     """Walk resolved folders, upper ones first: at most so many names in all, and so many folders deep."""
     found: list[Telling] = []
     queue, seen, entries, is_deep = deque((root, 0) for root in roots), set(roots), 0, False
@@ -167,4 +164,5 @@ def _look(folder: str, held: dict[str, bool]) -> tuple[list[Telling], list[str]]
 
 
 def _is_table(name: str) -> bool:
-    return (name.startswith(_SIGN_STARTS) and name.endswith(".parquet")) or name.endswith(LABELLED)
+    # Truths of one part of a task in a release; answers of a run
+    return (name.startswith(("truth-", "part-")) and name.endswith(".parquet")) or name.endswith(LABELLED)

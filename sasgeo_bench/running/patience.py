@@ -7,7 +7,6 @@ from typing import Final
 from sasgeo_bench.matching.results import Status
 from sasgeo_bench.texts import one_line
 
-MOST_LATE: Final = 10  # questions in a row
 GIVEN_UP: Final = "given up after"  # begins the message of those that are not asked any more
 
 
@@ -21,7 +20,7 @@ class Patience:
     'given up after 2 queries in a row without an answer in time (no answer within 30 s)'
     """
 
-    def __init__(self, what: str = "queries", *, most_late: int = MOST_LATE) -> None:
+    def __init__(self, what: str = "queries", *, most_late: int = 10) -> None:  # questions in a row
         self._what, self._most_late = what, most_late
         self._lock = threading.Lock()
         self._late = 0

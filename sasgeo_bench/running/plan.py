@@ -39,7 +39,6 @@ _HIDDEN: Final = (
     *("tasks", "truth", "runs", "boards", "release", "results", "sheets", "sealed"),
     *("segmenters", "private", "datasets", "head-start"),
 )
-_LATER_LIMITS: Final = ("scratch_bytes", "processes")  # hashed only where they differ from the default
 _LEAST_MB, _MOST_MB = 64, 4_000_000
 
 
@@ -242,7 +241,8 @@ def _check_seen(tasks: Sequence[Task], card: MatcherCard) -> None:
 
 
 def _hashed(limits: Limits, *, learns: bool) -> dict[str, float]:
-    left_out = {name for name in _LATER_LIMITS if getattr(limits, name) == getattr(Limits(), name)}
+    # Hashed only where they differ from the default
+    left_out = {name for name in ("scratch_bytes", "processes") if getattr(limits, name) == getattr(Limits(), name)}
     left_out |= set() if learns else {"learn_s"}
     return {name: value for name, value in asdict(limits).items() if name not in left_out}
 

@@ -31,7 +31,6 @@ from sasgeo_bench.tasks.query import Query
 LEAST_FIXES: Final = 20  # whatever time they take: fewer have no percentiles
 MOST_ASKED: Final = 512  # queries, again and again: their rows are held
 _PART_S: Final = 60.0  # of the time that a part of the table is about
-_SAMPLE_S: Final = 1.0  # between two looks at the sensors
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -298,7 +297,7 @@ def _sustained(
         since_s = time.perf_counter() - begun
         if since_s >= request.sustain_s and len(fixes) >= LEAST_FIXES:
             break
-        if not readings or since_s - readings[-1].since_s >= _SAMPLE_S:
+        if not readings or since_s - readings[-1].since_s >= 1.0:  # 1 s between two looks at the sensors
             readings.append(Reading(since_s=since_s, celsius=hottest_celsius(), mhz=clock_mhz()))
             meter.joules()
         reply = worker.match(blob, top_k=request.top_k)

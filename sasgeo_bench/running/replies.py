@@ -26,8 +26,6 @@ from sasgeo_bench.texts import (
 )
 
 _MOST_BYTES: Final = 2**50  # of memory
-_MOST_PLACES: Final = 1000
-_SHOWN: Final = 60  # characters of where a fault is
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,7 +121,7 @@ class SentCard(Strictly):
     ours: Line
     licence: Line
     limits: Line
-    trained_on: Annotated[list[Line], Field(max_length=_MOST_PLACES)]
+    trained_on: Annotated[list[Line], Field(max_length=1000)]
 
     def fields(self) -> dict[str, Any]:
         """Return the arguments of a card, which has tuples for lists."""
@@ -232,5 +230,5 @@ def read_answer(model: type[Model], given: Message, *, nonce: str) -> Model | Fa
         return Failed.model_validate(content) if content.get("status") != "ok" else model.model_validate(content)
     except ValidationError as error:
         first = error.errors(include_url=False, include_input=False, include_context=False)[0]
-        where = ".".join(map(str, first["loc"]))[:_SHOWN]
+        where = ".".join(map(str, first["loc"]))[:60]  # characters of where a fault is
         raise MatchError(one_line(f"{where}: {first['msg']}" if where else first["msg"])) from error

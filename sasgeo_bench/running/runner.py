@@ -30,9 +30,6 @@ from sasgeo_bench.running.training import trained
 if TYPE_CHECKING:
     from distributed import Client
 
-_CHUNKS_PER_THREAD: Final = 4  # so that the last ones end at about the same time
-_MOST_QUERIES: Final = 256  # of a chunk, which has `LEAST_ITEMS` at least
-
 
 def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iterator[tuple[int, int, Cost]]:
     """Ask all pending queries on a cluster whose workers all reach the same folders and have the plugin.
@@ -55,8 +52,8 @@ def answer_on(client: "Client", plan: RunPlan, parts: Sequence[RunPart]) -> Iter
 
 def _chunks(ids: Sequence[str], threads: int, unit_of: Callable[[str], str]) -> Iterator[tuple[str, ...]]:
     """Split ids into chunks, several for each thread; no flight is split."""
-    size = -(-len(ids) // (threads * _CHUNKS_PER_THREAD))
-    size = min(max(size, LEAST_ITEMS), _MOST_QUERIES)
+    size = -(-len(ids) // (threads * 4))  # so that the last ones end at about the same time
+    size = min(max(size, LEAST_ITEMS), 256)  # at most 256 queries of a chunk, which has `LEAST_ITEMS` at least
     chunk: list[str] = []
     for _, unit in groupby(ids, key=unit_of):
         chunk += unit

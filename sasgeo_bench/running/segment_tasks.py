@@ -35,7 +35,6 @@ from sasgeo_bench.tasks.task_files import Task, TruthManifest
 FOLDER: Final = "segmenters"  # below the root: what segmenters learned
 _TRAIN: Final = "train"
 _MOST_SHOWN: Final = 3  # failures that are told
-_DIGEST: Final = 16  # hexadecimal digits of the text in the name of its file
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +231,7 @@ def _learned(wanted: SegmentTasks, loaded: LoadedSegmenter, group: _Group) -> st
 
 
 def _digest(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:_DIGEST]
+    return hashlib.sha256(text.encode()).hexdigest()[:16]  # hexadecimal digits of the text in the name of its file
 
 
 def _kept_text(path: Path) -> str:

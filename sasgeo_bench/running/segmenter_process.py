@@ -32,8 +32,6 @@ from sasgeo_bench.sensing.image import AerialImage
 from sasgeo_bench.sensing.image_bytes import image_bytes
 from sasgeo_bench.sensing.segmentation import MOST_CLASSES, Segmentation
 
-_MOST_GROWTH: Final = 1.01  # of bytes that do not become fewer by compression
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SegmenterReply(PluginReply):
@@ -103,7 +101,8 @@ class SegmenterProcess(PluginProcess[SegmenterReply]):
         """Ask about one image; `classes` are those of the card, against which the answer is checked once more."""
         self._asked = (image, tuple(classes))
         rows, cols = image.shape
-        most_bytes = int(MOST_CLASSES * rows * cols * _MOST_GROWTH) + wire.MOST_BYTES
+        # 1.01: growth of bytes that do not become fewer by compression
+        most_bytes = int(MOST_CLASSES * rows * cols * 1.01) + wire.MOST_BYTES
         return self._ask("segment", image_bytes(image), timeout_s=self.limits.match_s, most_bytes=most_bytes)
 
     def _luggage(self) -> bytes | None:

@@ -8,16 +8,13 @@ from typing import Final
 
 import psutil
 
-_THERMAL: Final = "class/thermal"
-_POWER: Final = "class/powercap"
 _SYS: Final = Path("/sys")
-_PER_UNIT: Final = 1e6  # microjoules in a joule
 _PER_DEGREE: Final = 1e3
 
 
 def hottest_celsius(root: Path = _SYS) -> float | None:
     """Return the temperature of the hottest zone, degrees Celsius; of zones that say something possible."""
-    found = (_number(path) for path in (root / _THERMAL).glob("thermal_zone*/temp"))
+    found = (_number(path) for path in (root / "class/thermal").glob("thermal_zone*/temp"))
     celsius = (milli / _PER_DEGREE for milli in found if milli)
     return max((value for value in celsius if -50 < value < 200), default=None)  # others are no sensor
 
@@ -51,7 +48,7 @@ class EnergyMeter:
             grown = now - self._last[at]
             self._sum += grown if grown >= 0 else grown + (_number(path / "max_energy_range_uj") or 0)
             self._last[at] = now
-        return self._sum / _PER_UNIT
+        return self._sum / 1e6  # microjoules in a joule
 
 
 def processor_name(info: Path = Path("/proc/cpuinfo")) -> str:
@@ -65,7 +62,7 @@ def processor_name(info: Path = Path("/proc/cpuinfo")) -> str:
 
 
 def _packages(root: Path) -> Iterator[Path]:
-    yield from (path for path in sorted((root / _POWER).glob("*:*")) if path.name.count(":") == 1)
+    yield from (path for path in sorted((root / "class/powercap").glob("*:*")) if path.name.count(":") == 1)
 
 
 def _number(path: Path) -> int | None:

@@ -23,8 +23,6 @@ from sasgeo_bench.tasks.task_plan import Request, Wanted, plan_requests
 from sasgeo_bench.texts import message_of
 
 TOWN: Final = "town-agricultural"  # a square kilometre, built in a second
-_COUNT: Final = 2  # sites
-_SPLIT: Final = "crossfit"
 _SENTENCES: Final = ("title", "what", "separates", "falsifier")  # of a card: what a reader must be told
 
 
@@ -63,7 +61,8 @@ def _lost_role(suite: Suite) -> str | None:
 
 
 def _drawn_checks(spec: str, folder: Path) -> Iterator[Check]:
-    wanted = Wanted(suites=(spec,), regions=(TOWN,), split=_SPLIT, count=_COUNT, seed=1, out=folder, may_be_fewer=True)
+    # 2 sites
+    wanted = Wanted(suites=(spec,), regions=(TOWN,), split="crossfit", count=2, seed=1, out=folder, may_be_fewer=True)
     with reporting(silent):
         (request,) = plan_requests(wanted)
     name = f"draws queries on {TOWN}"

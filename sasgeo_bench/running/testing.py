@@ -30,9 +30,6 @@ from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWN: Final = "town-agricultural"  # the smallest that has room for candidates
 TOP_K: Final = 10
-_SUITES: Final = ("clean", "no-priors")
-_EACH: Final = 2  # queries asked of each kind
-_RADIUS_M: Final = 100.0  # of two discs that do not meet, each so far from the edge of the map:
 _EDGE_SHARE: Final = 0.3
 _QUICK_S: Final = 5.0
 
@@ -76,7 +73,9 @@ def tiny_place(path: str | Path) -> TinyPlace:
     folder = Path(path)
     queries: list[Query] = []
     truths: list[Truth] = []
-    wanted = Wanted(suites=_SUITES, regions=(TOWN,), split="crossfit", count=1, seed=1, out=folder, may_be_fewer=True)
+    wanted = Wanted(
+        suites=("clean", "no-priors"), regions=(TOWN,), split="crossfit", count=1, seed=1, out=folder, may_be_fewer=True
+    )
     with reporting(silent):
         build_region(plan_build(read_region_file(find_region_file(TOWN)), out=folder))
         for request in plan_requests(wanted):
@@ -171,7 +170,7 @@ def _chosen(queries: Iterable[Query]) -> list[Query]:
     kinds: dict[tuple[str, bool], list[Query]] = {}
     for query in sorted(queries, key=lambda item: (item.prior.yaw_deg is None, item.evidence.shape, item.query_id)):
         kinds.setdefault((query.track, query.vectors is not None), []).append(query)
-    return [query for kind in kinds.values() for query in kind[:_EACH]]
+    return [query for kind in kinds.values() for query in kind[:2]]  # queries asked of each kind
 
 
 def _one_of_each_track(queries: Sequence[Query]) -> list[Query]:
@@ -303,7 +302,8 @@ class _Kit:
         places = []
         for share in (_EDGE_SHARE, 1 - _EDGE_SHARE):
             center_m = (west_m + share * (east_m - west_m), (south_m + north_m) / 2)
-            prior = replace(query.prior, center_m=center_m, radius_m=_RADIUS_M)
+            # 100 m: radius of two discs that do not meet, each so far from the edge of the map:
+            prior = replace(query.prior, center_m=center_m, radius_m=100.0)
             reply = self._ask(_changed(query, f"moved {share:g}", prior=prior))
             if reply.match is None:
                 return f"{reply.status} with a small disc: {reply.message}"

@@ -31,12 +31,8 @@ from sasgeo_bench.tasks.task_files import query_bytes
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
 TOWN: Final = "town-riverside"  # the smallest over which views tell where they are
-TOP_K: Final = 10
 _SUITE, _KIND = "flight-clean", "F1 vo-mono-survey"
-_VIEWS: Final = 12  # of a flight that are asked
-_CUT: Final = 6  # of them, where the flight is cut short
 _ODD: Final = slice(5, 8)  # views that are changed: once a tracker may know its place, and some are left
-_OFF_M: Final = 5000.0  # flown in one step, off the map
 _NEAR_M: Final = 25.0
 _QUICK_S: Final = 5.0
 
@@ -137,7 +133,7 @@ class _Kit:
 
     def checks(self) -> Iterator[Check]:
         """Run every check in turn; nothing more where an ordinary flight is not followed."""
-        views, other = (flight[:_VIEWS] for flight in self.made.flights[:2])
+        views, other = (flight[:12] for flight in self.made.flights[:2])  # 12 views of a flight that are asked
         lack = lacks(self.card, views[0])
         if lack is not None:
             yield Check(name="follows a flight", outcome="not applicable", found=f"the flights here have {lack}")
@@ -151,7 +147,8 @@ class _Kit:
         self._fly(other)
         yield self._again("forgets the flight before", first, views)
         self.worker.end()
-        yield self._again("the same answers to a flight that is cut short, in a fresh process", first, views[:_CUT])
+        # 6 of them, where the flight is cut short
+        yield self._again("the same answers to a flight that is cut short, in a fresh process", first, views[:6])
         for name, changed in odd_flights(views).items():
             yield check_of(name, _fault(self._fly(changed), changed), counted(len(changed), "view"))
         yield self._unseen(views)
@@ -161,7 +158,7 @@ class _Kit:
         """Ask the views of a flight in order; stop at the first without an answer."""
         replies = []
         for query in views:
-            replies.append(self.worker.match(query_bytes(query), top_k=TOP_K))
+            replies.append(self.worker.match(query_bytes(query), top_k=10))
             self.refused = self.refused or refusal_of(replies[-1])
             if replies[-1].status != "ok":
                 break
@@ -216,6 +213,7 @@ def odd_flights(views: Sequence[Query]) -> dict[str, tuple[Query, ...]]:
     prior = views[0].prior
     nowhere = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=prior.scale_sigma)
     chosen = range(len(views))[_ODD]
+    # 5000 m: flown in one step, off the map
     return {
         "bears views that show nothing": tuple(
             replace(query, evidence=_unknown(query)) if at in chosen else query for at, query in enumerate(views)
@@ -228,7 +226,7 @@ def odd_flights(views: Sequence[Query]) -> dict[str, tuple[Query, ...]]:
             for query in views
         ),
         "bears a flight off the map": tuple(
-            replace(query, step=_stepped(query, (0.0, _OFF_M, 0.0))) if at == chosen[0] else query
+            replace(query, step=_stepped(query, (0.0, 5000.0, 0.0))) if at == chosen[0] else query
             for at, query in enumerate(views)
         ),
         "bears a prior without a place": (replace(views[0], prior=nowhere), *views[1:]),

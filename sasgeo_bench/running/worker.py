@@ -37,12 +37,9 @@ from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.task_files import pairs_bytes
 from sasgeo_bench.texts import one_line
 
-_KEEPER_S: Final = 5.0  # for the keeper of a matcher's process to end all its descendants
 _ANSWERS: Final = ("-P", "-m", sasgeo_bench.running.child.__name__)
 _KEPT_BYTES: Final = 4000  # of a matcher's output
 _START_S: Final = 120.0
-_DRAIN_S: Final = 10.0  # for the rest of its output, once it is dead
-_SLACK_S: Final = 0.1  # of processor seconds beyond those of all processors: clocks tick
 _PASSED_ON: Final = ("LANG", "LC_ALL", "TZ")
 
 
@@ -163,7 +160,8 @@ class PluginProcess(ABC, Generic[AnyReply]):
         if reply.status != "ok":
             return reply
         seconds = came - asked
-        most_cpu_s = seconds * (os.cpu_count() or 1) + _SLACK_S
+        # 0.1 s of processors beyond those of all processors: clocks tick
+        most_cpu_s = seconds * (os.cpu_count() or 1) + 0.1
         return replace(reply, seconds=seconds, cpu_s=min(reply.cpu_s, most_cpu_s))
 
     def _started(self) -> socket.socket:
@@ -272,7 +270,7 @@ class PluginProcess(ABC, Generic[AnyReply]):
             how = f"died by {_signal_name(-code)}" if code < 0 else f"ended with exit status {code}"
         if self._process is not None and self._drain is not None:
             _kill_family(self._process)  # no descendant keeps its output open
-            self._drain.join(timeout=_DRAIN_S)
+            self._drain.join(timeout=10.0)  # for the rest of its output, once it is dead
         lines = b"".join(self._printed).decode(errors="replace").split("\n")
         last = next((line for line in reversed(lines) if line.strip()), "")
         return one_line(f"{how}: {last}" if last else how)
@@ -401,7 +399,7 @@ def _kill_family(process: subprocess.Popen[bytes]) -> None:
         family = []
     process.terminate()  # the keeper first kills the others
     with contextlib.suppress(subprocess.TimeoutExpired):
-        process.wait(timeout=_KEEPER_S)
+        process.wait(timeout=5.0)  # for the keeper of a matcher's process to end all its descendants
     try:
         os.killpg(process.pid, signal.SIGKILL)
     except (ProcessLookupError, PermissionError):

@@ -30,8 +30,6 @@ CELL_M: Final = 4.0  # of a configuration: each sector of a ring holds some cell
 RINGS_M: Final = (16.0, 48.0)  # a junction; a junction and the next houses
 SECTORS: Final = 8
 GROUPS: Final = tuple(load_taxonomy().groups.values())  # classes of a configuration
-WORDS: Final = 64  # kinds of configurations
-EPSILON: Final = 1e-3  # of Eq. 6
 LEAST: Final = 0.25  # of a weight, in means of the map
 MOST: Final = 4.0
 _SAMPLES: Final = 6000
@@ -81,13 +79,13 @@ class Rarity:
         few = standard[::step].astype(np.float64)
         starts = np.unique(few, axis=0)
         rng = np.random.default_rng(0)
-        starts = starts[np.sort(rng.permutation(len(starts))[:WORDS])]
+        starts = starts[np.sort(rng.permutation(len(starts))[:64])]  # kinds of configurations
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # an empty cluster keeps its centre
             words = vq.kmeans2(few, starts, iter=_ROUNDS, minit="matrix")[0].astype(np.float32)
         word = _nearest(standard, words)
         share = np.bincount(word, minlength=len(words)) / len(word)
-        weight = -np.log(share + EPSILON)
+        weight = -np.log(share + 1e-3)  # epsilon of Eq. 6
         mean = float(weight[word].mean())
         relative = np.clip(weight / mean, LEAST, MOST) if mean > _NOTHING else np.ones(len(words))
         return cls(middle=middle, spread=spread, words=words, weight=relative.astype(np.float32))

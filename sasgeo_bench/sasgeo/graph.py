@@ -31,7 +31,6 @@ _SPREAD_M: Final = np.array([kind.spread_m for kind in NODE_KINDS])
 _IS_DRAWN: Final = np.array([kind.drawing == "vectors" for kind in NODE_KINDS])
 _NONE: Final[frozenset[int]] = frozenset()
 _SLACK_M: Final = 1.0
-_LEAST_MATCHED: Final = 3  # nodes needed to estimate a local shift
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,7 +165,7 @@ class _Judge:
 
     def _matched(self, stage: _Stage) -> _Pairs:
         pairs = self._assigned(stage, np.zeros_like(stage.places_m))
-        if len(pairs.seen) < _LEAST_MATCHED:
+        if len(pairs.seen) < 3:  # nodes needed to estimate a local shift
             return pairs
         return self._assigned(stage, self._shift_m(stage, pairs))
 

@@ -17,7 +17,6 @@ from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.search.plan import Null, posterior
 
 APART_M: Final = 25.0  # the widest tolerance of the benchmark: nearer modes are one answer
-RIVAL_SHARE: Final = 0.05  # least mass of a rival, relative to the chosen mode
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,10 +174,11 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **given: float | None
     rival = rivals[np.argmax(modes.scores[rivals])] if len(rivals) else None
     against = modes.none_nats if rival is None else modes.scores[rival]
     middle_m = modes.shares @ modes.positions_m
+    # 0.05: least mass of a rival, relative to the chosen mode
     found: dict[str, float | None] = {
         "margin_nats": modes.scores[0] - against,
         "posterior_entropy_nats": -(modes.masses * np.log(np.maximum(modes.masses, np.finfo(float).tiny))).sum(),
-        "modes_above": 1 + (modes.masses[rivals] >= RIVAL_SHARE * modes.masses[0]).sum(),
+        "modes_above": 1 + (modes.masses[rivals] >= 0.05 * modes.masses[0]).sum(),
         "spread_m": np.sqrt(modes.shares @ ((modes.positions_m - middle_m) ** 2).sum(axis=1)),
         "null_z": None if null is None or not null.deviation > 0 else (null.best - null.mean) / null.deviation,
         "class_agreement": _agreement(modes.by_class[0] - (0.0 if rival is None else modes.by_class[rival])),

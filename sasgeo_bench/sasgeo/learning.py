@@ -34,11 +34,6 @@ from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.query import Query, Truth, base_of
 
-MODES: Final = 16  # of each training search
-SEARCHES: Final = 2  # of each view; the second finds the wrong places that the exponents of the first take for right
-WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
-MOST_VALUES: Final = 400_000_000  # cells in all layers of a map that is held whole: 16 km2 in cells of 1 m
-_MARGIN_M: Final = 72.0  # of a part of a map, beyond what any view there shows
 _UNIT: Final = 64  # cells: parts begin where cells of any size of the search do
 
 
@@ -89,7 +84,11 @@ def on_maps_of_the_day(views: ViewsByMap, regions: Mapping[str, Region]) -> View
 
 
 def around_views(
-    views: ViewsByMap, regions: Mapping[str, Region], *, most_values: int = MOST_VALUES
+    # 400 million cells in all layers of a map that is held whole: 16 km2 in cells of 1 m
+    views: ViewsByMap,
+    regions: Mapping[str, Region],
+    *,
+    most_values: int = 400_000_000,
 ) -> tuple[ViewsByMap, Mapping[str, Region]]:
     """Cut each large map to what its views may be held against: a part for each view, under a name of its own.
 
@@ -120,7 +119,8 @@ def _box(query: Query, truth: Truth, grid: Grid) -> tuple[int, int, int, int]:
     view_m = math.hypot(*query.evidence.size_m) / 2 * (1 + 3 * query.prior.scale_sigma)
     low, high = [], []
     for (row, col), radius_m in zip(grid.to_cells(middles_m).tolist(), reach_m, strict=True):
-        reach = math.ceil((radius_m + view_m + RINGS_M[-1] + _MARGIN_M) / grid.cell_size_m)
+        # 72 m: margin of a part of a map, beyond what any view there shows
+        reach = math.ceil((radius_m + view_m + RINGS_M[-1] + 72.0) / grid.cell_size_m)
         low.append((row - reach, col - reach))
         high.append((row + reach, col + reach))
     (top, left), (bottom, right) = np.min(low, axis=0) // _UNIT * _UNIT, np.max(high, axis=0) // _UNIT * _UNIT + _UNIT
@@ -159,7 +159,8 @@ def learn(training: Training, switches: Switches, *, plan: Plan | None = None) -
     classes = classes_of(regions[name] for name in views)
     model = _fit_classes(regions, views, switches, classes) if switches.learns else _even(views, classes)
     lists: list[_ScoredModes] = []
-    for _ in range(SEARCHES if switches.learns else 1):
+    # 2 searches of each view; the second finds the wrong places that the exponents of the first take for right
+    for _ in range(2 if switches.learns else 1):
         lists = _searched(views, regions, model, switches, plan or Plan())
         if switches.learns and lists:
             model = replace(model, scaling=fit_scaling([one.by_class for one in lists]))
@@ -329,9 +330,10 @@ def _searched(
 def _list(query: Query, pose: Pose, reader: Reader, plan: Plan, classes: tuple[str, ...]) -> _ScoredModes:
     """Score the true pose of a view and the wrong modes that a search finds; 0 in classes that the map lacks."""
     reading = reader.read(query)
-    modes = search(reader.field, reading.template, query.prior, plan, count=MODES).modes
+    modes = search(reader.field, reading.template, query.prior, plan, count=16).modes  # of each training search
     here = (pose.easting_m, pose.northing_m)
-    wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
+    # 25 m: a mode this far from the truth is a wrong place
+    wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > 25.0]
     poses = [pose, *wrong]
     by_class = np.zeros((len(poses), len(classes)))
     by_class[:, [classes.index(name) for name in reader.region.classes]] = reading.by_class(poses)

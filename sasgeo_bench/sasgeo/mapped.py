@@ -100,7 +100,6 @@ def _widened(arms: Bits) -> Bits:
 
 
 CROWD_M: Final = 150.0  # around a node, where its like are counted
-PAIRED_M: Final = (20.0, 230.0)  # of two junctions, on the ground
 _APART_M: Final = 1e4  # much more than any gate
 
 
@@ -152,7 +151,8 @@ class MappedGraph:
     @cached_property
     def junction_pairs(self) -> dict[int, tuple[JunctionPairs, JunctionPairs]]:
         """Return pairs of junctions of each kind, once from either end."""
-        found = {kind: JunctionPairs.of(self.nodes, kind, range_m=PAIRED_M) for kind in JUNCTIONS}
+        # Of two junctions, on the ground
+        found = {kind: JunctionPairs.of(self.nodes, kind, range_m=(20.0, 230.0)) for kind in JUNCTIONS}
         return {kind: (pairs, pairs.turned()) for kind, pairs in found.items()}
 
     def around(self, place_m: Floats, radius_m: float) -> Ints:

@@ -79,14 +79,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 MOST_ARMS: Final = 6
-ARM_M: Final = 12.0  # along a road to where its direction is measured: past the curbs of a junction
-BLUR_M: Final = 8.0  # junctions nearer than this are one in a mask: a road's width
-TOUCH_M: Final = 0.5  # outlines nearer than this are one patch in a mask
 _ALONG_WAYS: Final = [RELATIONS.index(name) for name in ("connectivity", "crossing")]
 _TOWARDS_DEG: Final = 45.0
 _PASSING: Final = 2
-_PLAIN_CROSSING: Final = 4  # arms of two roads that cross
-_DECIMALS: Final = 3  # of places, as those of features: a millimetre
 
 _BY_NODE: Final = ("places_m", "kind", "degree", "area_m2", "reach_m", "arms_deg", "feature")  # fields of `Nodes`
 _IN_A_MASK: Final = {
@@ -187,7 +182,8 @@ def in_plan(ways: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     network = make_network(ways)
     found = find_crossings(network)
     is_road = (network.layer[found.segments] == ROAD).all(axis=1)
-    segments, shares, en_m = found.segments[is_road], found.shares[is_road], found.en_m[is_road].round(_DECIMALS)
+    # 3 decimals of places, as those of features: a millimetre
+    segments, shares, en_m = found.segments[is_road], found.shares[is_road], found.en_m[is_road].round(3)
     if not len(segments):
         return ways
     # Where one of both has a vertex at the crossing already, the other gets the same.
@@ -224,7 +220,7 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
     kind = np.array([INDEX[renamed[name]] if name in renamed else -1 for name in names], dtype=np.int64)
     places_m = np.asarray(shapely.get_coordinates(table.geometry.to_numpy())).reshape(-1, 2)
     code = {name: at for at, name in enumerate(RELATIONS)}
-    degree = np.where(names == "crossing", _PLAIN_CROSSING, table["degree"].to_numpy(dtype=np.int64))
+    degree = np.where(names == "crossing", 4, table["degree"].to_numpy(dtype=np.int64))  # arms of two roads that cross
     if drawing == "mask":
         degree[names == "level_crossing"] = 0  # as where the railway passes over the road
     found = Nodes(
@@ -243,7 +239,8 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
 
 def _blurred(nodes: Nodes) -> Nodes:
     """Merge nodes of one kind within a road's width."""
-    near = cKDTree(nodes.places_m).query_pairs(BLUR_M, output_type="ndarray") if len(nodes) else nodes.pairs
+    # 8 m: junctions nearer than this are one in a mask: a road's width
+    near = cKDTree(nodes.places_m).query_pairs(8.0, output_type="ndarray") if len(nodes) else nodes.pairs
     near = near[nodes.kind[near[:, 0]] == nodes.kind[near[:, 1]]]
     links = coo_array((np.ones(len(near)), near.T), shape=(len(nodes), len(nodes)))
     group = nodes.kind
@@ -326,7 +323,8 @@ def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
         return arms
     line = np.repeat(np.arange(len(chains.length_m)), np.diff(chains.first))
     ways = shapely.linestrings(chains.en_m, indices=line)
-    along_m = np.minimum(ARM_M, chains.length_m / 2)
+    # 12 m: arm along a road to where its direction is measured: past the curbs of a junction
+    along_m = np.minimum(12.0, chains.length_m / 2)
     points = (
         shapely.line_interpolate_point(ways, along_m),
         shapely.line_interpolate_point(ways, chains.length_m - along_m),
@@ -357,7 +355,7 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
         if not len(chosen):
             continue
         shapes = all_shapes[chosen]
-        group = groups_within(shapes, TOUCH_M)
+        group = groups_within(shapes, 0.5)  # m: outlines nearer than this are one patch in a mask
         area_m2: Floats = np.bincount(group, weights=shapely.area(shapes)).astype(np.float64)
         weight = shapely.area(shapes) / area_m2[group]
         parts_m = [np.bincount(group, weights=weight * part) for part in centroids(shapes).T]

@@ -38,8 +38,6 @@ from sasgeo_bench.tasks.vectors import as_features, instances_of_mask, vector_ta
 
 # Classes thinned together, and the class of their lines: crossings do not depend on the class of a road.
 SKELETON_LAYERS: Final = {"road_minor": ROADS} | {name: (name,) for name in LAYERS if name not in ROADS}
-SPUR_M: Final = 8.0  # shorter branches are corners of a broad line
-_ROUGH_CELLS: Final = 0.75  # tolerance of the simplification of stairs
 _FORK: Final = 3
 
 
@@ -63,7 +61,8 @@ def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.o
         return np.empty(0, dtype=object)
     lines = _merged(shapely.linestrings(places_m[ends]))
     lines = _merged(lines[~_is_spur(lines)])
-    return np.asarray(shapely.simplify(lines, _ROUGH_CELLS * cell_size_m), dtype=object)
+    # 0.75 cells: tolerance of the simplification of stairs
+    return np.asarray(shapely.simplify(lines, 0.75 * cell_size_m), dtype=object)
 
 
 def _links(thin: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -93,15 +92,12 @@ def _is_spur(lines: NDArray[np.object_]) -> NDArray[np.bool_]:
     _, tip = np.unique(tips_m.reshape(-1, 2), axis=0, return_inverse=True)
     tip = tip.reshape(-1, 2)
     ends = np.sort(np.bincount(tip.ravel())[tip], axis=1)
-    return np.asarray((shapely.length(lines) < SPUR_M) & (ends[:, 0] == 1) & (ends[:, 1] >= _FORK))
+    # 8 m: shorter branches are corners of a broad line
+    return np.asarray((shapely.length(lines) < 8.0) & (ends[:, 0] == 1) & (ends[:, 1] >= _FORK))
 
 
-MARGIN_M: Final = 8.0  # along the border of known cells, where objects may be cut
 NEAR_M: Final = 80.0  # neighbours whose relative places are compared
-BRIDGED_M: Final = 7.0  # facing ends of roads within this distance are one road: as far as a street is wide
-LEAST_M2: Final = 12.0  # smaller patches are noise
 _FACING_DEG: Final = 30.0
-_MOSTLY: Final = 0.9  # of the cells around a place
 _FAMILIES: Final = (ROADS, ("railway",), ("waterway",), ("building",))
 _SIGHTS: Final = tuple(dict.fromkeys(kind.classes for kind in NODE_KINDS))
 _VISIBLE_OF: Final = np.array([_SIGHTS.index(kind.classes) for kind in NODE_KINDS])
@@ -196,7 +192,7 @@ def _from_mask(evidence: Evidence, *, without: set[str]) -> Nodes:
         (str(name), 0, False, shape)
         for table in shapes
         for name, shape in zip(table["class"], table.geometry, strict=True)
-        if shape.area >= LEAST_M2
+        if shape.area >= 12.0  # m2: smaller patches are noise
     ]
     return Nodes.joined([nodes_of(build_graph(ways), ways, "mask"), patches_of(as_features(vector_table(rows)))])
 
@@ -210,7 +206,8 @@ def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     arm_deg = arms_of(features, places_m)[:, 0]
     if len(free) < 2:  # a join has two ends
         return vectors
-    pairs = cKDTree(places_m).query_pairs(BRIDGED_M, output_type="ndarray")
+    # 7 m: facing ends of roads within this distance are one road: as far as a street is wide
+    pairs = cKDTree(places_m).query_pairs(7.0, output_type="ndarray")
     ahead_deg = bearing_deg(*(places_m[pairs[:, 1]] - places_m[pairs[:, 0]]).T)
     off_deg = np.abs(
         np.stack((wrap_deg(arm_deg[pairs[:, 0]] + 180 - ahead_deg), wrap_deg(arm_deg[pairs[:, 1]] - ahead_deg)))
@@ -238,12 +235,14 @@ def _asked(evidence: Evidence, names: set[str], drawn: set[str]) -> Bools:
 def _visible(evidence: Evidence) -> Bools:
     """Return where nearly all cells around are known in each set of classes; absent sets are known nowhere."""
     sights = np.zeros((len(_SIGHTS), *evidence.shape), dtype=bool)
-    size = 2 * max(1, round(MARGIN_M / evidence.cell_size_m)) + 1
+    # 8 m: margin along the border of known cells, where objects may be cut
+    size = 2 * max(1, round(8.0 / evidence.cell_size_m)) + 1
     for into, classes in zip(sights, _SIGHTS, strict=True):
         layers = [evidence.layer(name) != UNKNOWN for name in classes if name in evidence.classes]
         if layers:
             known = np.all(layers, axis=0).astype(np.float32)
-            into[:] = cv2.boxFilter(known, -1, (size, size), borderType=cv2.BORDER_CONSTANT) > _MOSTLY
+            # 0.9 of the cells around a place
+            into[:] = cv2.boxFilter(known, -1, (size, size), borderType=cv2.BORDER_CONSTANT) > 0.9
     return sights
 
 

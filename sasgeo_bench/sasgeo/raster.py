@@ -33,17 +33,15 @@ if TYPE_CHECKING:
     import geopandas as gpd
 
 BRIDGE: Final = "bridge"
-REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
-DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
 LEVEL_M: Final = 24.0  # standard deviation of the ground that a class is compared with; from train places
 REPEATED: Final = 3e3  # nats2 m2 of a class that say half of what as many independent cells would; from train places
-_STEPS: Final = 8  # coarse cells in it
 _LEAST: Final = 1e-6
 _FIELD_VERSION: Final = 1  # raised whenever the same map and settings give other levels
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
-def likeness_by_hand(classes: Sequence[str], *, reach_m: float = REACH_M) -> NDArray[np.float64]:
+# 4 m: the paper's tau, by hand: OSM lines lie a few metres off
+def likeness_by_hand(classes: Sequence[str], *, reach_m: float = 4.0) -> NDArray[np.float64]:
     """Return the likeness of cells near a class to cells on it, shape (C, FAR + 1): exp(-D^2 / 2 tau^2) for lines.
 
     Examples
@@ -163,7 +161,8 @@ def doubted(evidence: Evidence) -> Evidence:
     for name, layer in zip(evidence.classes, cells, strict=True):
         if name in load_taxonomy().lines and (layer == PRESENT).any():
             off = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            layer[(layer == ABSENT) & (off * evidence.cell_size_m <= DOUBT_M)] = UNKNOWN
+            # 8 m: doubt around a seen line: a mapped line there may be the same
+            layer[(layer == ABSENT) & (off * evidence.cell_size_m <= 8.0)] = UNKNOWN
     return Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
 
 
@@ -227,7 +226,8 @@ def line_width_m(class_name: str) -> float:
 def _around(layers: NDArray[np.float32], is_known: NDArray[np.float32], *, sigma: float) -> NDArray[np.float32]:
     """Return the mean of known cells around each cell, shape (C, rows, cols), weighed by a Gaussian of some cells."""
     rows, cols = layers.shape[1:]
-    step = max(1, round(sigma / _STEPS))  # a mean over tens of cells needs no fine ones
+    # 8: coarse cells in it
+    step = max(1, round(sigma / 8))  # a mean over tens of cells needs no fine ones
     coarse = max(1, cols // step), max(1, rows // step)
 
     def summed(layer: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -19,11 +19,9 @@ RINGS_M: Final = (4.0, 8.0, 12.0)  # around a class: OSM and masks of views are 
 FAR: Final = len(RINGS_M) + 1
 NOWHERE: Final = FAR + 1
 
-_SLACK_M: Final = 1e-3  # tolerance of a distance at the edge of a ring
 _SHARES: Final = ("hit", "false_alarm", "missing", "mapped")
 _YEARLY: Final = ("vanish_per_year", "appear_per_year")
 _CELLS_PER_WITNESS: Final = 200.0  # a house or a piece of road is right or wrong as a whole
-_PRIOR_WIDTH: Final = 1.5  # of logits of shares and logarithms of rates
 _EDGE: Final = 1e-5  # least distance of probabilities from 0 and 1
 
 
@@ -109,7 +107,7 @@ def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.ui
     distance = cv2.distanceTransform((~is_there).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     beyond = np.zeros(is_there.shape, dtype=np.uint8)
     for edge_m in (0.0, *RINGS_M):
-        beyond += distance > (edge_m + _SLACK_M) / cell_size_m
+        beyond += distance > (edge_m + 1e-3) / cell_size_m  # m: tolerance of a distance at the edge of a ring
     return beyond
 
 
@@ -222,7 +220,8 @@ def _fitted(hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[n
         mapped, empty = _chances(vector, ages_years)
         chances = np.stack((mapped, 1 - mapped, empty, 1 - empty), axis=1)
         losses = np.einsum("bak,ak->b", counts, np.log(chances)) / -_CELLS_PER_WITNESS
-        return float(losses.sum() + 0.5 * (((vector - start) / _PRIOR_WIDTH) ** 2).sum())
+        # 1.5: width of the prior of logits of shares and logarithms of rates
+        return float(losses.sum() + 0.5 * (((vector - start) / 1.5) ** 2).sum())
 
     total = counts.sum()
     mapped = float(counts[..., :2].sum() / total) if total else hand.mapped

@@ -30,10 +30,7 @@ from sasgeo_bench.tasks.query import Query
 
 APART_M: Final = (30.0, 180.0)  # of two junctions: nearer ones give no heading, farther ones are seldom both in a view
 SLACK_M: Final = 4.0  # tolerance of their distance
-MOST_PAIRS: Final = 150  # of a view, the longest: they give the best heading
 _PLACE_M, _YAW_DEG, _LOG_SCALE = 12.0, 8.0, 0.08  # votes within these are for one pose
-_ROUNDS: Final = 2
-_TRIED: Final = 10  # cells of votes tried for each requested pose
 _SIGMAS: Final = 3.0
 _REACH: Final = 1.0 + 1e-6  # tolerance, so that a mean keeps some of its votes
 
@@ -80,7 +77,8 @@ def _votes(nodes: Nodes, mapped: MappedGraph, kind: int, scales: tuple[float, fl
             np.searchsorted(theirs.length_m, ours.length_m * scale + slack_m)
             for scale, slack_m in zip(scales, (-SLACK_M, SLACK_M), strict=True)
         )
-        for number in range(max(0, len(ours.length_m) - MOST_PAIRS), len(ours.length_m)):
+        # At most 150 pairs of a view, the longest: they give the best heading
+        for number in range(max(0, len(ours.length_m) - 150), len(ours.length_m)):
             first, last = int(low[number]), int(high[number])
             hits = theirs.like(ours.arms[number], first, last)
             if len(hits):
@@ -123,7 +121,8 @@ def _counted(cast: Floats, count: int) -> list[Proposal]:
     """Return poses with the most votes, best first, no two for one place and heading."""
     at = _spread(cast)
     tree = cKDTree(at)
-    found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, _TRIED * count)]
+    # 10 cells of votes tried for each requested pose
+    found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, 10 * count)]
     kept: list[tuple[Proposal, Floats]] = []
     for proposal, place in sorted(found, key=lambda item: -item[0].votes):
         if all(np.linalg.norm(place - other) > 2 * _REACH for _, other in kept):
@@ -155,7 +154,7 @@ def _crowded(cast: Floats, at: Floats, most: int) -> Floats:
 def _gathered(cast: Floats, at: Floats, tree: cKDTree, start: Floats) -> tuple[Proposal, Floats]:
     """Return the pose of the votes around a point, and its point; each pair of the view votes once."""
     place = at[tree.query(start)[1]]
-    for _ in range(_ROUNDS):
+    for _ in range(2):
         near = np.array(sorted(tree.query_ball_point(place, _REACH)), dtype=np.int64)
         some = cast[near]
         place = np.average(at[near], axis=0, weights=some[:, 4])
@@ -168,10 +167,7 @@ def _gathered(cast: Floats, at: Floats, tree: cKDTree, start: Floats) -> tuple[P
 
 
 DAYS_PER_YEAR: Final = 365.25
-LEAST_SIGMA_M: Final = 1.0  # of a refined position: half a cell of the search
 MOST_SIGMA_M: Final = 25.0  # of a position where the score is flat
-PROPOSED: Final = 20  # poses by the graph, of a view of any heading
-SCALE_SPREAD: Final = 2.5  # standard deviations of scale, as in the search
 MOST_SCALED: Final = 0.9
 _STEP_M: Final = 4.0  # for the curvature of a score
 
@@ -271,8 +267,9 @@ class Reading:
         prior, graph = self.query.prior, self.graph
         if graph is None or prior.yaw_deg is not None:
             return []
-        reach = min(SCALE_SPREAD * prior.scale_sigma, MOST_SCALED)
-        found = proposals(self.observed, graph, count=PROPOSED, scales=(1 - reach, 1 + reach), prior=prior)
+        reach = min(2.5 * prior.scale_sigma, MOST_SCALED)  # standard deviations of scale, as in the search
+        # 20 poses by the graph, of a view of any heading
+        found = proposals(self.observed, graph, count=20, scales=(1 - reach, 1 + reach), prior=prior)
         return [item.pose for item in found]
 
     def by_class(self, poses: Sequence[Pose]) -> NDArray[np.float64]:
@@ -299,7 +296,8 @@ class Reading:
         ]
         here, east, west, north, south = (self.by_class(poses) * self.reader.model.scaling).sum(axis=1).tolist()
         bend = min(2 * here - east - west, 2 * here - north - south) / _STEP_M**2
-        return float(np.clip(1 / math.sqrt(bend), LEAST_SIGMA_M, MOST_SIGMA_M)) if bend > 0 else MOST_SIGMA_M
+        # 1 m: least sigma of a refined position: half a cell of the search
+        return float(np.clip(1 / math.sqrt(bend), 1.0, MOST_SIGMA_M)) if bend > 0 else MOST_SIGMA_M
 
     @cached_property
     def information_nats(self) -> float:

@@ -22,7 +22,6 @@ Rows = NDArray[np.float64]
 
 _MOST: Final = 1e100  # numbers are clipped to it, so that squares and differences stay finite
 _FAR: Final = 10.0  # standard deviations: features are clipped to it
-_NEAR: Final = 1e-12  # a smaller spread is zero
 _SURE: Final = 1e-6  # least distance of a confidence from 0 and 1
 
 
@@ -91,7 +90,8 @@ class Frame:
         rows = cls._with_flags(raw, medians, is_flagged)
         spreads = rows.std(axis=0)
         # A feature that is constant in calibration must not count later: its spread is infinite.
-        spreads = np.where((spreads > _NEAR * np.maximum(1.0, np.abs(rows).max(axis=0))), spreads, np.inf)
+        # 1e-12: a smaller spread is zero
+        spreads = np.where((spreads > 1e-12 * np.maximum(1.0, np.abs(rows).max(axis=0))), spreads, np.inf)
         return cls(medians=medians, is_flagged=is_flagged, means=rows.mean(axis=0), spreads=spreads)
 
     def filled(self, raw: Rows) -> Rows:
@@ -105,11 +105,8 @@ class Frame:
         return np.hstack((np.where(gap, medians, raw), gap[:, is_flagged].astype(np.float64)))
 
 
-_DECIMALS: Final = 12  # of a probability: the last digits of a fit depend on memory alignment
-
 FEW: Final = 5  # least number of right and of false answers for a fit
 _FOLDS: Final = 4
-_PER_TREE: Final = 500  # answers of one tree at most: more cost time and gain nothing at this depth
 
 
 # From complete rows of features, shape (N, F), to log-odds of a false fix, shape (N,).
@@ -154,7 +151,8 @@ class _Fitted(ABC):
         found = np.ones(len(predictions))
         at = [index for index, item in enumerate(predictions) if not is_none(item)]
         if at:
-            found[at] = self._rule.p_false([predictions[index] for index in at]).round(_DECIMALS)
+            # 12 decimals of a probability: the last digits of a fit depend on memory alignment
+            found[at] = self._rule.p_false([predictions[index] for index in at]).round(12)
         return found
 
 
@@ -269,12 +267,13 @@ def _logistic(rows: Rows, is_false: NDArray[np.bool_]) -> LogisticRegression:
 
 
 def _trees(rows: Rows, is_false: NDArray[np.bool_]) -> GradientBoostingClassifier:
+    # 500 answers of one tree at most: more cost time and gain nothing at this depth
     trees = GradientBoostingClassifier(
         n_estimators=60,
         learning_rate=0.08,
         max_depth=2,
         min_samples_leaf=10,
-        subsample=min(1.0, _PER_TREE / len(rows)),
+        subsample=min(1.0, 500 / len(rows)),
         random_state=0,
     )
     return trees.fit(rows, is_false)

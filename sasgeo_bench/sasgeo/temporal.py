@@ -42,17 +42,10 @@ FRESH: Final = 0.5
 LEAST: Final = 0.9  # mass within 25 m of a fix that is accepted
 LOST_M: Final = 600.0  # radius of the first search for another place
 _MOST_LOST_M: Final = 8000.0
-_WIDER: Final = 4.0  # the next search, where the one before found nothing
-_LIFE: Final = 20  # views for which another place is followed beside the belief
-_EXACT: Final = 1e-9  # m2 and deg2, added to an odometer's covariance: one that is exact has none
 _DOUBTS: Final = 3  # views in a row that fit better elsewhere
-_PROOF_NATS: Final = 6.0  # more evidence than the belief has
-_AROUND_M: Final = 450.0  # radius of the places that a view is held against
-_AROUND_FACTOR: Final = 4
 _AROUND_DEG: Final = 10.0
 VIO: Final = "vio_mahalanobis"  # diagnostic: the last step of the estimate against the odometer's (Eq. 10)
 _SCALES: Final = np.arange(-0.09, 0.0901, 0.01)  # logarithms
-_USUAL_M: Final = 50.0  # between two views, where no odometer says it
 _NO_ODOMETER: Final = np.diag([60.0**2, 60.0**2, 30.0**2]).ravel()  # m2, deg2: as far as a drone flies between views
 
 
@@ -106,7 +99,8 @@ def increment_cost(step: Step, before: Pose, after: Pose) -> float:
     right_m, up_m = east_m * np.cos(turn) - north_m * np.sin(turn), east_m * np.sin(turn) + north_m * np.cos(turn)
     off_deg = float(wrap_deg(after.yaw_deg - before.yaw_deg - step.increment[2]))
     residual = np.array([right_m - step.increment[0], up_m - step.increment[1], off_deg])
-    covariance = np.reshape(step.covariance, (SIDE, SIDE)) + _EXACT * np.eye(SIDE)
+    # 1e-9 m2 and deg2, added to an odometer's covariance: one that is exact has none
+    covariance = np.reshape(step.covariance, (SIDE, SIDE)) + 1e-9 * np.eye(SIDE)
     return float(residual @ np.linalg.solve(covariance, residual))
 
 
@@ -222,7 +216,7 @@ class SasgeoTrack:
 
     def _way_m(self, step: Step) -> float:
         if not self.over_time.has_odometry:
-            return _USUAL_M
+            return 50.0  # m between two views, where no odometer says it
         return math.inf if step.increment is None else math.hypot(*step.increment[:2])
 
     def _moved(self, belief: GridBelief, step: Step) -> GridBelief:
@@ -273,13 +267,14 @@ class SasgeoTrack:
         theirs = logs_on(rival.belief)
         lead_nats += rival.lead_nats + _evidence(rival.belief, theirs)
         found = rival.belief.weighed(theirs, doubt=self.doubt).fitted()
-        if lead_nats > _PROOF_NATS and fix_of(found, least=LEAST).is_accepted:
+        if lead_nats > 6.0 and fix_of(found, least=LEAST).is_accepted:  # nats: more evidence than the belief has
             self._rival, self._doubts, self._lost_m = None, 0, LOST_M
             return found
         self._rival = replace(rival, belief=found, lead_nats=lead_nats, views=rival.views + 1)
-        if self._rival.views >= _LIFE:
+        if self._rival.views >= 20:  # views for which another place is followed beside the belief
             is_lost = self._doubts >= _DOUBTS
-            self._lost_m = min(_WIDER * self._lost_m, _MOST_LOST_M) if is_lost else LOST_M
+            # 4: the next search, where the one before found nothing
+            self._lost_m = min(4.0 * self._lost_m, _MOST_LOST_M) if is_lost else LOST_M
             self._rival = None
         return weighed
 
@@ -307,9 +302,9 @@ class _Scored:
                 self.field,
                 self.template,
                 center_m=center_m,
-                radius_m=_AROUND_M,
+                radius_m=450.0,  # radius of the places that a view is held against
                 yaws_deg=np.arange(0.0, 360.0, _AROUND_DEG),
-                factor=_AROUND_FACTOR,
+                factor=4,
                 scale=self.scale,
             )
         except PoseError:  # the disc does not meet the map

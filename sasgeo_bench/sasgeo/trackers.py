@@ -13,7 +13,6 @@ _OURS: Final = (
     f"of lists of modes, moved by the odometer and spread by its covariance; cells of {CELL_M:g} m and more; a view "
     f"weighs by {FRESH:g} of its fitted exponents times the share of its ground that is new"
 )
-_SCALE: Final = "the scale of the flight's views is learnt as it goes"
 _NONE: Final = f"a view fits no place with probability {NONE:g}"
 _RIVAL: Final = (
     "where three views in a row fit worse than an average place around, another belief is followed beside, and takes "
@@ -35,7 +34,7 @@ def _card(name: str, title: str, *ours: str, equations: str = "Eqs. 5, 7-8, 10-1
         version="2",
         title=title,
         source=f"SASGeo paper (Trukhina and Vashkelis), {equations}",
-        ours="; ".join((_OURS, _SCALE, *ours, _ACCEPTS)),
+        ours="; ".join((_OURS, "the scale of the flight's views is learnt as it goes", *ours, _ACCEPTS)),
         licence="Apache-2.0",
         tracks=("sequence",),
         limits=_LIMITS,

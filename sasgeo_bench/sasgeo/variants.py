@@ -131,7 +131,6 @@ def _at_candidate(query: Query, at: int, mode: Mode) -> Pose:
     return replace(query.candidates[at], yaw_deg=mode.pose.yaw_deg, scale=mode.pose.scale)
 
 
-_SOURCE: Final = "SASGeo paper (Trukhina and Vashkelis), {what}"
 _OURS: Final = (
     "dense search over place, heading and scale in the Fourier domain, coarse to fine, 20 modes; what lies within 8 m "
     "of a seen line is left open; a posterior over the modes and none of them"
@@ -178,7 +177,7 @@ def _card(name: str, title: str, what: str, *ours: str, limits: str = _LIMITS) -
         name=name,
         version=str(1 + (_CORRELATED in ours) + bool({_GRAPH_FITTED, _GRAPH_BY_HAND}.intersection(ours))),
         title=title,
-        source=_SOURCE.format(what=what),
+        source=f"SASGeo paper (Trukhina and Vashkelis), {what}",
         ours="; ".join((_OURS, *ours)),
         licence="Apache-2.0",
         tracks=("retrieval", "localization"),

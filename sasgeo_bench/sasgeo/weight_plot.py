@@ -22,7 +22,6 @@ from sasgeo_bench.tasks.sheet import HIDDEN, paint
 
 UNIT: Final = "nats for 100 m\u00b2"
 _MOST_CELLS: Final = 900  # of a picture's side
-_TOP_PERCENTILE: Final = 99.0  # of what is drawn; a few cells beyond it take its colour
 _MAP_INCHES: Final = 6.6
 _LEAST_INCHES: Final = 2.2
 _KEYS: Final = "Legend: class, and its weight where its surroundings are as rare as the map's mean (\u03bd = 1)"
@@ -49,7 +48,8 @@ def top_of(weights: Sequence[NDArray[np.float32]]) -> float:
     """Return a common end of the colours of several maps: a high percentile of all positive weights."""
     drawn = [one[one > 0] for one in weights]
     found = np.concatenate(drawn) if drawn else np.zeros(0)
-    return float(np.percentile(found, _TOP_PERCENTILE)) if len(found) else 1.0
+    # 99: top percentile of what is drawn; a few cells beyond it take its colour
+    return float(np.percentile(found, 99.0)) if len(found) else 1.0
 
 
 def shrunk(layers: NDArray[np.uint8], *, most_cells: int = _MOST_CELLS) -> NDArray[np.uint8]:

@@ -21,13 +21,10 @@ Slices = tuple[slice, slice]
 FACTORS: Final = (1, 2, 4, 8)  # sides of a cell of the belief, in cells of the map
 UNIT: Final = FACTORS[-1]  # windows begin at whole cells of every size
 COARSEST_M: Final = 32.0  # largest cell
-FINE_M: Final = 8.0  # largest cell with FINE_YAWS headings; larger ones have COARSE_YAWS
 FINE_YAWS: Final = 72
 COARSE_YAWS: Final = 36
 MOST: Final = 2_500_000  # values of a belief before its cells become larger
-REFINED: Final = 400_000  # values below which they become smaller
 TAIL: Final = 1e-4  # mass that a window may lose at each side
-QUIET: Final = 1e-7  # mass of a heading below which no view is asked about it
 BEYOND_M: Final = 500.0  # a drone may leave the map so far
 _CIRCLE_DEG: Final = 360.0
 
@@ -114,7 +111,8 @@ class GridBelief:
     @cached_property
     def asked(self) -> NDArray[np.int64]:
         """Return indices of headings that are not all but excluded."""
-        return np.flatnonzero(self.mass.sum(axis=(1, 2)) > QUIET)
+        # 1e-7: mass of a heading below which no view is asked about it
+        return np.flatnonzero(self.mass.sum(axis=(1, 2)) > 1e-7)
 
     def normalised(self) -> Self:
         """Return the belief with a sum of 1; without any mass it is even."""
@@ -138,7 +136,8 @@ class GridBelief:
         found = self.cut(self._held())
         while found.mass.size > MOST and found.factor < sizes_of(found.mapped)[-1]:
             found = found.coarser()
-        while found.factor > 1 and values(found.box, found.mapped, found.factor // 2) <= REFINED:
+        # 400_000 values below which they become smaller
+        while found.factor > 1 and values(found.box, found.mapped, found.factor // 2) <= 400_000:
             found = found.finer()
         return found
 
@@ -189,7 +188,8 @@ def sizes_of(mapped: Grid) -> tuple[int, ...]:
 
 def yaw_count(mapped: Grid, factor: int) -> int:
     """Return the number of headings on cells of a size."""
-    return FINE_YAWS if factor * mapped.cell_size_m <= FINE_M else COARSE_YAWS
+    # 8 m: largest cell with FINE_YAWS headings; larger ones have COARSE_YAWS
+    return FINE_YAWS if factor * mapped.cell_size_m <= 8.0 else COARSE_YAWS
 
 
 def values(box: Box, mapped: Grid, factor: int) -> int:

@@ -25,7 +25,6 @@ from sasgeo_bench.search.belief import (
 LOST: Final = np.diag([1000.0**2, 1000.0**2, 90.0**2])  # m2, m2, deg2: where the odometer lost its way
 _SIGMAS: Final = 3.5  # of a spread that a window holds
 _SMALL: Final = 0.5  # variance in cells2 below which a Gaussian is mixed with no move at all
-_WIDE: Final = 5.0  # standard deviation in cells from which a Gaussian is three boxes one after the other
 _TINY: Final = 1e-4  # variance in cells2 that is none
 
 Matrix = NDArray[np.float64]
@@ -122,7 +121,8 @@ def _spread(belief: GridBelief, covariance: Matrix) -> GridBelief:
         for layer, yaw_deg in zip(mass, belief.yaws_deg.tolist(), strict=True):
             if layer.any():
                 turned = rotation(yaw_deg) @ planar @ rotation(yaw_deg).T
-                layer[:] = _boxed(layer, np.trace(planar) / 2) if widest > _WIDE**2 else _blurred(layer, turned)
+                # 5: standard deviation in cells from which a Gaussian is three boxes one after the other
+                layer[:] = _boxed(layer, np.trace(planar) / 2) if widest > 5.0**2 else _blurred(layer, turned)
     return replace(belief, mass=mass)
 
 

@@ -13,8 +13,6 @@ from sasgeo_bench.search.field import FULL, Field, Template
 from sasgeo_bench.search.surface import surface
 
 SCORED_M: Final = 16.0  # largest cell that a view is scored on
-_AT_ONCE: Final = 16_000_000  # scores computed at a time: bounds memory where the belief is wide
-_QUARTERS: Final = 4
 
 
 def surface_logs(field: Field, template: Template, belief: GridBelief, *, temper: float, scale: float = 1.0) -> Floats:
@@ -26,9 +24,10 @@ def surface_logs(field: Field, template: Template, belief: GridBelief, *, temper
     """
     parts = 2 if belief.grid.cell_size_m > SCORED_M and belief.factor > 1 else 1
     found = np.empty((len(belief.asked), *belief.shape), dtype=np.float32)
-    step = max(1, _AT_ONCE // (belief.mass[0].size * parts**2))
+    # 16 million scores computed at a time: bounds memory where the belief is wide
+    step = max(1, 16_000_000 // (belief.mass[0].size * parts**2))
     # Headings at right angles share their work, so they are asked for together.
-    order = np.argsort(belief.asked % (len(belief.mass) // _QUARTERS), kind="stable")
+    order = np.argsort(belief.asked % (len(belief.mass) // 4), kind="stable")
     for first in range(0, len(order), step):
         chosen = order[first : first + step]
         scores = _scores(

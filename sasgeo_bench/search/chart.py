@@ -16,7 +16,6 @@ from sasgeo_bench.regions.region import Region
 from sasgeo_bench.search.field import FULL
 
 _NOTHING: Final = 6.5  # times the reach: less than 1e-9 remains
-_DECIMALS: Final = 6  # of a place within its cell: the same on every copy of a piece of map
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -82,7 +81,8 @@ class Chart:
         turn = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=pose.yaw_deg, scale=pose.scale)
         right, up = turn.to_map(np.eye(2) * cell_size_m) / (self.grid.cell_size_m, -self.grid.cell_size_m)
         across, along = (np.arange(count) + 0.5 - count / 2 for count in (shape[1], shape[0]))
-        uv = (place - whole).round(_DECIMALS)[:, None, None] + np.multiply.outer(right, across)[:, None, :]
+        # 6 decimals of a place within its cell: the same on every copy of a piece of map
+        uv = (place - whole).round(6)[:, None, None] + np.multiply.outer(right, across)[:, None, :]
         moved = np.floor(uv - np.multiply.outer(up, along)[:, :, None]).astype(np.int64)
         cols, rows = moved + whole.astype(np.int64)[:, None, None]
         inside = (rows >= 0) & (rows < self.grid.rows) & (cols >= 0) & (cols < self.grid.cols)

@@ -17,7 +17,6 @@ from sasgeo_bench.search.field import Level, Template, between, pooled, warped
 from sasgeo_bench.search.plan import Tile, Turns
 from sasgeo_bench.search.votes import correlated, map_spectrum
 
-_BLUR: Final = 3  # squares of the view across a coarse cell before rotation: odd, so that nothing is shifted
 _HALF_TURN: Final = 2  # right angles
 
 
@@ -31,7 +30,8 @@ def around_of(template: Template, grid: Grid, turns: Turns) -> Grid:
 
 def squares_across(template: Template, grid: Grid) -> int:
     """Return how many cells of a view make the side of a square to be resampled onto a level."""
-    return max(1, round(grid.cell_size_m / template.cell_size_m / _BLUR))
+    # 3 squares of the view across a coarse cell before rotation: odd, so that nothing is shifted
+    return max(1, round(grid.cell_size_m / template.cell_size_m / 3))
 
 
 def blur_width(frame: Grid, grid: Grid) -> int:

@@ -17,9 +17,7 @@ from sasgeo_bench.geometry.pose import Pose
 FULL: Final = 255  # of a field: the class is certain
 
 _AXES: Final = 3
-_THIN: Final = 0.5  # share of its spread area below which a class counts as thin
 _NOTHING: Final = 1e-9
-_MOST_SIDE: Final = 32_766  # cells: OpenCV warps no larger raster
 Value = TypeVar("Value", np.float32, np.uint8)
 
 
@@ -186,7 +184,7 @@ def _spread(band: NDArray[np.uint8], kernel: NDArray[np.uint8]) -> tuple[NDArray
 
 def is_thin(share: NDArray[np.float64] | np.float64) -> NDArray[np.bool_]:
     """Return whether a class that has such a share of its spread area is spread on a level."""
-    return np.asarray(share < _THIN)
+    return np.asarray(share < 0.5)  # share of its spread area below which a class counts as thin
 
 
 def round_kernel(radius: float) -> NDArray[np.uint8]:
@@ -253,7 +251,7 @@ def between(frame: Grid, pose: Pose, grid: Grid) -> NDArray[np.float64]:
 def warped(layer: NDArray[Value], to_layer: NDArray[np.float64], shape: tuple[int, int]) -> NDArray[Value]:
     """Resample a raster, (rows, cols) or (rows, cols, bands), linearly, 0 beyond it; `to_layer` from `between`."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    if max(layer.shape[:2]) > _MOST_SIDE:
+    if max(layer.shape[:2]) > 32_766:  # 32_766 cells: OpenCV warps no larger raster
         layer, to_layer = _near(layer, to_layer, shape)
     return np.asarray(cv2.warpAffine(layer, to_layer, shape[::-1], flags=flags), dtype=layer.dtype)
 

@@ -31,7 +31,6 @@ from sasgeo_bench.search.plan import (
 )
 
 PATCH_KM2: Final = 17.0  # of places: a town, for which the beam was chosen
-_GROWTH: Final = 0.75  # of the beam with the area
 _NOTHING: Final = 1e-9
 _CORNER: Final = math.sqrt(0.5)  # cells from the middle of one to its corner
 
@@ -163,7 +162,8 @@ class Search:
         patch do, or 0.03 nats less, in half of its time.
         """
         allowed = sum(int(tile.allowed.sum()) for tile in self.tiles)
-        return max(1, round(math.pow(allowed * (self._coarse_m / 1000) ** 2 / PATCH_KM2, _GROWTH)))
+        # 0.75: growth of the beam with the area
+        return max(1, round(math.pow(allowed * (self._coarse_m / 1000) ** 2 / PATCH_KM2, 0.75)))
 
     @cached_property
     def turns(self) -> Turns:

@@ -96,7 +96,6 @@ def posterior(scores: Sequence[float], *, null_score: float = 0.0) -> NDArray[np
     return np.asarray(mass / mass.sum())
 
 
-_QUARTERS: Final = 4
 _MOST_PLACES: Final = 512  # a side of a tile: bounds the memory of the transforms
 _NOTHING: Final = 1e-9
 
@@ -126,7 +125,7 @@ def all_around(step_deg: float, scales: Sequence[float] = (1.0,), scale_step: fl
     """Return all headings in equal steps of at most `step_deg`."""
     count = math.ceil(90 / step_deg - _NOTHING)
     bases = tuple(_turn(90 * at / count, scale) for scale in scales for at in range(count))
-    return Turns(bases=bases, quarters=_QUARTERS, yaw_step_deg=90 / count, scale_step=scale_step)
+    return Turns(bases=bases, quarters=4, yaw_step_deg=90 / count, scale_step=scale_step)
 
 
 def _turn(yaw_deg: float, scale: float) -> Pose:

@@ -16,8 +16,6 @@ from sasgeo_bench.search.correlation import Correlation
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.plan import Disc, Mode, Tile, Turns, tiles_of
 
-_SAME_DEG: Final = 1e-7  # closer headings are the same one
-_DIGITS: Final = 6
 _RIGHT_DEG: Final = 90.0
 _CIRCLE_DEG: Final = 360.0
 
@@ -167,9 +165,9 @@ class _Headings:
         ordered = np.sort(yaws_deg)
         gaps_deg = np.diff(ordered, prepend=ordered[-1] - _CIRCLE_DEG)
         start_deg = ordered[gaps_deg.argmax()]
-        offset_deg = np.mod(yaws_deg - start_deg + _SAME_DEG, _CIRCLE_DEG)
+        offset_deg = np.mod(yaws_deg - start_deg + 1e-7, _CIRCLE_DEG)  # degrees: closer headings are the same one
         quarter = (offset_deg // _RIGHT_DEG).astype(np.int64)
-        rest_deg, base = np.unique((offset_deg - _RIGHT_DEG * quarter).round(_DIGITS), return_inverse=True)
+        rest_deg, base = np.unique((offset_deg - _RIGHT_DEG * quarter).round(6), return_inverse=True)
         poses = (
             Pose(easting_m=0.0, northing_m=0.0, yaw_deg=start_deg + rest, scale=scale) for rest in rest_deg.tolist()
         )

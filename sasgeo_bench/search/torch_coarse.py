@@ -21,10 +21,6 @@ Tensor = Any
 
 _LOW: Final = -1e30  # score of a place that is not allowed
 _NOTHING: Final = 1e-9
-_PLACES: Final = 64  # places for each requested mode whose headings are looked through
-_PEAKS: Final = 8  # peaks for each requested mode: far more than their better neighbours can drop
-_PARTS: Final = 5  # arrays as large as the transformed scores that are alive at once
-_HALF: Final = 0.5  # of a cell, where whole cells are counted
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,7 +61,8 @@ class Views:
             return self.bands
         kernel = torch.from_numpy(round_kernel(level.grid.cell_size_m / self.template.cell_size_m)).to(self.bands)
         gains = (self.bands > 0).to(kernel.dtype).flatten(0, 1)[:, None]
-        near = torch.nn.functional.conv2d(gains, kernel[None, None], padding="same").view(self.bands.shape) > _HALF
+        # 0.5 of a cell, where whole cells are counted
+        near = torch.nn.functional.conv2d(gains, kernel[None, None], padding="same").view(self.bands.shape) > 0.5
         thinner = torch.from_numpy(level.thinner[self.active]).to(self.bands)[:, None, None]
         return (self.bands * thinner * ~near).where((self.bands < 0) & (thinner < 1), self.bands)
 
@@ -109,7 +106,8 @@ class Coarse:
         """Return at most `most` modes of a tile, and the highest score of each of its places, shape (Q, places)."""
         board = Board.of(self, tile)
         quarters = self.turns.quarters
-        planes = max(1, self.most_bytes // (_PARTS * board.bytes_a_plane))
+        # 5 arrays as large as the transformed scores that are alive at once
+        planes = max(1, self.most_bytes // (5 * board.bytes_a_plane))
         bases = max(1, min(planes // quarters, len(self.turns.bases)))
         modes, best = [], []
         for first in range(0, len(self.turns.bases), bases):
@@ -257,7 +255,8 @@ class Board:
         is_top = (highest == torch.nn.functional.max_pool2d(highest, 3, 1, 1)) & self.allowed
         flat, enough = highest.flatten(1), min(SPARE * most, self.allowed.numel())
         least = highest.where(is_top, _LOW).flatten(1).topk(enough).values[:, -1]
-        places = flat.topk(min(_PLACES * most, flat.shape[1])).indices.sort(1).values
+        # 64 places for each requested mode whose headings are looked through
+        places = flat.topk(min(64 * most, flat.shape[1])).indices.sort(1).values
         row, col = places // self.allowed.shape[1], places % self.allowed.shape[1]
         values = scores[row, torch.arange(len(laid), device=laid.device)[:, None], :, col]
         is_high = (values >= least[:, None, None]) & self.allowed[row, col][..., None]
@@ -269,8 +268,9 @@ class Board:
             is_peak &= ~self.allowed[there] | (score >= scores[there[0], view, turn, there[1]])
         view, row, col, turn, score = (part[is_peak] for part in (view, row, col, turn, score))
         pose = torch.cat((torch.stack((row, col), dim=1).double(), turned[turn]), dim=1)
+        # 8 peaks for each requested mode: far more than their better neighbours can drop
         return flat[:, self.allowed.flatten()] * unit[:, None], _padded(
-            view, pose, score.double() * unit[view], (len(laid), _PEAKS * most)
+            view, pose, score.double() * unit[view], (len(laid), 8 * most)
         )
 
 

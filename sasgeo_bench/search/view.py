@@ -3,7 +3,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Final, Self, TypeVar
+from typing import Self, TypeVar
 
 import cv2
 import numpy as np
@@ -16,7 +16,6 @@ from sasgeo_bench.search.chart import Chart
 from sasgeo_bench.search.field import FULL
 
 NOWHERE = -math.inf  # score of a pose with too little of the map in view
-_AT_ONCE: Final = 16384  # samples
 
 Number = TypeVar("Number", np.float32, np.uint8)
 
@@ -157,7 +156,7 @@ class Patch:
 
 
 def _blocks(rows: int, cols: int) -> list[slice]:
-    step = max(1, _AT_ONCE // cols)
+    step = max(1, 16384 // cols)  # 16384 samples
     return [slice(start, start + step) for start in range(0, rows, step)]
 
 

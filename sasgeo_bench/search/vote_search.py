@@ -17,13 +17,8 @@ from sasgeo_bench.search.view import NOWHERE, Patch, Samples, View
 from sasgeo_bench.search.votes import ByPlanes, ByRows
 
 _FEW: Final = 32  # places a side: more cost less by transforms of planes
-_TILE: Final = 256  # places a side of a tile: larger ones take more memory and save no time
-_SCALE_SPREAD: Final = 2.0  # standard deviations of the scale: at 0.03 three scales, between which modes are refined
-_NOTHING: Final = 1e-6  # known cells: less is rounding of the transform
 _MARGIN_M: Final = 12.0  # a mode may move so far while it is refined
 _WIDEN: Final = 0.05  # its scale may exceed the searched ones by so much
-_ROUNDS: Final = 8  # of steps of one size
-_SOME_CELLS: Final = 96  # a side: enough for the first steps
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,7 +77,8 @@ class _Votes:
 
 def turns(prior: Prior, plan: VotePlan) -> tuple[Pose, ...]:
     """Return headings and scales to search, as poses at the origin."""
-    scales = [1 + offset for offset in _steps(min(_SCALE_SPREAD * prior.scale_sigma, 0.9), plan.scale_step)]
+    # 2: standard deviations of the scale: at 0.03 three scales, between which modes are refined
+    scales = [1 + offset for offset in _steps(min(2.0 * prior.scale_sigma, 0.9), plan.scale_step)]
     yaws_deg = _yaws_deg(prior, plan)
     return tuple(Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw, scale=scale) for scale in scales for yaw in yaws_deg)
 
@@ -189,7 +185,8 @@ class VoteSearch:
         top, left, bottom, right = self._box()
         if top >= bottom or left >= right:
             return []
-        count = min(_TILE, -(-max(bottom - top, right - left) // factor))
+        # 256 places a side of a tile: larger ones take more memory and save no time
+        count = min(256, -(-max(bottom - top, right - left) // factor))
         limit = self._limit(factor)
         starts = [
             (row, col) for row in range(top, bottom, count * factor) for col in range(left, right, count * factor)
@@ -245,7 +242,8 @@ class VoteSearch:
             for tile, window, best in zip(tiles, windows, votes, strict=True):
                 total, counted = how.votes(window, spectrum)
                 enough = counted >= least[:, None, None, None]
-                score = np.where(enough, total / np.maximum(counted, _NOTHING), NOWHERE)
+                # 1e-6 known cells: less is rounding of the transform
+                score = np.where(enough, total / np.maximum(counted, 1e-6), NOWHERE)
                 for k in range(1, quarters):
                     score[:, k] = np.rot90(score[:, k], -k, (1, 2))
                 score = score.reshape(some.size, -1)
@@ -299,7 +297,8 @@ class VoteSearch:
         blurred = self.view.samples(
             self.view.blurred(blur_m), stride=max(1, round(blur_m / self.view.grid.cell_size_m))
         )
-        some = self.view.samples(self.view.template, stride=max(1, round(max(self.view.grid.shape) / _SOME_CELLS)))
+        # 96 cells a side: enough for the first steps
+        some = self.view.samples(self.view.template, stride=max(1, round(max(self.view.grid.shape) / 96)))
         every = self.view.samples(self.view.template, stride=1)
         return (
             _Level(samples=blurred, steps=(blur_m / 2, yaw_deg / 2, scale / 2), halvings=2),
@@ -369,7 +368,7 @@ def above_others(score: NDArray[np.float64], points_m: NDArray[np.float64], *, a
 def _climb(best: Mode, score_of: Callable[[Pose], float], steps: Sequence[float]) -> Mode:
     """Step along place, heading and scale, one at a time, while the score improves."""
     metres, degrees, scale = steps
-    for _ in range(_ROUNDS):
+    for _ in range(8):  # rounds of steps of one size
         before = best
         for name, step in (("easting_m", metres), ("northing_m", metres), ("yaw_deg", degrees), ("scale", scale)):
             for sign in (1, -1):

@@ -2,15 +2,13 @@
 """Three-state votes of a view on a map (Eqs. 7-8 of the SASGeo paper) for all shifts at once, by FFT."""
 
 from dataclasses import dataclass
-from typing import Final, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
-
-_MOST_VALUES: Final = 4_000_000  # of transformed templates at a time
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -143,7 +141,8 @@ class ByRows:
 
     def at_once(self, bands: int) -> int:
         """Return how many templates to transform together: as many as stay small."""
-        return max(1, _MOST_VALUES // (bands * self.high * self.size))
+        # At most 4 million values of transformed templates at a time
+        return max(1, 4_000_000 // (bands * self.high * self.size))
 
     def window(self, layers: NDArray[np.floating]) -> NDArray[np.complexfloating]:
         """Transform squares of the map, once for all templates."""

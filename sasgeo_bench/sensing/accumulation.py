@@ -22,7 +22,6 @@ from sasgeo_bench.sensing.camera import Attitude, Camera
 Planes = NDArray[np.float32]
 
 _SUREST: Final = 0.98  # probability beyond which one frame is not believed
-_MEAN_REACH: Final = 0.3826  # mean distance of the points of a square from its middle, in sides
 _HALF: Final = 0.5
 _M_PER_KM: Final = 1000.0
 _MOST_SHARE: Final = 1.0
@@ -159,7 +158,8 @@ def accumulate(
     _check(frames, steps, correlation, caution)
     errors = errors or Errors()
     last = frames[-1]
-    reach_m = _MEAN_REACH * last.probabilities.shape[1] * last.cell_size_m
+    # 0.3826: mean distance of the points of a square from its middle, in sides
+    reach_m = 0.3826 * last.probabilities.shape[1] * last.cell_size_m
     total = np.zeros(last.probabilities.shape, dtype=np.float64)
     count = np.zeros(last.probabilities.shape, dtype=np.int64)
     pose, distance_m = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0), 0.0  # of the last frame in frame `index`

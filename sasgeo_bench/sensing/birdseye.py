@@ -30,8 +30,6 @@ STANDING_M: Final[Mapping[str, float]] = MappingProxyType(
 
 _MOST_CELLS: Final = 4096  # a side of a view
 _HALF: Final = 0.5
-_FINEST: Final = 10  # percentile of the sampling distances by which a picture is reduced before it is sampled
-_LEAST_HEIGHT: Final = 1.5  # of the camera over what stands up: from less, nothing is known behind it
 _FULL: Final = 255
 
 
@@ -170,7 +168,8 @@ class BirdsEye:
     def _factor(self) -> int:
         if not self.is_seen.any():
             return 1
-        return max(1, int(self.cell_size_m / max(np.nanpercentile(self.gsd_m, _FINEST), 1e-6)))
+        # 10: percentile of the sampling distances by which a picture is reduced before it is sampled
+        return max(1, int(self.cell_size_m / max(np.nanpercentile(self.gsd_m, 10), 1e-6)))
 
     def _take(self, plane: Planes, where: Planes, factor: int) -> Planes:
         rows, cols = plane.shape
@@ -190,7 +189,8 @@ class BirdsEye:
         """
         if not standing.any() or height_m <= 0:
             return np.zeros_like(standing)
-        if self.above_m < _LEAST_HEIGHT * height_m:
+        # 1.5: least height of the camera over what stands up: from less, nothing is known behind it
+        if self.above_m < 1.5 * height_m:
             return standing.copy()
         outward = height_m / (self.above_m - height_m)
         rows, cols = standing.shape

@@ -30,12 +30,8 @@ _CAMERA_OF_BODY: Final = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 
 _NED_OF_ENU: Final = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 
 _STRAIGHT_DOWN_DEG: Final = -90.0
-_MOST_M: Final = 1e8  # of a coordinate: more than any projected CRS has
 _HIGHEST_M: Final = 50_000.0
-_NEAREST_M: Final = 1e-6  # ahead of the camera; what is nearer is not projected
 _MESH: Final = 32  # parts of a side of the picture, for the footprint
-_REACH: Final = 20.0  # of a footprint, in heights above the ground
-_BEYOND: Final = 0.01  # of the slope at a footprint's end: where its straight far side is cut, before its round end
 _HALF_PX: Final = 0.5
 
 
@@ -110,7 +106,8 @@ class Camera:
 
     def __post_init__(self) -> None:
         _check_finite(self, self.east_m, self.north_m, self.height_m, *self.rotation)
-        if max(abs(self.east_m), abs(self.north_m)) > _MOST_M or abs(self.height_m) > _HIGHEST_M:
+        # 1e8 m of a coordinate: more than any projected CRS has
+        if max(abs(self.east_m), abs(self.north_m)) > 1e8 or abs(self.height_m) > _HIGHEST_M:
             raise CameraError(
                 f"a camera is within {_HIGHEST_M:g} m of height 0 and at coordinates in metres, got height "
                 f"{self.height_m!r} at {self.east_m!r}, {self.north_m!r}"
@@ -234,7 +231,8 @@ class Camera:
         Points beside the picture get pixels outside it: ask `intrinsics.contains`.
         """
         seen = (np.asarray(points_m, dtype=np.float64) - self.position_m) @ self.matrix.T
-        ahead_m = np.where(seen[:, 2] > _NEAREST_M, seen[:, 2], np.nan)
+        # 1e-6 m ahead of the camera; what is nearer is not projected
+        ahead_m = np.where(seen[:, 2] > 1e-6, seen[:, 2], np.nan)
         return self.intrinsics.to_pixels(seen[:, :2] / ahead_m[:, None])
 
     def rays(self, points_px: Points) -> Points:
@@ -284,13 +282,14 @@ class Camera:
         above_m = self.height_m - (beneath_m if math.isfinite(beneath_m) else 0.0)
         if above_m <= 0:
             return shapely.Polygon()
-        reach_m = reach_m or _REACH * above_m
+        reach_m = reach_m or 20.0 * above_m  # reach of a footprint, in heights above the ground
         seen = self._outline(ground, above_m / reach_m) if isinstance(ground, Plane) else self._patches(ground)
         return _largest(seen.intersection(shapely.Point(self.east_m, self.north_m).buffer(reach_m, quad_segs=64)))
 
     def _outline(self, ground: Plane, slope: float) -> shapely.Geometry:
         rays = self.rays(self.intrinsics.border_px(_MESH))
-        points_m = ground.meet(self.position_m, _cut(rays[np.isfinite(rays).all(axis=1)], slope * _BEYOND))
+        # 0.01 of the slope at a footprint's end: where its straight far side is cut, before its round end
+        points_m = ground.meet(self.position_m, _cut(rays[np.isfinite(rays).all(axis=1)], slope * 0.01))
         seen = points_m[np.isfinite(points_m).all(axis=1), :2].round(6)
         return shapely.Polygon(seen).buffer(0) if len(seen) > 2 else shapely.Polygon()  # a triangle
 

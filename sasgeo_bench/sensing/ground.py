@@ -24,10 +24,8 @@ from sasgeo_bench.texts import one_line
 Points = NDArray[np.float64]
 
 _MARGIN_M: Final = 0.01  # above the highest and under the lowest ground, against rounding
-_HALVINGS: Final = 8  # of the step in which a ray met the ground, before the rest is taken for straight
 _LOWEST_M, _HIGHEST_M = -12_000.0, 9_000.0  # what is outside is no height of a ground in metres
 _CHUNK: Final = 200_000  # rays followed at a time
-_MOST_STEPS: Final = 4_000  # of one cell each
 _UNITS_M: Final = dict.fromkeys(("m", "metre", "meter", "metres", "meters"), 1.0) | {
     **dict.fromkeys(("ft", "foot", "feet", "international foot"), 0.3048),
     **dict.fromkeys(("us survey foot", "us_survey_foot", "us-ft", "ftus", "us foot", "foot_us"), 1200 / 3937),
@@ -131,7 +129,7 @@ class Dem:
         step = np.where(falling, np.minimum(step, end - start), 1.0)
         at, found = np.where(falling, start, np.nan), np.full(len(directions), np.nan)
         is_open = falling & (self._clearance_m(origin_m, directions, at) >= 0)
-        for _ in range(_MOST_STEPS):
+        for _ in range(4_000):  # at most 4_000 steps of one cell each
             rays = np.flatnonzero(is_open)
             if not len(rays):
                 break
@@ -151,7 +149,7 @@ class Dem:
         """Halve the step that begins above ground and ends under it."""
         rays = np.flatnonzero(np.isfinite(above))
         low, high, directions_met = above[rays], above[rays] + step[rays], directions[rays]
-        for _ in range(_HALVINGS):
+        for _ in range(8):  # halvings of the step in which a ray met the ground, before the rest is taken for straight
             middle = (low + high) / 2
             is_under = self._clearance_m(origin_m, directions_met, middle) <= 0
             low, high = np.where(is_under, low, middle), np.where(is_under, middle, high)

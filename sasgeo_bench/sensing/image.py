@@ -26,9 +26,6 @@ _WITHIN_8_BITS: Final = frozenset(
 )
 _16_BITS: Final = 65535
 _BETWEEN: Final = (2, 249)  # levels of an alpha that are neither transparent nor opaque
-_MOST_BETWEEN: Final = 0.1  # of a TIFF's pixels, at the edges of a mask, are neither opaque nor transparent
-_KIND: Final = 254  # TIFF's NewSubfileType
-_REDUCED: Final = 1  # its bit of a preview, as raw photos (DNG) have one in front
 
 
 def decode_image(
@@ -107,7 +104,8 @@ def _check_head(image: Image.Image, name: str, most_pixels: int) -> None:
         raise ImageError(
             f"{name} has {width} x {height} pixels, at most {most_pixels} are decoded: cut it, or scale it down, first"
         )
-    if getattr(image, "tag_v2", {}).get(_KIND, 0) & _REDUCED:
+    # 1: its bit of a preview, as raw photos (DNG) have one in front
+    if getattr(image, "tag_v2", {}).get(254, 0) & 1:  # 254: TIFF's NewSubfileType
         raise ImageError(f"{name} begins with what is a preview of another picture in the file: export it as JPEG")
     if image.mode not in _WITHIN_8_BITS and not image.mode.startswith("I;16"):
         raise ImageError(
@@ -124,7 +122,8 @@ def _to_rgb(image: Image.Image, name: str, *, is_tiff: bool) -> Picture:
     if image.has_transparency_data:
         seen = image.convert("RGBA")
         alpha = np.asarray(seen.getchannel("A"))
-        if is_tiff and ((alpha >= _BETWEEN[0]) & (alpha <= _BETWEEN[1])).mean() > _MOST_BETWEEN:
+        # 0.1 of a TIFF's pixels, at the edges of a mask, are neither opaque nor transparent
+        if is_tiff and ((alpha >= _BETWEEN[0]) & (alpha <= _BETWEEN[1])).mean() > 0.1:
             raise ImageError(
                 f"{name} has a band that calls itself alpha and holds a picture, such as near infrared: write its red, "
                 "green and blue alone (gdal_translate -b 1 -b 2 -b 3)"

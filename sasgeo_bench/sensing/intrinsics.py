@@ -24,7 +24,6 @@ _HALF_PX: Final = 0.5  # from OpenCV's integer centres to pixel-is-area
 _WIDEST_DEG: Final = 170.0  # of a field of view; beyond it a pinhole no longer describes a lens
 _MOST_PX: Final = 100_000  # of a side
 _STEPS: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-10)  # to take distortion off
-_SAME_PX: Final = 1e-3  # a point whose distortion cannot be undone this well has no ray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,17 +167,16 @@ class Intrinsics:
             _STEPS,
         )
         slopes = np.asarray(found, dtype=np.float64).reshape(-1, 2)
-        missed = ~(np.abs(self.to_pixels(slopes) - points_px).max(axis=1) < _SAME_PX)
+        # 1e-3 pixels: a point whose distortion cannot be undone this well has no ray
+        missed = ~(np.abs(self.to_pixels(slopes) - points_px).max(axis=1) < 1e-3)
         return np.where(missed[:, None], np.nan, slopes)
-
-
-_NO_BEND: Final = 1e-15  # moves no pixel of any lens; the division of a root by less would overflow
 
 
 def _fold(distortion: Distortion) -> float:
     """Return the radius, as a slope, from which the radial polynomial no longer grows; infinite if it always does."""
     k1, k2, _, _, k3 = distortion
     slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])  # the derivative of r (1 + k1 r2 + k2 r4 + k3 r6), in r2
-    squares = np.roots(np.where(np.abs(slope) < _NO_BEND, 0.0, slope))
+    # 1e-15: moves no pixel of any lens; the division of a root by less would overflow
+    squares = np.roots(np.where(np.abs(slope) < 1e-15, 0.0, slope))
     real = squares.real[(np.abs(squares.imag) < 1e-12) & (squares.real > 0)]  # rounding of a real root
     return float(np.sqrt(real.min())) if len(real) else math.inf

@@ -16,7 +16,6 @@ from sasgeo_bench.sensing.photo_heads import Xmp, number_of
 
 DJI: Final = "http://www.dji.com/drone-dji/1.0"
 AUTEL: Final = "http://www.autelrobotics.com/drone/1.0"
-PARROT: Final = "http://www.parrot.com/drone-parrot/1.0"
 SKYDIO: Final = "https://www.skydio.com/drone-skydio/1.0"
 PIX4D: Final = "http://pix4d.com/camera/1.0"
 SENSEFLY: Final = "http://ns.sensefly.com/Camera/1.0"
@@ -25,7 +24,7 @@ _GIMBAL: Final = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
 _CAMERA: Final[Mapping[str, tuple[str, str, str]]] = {  # makers before Pix4D, whose tags several of them write as well
     DJI: _GIMBAL,
     AUTEL: _GIMBAL,
-    PARROT: ("CameraRollDegree", "CameraPitchDegree", "CameraYawDegree"),
+    "http://www.parrot.com/drone-parrot/1.0": ("CameraRollDegree", "CameraPitchDegree", "CameraYawDegree"),
     SKYDIO: ("CameraOrientationNED/Roll", "CameraOrientationNED/Pitch", "CameraOrientationNED/Yaw"),
     PIX4D: ("Roll", "Pitch", "Yaw"),
     SENSEFLY: ("Roll", "Pitch", "Yaw"),
@@ -33,8 +32,6 @@ _CAMERA: Final[Mapping[str, tuple[str, str, str]]] = {  # makers before Pix4D, w
 _HEIGHT: Final = ((DJI, "RelativeAltitude"), (AUTEL, "RelativeAltitude"), (SKYDIO, "RelativeAltitude"),
                   (PIX4D, "AboveGroundAltitude"), (SENSEFLY, "AboveGroundAltitude"))  # fmt: skip
 _ALTITUDE: Final = tuple((uri, "AbsoluteAltitude") for uri in (DJI, AUTEL, SKYDIO))
-_HIGHEST_DEG: Final = 30.0  # to which Autel's gimbals rise above the horizon
-_BACKWARD_DEG: Final = -20.0  # no camera that looks down at 0 leans back more, but one that counts from the horizon
 _STRAIGHT_DOWN: Final = Attitude(pitch_deg=-90.0)
 
 
@@ -97,7 +94,7 @@ def _autel(found: Attitude) -> Angles:
     """Autel counts the pitch downwards in some firmware, upwards in other; the gimbals rise by 30 degrees at most."""
     if found.pitch_deg <= 0:
         return Angles(attitude=found)
-    if found.pitch_deg > _HIGHEST_DEG:
+    if found.pitch_deg > 30.0:  # degrees to which Autel's gimbals rise above the horizon
         return Angles(attitude=Attitude(roll_deg=found.roll_deg, pitch_deg=-found.pitch_deg, yaw_deg=found.yaw_deg))
     return Angles(
         fault=f"a pitch of {found.pitch_deg:+g} degrees, which Autel counts from the horizon upwards or downwards"
@@ -106,7 +103,8 @@ def _autel(found: Attitude) -> Angles:
 
 def _pix4d(found: Attitude, make: str) -> Angles:
     """Pix4D: pitch 0 is straight down, 90 ahead; senseFly turns the sign of the roll."""
-    if found.pitch_deg < _BACKWARD_DEG:
+    # -20 degrees: no camera that looks down at 0 leans back more, but one that counts from the horizon
+    if found.pitch_deg < -20.0:
         return Angles(
             fault=f"a pitch of {found.pitch_deg:+g} degrees in Camera:Pitch, where 0 is straight down and 90 ahead: it "
             "seems to count from the horizon"

@@ -17,8 +17,6 @@ from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.texts import message_of
 
 _TIFF: Final = (b"II*\0", b"MM\0*")
-_REDUCED: Final = 1  # bit of NewSubfileType: a preview of another picture in the file
-_MOST_PARTS: Final = 32  # of a DNG
 _WIDTH, _HEIGHT, _KIND, _PARTS, _XMP, _CROP = 256, 257, 254, 330, 700, 50720
 _FRAME: Final = ("adobe:ns:meta", "http://www.w3.org/1999/02/22-rdf-syntax-ns#")  # namespaces that hold no property
 
@@ -82,12 +80,13 @@ def _read_tiff(file: IO[bytes]) -> PhotoHead:
     parts: list[Mapping[int, Any]] = [first]
     file.seek(0)
     start = file.read(8)
-    for offset in (offsets if isinstance(offsets, tuple) else (offsets,))[:_MOST_PARTS]:
+    for offset in (offsets if isinstance(offsets, tuple) else (offsets,))[:32]:  # at most 32 parts of a DNG
         part = ImageFileDirectory_v2(start)
         file.seek(int(offset))
         part.load(file)
         parts.append(dict(part))
-    whole = [part for part in parts if not int(part.get(_KIND, 0)) & _REDUCED] or parts
+    # 1: bit of NewSubfileType: a preview of another picture in the file
+    whole = [part for part in parts if not int(part.get(_KIND, 0)) & 1] or parts
     return _head(max(map(_size_px, whole), key=math.prod), exif, first.get(_XMP))
 
 

@@ -13,10 +13,6 @@ _FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
 _WIDEST_SENSOR: Final = 1.55  # width / height; a wider photo is cut out of a sensor of 4 : 3
 _CUTS: Final = (3 / 2, 16 / 9)  # width / height that cameras cut out of a higher sensor
 _SAME: Final = 0.02  # difference of two aspects that are one
-_NEAR: Final = 0.05  # of a picture's size, by which an optical centre lies beside its middle
-_AGREES: Final = 0.15  # difference of two focal lengths; that on film is rounded to millimetres
-_FOCAL_PX: Final = (0.3, 20.0)  # in widths of the picture: limits of a calibrated focal length that can be meant
-_NOT_IN_FILM: Final = ("dji", "hasselblad")  # makers whose focal length on film leaves digital zoom out
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,7 +55,8 @@ class Lens:
         if calibrated is not None:
             is_sized = self.calibrated_size_px or self.native_size_px
             by, other = "calibration", None if is_sized else calibrated
-        if film is not None and other is not None and abs(film / other - 1) > _AGREES:
+        # 0.15: difference of two focal lengths; that on film is rounded to millimetres
+        if film is not None and other is not None and abs(film / other - 1) > 0.15:
             raise CameraError(
                 f"{name} has two focal lengths, {film:.0f} px by 35 mm film and {other:.0f} px by {by}: it was cut or "
                 "resized; use the drone's own file, or give the camera's intrinsics"
@@ -68,7 +65,8 @@ class Lens:
         if found is None:
             raise CameraError(f"{name} has no focal length on 35 mm film: give the camera's intrinsics")
         zoom = self.zoom or 1.0
-        leaves_out = calibrated is None and film is not None and self.make.lower() in _NOT_IN_FILM
+        # Makers whose focal length on film leaves digital zoom out
+        leaves_out = calibrated is None and film is not None and self.make.lower() in ("dji", "hasselblad")
         if zoom < 1.0 or (zoom > 1.0 and not leaves_out):
             raise CameraError(
                 f"{name} has a digital zoom of {zoom:g}, which its focal length may count or not: give the camera's "
@@ -79,7 +77,7 @@ class Lens:
     def _by_calibration(self, name: str, size_px: Size) -> float | None:
         if self.calibrated_px is None:
             return None
-        low, high = _FOCAL_PX
+        low, high = 0.3, 20.0  # in widths of the picture: limits of a calibrated focal length that can be meant
         side_px = max(self.calibrated_size_px or size_px)
         if not low * side_px <= self.calibrated_px <= high * side_px:
             return None
@@ -129,7 +127,8 @@ class Lens:
 
 
 def _is_near(one: Size, two: Size) -> bool:
-    return all(abs(a / b - 1) <= _NEAR for a, b in zip(one, two, strict=True))
+    # 0.05 of a picture's size, by which an optical centre lies beside its middle
+    return all(abs(a / b - 1) <= 0.05 for a, b in zip(one, two, strict=True))
 
 
 def _text(size_px: Size) -> str:

@@ -23,13 +23,10 @@ from sasgeo_bench.sensing.photo_lens import Lens, Size
 from sasgeo_bench.texts import one_line
 
 MOST_BYTES: Final = 64 * 2**20  # of a photo
-MOST_PIXELS: Final = 200_000_000
 
 _STRAIGHT_DOWN_DEG: Final = -90.0
 _HORIZON_DEG: Final = 90.0 - 1e-6  # of tilt; the optical axis of a camera that leans more meets no level ground
 _STEP_DEG: Final = 1e-4  # to the north, by which the grid's north is found
-_TIFF: Final = "http://ns.adobe.com/tiff/1.0"
-_PANORAMA: Final = "http://ns.google.com/photos/1.0/panorama"
 _UNITS_MM: Final = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # EXIF's units of FocalPlaneXResolution
 
 # EXIF's orientation -> right and down of the upright picture in those of the sensor; 0 is none, the others mirror.
@@ -157,7 +154,7 @@ def _to_grid(lon_deg: float, lat_deg: float, epsg: int) -> tuple[float, float, f
     return here_m, low_m, float(bearing_deg(sign * (there_m - here_m), sign * (high_m - low_m)))
 
 
-def read_photo(path: Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = MOST_PIXELS) -> Photo:
+def read_photo(path: Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = 200_000_000) -> Photo:
     """Read the metadata of a drone's photo (JPEG, TIFF, DNG); raise `ImageError` if it is no sound photo.
 
     Nothing is decoded; limits are on the bytes of the file and the pixels that its head announces. What a file does not
@@ -185,7 +182,7 @@ def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:
     if _TURNS[orientation][0][0] == 0:
         width_px, height_px = height_px, width_px
     lon_deg, lat_deg = _place(head.gps)
-    make = _text(head.exif.get(ExifTags.Base.Make)) or head.xmp.get((_TIFF, "Make"), "")
+    make = _text(head.exif.get(ExifTags.Base.Make)) or head.xmp.get(("http://ns.adobe.com/tiff/1.0", "Make"), "")
     angles = camera_angles(head.xmp, make)
     return Photo(
         name=name,
@@ -232,7 +229,9 @@ def _lens(inner: Mapping[int, Any], xmp: Xmp, make: str) -> Lens:
 def _projection(xmp: Xmp) -> str:
     """Return the projection of a fisheye or a panorama, empty for the picture of a pinhole."""
     model = xmp.get((PIX4D, "ModelType"), "perspective").lower()
-    return one_line(xmp.get((_PANORAMA, "ProjectionType"), "" if model == "perspective" else model))[:40]
+    return one_line(
+        xmp.get(("http://ns.google.com/photos/1.0/panorama", "ProjectionType"), "" if model == "perspective" else model)
+    )[:40]
 
 
 def _calibration(xmp: Xmp) -> tuple[float | None, Size | None]:

@@ -23,14 +23,9 @@ from sasgeo_bench.sensing.ground import Plane
 Lines = NDArray[np.float64]
 
 _ROBUST: Final = 2.0  # standard deviations from which a line counts less: roads that widen are no rails
-_WORST: Final = 1e3  # residual of a border above the horizon
-_BEND_PX: Final = 4.0  # by which the outline of a road may leave a straight line
 _END_PX: Final = 6  # of a straight piece, left out at both ends: corners are round
-_SKEW_DEG: Final = 12.0  # between the two borders of a road in the picture
 _WIDEST_PX: Final = 200.0
 _NARROWEST_PX: Final = 3.0
-_OVERLAP: Final = 0.5  # of the shorter border, beside the other
-_SAMPLES: Final = 9  # places between two borders that must be road
 _HALF_TURN_DEG: Final = 180.0
 
 
@@ -156,7 +151,7 @@ def _angles_deg(camera: Camera, lines: Lines, sigmas_deg: NDArray[np.float64]) -
     """Return the angle on the ground between each border and the weighted mean of its road, degrees."""
     bearings_deg = _bearings_deg(camera, lines)
     if not np.isfinite(bearings_deg).all():
-        return np.full(len(lines), _WORST)
+        return np.full(len(lines), 1e3)  # residual of a border above the horizon
     off_deg = _off_deg(bearings_deg, bearings_deg[0])
     return np.asarray(off_deg - np.average(off_deg, weights=sigmas_deg**-2))
 
@@ -235,7 +230,8 @@ def _straight_pieces(is_road: NDArray[np.bool_], least_px: float) -> list[Lines]
     pieces = []
     for outline in outlines:
         points = outline.reshape(-1, 2)
-        corners = cv2.approxPolyDP(outline, _BEND_PX, closed=True).reshape(-1, 2)
+        # 4 pixels: bend by which the outline of a road may leave a straight line
+        corners = cv2.approxPolyDP(outline, 4.0, closed=True).reshape(-1, 2)
         if len(corners) < 2:  # a speck
             continue
         at = sorted(int(np.flatnonzero((points == corner).all(axis=1))[0]) for corner in corners)
@@ -259,13 +255,13 @@ def _beside_px(is_road: NDArray[np.bool_], first: Lines, second: Lines) -> float
     """Return along how many pixels two lines are the borders of one road; 0 if they are not."""
     along = (first[1] - first[0]) / np.linalg.norm(first[1] - first[0])
     other = (second[1] - second[0]) / np.linalg.norm(second[1] - second[0])
-    if abs(along @ other) < np.cos(np.radians(_SKEW_DEG)):
+    if abs(along @ other) < np.cos(np.radians(12.0)):  # degrees: skew between the two borders of a road in the picture
         return 0.0
     spans = np.sort([(line - first[0]) @ along for line in (first, second)], axis=1)
     low, high = spans[:, 0].max(), spans[:, 1].min()
-    if high - low < _OVERLAP * (spans[:, 1] - spans[:, 0]).min():
+    if high - low < 0.5 * (spans[:, 1] - spans[:, 0]).min():  # 0.5: overlap of the shorter border, beside the other
         return 0.0
-    steps = np.linspace(low, high, _SAMPLES + 2)[1:-1]
+    steps = np.linspace(low, high, 9 + 2)[1:-1]  # 9 places between two borders that must be road
     on_first = first[0] + steps[:, None] * along
     # Where the line across a place on the first border meets the second one.
     normal = np.array([-other[1], other[0]])

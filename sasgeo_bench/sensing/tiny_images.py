@@ -15,10 +15,7 @@ from sasgeo_bench.sensing.intrinsics import Intrinsics
 CLASSES: Final = ("road_minor", "building", "water", "green")
 PLACES: Final = ("drawn-east", "drawn-west")
 SIZE_PX: Final = (96, 128)  # rows and columns
-HEIGHT_M: Final = 80.0
-_EACH: Final = 2  # pictures of a place
 _SEED: Final = 1  # of the drawings, which never change
-_NOISE: Final = 8.0  # of a pixel, in steps of 255
 _GROUND: Final = (150, 140, 120)
 _COLOURS: Final = {
     "road_minor": (100, 100, 105),
@@ -26,8 +23,6 @@ _COLOURS: Final = {
     "water": (40, 70, 110),
     "green": (70, 110, 60),
 }
-_SPREAD: Final = 8  # of a colour between pictures
-_MARGIN_PX: Final = 6  # at the right edge, where nobody has looked
 
 
 def tiny_images() -> tuple[LabelledImage, ...]:
@@ -38,7 +33,7 @@ def tiny_images() -> tuple[LabelledImage, ...]:
     (4, (96, 128), ['drawn-east', 'drawn-west'])
     """
     rng = np.random.default_rng(_SEED)
-    return tuple(_picture(place, rng) for place in PLACES for _ in range(_EACH))
+    return tuple(_picture(place, rng) for place in PLACES for _ in range(2))  # pictures of a place
 
 
 def with_picture(rgb: Picture) -> AerialImage:
@@ -49,7 +44,7 @@ def with_picture(rgb: Picture) -> AerialImage:
     """
     rows, cols = rgb.shape[:2]
     lens = Intrinsics.from_field_of_view(horizontal_deg=70.0, width_px=cols, height_px=rows)
-    camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=HEIGHT_M, yaw_deg=0.0)
+    camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=80.0, yaw_deg=0.0)
     return AerialImage(rgb=rgb, camera=camera, height_sigma_m=1.0, attitude_sigma_deg=1.0)
 
 
@@ -58,9 +53,10 @@ def _picture(place: str, rng: np.random.Generator) -> LabelledImage:
     rgb = np.empty((*SIZE_PX, 3), dtype=np.float64)
     rgb[:] = _GROUND
     for name in ("green", "water", "road_minor", "building"):
-        rgb[labels[CLASSES.index(name)] == 1] = rng.normal(_COLOURS[name], _SPREAD)
-    noisy = np.clip(rgb + rng.normal(scale=_NOISE, size=rgb.shape), 0, 255).astype(np.uint8)
-    labels[:, :, -_MARGIN_PX:] = UNKNOWN
+        rgb[labels[CLASSES.index(name)] == 1] = rng.normal(_COLOURS[name], 8)  # spread of a colour between pictures
+    # 8: noise of a pixel, in steps of 255
+    noisy = np.clip(rgb + rng.normal(scale=8.0, size=rgb.shape), 0, 255).astype(np.uint8)
+    labels[:, :, -6:] = UNKNOWN  # pixels: margin at the right edge, where nobody has looked
     return LabelledImage(image=with_picture(noisy), classes=CLASSES, labels=labels, place=place)
 
 

@@ -22,13 +22,7 @@ NEIGHBOURS: Final = 4
 LEAST_ALIKE: Final = 8  # matching buildings that make a patch
 LEAST_AREA_M2: Final = 40.0
 
-_STEP_M: Final = 1.0  # resolution of distances
-_STEP_AREA: Final = 0.1  # resolution of the area's logarithm
-_REACH_M: Final = 250.0  # largest distance of neighbours
-_MOST_ALIKE: Final = 3  # a key that is more frequent in one map belongs to rows of equal houses
 _WITHIN_M: Final = 2.0  # tolerance of a match
-_TRIES: Final = 300
-_LEAST_BASE_M: Final = 20.0  # least distance of the two buildings that define a placement
 
 Points = NDArray[np.float64]
 
@@ -66,9 +60,10 @@ def constellations(features: gpd.GeoDataFrame) -> Constellations:
     if len(en_m) <= NEIGHBOURS:
         return Constellations(en_m=np.zeros((0, 2)), keys=np.zeros(0, dtype=np.uint64))
     distances_m, nearest = (np.asarray(found) for found in KDTree(en_m).query(en_m, k=NEIGHBOURS + 1))
-    areas = np.log(shapely.area(shapes)) / _STEP_AREA
-    described = np.column_stack((areas, distances_m[:, 1:] / _STEP_M, areas[nearest[:, 1:]]))
-    is_near = distances_m[:, -1] < _REACH_M
+    areas = np.log(shapely.area(shapes)) / 0.1  # resolution of the area's logarithm
+    # 1 m: resolution of distances
+    described = np.column_stack((areas, distances_m[:, 1:] / 1.0, areas[nearest[:, 1:]]))
+    is_near = distances_m[:, -1] < 250.0  # 250 m: largest distance of neighbours
     return Constellations(en_m=en_m[is_near], keys=_keys(np.floor(described[is_near]).astype(np.int64)))
 
 
@@ -88,7 +83,7 @@ def find_duplicate(first: Constellations, second: Constellations) -> Duplicate |
         return None
     rng = np.random.default_rng(0)
     best = np.zeros(0, dtype=np.int64)
-    for _ in range(_TRIES):
+    for _ in range(300):
         at, other = rng.choice(len(one), size=2, replace=False)
         alike = _alike(one, two, int(at), int(other))
         if len(alike) > len(best):
@@ -141,13 +136,14 @@ def _matches(first: Constellations, second: Constellations) -> tuple[Points, Poi
 
 def _rare(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
     _, back, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    return np.flatnonzero(counts[back] <= _MOST_ALIKE)
+    return np.flatnonzero(counts[back] <= 3)  # a key that is more frequent in one map belongs to rows of equal houses
 
 
 def _alike(one: Points, two: Points, at: int, other: int) -> NDArray[np.int64]:
     """Return the matches that agree with the move and rotation given by two of them."""
     a, b = (complex(*(side[other] - side[at])) for side in (one, two))
-    if abs(a) < _LEAST_BASE_M or abs(abs(a) - abs(b)) > _WITHIN_M:
+    # 20 m: least distance of the two buildings that define a placement
+    if abs(a) < 20.0 or abs(abs(a) - abs(b)) > _WITHIN_M:
         return np.zeros(0, dtype=np.int64)
     turn = b / a / abs(b / a)
     shifted = (one - one[at]) @ np.array([[turn.real, turn.imag], [-turn.imag, turn.real]]) + two[at]

@@ -25,11 +25,6 @@ from sasgeo_bench.tasks.suites.flights import EXTENT, HEIGHT_M, LENGTHS_M, LOITE
 
 Floats = NDArray[np.float64]
 
-_TRIES: Final = 6  # paths of a kind and length before it does not fit
-_CARRIES: Final = 20  # shapes of the path that may end where a carried drone is taken from
-_PLACES: Final = 24  # tried for each shape
-_CARRY_SPREAD: Final = 1.25  # most that a distance carried is more or less than asked for, as a factor
-_CARRY_ROOM: Final = 1.5  # length of the path before the carrying, in that of the half it stands for
 _SCALE_CUT: Final = 2.0  # sigmas, as for views alone
 
 
@@ -109,7 +104,7 @@ class Airspace:
         longest_m = min(EXTENT * extent_m, self.suite.longest_m)
         for length_m in (length_m for length_m in LENGTHS_M if length_m <= longest_m):
             for kind in kinds:
-                for attempt in range(_TRIES):
+                for attempt in range(6):  # paths of a kind and length before it does not fit
                     rng = seeds.rng("path", kind, f"{length_m:g}", attempt)
                     views = self._views(kind, length_m, spacing_m, rng)
                     if views is None:
@@ -133,14 +128,15 @@ class Airspace:
     def elsewhere(self, flight: Flight, carried_m: float) -> Trajectory | None:
         """Return another first half for a flight, which ends so far from its middle; None if none is found."""
         area, seeds = flight_area(self.region, self.suite.clear_m(self.scene)), self.seeds_of(flight.site.index)
-        length_m = max(_CARRY_ROOM * flight.middle * flight.spacing_m, min(LENGTHS_M))
-        for attempt in range(_CARRIES):
+        # 1.5: length of the path before the carrying, in that of the half it stands for
+        length_m = max(1.5 * flight.middle * flight.spacing_m, min(LENGTHS_M))
+        for attempt in range(20):  # shapes of the path that may end where a carried drone is taken from
             rng = seeds.rng("carried", f"{carried_m:g}", attempt)
             views = self._views("waypoints", length_m, flight.spacing_m, rng)
             if views is None or len(views) < flight.middle:
                 continue
             shape = rows(views, slice(0, flight.middle))
-            for _ in range(_PLACES):
+            for _ in range(24):  # tried for each shape
                 half = _placed(shape, flight.views.position_m[flight.middle, :2], carried_m, rng)
                 is_over = bool(area.covers(shapely.MultiPoint(half.position_m[:, :2])))
                 if is_over and self._is_in_one_part(half, flight.views) and self._is_drawn(half, flight.scale):
@@ -187,7 +183,8 @@ class Airspace:
 
 def _placed(shape: Trajectory, middle_m: Floats, carried_m: float, rng: np.random.Generator) -> Trajectory:
     """Turn and move a path so that it ends about `carried_m` from a place, in any direction."""
-    far_m = carried_m * _CARRY_SPREAD ** rng.uniform(-1, 1)
+    # 1.25: most that a distance carried is more or less than asked for, as a factor
+    far_m = carried_m * 1.25 ** rng.uniform(-1, 1)
     bearing, turn_deg = rng.uniform(0, 2 * np.pi), float(rng.uniform(0, 360))
     position_m = shape.position_m.copy()
     end_m = middle_m + far_m * np.array([np.sin(bearing), np.cos(bearing)])

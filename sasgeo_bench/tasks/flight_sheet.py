@@ -34,18 +34,10 @@ LOST: Final = "#7b2fa0"
 OFF_MAP: Final = "#ffc928"
 COPY: Final = "#00796b"
 _COLUMNS: Final = ("query_id", "increment", "prior_easting_m", "prior_northing_m", "prior_radius_m")
-_MOST_ACROSS: Final = 4  # panels; a site with more variants takes two rows
-_ALONE_ACROSS: Final = 3  # panels, where each site has one
 _PANEL_INCHES: Final = 3.4
 _ONE_INCHES: Final = 8.0  # of a flight that is drawn alone
-_FINE_CELLS: Final = 3000  # on a side of a panel, up to which the map is read as it is
-_OVERVIEW_CELLS: Final = 4000  # of the whole map, where it is not
 _DRAWN_CELLS: Final = 900
-_MANY: Final = 120  # views: their dots are smaller
 _PALE: Final = 0.6  # of the map's colours that is white
-_AROUND: Final = 0.12  # of the extent of the paths, left free around them
-_ASTRAY: Final = 0.35  # of the extent of the true paths, by which reckoned ones may widen a panel
-_LEAST_M: Final = 300.0  # half a panel
 _IN_A_ROW: Final = "Flights of a row are of one site. "
 _RANK: Final = {"control": 0, "stress": 1, "falsifier": 2}
 
@@ -200,11 +192,11 @@ def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
     for panel in shown:
         sizes[panel.truth.pair_id] = sizes.get(panel.truth.pair_id, 0) + 1
     if len(sizes) == len(shown):
-        yield from (divmod(at, _ALONE_ACROSS) for at in range(len(shown)))
+        yield from (divmod(at, 3) for at in range(len(shown)))  # panels, where each site has one
         return
     begin = 0
     for size in sizes.values():
-        lines = -(-size // _MOST_ACROSS)
+        lines = -(-size // 4)  # panels; a site with more variants takes two rows
         across = -(-size // lines)
         yield from ((begin + at // across, at % across) for at in range(size))
         begin += lines
@@ -214,10 +206,12 @@ def bounds_of_m(shown: Sequence[FlightPanel]) -> tuple[float, float, float, floa
     """Return the square that the panels of a site show: west, east, south, north."""
     true = np.concatenate([panel.place_m for panel in shown] + [panel.copy_m[panel.is_copied] for panel in shown])
     low, high = true.min(axis=0), true.max(axis=0)
-    reach_m = _ASTRAY * float((high - low).max())
+    # 0.35 of the extent of the true paths, by which reckoned ones may widen a panel
+    reach_m = 0.35 * float((high - low).max())
     reckoned = np.clip(np.concatenate([panel.reckoned_m for panel in shown]), low - reach_m, high + reach_m)
     low, high = np.minimum(low, reckoned.min(axis=0)), np.maximum(high, reckoned.max(axis=0))
-    half_m = max(_LEAST_M, (0.5 + _AROUND) * float((high - low).max()))
+    # 0.12 of the extent of the paths, left free around them
+    half_m = max(300.0, (0.5 + 0.12) * float((high - low).max()))  # 300 m: half a panel
     east_m, north_m = ((low + high) / 2).tolist()
     return (east_m - half_m, east_m + half_m, north_m - half_m, north_m + half_m)
 
@@ -237,8 +231,10 @@ class Ground:
         cell_m, path = manifest.cell_size_m, folder / region_files.LAYERS
         left, right = (int(np.clip((at - west) // cell_m, 0, manifest.cols)) for at in bounds_m[:2])
         bottom, top = (int(np.clip((north - at) // cell_m, 0, manifest.rows)) for at in bounds_m[2:])
-        if max(right - left, bottom - top) > _FINE_CELLS:
-            layers, extent_m = read_overview(path, longest_cells=_OVERVIEW_CELLS), (west, east, south, north)
+        # 3000 cells on a side of a panel, up to which the map is read as it is
+        if max(right - left, bottom - top) > 3000:
+            # 4000 cells of the whole map, where it is not
+            layers, extent_m = read_overview(path, longest_cells=4000), (west, east, south, north)
         else:
             layers = read_layers(path, window=(top, left, bottom - top, right - left))
             extent_m = (west + left * cell_m, west + right * cell_m, north - bottom * cell_m, north - top * cell_m)
@@ -259,7 +255,8 @@ def draw_flight(chart: Axes, panel: FlightPanel, ground: Ground) -> None:
     if jump is not None:
         ahead = {"arrowstyle": "-|>", "color": LOST, "lw": 1.4, "ls": "--", "shrinkA": 0, "shrinkB": 0}
         chart.annotate("", place[jump], place[jump - 1], arrowprops=ahead, zorder=6)
-    chart.plot(*place[panel.is_seen].T, ".", ms=3.5 if len(place) < _MANY else 2.0, color=TRUE, zorder=4)
+    # 120 views: their dots are smaller
+    chart.plot(*place[panel.is_seen].T, ".", ms=3.5 if len(place) < 120 else 2.0, color=TRUE, zorder=4)
     chart.plot(*panel.copy_m.T, color="white", lw=3.2, zorder=2)
     chart.plot(*panel.copy_m.T, ".-", color=COPY, lw=1.1, ms=4, zorder=3)
     chart.plot(*place[~panel.is_on_map].T, "D", ms=3.8, mfc=OFF_MAP, mec=TRUE, mew=0.7, zorder=5)

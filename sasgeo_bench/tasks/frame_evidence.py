@@ -16,7 +16,6 @@ from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.frames import Frame
 
 _M_PER_KM: Final = 1000.0
-_STILL_M: Final = 1.0  # nearer frames tell nothing of drift
 
 
 def evidence_of(
@@ -83,7 +82,8 @@ def _errors(frames: Sequence[Frame]) -> Errors:
     far_m = [
         math.hypot(one.camera.east_m - last.camera.east_m, one.camera.north_m - last.camera.north_m) for one in frames
     ]
-    moved = [(frame, distance_m) for frame, distance_m in zip(frames, far_m, strict=True) if distance_m > _STILL_M]
+    # 1 m: nearer frames tell nothing of drift
+    moved = [(frame, distance_m) for frame, distance_m in zip(frames, far_m, strict=True) if distance_m > 1.0]
     return Errors(
         attitude_deg=last.attitude_sigma_deg,
         height_share=0.0,  # one error for a flight: the scale of the view, which the prior declares

@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 LABELS: Final = "labels.parquet"  # beside the truths: what is on each pixel of each frame
 MOST_PICTURE_BYTES: Final = 150_000
 MOST_FRAMES: Final = 64
-_QUALITIES: Final = (85, 75, 65, 55, 45, 35, 25, 15, 5)  # of WebP, tried in turn until the picture fits
 _SIGMAS: Final = ("height_sigma_m", "attitude_sigma_deg", "position_sigma_m", "yaw_sigma_deg")
-_MOST_PICTURE_PIXELS: Final = 16_000_000
 
 FRAME: Final = pa.struct(
     [
@@ -93,7 +91,7 @@ class Frame:
         """Decode the picture; its camera stands above the origin and looks as in the view's frame."""
         from sasgeo_bench.sensing.image import AerialImage, decode_image  # noqa: PLC0415 - see above
 
-        rgb = decode_image(self.picture, name="the picture of a frame", most_pixels=_MOST_PICTURE_PIXELS)
+        rgb = decode_image(self.picture, name="the picture of a frame", most_pixels=16_000_000)
         return AerialImage(
             rgb=rgb,
             camera=self.camera.moved(east_m=-self.camera.east_m, north_m=-self.camera.north_m),
@@ -154,7 +152,7 @@ def encode_webp(rgb: NDArray[np.uint8], *, most_bytes: int = MOST_PICTURE_BYTES)
     from PIL import Image  # noqa: PLC0415 - see above
 
     picture = Image.fromarray(np.ascontiguousarray(rgb))
-    for quality in _QUALITIES:
+    for quality in (85, 75, 65, 55, 45, 35, 25, 15, 5):  # of WebP, tried in turn until the picture fits
         encoded = BytesIO()
         picture.save(encoded, format="WEBP", quality=quality, method=2)
         if encoded.tell() <= most_bytes:

@@ -85,7 +85,6 @@ def seed_record(seed: Seed) -> dict[str, Any]:
 VARIABLE: Final = "SASGEO_SEED"
 SEALED_VARIABLE: Final = "SASGEO_SEALED_SEED"
 SUFFIX: Final = ".seed"  # by which every run recognizes the file and hides it from matchers
-_MOST_BYTES: Final = 4096  # more digits are refused
 _PR_SET_DUMPABLE: Final = 4
 
 
@@ -127,7 +126,8 @@ def _read(file: Path) -> str:
             f"{file} must be named <name>{SUFFIX}, by which runs know what to hide from matchers: rename it"
         )
     try:
-        status, text = file.stat(), plain_file(file).read_bytes()[: _MOST_BYTES + 1].decode("ascii", errors="replace")
+        # 4096 bytes: more digits are refused
+        status, text = file.stat(), plain_file(file).read_bytes()[: 4096 + 1].decode("ascii", errors="replace")
     except OSError as error:
         raise StoreError(
             f"{file} cannot be read ({error.strerror or error}): name a file with a seed that you can read"

@@ -47,7 +47,6 @@ _SAMPLES: Final = 256
 _GOLDEN: Final = math.pi * (3 - math.sqrt(5))  # golden angle: spreads points evenly
 _TURNS: Final = 72
 _JITTER_M: Final = STRIDE_M / 2
-_HOLDING: Final = 1024  # points drawn for a centre, of which one at least should fit
 _ROUNDED_M: Final = 0.1  # resolution of a disc's centre
 
 
@@ -323,7 +322,8 @@ def _holding(places_m: NDArray[np.float64], reach_m: float, *, rng: np.random.Ge
     """Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre."""
     low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
     # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
-    points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (_HOLDING, 2))
+    # 1024 points drawn for a centre, of which one at least should fit
+    points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (1024, 2))
     off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
     fit = points[(off_m <= reach_m).all(axis=1)]
     if len(fit) == 0:

@@ -32,11 +32,9 @@ AGREE: Final = "#d9d9d9"
 TWIN: Final = "map at the twin"
 DECOY: Final = "map at the hardest decoy"
 _OF_TWIN: Final = (TWIN_EAST, TWIN_NORTH, RIVALS, IN_DISC, LISTED, TRUTH_LISTED, LEAD)  # told in words
-_PICTURE: Final = "newest picture"
 _COLUMNS: Final = ("view", "map at the true place", "view against map")
 _CELL_INCHES: Final = 2.4
 _TEXT_INCHES: Final = 3.0  # width of the text column, readable when the sheet is shown smaller
-_LETTERS: Final = 36  # per line of text
 _DPI: Final = 100
 
 
@@ -92,7 +90,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     rivals = list(dict.fromkeys(panel.rival for panel in panels)) or [DECOY]
     has_pictures = any(panel.query.frames for panel in panels)
     columns = (
-        *((_PICTURE,) if has_pictures else ()),
+        *(("newest picture",) if has_pictures else ()),
         *(*_COLUMNS, " / ".join(rivals)),
         *(("perceived vectors",) if has_vectors else ()),
     )
@@ -104,7 +102,7 @@ def sheet_figure(title: str, panels: Sequence[Panel], *, dpi: int = _DPI) -> Fig
     _draw_legend(figure, width, height, {name for panel in panels for name in panel.query.evidence.classes})
     for at, panel in enumerate(panels):
         bottom = height - 1.15 - (_CELL_INCHES + 0.1) * at - _CELL_INCHES + 0.1
-        text = "\n".join(line for part in _text(panel) for line in wrap(part, _LETTERS))
+        text = "\n".join(line for part in _text(panel) for line in wrap(part, 36))  # letters per line of text
         figure.text(0.15 / width, (bottom + _CELL_INCHES - 0.15) / height, text, va="top", fontsize=10)
         pictures = (*((_photo(panel.query),) if has_pictures else ()), *_pictures(panel), None)[: len(columns)]
         for place, (name, picture) in enumerate(zip(columns, pictures, strict=True)):

@@ -24,7 +24,6 @@ Part = Literal["train", "calibration", "test"]
 Half = Literal["a", "b"]
 HALVES: Final[tuple[Half, ...]] = ("a", "b")
 
-_LEAST_PLACES: Final = 2  # of a half: one is tested, and another one calibrates
 _GEOD: Final = pyproj.Geod(ellps="WGS84")
 
 
@@ -108,7 +107,8 @@ class SplitFile(NamedDocument):
                 )
         for half in HALVES if self.kind == "crossfit" else ():
             own = [place for place in self.place if place.half == half]
-            if sum(not place.sealed for place in own) < _LEAST_PLACES:
+            # Two places of a half: one is tested, and another one calibrates
+            if sum(not place.sealed for place in own) < 2:
                 open_ones = "two places that are not sealed" if any(place.sealed for place in own) else "two places"
                 raise ValueError(f"half {half!r} needs {open_ones} at least: one is tested, and another one calibrates")
             if len({place.country or place.name for place in own if not place.sealed}) == 1:

@@ -416,7 +416,6 @@ PRIVATE: Final = "private_seed"  # in task.json and truth.json: commitment and b
 SCHEMA_VERSION: Final = 1
 _MEND: Final = "make the queries again"
 _ROWS: Final = 128  # of a row group, which is in memory at once
-_ROWS_WITH_FRAMES: Final = 8  # the same where labels of pictures are in memory, too
 
 
 class TaskFile(Document):
@@ -820,7 +819,7 @@ def _batches(pairs: Iterable[tuple[Query, Truth]]) -> Iterator[Sequence[tuple[Qu
     first = next(left, None)
     if first is None:
         return
-    rows = _ROWS_WITH_FRAMES if first[0].frames else _ROWS
+    rows = 8 if first[0].frames else _ROWS  # 8: the same where labels of pictures are in memory, too
     whole = chain([first], left)
     while batch := list(islice(whole, rows)):
         yield batch

@@ -27,12 +27,10 @@ Change = Callable[["gpd.GeoDataFrame"], "gpd.GeoDataFrame"]
 
 ROADS: Final = load_taxonomy().of_graph("road")
 
-_ARC_SEGMENTS: Final = 16
 _DECIMALS: Final = 3  # as in `osm.read`: shared vertices stay equal
 _FINE_DECIMALS: Final = 6  # of a cut or a copy: both stay on the cut line, so that the mask stays the same
 _AT_M: Final = 0.1  # a road this near to a junction meets it
 _BEND_M: Final = 10.0  # length of a road that is bent to meet a moved junction
-_OPPOSITE: Final = -0.8  # cosine between two arms of a continuing road
 _LEAST_M: Final = 0.05  # shorter or thinner leftovers of a cut are dropped
 
 
@@ -106,7 +104,7 @@ def _copy(features: "gpd.GeoDataFrame", item: Paste, *, first_id: int) -> "gpd.G
 
 
 def _disc(center_m: tuple[float, float], radius_m: float) -> shapely.Polygon:
-    return shapely.Point(center_m).buffer(radius_m, quad_segs=_ARC_SEGMENTS)
+    return shapely.Point(center_m).buffer(radius_m, quad_segs=16)
 
 
 def _cut(features: "gpd.GeoDataFrame", area: shapely.Geometry, *, keep_inside: bool) -> "gpd.GeoDataFrame":
@@ -237,7 +235,7 @@ def stagger(
             (one, two)
             for at, one in enumerate(arms)
             for two in arms[at + 1 :]
-            if float(np.dot(one.direction, two.direction)) < _OPPOSITE
+            if float(np.dot(one.direction, two.direction)) < -0.8  # cosine between two arms of a continuing road
         ]
         if len(pairs) < 2:  # two roads that both go on make an X
             continue

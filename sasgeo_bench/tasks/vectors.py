@@ -19,7 +19,6 @@ else:  # loaded when a table is made
 VECTOR_CLASSES: Final = load_taxonomy().of_graph("road", "rail", "building", "water")
 COLUMNS: Final = ("class", "level", "is_bridge", "geometry")
 _DECIMALS: Final = 1  # decimetres: finer than any detector, and far smaller on disk
-_EPSG: Final = 32632  # any projected CRS: the view's frame lies nowhere
 
 
 def vector_table(rows: list[tuple[str, int, bool, shapely.Geometry]]) -> "gpd.GeoDataFrame":
@@ -79,4 +78,5 @@ def as_features(vectors: "gpd.GeoDataFrame") -> "gpd.GeoDataFrame":
         "width_m": np.where(shapely.get_dimensions(vectors.geometry.to_numpy()) == 1, 4.0, np.nan),
         "geometry": vectors.geometry.to_numpy(),
     }
-    return make_features({name: columns[name] for name in (*DTYPES, "geometry")}, epsg=_EPSG)
+    # 32632: any projected CRS: the view's frame lies nowhere
+    return make_features({name: columns[name] for name in (*DTYPES, "geometry")}, epsg=32632)

@@ -28,22 +28,15 @@ Planes = NDArray[np.float32]
 Known = NDArray[np.bool_]
 
 PIXEL_M: Final = 0.5
-LEVELS: Final = (2, 3)  # of the encoder, whose cells are 4 and 8 m
 CELL_PX: Final = 8  # of the finer one
 BLOCK_PX: Final = 16  # between the middles of two descriptors
-WINDOW_M: Final = 10.0  # standard deviation of the Gaussian that a descriptor pools over
 PART_BLOCKS: Final = 3  # between two parts of a view
 PARTS: Final = 64  # of a descriptor, its principal components
 POWER: Final = 3.0  # of generalized means
-_SMOOTH_PX: Final = 1.0  # less noise, which whitening would make much of
-_EDGE_M: Final = 12.0  # a part lies so far within a view
-_STEP_M: Final = 16.0  # at the edge of a view, between two headings
 _TILE_PX: Final = 256
 _MARGIN_PX: Final = 64
 _MOST_TAUGHT: Final = 20_000
-_SEED: Final = 7
 _NOTHING: Final = 1e-6
-_HALF: Final = 0.5
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,20 +59,22 @@ class Encoder:
         """
         rows, cols = is_known.shape
         more = ((0, -rows % MULTIPLE), (0, -cols % MULTIPLE))
-        soft = np.asarray(cv2.GaussianBlur(rgb, (0, 0), _SMOOTH_PX), dtype=np.uint8)
+        # 1 pixel: less noise, which whitening would make much of
+        soft = np.asarray(cv2.GaussianBlur(rgb, (0, 0), 1.0), dtype=np.uint8)
         planes = np.where(is_known, input_planes(soft, balance), 0).astype(np.float32)
         with self.torch.inference_mode():
             given = self.torch.from_numpy(np.pad(planes, ((0, 0), *more))[None])
             levels = [np.asarray(one[0].numpy()) for one in encoded(self.torch, self.arrays, given)]
         known = np.pad(is_known, more).astype(np.float32)
         weight = cv2.resize(known, (known.shape[1] // CELL_PX, known.shape[0] // CELL_PX), interpolation=cv2.INTER_AREA)
-        pooled = [_generalized_means(levels[level], np.asarray(weight, dtype=np.float32)) for level in LEVELS]
+        # Of the encoder, whose cells are 4 and 8 m
+        pooled = [_generalized_means(levels[level], np.asarray(weight, dtype=np.float32)) for level in (2, 3)]
         return np.concatenate(pooled, axis=2)[: -(-rows // BLOCK_PX), : -(-cols // BLOCK_PX)]
 
 
 def _generalized_means(channels: Planes, weight: Planes) -> Planes:
     """Return unit vectors of means around every block, shape (rows, cols, C), of channels of one level."""
-    sigma = WINDOW_M / (CELL_PX * PIXEL_M)
+    sigma = 10.0 / (CELL_PX * PIXEL_M)  # m: standard deviation of the Gaussian that a descriptor pools over
     size = (weight.shape[1] * CELL_PX // BLOCK_PX, weight.shape[0] * CELL_PX // BLOCK_PX)
     whole = _pooled(weight, sigma, size)
     found = np.empty((*whole.shape, len(channels)), dtype=np.float32)
@@ -87,7 +82,7 @@ def _generalized_means(channels: Planes, weight: Planes) -> Planes:
         fine = cv2.resize(channel, weight.shape[::-1], interpolation=cv2.INTER_NEAREST)
         found[:, :, at] = _pooled(np.asarray(fine, dtype=np.float32) ** POWER * weight, sigma, size)
     means = (found / np.maximum(whole, _NOTHING)[:, :, None]) ** (1 / POWER)
-    return np.where((whole >= _HALF)[:, :, None], unit(means.astype(np.float32)), 0).astype(np.float32)
+    return np.where((whole >= 0.5)[:, :, None], unit(means.astype(np.float32)), 0).astype(np.float32)
 
 
 def _pooled(plane: Planes, sigma: float, size: tuple[int, int]) -> Planes:
@@ -182,7 +177,7 @@ class DeepRetrieval:
         blocks = described(self._encoder, ortho)
         known = blocks[blocks.any(axis=2)]
         if len(known) > PARTS:
-            self._whitening = Whitening.of(known, np.random.default_rng(_SEED))
+            self._whitening = Whitening.of(known, np.random.default_rng(7))
             self._blocks = self._whitening.short(blocks).astype(np.float16)
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
@@ -206,7 +201,8 @@ class DeepRetrieval:
         if top >= bottom or left >= right:
             return None
         reach_m = side_of(query) / 2
-        headings = dict.fromkeys(turn.yaw_deg for turn in turns_for(query, reach_m=reach_m, step_m=_STEP_M))
+        # 16 m at the edge of a view, between two headings
+        headings = dict.fromkeys(turn.yaw_deg for turn in turns_for(query, reach_m=reach_m, step_m=16.0))
         turns = tuple(sgb.Pose(easting_m=0.0, northing_m=0.0, yaw_deg=yaw_deg) for yaw_deg in headings)
         best = np.full((bottom - top, right - left), -np.inf, dtype=np.float32)
         which = np.zeros(best.shape, dtype=np.int32)
@@ -232,7 +228,8 @@ class DeepRetrieval:
         """Return the mean cosine of the parts of a view and those of the tile around each block of `bounds`."""
         top, left, bottom, right = bounds
         middle = len(parts) // 2
-        reach = int(max(middle - _EDGE_M / (BLOCK_PX * PIXEL_M), 0)) // PART_BLOCKS
+        # 12 m: a part lies so far within a view
+        reach = int(max(middle - 12.0 / (BLOCK_PX * PIXEL_M), 0)) // PART_BLOCKS
         steps = [PART_BLOCKS * at for at in range(-reach, reach + 1)]
         total = np.zeros((bottom - top, right - left), dtype=np.float32)
         count = 0

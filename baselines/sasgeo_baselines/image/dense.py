@@ -22,7 +22,6 @@ SPREAD: Final = 2.5  # standard deviations of heading and scale that are searche
 APART_M: Final = 25.0  # between two places of an answer
 AROUND_M: Final = 24.0  # a view may lie so far from its candidate
 MOST_PLACES: Final = 10  # of an answer
-_LEAST_SHARED: Final = 0.5  # of a view must lie on known imagery
 _NOTHING: Final = 1e-3  # of the greatest energy: places below have no texture
 
 
@@ -181,7 +180,8 @@ class Search:
         product = self._at_places(summed)
         floor = max(self.least_energy * weight, 1e-12)
         cosine = np.where(energy > floor, product / np.sqrt(power * np.maximum(energy, floor)), 0.0)
-        return np.where(shared >= _LEAST_SHARED * weight, cosine, -np.inf).astype(np.float32)
+        # 0.5 of a view must lie on known imagery
+        return np.where(shared >= 0.5 * weight, cosine, -np.inf).astype(np.float32)
 
     def _at_places(self, spectrum: Spectra) -> Planes:
         rows, cols = self.place.shape

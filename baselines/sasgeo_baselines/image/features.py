@@ -18,7 +18,6 @@ _TILE_PX: Final = 256
 _MARGIN_PX: Final = 48  # around a tile, so that its edge has features too
 _RIM_PX: Final = 20  # of what is known, without features
 _PER_TILE: Final = 300  # features of 128 x 128 m
-_SMOOTH_PX: Final = 1.5  # less noise, fewer corners
 _HALF: Final = 0.5
 
 
@@ -46,7 +45,7 @@ def detect(grey: NDArray[np.uint8], is_known: NDArray[np.bool_], *, most: int) -
         np.ones((2 * _RIM_PX + 1,) * 2, dtype=np.uint8),
     )[1:-1, 1:-1]
     orb = cv2.ORB.create(nfeatures=most, scaleFactor=1.2, nlevels=6, edgeThreshold=19, fastThreshold=7)
-    smooth = cv2.GaussianBlur(grey, (0, 0), _SMOOTH_PX)
+    smooth = cv2.GaussianBlur(grey, (0, 0), 1.5)  # 1.5 pixels: less noise, fewer corners
     found, descriptors = orb.detectAndCompute(smooth, np.ascontiguousarray(inside) * 255)
     if descriptors is None or not len(found):
         return Features(points=np.zeros((0, 2)), descriptors=np.zeros((0, _BYTES), dtype=np.uint8))

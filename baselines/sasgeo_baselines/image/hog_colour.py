@@ -23,10 +23,6 @@ from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, side_of
 PIXEL_M: Final = 1.0
 CELL_PX: Final = 4  # pixels a side of a cell of the descriptor
 BINS: Final = 8  # of the direction of a gradient, over 180 degrees
-_AROUND_CELLS: Final = 8.0  # standard deviation of the surroundings whose mean is taken off
-_SOFT_CELLS: Final = 1.0  # cells lend to their neighbours
-_STEP: Final = 2.0  # cells at the edge of a view between two headings
-_HALF: Final = 0.5
 _LEAST: Final = 1e-3
 
 
@@ -42,7 +38,7 @@ def descriptors(rgb: NDArray[np.uint8], is_known: NDArray[np.bool_]) -> Stack:
     bins, length = _gradients(lab[:, :, 0], is_known)
     planes = [_pooled(np.where(bins == at, length, 0).astype(np.float32)) / weight for at in range(BINS)]
     planes += [_pooled(np.where(is_known, lab[:, :, at], 0).astype(np.float32)) / weight for at in range(3)]
-    there = cells > _HALF
+    there = cells > 0.5
     channels = np.stack([_standard(plane.astype(np.float32), there) for plane in planes])
     return Stack(channels=channels, is_known=there)
 
@@ -69,7 +65,8 @@ def _pooled(plane: NDArray[np.float32]) -> NDArray[np.float32]:
 
 def _standard(plane: NDArray[np.float32], there: NDArray[np.bool_]) -> NDArray[np.float32]:
     """Return a channel without the mean of its surroundings, of standard deviation 1, 0 where it is not known."""
-    soft = _mean_around(plane, there, _SOFT_CELLS) - _mean_around(plane, there, _AROUND_CELLS)
+    # 8 cells: standard deviation of the surroundings whose mean is taken off
+    soft = _mean_around(plane, there, 1.0) - _mean_around(plane, there, 8.0)  # 1: cells lend to their neighbours
     spread = float(soft[there].std()) if there.any() else 0.0
     return np.where(there, soft / max(spread, _LEAST), 0).astype(np.float32)
 
@@ -118,7 +115,8 @@ class HogColour:
         if self._stack is None:
             return sgb.WITHHELD
         cell_m = CELL_PX * PIXEL_M
-        question = Question.of(query, self._grid, gsd_m=PIXEL_M, step_m=_STEP * cell_m)
+        # 2 cells at the edge of a view between two headings
+        question = Question.of(query, self._grid, gsd_m=PIXEL_M, step_m=2.0 * cell_m)
         if question is None:
             return sgb.WITHHELD
         size = size_for(question.turns, side_of(query) / cell_m)

@@ -38,8 +38,6 @@ SLOW: Final = (
     "more than a second a view, since every place is tried at every heading and scale: pixels of 3 m would take a "
     "third of that and find as much on maps, but less in imagery"
 )
-_SAMPLED: Final = 8  # headings that tell the mean and the spread of scores
-_STEP: Final = 2.0  # pixels at the edge of a view between two headings
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -255,7 +253,8 @@ class _Part:
         return self.search.scores(self.view.turned(turn, self.size_px))
 
     def scale(self, turns: Sequence[sgb.Pose]) -> tuple[np.float32, np.float32]:
-        some = [self.scores(turn) for turn in turns[:: max(1, len(turns) // _SAMPLED)]]
+        # 8 headings that tell the mean and the spread of scores
+        some = [self.scores(turn) for turn in turns[:: max(1, len(turns) // 8)]]
         values = np.concatenate([scores[np.isfinite(scores)] for scores in some])
         spread = values.std() if len(values) else np.float32(0)
         return (values.mean(), spread) if spread > 0 else (np.float32(0), np.float32(1))
@@ -276,7 +275,8 @@ class _Pair:
         if top >= bottom or left >= right:
             return None
         gsd_m = reference.grid.cell_size_m
-        turns = turns_for(query, reach_m=side_of(query) / 2, step_m=_STEP * gsd_m)
+        # 2 pixels at the edge of a view between two headings
+        turns = turns_for(query, reach_m=side_of(query) / 2, step_m=2.0 * gsd_m)
         size_px = size_for(turns, side_of(query) / gsd_m)
         sight = sight_of(query, gsd_m=gsd_m) if reference.pictured else None
         laid = (

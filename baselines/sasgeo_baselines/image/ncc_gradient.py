@@ -24,9 +24,6 @@ from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, grey_of,
 
 COARSE_M: Final = 2.0  # pixels of the search
 FINE_M: Final = 1.0  # of the local one that follows
-_REACH_M: Final = 4.0  # of the local one
-_STEPS: Final = (-0.5, -0.25, 0.0, 0.25, 0.5)  # of a step of heading
-_SCALES: Final = (-0.4, 0.0, 0.4)  # of a step of scale
 _RIM_PX: Final = 3  # beside what is not known, a gradient is that of the rim
 _STEP: Final = 2.0  # pixels at the edge of a view between two headings
 
@@ -110,10 +107,10 @@ class NccGradient:
         pose = mode.pose
         turns = tuple(
             replace(pose, yaw_deg=pose.yaw_deg + float(np.degrees(part * step)), scale=pose.scale * (1 + more * step))
-            for part in _STEPS
-            for more in _SCALES
+            for part in (-0.5, -0.25, 0.0, 0.25, 0.5)  # of a step of heading
+            for more in (-0.4, 0.0, 0.4)  # of a step of scale
         )
-        reach, margin = round(_REACH_M / FINE_M), size_for(turns, len(sight.rgb)) // 2
+        reach, margin = round(4.0 / FINE_M), size_for(turns, len(sight.rgb)) // 2  # 4 m: reach of the local search
         row, col = self._fine.to_cells(sgb.points_of([pose]))[0].tolist()
         whole = reach + margin + 2 * _RIM_PX
         top, left = max(row - whole, 0), max(col - whole, 0)

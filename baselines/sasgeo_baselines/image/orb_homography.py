@@ -26,11 +26,7 @@ from sasgeo_baselines.image.sight import LIMITS, PICTURE, side_of, sight_of
 RATIO: Final = 0.85
 NEAR_M: Final = 3.0  # of a match from where the similarity puts it
 LEAST_MATCHES: Final = 5  # that agree
-_STEP: Final = 0.5  # of the side of a view between two windows
-_REACH: Final = 0.85  # of the side of a view, half the side of a window: holds a view anywhere around its middle
-_SLACK: Final = 0.1  # of scale, and 10 degrees: beyond what the prior makes likely
 _SLACK_DEG: Final = 10.0
-_ROUNDS: Final = 2000
 
 
 def similarity(seen: NDArray[np.float64], mapped: NDArray[np.float64]) -> sgb.Mode | None:
@@ -48,7 +44,7 @@ def similarity(seen: NDArray[np.float64], mapped: NDArray[np.float64]) -> sgb.Mo
         return None
     origin = mapped.mean(axis=0)
     matrix, agreeing = cv2.estimateAffinePartial2D(
-        seen, mapped - origin, method=cv2.RANSAC, ransacReprojThreshold=NEAR_M, maxIters=_ROUNDS, confidence=0.999
+        seen, mapped - origin, method=cv2.RANSAC, ransacReprojThreshold=NEAR_M, maxIters=2000, confidence=0.999
     )
     if matrix is None or int(np.count_nonzero(agreeing)) < LEAST_MATCHES:
         return None
@@ -64,7 +60,8 @@ def similarity(seen: NDArray[np.float64], mapped: NDArray[np.float64]) -> sgb.Mo
 
 def is_likely(pose: sgb.Pose, prior: sgb.Prior) -> bool:
     """Return whether heading and scale of a pose are what a prior leaves open, with some slack."""
-    if abs(pose.scale - 1) > SPREAD * prior.scale_sigma + _SLACK:
+    # 0.1: slack of scale, and 10 degrees: beyond what the prior makes likely
+    if abs(pose.scale - 1) > SPREAD * prior.scale_sigma + 0.1:
         return False
     if prior.yaw_deg is None or prior.yaw_sigma_deg is None:
         return True
@@ -128,7 +125,8 @@ class OrbHomography:
             found = [self._near(seen, pose, query.prior, side_m) for pose in query.candidates]
             return answer_candidates(query, found, top_k=top_k, diagnostics=diagnostics)
         disc = disc_of(query.prior)
-        places = lattice_m(query.prior, self._grid, step_m=_STEP * side_m)
+        # 0.5: step of the side of a view between two windows
+        places = lattice_m(query.prior, self._grid, step_m=0.5 * side_m)
         windows = [self._window(seen, (x, y), side_m, query.prior) for x, y in places.tolist()]
         modes = [mode for mode in windows if mode is not None and disc.has(mode.pose)]
         most = min(top_k, MOST_PLACES)
@@ -145,7 +143,8 @@ class OrbHomography:
         self, seen: Features, middle_m: tuple[float, float], side_m: float, prior: sgb.Prior
     ) -> sgb.Mode | None:
         assert self._features is not None  # noqa: S101 - match() has looked
-        within = np.asarray((np.abs(self._features.points - middle_m) <= _REACH * side_m).all(axis=1))
+        # 0.85: reach of the side of a view, half the side of a window: holds a view anywhere around its middle
+        within = np.asarray((np.abs(self._features.points - middle_m) <= 0.85 * side_m).all(axis=1))
         mapped = self._features.chosen(within)
         if min(len(seen), len(mapped)) < LEAST_MATCHES:
             return None

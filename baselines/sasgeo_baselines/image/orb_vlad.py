@@ -21,17 +21,14 @@ from sasgeo_baselines.image.dense import (
 from sasgeo_baselines.image.features import BITS, PIXEL_M, Features, map_features, view_features
 from sasgeo_baselines.image.sight import LIMITS, PICTURE, side_of, sight_of
 
-BLOCK_M: Final = 8.0  # between the middles of two tiles
 WINDOW_M: Final = 20.0  # standard deviation of the weight of a feature by its distance from the middle of a tile
 WORDS: Final = 32
 PARTS: Final = 16  # of a descriptor, its principal components
 LEAST_FEATURES: Final = 8
 _MOST_TAUGHT: Final = 20_000
 _SEED: Final = 7
-_ROUNDS: Final = 20
 _NOTHING: Final = 1e-9
 _AROUND: Final = 3  # blocks around a mode whose scores say where it is
-_LEVEL: Final = 0.6  # of its score, which counts as nothing there
 _HALF: Final = 0.5
 
 
@@ -53,7 +50,7 @@ class Vocabulary:
         mean = bits.mean(axis=0)
         _, directions = np.linalg.eigh(np.cov((bits - mean).T))
         chosen = directions[:, ::-1][:, :PARTS].astype(np.float32)
-        words, _ = kmeans2((bits - mean) @ chosen, WORDS, iter=_ROUNDS, minit="points", seed=rng)
+        words, _ = kmeans2((bits - mean) @ chosen, WORDS, iter=20, minit="points", seed=rng)
         return cls(mean=mean.astype(np.float32), directions=chosen, words=words.astype(np.float32))
 
     def residuals(self, descriptors: NDArray[np.uint8]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -119,7 +116,7 @@ class OrbVlad:
         if found is None or len(found[0]) < WORDS:
             return
         features, fine = found
-        self._grid = fine.coarsen(round(BLOCK_M / fine.cell_size_m))
+        self._grid = fine.coarsen(round(8.0 / fine.cell_size_m))  # m: block between the middles of two tiles
         self._vocabulary = Vocabulary.of(features.descriptors, np.random.default_rng(_SEED))
         self._tiles = gathered(features, self._vocabulary, self._grid)
 
@@ -155,7 +152,8 @@ def centred(mode: sgb.Mode, field: Field, disc: sgb.Disc) -> sgb.Mode:
     part = field.scores[top : row + _AROUND + 1, left : col + _AROUND + 1].astype(np.float64)
     rows, cols = np.indices(part.shape)
     is_near = np.hypot(rows - (row - top), cols - (col - left)) <= _AROUND
-    weights = np.where(is_near & np.isfinite(part), np.maximum(part - _LEVEL * mode.score, 0), 0)
+    # 0.6 of its score, which counts as nothing there
+    weights = np.where(is_near & np.isfinite(part), np.maximum(part - 0.6 * mode.score, 0), 0)
     if not weights.any():
         return mode
     uv = np.array([[(weights * (at + _HALF)).sum() for at in (cols + left, rows + top)]]) / weights.sum()

@@ -14,10 +14,6 @@ import sasgeo_bench as sgb
 Pixels = NDArray[np.uint8]
 Plane = NDArray[np.float32]
 
-LEAST_CONTRAST: Final = 2.0  # standard deviation of the grey of a view, of 255: a flatter one shows nothing
-LEAST_SEEN: Final = 0.1  # of a view
-_BLOCK_PX: Final = 2048  # of imagery read at once
-_ALL: Final = 0.99  # of a warped pixel must be known
 
 # Texts that the cards share.
 PICTURE: Final = (
@@ -60,7 +56,8 @@ class Sight:
 
         seen = self.is_seen.astype(np.float32)
         rgb, share = (cv2.warpAffine(plane, matrix, (size_px, size_px), flags=_HOW) for plane in (self.rgb, seen))
-        return type(self)(rgb=np.asarray(rgb, dtype=np.uint8), is_seen=np.asarray(share) > _ALL, gsd_m=self.gsd_m)
+        # 0.99 of a warped pixel must be known
+        return type(self)(rgb=np.asarray(rgb, dtype=np.uint8), is_seen=np.asarray(share) > 0.99, gsd_m=self.gsd_m)
 
 
 _HOW: Final = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
@@ -86,7 +83,8 @@ def sight_of(query: sgb.Query, *, gsd_m: float, size_px: int | None = None) -> S
         pose=sgb.Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0),
     )
     sight = Sight(rgb=rgb, is_seen=np.asarray(rgb.max(axis=2) > 0), gsd_m=gsd_m)
-    if sight.is_seen.mean() < LEAST_SEEN or sight.grey[sight.is_seen].std() < LEAST_CONTRAST:
+    # 2: standard deviation of the grey of a view, of 255: a flatter one shows nothing
+    if sight.is_seen.mean() < 0.1 or sight.grey[sight.is_seen].std() < 2.0:  # 0.1: least seen of a view
         return None
     return sight
 
@@ -114,7 +112,7 @@ class Ortho:
             return None
         grid = sgb.Grid.from_bounds(*imagery.record.bounds_m, cell_size_m=gsd_m, epsg=imagery.epsg)
         rgb, is_known = np.zeros((*grid.shape, 3), dtype=np.uint8), np.zeros(grid.shape, dtype=bool)
-        for row, col, part in grid.windows(_BLOCK_PX):
+        for row, col, part in grid.windows(2048):  # pixels: block of imagery read at once
             west_m, south_m, east_m, north_m = part.bounds_m
             hair_m = gsd_m / 100  # a block ends at its last pixel, whatever rounding says
             window = imagery.read((west_m + hair_m, south_m + hair_m, east_m - hair_m, north_m - hair_m), gsd_m=gsd_m)

@@ -3,15 +3,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.rejectors.leads import MOST, with_withheld
 from sasgeo_bench import Prediction, RejectorCard
-
-TOLD: Final = ("inliers", "inlier_ratio")  # diagnostics in the order in which they are asked for
 
 
 class Inliers:
@@ -47,5 +44,6 @@ class Inliers:
 
 def _told(item: Prediction) -> float:
     """Return the first diagnostic that is given and a number; 0 without one."""
-    values = (item.diagnostics.get(name, math.nan) for name in TOLD)
+    # Diagnostics in the order in which they are asked for
+    values = (item.diagnostics.get(name, math.nan) for name in ("inliers", "inlier_ratio"))
     return next((min(max(value, 0.0), MOST) for value in values if not math.isnan(value)), 0.0)

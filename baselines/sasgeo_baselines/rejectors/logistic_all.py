@@ -22,10 +22,7 @@ from sasgeo_baselines.rejectors.leads import (
 )
 from sasgeo_bench import Prediction, RejectorCard
 
-_NEAR: Final = 1e-150  # a smaller spread is zero, so that quotients stay finite
 _FAR: Final = 10.0  # standard deviations: features are clipped to it
-
-_DECIMALS: Final = 12  # of a probability: the last digits of a fit depend on memory alignment
 
 
 class LogisticAll:
@@ -90,7 +87,8 @@ class _Model:
         medians = np.nanmedian(raw, axis=0)
         filled = np.where(np.isnan(raw), medians, raw)
         means, spreads = filled.mean(axis=0), filled.std(axis=0)
-        varies = (np.ptp(filled, axis=0) > 0) & (spreads > _NEAR)
+        # 1e-150: a smaller spread is zero, so that quotients stay finite
+        varies = (np.ptp(filled, axis=0) > 0) & (spreads > 1e-150)
         spreads = np.where(varies, spreads, 1.0)
         weights = LogisticRegression(solver="newton-cholesky", tol=1e-8, max_iter=1000)
         weights.fit(_standardised(filled, means, spreads), is_false)
@@ -101,7 +99,8 @@ class _Model:
         raw = features(answers, self.names)
         filled = np.where(np.isnan(raw), self.medians, raw)
         chances = self.weights.predict_proba(_standardised(filled, self.means, self.spreads))
-        return np.asarray(chances[:, 1], dtype=np.float64).round(_DECIMALS)
+        # 12 decimals of a probability: the last digits of a fit depend on memory alignment
+        return np.asarray(chances[:, 1], dtype=np.float64).round(12)
 
 
 def features(answers: Sequence[Prediction], names: Sequence[str]) -> NDArray[np.float64]:

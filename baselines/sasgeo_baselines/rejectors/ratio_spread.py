@@ -2,15 +2,12 @@
 """`ratio_spread`: how far the ratios of the further scores to the first spread from it."""
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.rejectors.leads import ratios, scores_of, with_withheld
 from sasgeo_bench import Prediction, RejectorCard
-
-MOST: Final = 10  # candidates that compete: as many as `sue` looks at
 
 
 class RatioSpread:
@@ -56,5 +53,5 @@ def spread_of_ratios(scores: NDArray[np.float64]) -> float:
     >>> spread_of_ratios(np.array([4.0, 3.0, 3.0])), spread_of_ratios(np.array([4.0, 4.0]))
     (0.25, 0.0)
     """
-    gaps = 1 - ratios(scores[:MOST])
+    gaps = 1 - ratios(scores[:10])  # 10 candidates that compete: as many as `sue` looks at
     return float(np.sqrt(np.square(gaps).mean())) if len(gaps) else 0.0

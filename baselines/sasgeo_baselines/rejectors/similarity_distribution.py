@@ -2,16 +2,12 @@
 """`similarity_distribution`: how far the first score stands out from all others."""
 
 from collections.abc import Sequence
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_baselines.rejectors.leads import scores_of, with_withheld
 from sasgeo_bench import Prediction, RejectorCard
-
-FEWEST: Final = 3  # candidates: of two, the rest has no spread
-_LEAST_SPREAD: Final = 0.01  # of the largest score in size: where the others tie, a small lead is no certainty
 
 
 class SimilarityDistribution:
@@ -58,8 +54,9 @@ def distinctness(scores: NDArray[np.float64]) -> float:
     >>> distinctness(np.array([6.0, 3.0, 1.0])), round(distinctness(np.array([1.0, 0.99, 0.99])), 6)
     (4.0, 1.0)
     """
-    if len(scores) < FEWEST:
+    if len(scores) < 3:  # candidates: of two, the rest has no spread
         return 0.0
     scaled = scores / max(float(np.abs(scores).max()), 1e-300)  # squares of large scores overflow
     first, others = scaled[0], scaled[1:]
-    return max(float(first - others.mean()), 0.0) / max(float(others.std()), _LEAST_SPREAD)
+    # 0.01: least spread of the largest score in size: where the others tie, a small lead is no certainty
+    return max(float(first - others.mean()), 0.0) / max(float(others.std()), 0.01)

@@ -12,10 +12,8 @@ from sasgeo_baselines.rejectors.leads import APART_M, answered, scores_of, sprea
 from sasgeo_bench import Prediction, RejectorCard
 
 MOST: Final = 10  # candidates, as in the source
-FAR_M: Final = 500.0  # as in the source: what is further away counts as that far
 SLOPES: Final = (1.0, 3.0, 10.0, 30.0)  # per usual standard deviation of the first ten scores
 UNTAUGHT: Final = 10.0  # the slope where calibration knows one kind only
-_NEAR: Final = 1e-150  # a smaller spread is none, so that quotients stay finite
 
 
 class Sue:
@@ -76,12 +74,13 @@ class Sue:
 def _usual_spread(answers: Sequence[Prediction]) -> float:
     """Return the median of the standard deviations of the first scores, of answers with any; 1 if none has."""
     spreads = np.array([scores_of(item)[:MOST].std() for item in answers])
-    some = spreads[spreads > _NEAR]
+    some = spreads[spreads > 1e-150]  # a smaller spread is none, so that quotients stay finite
     return float(np.median(some)) if len(some) else 1.0
 
 
 def _doubt(item: Prediction, slope: float) -> float:
     if len(item.candidates) == 1:
         return 1 / 2
-    variance_m2 = spread_m2(item, slope=slope, most=MOST, far_m=FAR_M)
+    # 500 m: as in the source: what is further away counts as that far
+    variance_m2 = spread_m2(item, slope=slope, most=MOST, far_m=500.0)
     return variance_m2 / (variance_m2 + APART_M**2)

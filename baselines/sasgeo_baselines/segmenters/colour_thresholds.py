@@ -9,9 +9,6 @@ import numpy as np
 import sasgeo_bench as sgb
 from sasgeo_baselines.segmenters.features import FINEST_M, Plane, ground_pixel_m, has_data
 
-_SMOOTH_M: Final = 0.5  # standard deviation of the Gaussian before any index
-_DARK: Final = 0.05  # added to a sum of bands: the colour of black is noise
-_STEEP: Final = 25.0  # log-odds for each unit of an index beyond its limit
 _MOST: Final = 0.9  # no index is surer than this
 
 
@@ -34,7 +31,8 @@ class ColourThresholds:
         gsd_m = ground_pixel_m(image)
         pixel_m = gsd_m if np.isfinite(gsd_m) else FINEST_M
         bands = np.asarray(image.rgb, dtype=np.float32) / 255
-        smooth = cv2.GaussianBlur(bands, (0, 0), max(0.3, _SMOOTH_M / pixel_m))
+        # 0.5 m: standard deviation of the Gaussian before any index
+        smooth = cv2.GaussianBlur(bands, (0, 0), max(0.3, 0.5 / pixel_m))
         found = np.stack(_chances(np.asarray(smooth, dtype=np.float32)))
         found[:, ~has_data(image.rgb, pixel_m)] = np.nan
         return sgb.Segmentation.of_probabilities(self.card.classes, found)
@@ -43,7 +41,8 @@ class ColourThresholds:
 def _chances(bands: Plane) -> tuple[Plane, Plane, Plane]:
     """Return the chances of a roof, of water and of something green, shape (H, W) each, of bands in 0..1."""
     light = bands.mean(axis=2)
-    red, green, blue = bands.transpose(2, 0, 1) / (bands.sum(axis=2) + _DARK)
+    # 0.05 is added to a sum of bands: the colour of black is noise
+    red, green, blue = bands.transpose(2, 0, 1) / (bands.sum(axis=2) + 0.05)
     greener, bluer = 2 * green - red - blue, blue - red
     building = np.minimum(light - 0.62, 0.05 - greener)
     water = np.minimum(bluer - 0.08, 0.4 - light)
@@ -51,4 +50,5 @@ def _chances(bands: Plane) -> tuple[Plane, Plane, Plane]:
 
 
 def _slope(beyond: Plane) -> Plane:
-    return np.asarray(_MOST / (1 + np.exp(-_STEEP * beyond)) + (1 - _MOST) / 2, dtype=np.float32)
+    # 25: log-odds for each unit of an index beyond its limit
+    return np.asarray(_MOST / (1 + np.exp(-25.0 * beyond)) + (1 - _MOST) / 2, dtype=np.float32)

@@ -23,11 +23,8 @@ from sasgeo_baselines.segmenters.network import input_planes
 Pixels = NDArray[np.uint8]
 
 CROP_PX: Final = 128
-_MOST_KEPT: Final = 40_000_000  # pixels of all pictures together
 _LEAST_PX: Final = 2 * CROP_PX  # side of what is kept of a picture, however many there are
-_SAMPLE: Final = 4000  # pixels that tell the colours of a picture
 _LARGER: Final = 1.3  # at most, and as much smaller
-_HALF: Final = 0.5
 _LUMA: Final = np.array([0.299, 0.587, 0.114])
 
 
@@ -45,7 +42,8 @@ class LearningPicture:
         rgb, pixel_m = working_picture(labelled.image)
         labels = np.stack([reduced_labels(plane, rgb.shape[:2]) for plane in labelled.labels])
         labels[:, ~has_data(rgb, pixel_m)] = sgb.UNKNOWN
-        sample = rgb.reshape(-1, 3)[rng.integers(0, rgb[:, :, 0].size, _SAMPLE)]
+        # 4000 pixels that tell the colours of a picture
+        sample = rgb.reshape(-1, 3)[rng.integers(0, rgb[:, :, 0].size, 4000)]
         top, left = (int(rng.integers(0, max(side - most_px, 0) + 1)) for side in rgb.shape[:2])
         part = np.s_[top : top + most_px, left : left + most_px]
         return cls(rgb=rgb[part].copy(), labels=labels[:, *part].copy(), sample=sample)
@@ -53,7 +51,7 @@ class LearningPicture:
 
 def learning_pictures(images: Sequence[sgb.LabelledImage], rng: np.random.Generator) -> list[LearningPicture]:
     """Read pictures one after the other; of many, or of large ones, a part of each is kept."""
-    most_px = max(int(np.sqrt(_MOST_KEPT / len(images))), _LEAST_PX)
+    most_px = max(int(np.sqrt(40_000_000 / len(images))), _LEAST_PX)  # pixels of all pictures together
     return [LearningPicture.of(labelled, most_px=most_px, rng=rng) for labelled in images]
 
 
@@ -106,7 +104,7 @@ class Crops:
 def _turned_lattice(middle: NDArray[np.float64], rng: np.random.Generator) -> tuple[Plane, Plane]:
     """Return rows and columns, shape (CROP_PX, CROP_PX), of a crop of any heading and size, flipped or not."""
     turn, scale = rng.uniform(0, 2 * np.pi), np.exp(rng.uniform(-np.log(_LARGER), np.log(_LARGER)))
-    flip = 1 if rng.random() < _HALF else -1
+    flip = 1 if rng.random() < 0.5 else -1
     side = np.arange(CROP_PX) - (CROP_PX - 1) / 2
     down, right = np.meshgrid(side * scale, side * scale * flip, indexing="ij")
     rows = middle[0] + np.cos(turn) * down - np.sin(turn) * right

@@ -14,16 +14,11 @@ import sasgeo_bench as sgb
 Plane = NDArray[np.float32]
 
 FINEST_M: Final = 0.5  # side of a pixel that features are computed from; a coarser picture keeps its own
-_BLURS_M: Final = (0.5, 1.0, 2.0, 4.0, 8.0)  # standard deviations of the Gaussians
 _PLAIN_M: Final = (0.5, 4.0)
 _SHAPES_M: Final = (1.0, 2.0, 4.0)
 _SPREADS_M: Final = (1.0, 2.0, 4.0, 8.0)
-_REACHES_M: Final = (1.5, 3.0, 6.0)  # radii of openings and closings: roofs, roads, shadows beside them
 _CUT: Final = (2.0, 98.0)  # percentiles that the normalization of colours ignores beyond
-_LEAST_SPREAD: Final = 4.0  # of 0..255: a picture of one colour is not stretched to a pattern
 _TARGET_SPREAD: Final = 40.0
-_ENOUGH: Final = 50_000  # pixels, for percentiles
-_SHRUNK: Final = 4.0  # pixels: a wider blur is computed on a smaller picture
 _EMPTY: Final = (3, 252)  # bytes: all bands below or above are taken for no data
 _HOLE_M: Final = 10.0  # radius
 
@@ -98,9 +93,10 @@ class ColourBalance:
     @classmethod
     def of(cls, lab: Plane) -> Self:
         """Measure the bands of a picture, shape (3, H, W)."""
-        some = lab.reshape(3, -1)[:, :: max(1, lab[0].size // _ENOUGH)]
+        some = lab.reshape(3, -1)[:, :: max(1, lab[0].size // 50_000)]  # 50_000 pixels, for percentiles
         low, middle, high = np.percentile(some, [_CUT[0], 50, _CUT[1]], axis=1)
-        spread = np.maximum(high - low, _LEAST_SPREAD)
+        # 4: least spread of 0..255: a picture of one colour is not stretched to a pattern
+        spread = np.maximum(high - low, 4.0)
         spread[1:] = spread[1:].max()
         return cls(middle=middle, factor=np.array([4.0, 1.0, 1.0]) * _TARGET_SPREAD / spread)
 
@@ -130,7 +126,7 @@ def features(rgb: NDArray[np.uint8], pixel_m: float) -> tuple[tuple[str, ...], P
 def _named(bands: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
     light = bands[0]
     yield from (("light", light), ("green_red", bands[1]), ("blue_yellow", bands[2]))
-    for sigma_m in _BLURS_M:
+    for sigma_m in (0.5, 1.0, 2.0, 4.0, 8.0):  # standard deviations of the Gaussians
         for name, band in zip(("light", "green_red", "blue_yellow"), bands, strict=True):
             yield f"{name}_{sigma_m:g}", blurred(band, sigma_m / pixel_m)
     for sigma_m in _SHAPES_M:
@@ -141,7 +137,7 @@ def _named(bands: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
             mean = blurred(band, sigma_m / pixel_m)
             square = blurred(band * band, sigma_m / pixel_m)
             yield f"{name}_spread_{sigma_m:g}", np.sqrt(np.maximum(square - mean * mean, 0))
-    for reach_m in _REACHES_M:
+    for reach_m in (1.5, 3.0, 6.0):  # radii of openings and closings: roofs, roads, shadows beside them
         kernel = _disc(reach_m / pixel_m)
         yield f"bright_{reach_m:g}", light - cv2.morphologyEx(light, cv2.MORPH_OPEN, kernel)
         yield f"dark_{reach_m:g}", cv2.morphologyEx(light, cv2.MORPH_CLOSE, kernel) - light
@@ -158,7 +154,7 @@ def blurred(band: Plane, sigma_px: float) -> Plane:
     """Return a band after a Gaussian, of a smaller picture where it is wide."""
     if sigma_px < 0.3:  # pixels; it would move nothing
         return band
-    shrink = int(sigma_px // _SHRUNK)
+    shrink = int(sigma_px // 4.0)  # pixels: a wider blur is computed on a smaller picture
     if shrink < 2 or min(band.shape) < 2 * shrink:  # nothing to gain
         return np.asarray(cv2.GaussianBlur(band, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT), dtype=np.float32)
     size = (-(-band.shape[1] // shrink), -(-band.shape[0] // shrink))

@@ -26,7 +26,6 @@ BANDS: Final = 6  # Lab relative to the picture, and Lab as it is
 WIDTHS: Final = (32, 64, 96, 128, 128)  # channels at cells of 2, 4, 8, 16 and 32 pixels
 MULTIPLE: Final = 2 ** len(WIDTHS)  # rows and columns that the network sees are multiples of this
 _FOLD: Final = 2  # pixels a side of a cell of the first level: half the rows and columns, four times the bands
-_GROUPS: Final = 8  # of channels that are normalized together
 _ENCODER: Final = "encoder."
 _RELATIVE: Final = np.array([80.0, 20.0, 20.0])  # usual spreads of bands, which become 1
 _PLAIN: Final = np.array([60.0, 20.0, 20.0])
@@ -136,7 +135,8 @@ def _block(functional: Any, arrays: Mapping[str, Any], name: str, at: Any) -> An
     for number in range(2):
         kernel, scale, shift = (arrays[f"{name}.{number}.{part}"] for part in ("kernel", "scale", "shift"))
         at = functional.conv2d(at, kernel, padding=1)
-        at = functional.relu(functional.group_norm(at, _GROUPS, scale, shift))
+        # 8 groups of channels that are normalized together
+        at = functional.relu(functional.group_norm(at, 8, scale, shift))
     return at
 
 

@@ -21,10 +21,7 @@ from sasgeo_baselines.segmenters.features import (
 )
 
 FORMAT: Final = "pixel_forest 1"
-_PIXELS: Final = 3000  # drawn from each picture
-_ROUNDS: Final = 100
 _LEAST_PRESENT: Final = 50  # drawn pixels of a class: fewer teach nothing
-_SURE: Final = 7.0  # log-odds: P = 0.001 or 0.999; further trees move no byte that matters
 _SETTINGS: Final[dict[str, Any]] = {
     "objective": "binary",
     "learning_rate": 0.1,
@@ -95,7 +92,8 @@ class PixelForest:
         return sgb.Segmentation.of_probabilities(tuple(forest.models), found)
 
 
-_STOPS: Final = {"pred_early_stop": True, "pred_early_stop_freq": 20, "pred_early_stop_margin": _SURE}
+# 7: log-odds: P = 0.001 or 0.999; further trees move no byte that matters
+_STOPS: Final = {"pred_early_stop": True, "pred_early_stop_freq": 20, "pred_early_stop_margin": 7.0}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,7 +122,8 @@ class _Drawn:
         even = np.full(len(at), 1 / len(at))
         by_class = (present[counts > 0] / counts[counts > 0, None]).mean(axis=0) if counts.any() else even
         chance = (even + by_class) / 2
-        picked = np.random.default_rng(seed).choice(len(at), size=_PIXELS, p=chance / chance.sum())
+        # 3000 are drawn from each picture
+        picked = np.random.default_rng(seed).choice(len(at), size=3000, p=chance / chance.sum())
         values = planes.reshape(len(names), -1)[:, at[picked]].T
         weights = 1 / (len(at) * chance[picked])
         return cls(names=names, values=values, labels=chosen[:, picked].T, weights=weights)
@@ -155,7 +154,7 @@ def _trees(values: Plane, present: NDArray[np.bool_], weights: NDArray[np.float6
     """Boost the trees of one class; the same pixels give the same text."""
     lightgbm = _lightgbm()
     data = lightgbm.Dataset(values, label=present.astype(np.float32), weight=weights)
-    return str(lightgbm.train(_SETTINGS, data, num_boost_round=_ROUNDS).model_to_string())
+    return str(lightgbm.train(_SETTINGS, data, num_boost_round=100).model_to_string())
 
 
 def _lightgbm() -> Any:  # noqa: ANN401 - a module

@@ -25,14 +25,9 @@ from sasgeo_baselines.segmenters.network import (
     weights_text,
 )
 
-_SEED: Final = 1
 _BATCH: Final = 8
-_CROPS_EACH: Final = 180  # of a picture, on average
-_MOST_CROPS: Final = 4800  # more make it surer of rendered pictures, and worse on real ones
 _RATE: Final = 2e-3  # of learning, at its highest
 _DECAY: Final = 1e-2
-_WARM: Final = 0.05  # of all steps, in which the rate rises
-_BY_CLASS: Final = 0.6  # of all steps, in which rare classes are drawn more often
 _LEAST_PRESENT: Final = 50  # labelled pixels of a class, and as many without it: fewer teach nothing
 _LEAST_SHARE: Final = 1e-4  # of a class, that the network begins with
 _TILE_PX: Final = 512
@@ -64,7 +59,7 @@ class UNet:
         limits="Needs the extra [torch]; the same text on one machine and thread, others may round differently",
     )
     weights: Path | None = None
-    most_crops: int = _MOST_CROPS
+    most_crops: int = 4800  # more make it surer of rendered pictures, and worse on real ones
 
     def __init__(self) -> None:
         self.card = card_with(type(self).card, self.weights)
@@ -72,7 +67,7 @@ class UNet:
     def learn(self, training: sgb.ImageTraining) -> str:
         """Return the weights that the pictures teach, as text."""
         torch = torch_module(self.card.name)
-        rng = np.random.default_rng(_SEED)
+        rng = np.random.default_rng(1)
         pictures = learning_pictures(training.images, rng)
         shares = _shares(pictures, len(training.classes))
         if not shares:
@@ -85,7 +80,7 @@ class UNet:
         odds = np.clip(list(shares.values()), _LEAST_SHARE, 1 - _LEAST_SHARE)
         weights["head.shift"] = np.repeat(np.log(odds / (1 - odds)), 4).astype(np.float32)
         crops = Crops(pictures=pictures, classes=tuple(shares))
-        steps = max(min(self.most_crops, _CROPS_EACH * len(pictures)) // _BATCH, 1)
+        steps = max(min(self.most_crops, 180 * len(pictures)) // _BATCH, 1)  # 180 crops each of a picture, on average
         fitted = _fit(torch, weights, crops, steps=steps, rng=rng)
         return weights_text(tuple(training.classes[at] for at in shares), fitted)
 
@@ -125,8 +120,10 @@ def _fit(torch: Any, weights: Weights, crops: Crops, *, steps: int, rng: np.rand
     for step in range(steps):
         done = step / steps
         for group in optimizer.param_groups:
-            group["lr"] = _RATE * min((step + 1) / (_WARM * steps + 1), (1 + np.cos(np.pi * done)) / 2)
-        planes, labels = crops.batch(_BATCH, rng, is_by_class=done < _BY_CLASS)
+            # 0.05 of all steps, in which the rate rises
+            group["lr"] = _RATE * min((step + 1) / (0.05 * steps + 1), (1 + np.cos(np.pi * done)) / 2)
+        # 0.6 of all steps, in which rare classes are drawn more often
+        planes, labels = crops.batch(_BATCH, rng, is_by_class=done < 0.6)
         loss = _loss(torch, log_odds(torch, arrays, torch.from_numpy(planes)), torch.from_numpy(labels))
         optimizer.zero_grad(set_to_none=True)
         loss.backward()

@@ -5,16 +5,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Final
 
 import numpy as np
 from sklearn.cluster import DBSCAN  # type: ignore[import-untyped, unused-ignore]
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.trackers.window import ASKED, NEAR_M, Floats, Raster, Seen, Window, aligned, asking, radius_95_m
-
-_FITS: Final = 3  # times that the alignment is refined with the views that fit it
-_ALIKE: Final = 2.0  # neighbouring residuals are alike: as if there were half as many
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -149,7 +145,7 @@ def laid_over(members: Sequence[tuple[Seen, sgb.Pose]], plan: RansacPlan) -> _La
     far = [pair for pair in pairs if math.dist(*places_m[pair]) >= plan.baseline_m]
     tried = (aligned(places_m[pair], points_m[pair], np.ones(2)) for pair in far)
     best = min((pose for pose in tried if pose), default=None, key=lambda pose: _misfit(away_m(pose), plan))
-    for _ in range(_FITS):
+    for _ in range(3):  # times that the alignment is refined with the views that fit it
         if best is not None:
             fits = away_m(best) <= plan.fits_m
             best = aligned(places_m[fits], points_m[fits], np.ones(int(fits.sum())))
@@ -173,7 +169,8 @@ def _covariance(laid: _Laid, plan: RansacPlan) -> Floats:
     information = np.zeros((3, 3))
     for east_m, north_m in turned:
         by_pose = np.array([[1.0, 0.0, np.radians(north_m)], [0.0, 1.0, np.radians(-east_m)]])
-        information += by_pose.T @ by_pose / (_ALIKE * variance_m2)
+        # 2: neighbouring residuals are alike: as if there were half as many
+        information += by_pose.T @ by_pose / (2.0 * variance_m2)
     # Odometry is no rigid body: the pose is that of the views' middle, and drifts from there on as odometry does.
     middle = laid.views[(2 * count) // 3]
     return np.asarray(np.linalg.inv(information) + middle.carried_covariance(laid.pose, np.zeros((3, 3))))

@@ -7,7 +7,6 @@ from typing import Final
 import sasgeo_bench as sgb
 from sasgeo_baselines.trackers.grid_filter import LEAST, Floats, GridFilter
 
-CELL_M: Final = 4.0  # of the map, and the finest of the belief
 # Of `python benchmarks/fit_grid_trackers.py`, on made-up towns that are in no split: of the settings with the most
 # views within 25 m (0.799 to 0.801, a view or two apart) that with the most belief near the truth.
 TEMPER: Final = 0.024
@@ -53,7 +52,8 @@ class GridMarkov(GridFilter):
     def read(self, region: sgb.Region, learned: str | None) -> sgb.Grid:
         """Read a map by hand-set rates."""
         del learned
-        self._field = sgb.prepare_levels(sgb.map_by_hand(region, cell_size_m=CELL_M))
+        # 4 m: cell of the map, and the finest of the belief
+        self._field = sgb.prepare_levels(sgb.map_by_hand(region, cell_size_m=4.0))
         self._classes = region.classes
         return self._field.grid
 

@@ -21,18 +21,15 @@ GROUPS: Final = (
     _OF["field"],
 )
 CELL_M: Final = 12.0  # of what is correlated
-SIDE: Final = 16  # cells a side, at most: 192 m
 SHIFTS: Final = 2  # cells to each side of a particle at which the correlation is looked at
 MAP_CELL_M: Final = 4.0
 COUNT: Final = 20_000
 FEWEST: Final = 5_000
-KEPT: Final = 0.7  # of the particles at each resampling
 LEAST_EFFECTIVE: Final = 0.5
 
 # Log of the likelihood ratio of being right, from the features of a correlation surface (`features`): a logistic
 # regression of right against wrong places on made-up towns, `benchmarks/fit_particle_filters.py`.
 RATIO: Final = np.array([-5.15, 7.01, 3.46])
-TEMPER: Final = 0.5  # views of a flight overlap, and share their errors
 
 _BLOCK: Final = 500  # particles weighed at once
 _LEAST_ENERGY: Final = 1e-3
@@ -95,7 +92,7 @@ class Template:
     @classmethod
     def of(cls, evidence: sgb.Evidence) -> Self:
         """Average a view over its cells."""
-        side = max(1, min(SIDE, int(min(evidence.size_m) / CELL_M + 1e-6)))
+        side = max(1, min(16, int(min(evidence.size_m) / CELL_M + 1e-6)))  # 16 cells a side, at most: 192 m
         height, width = evidence.shape
         rows, cols = (
             np.floor(((np.arange(count) + 0.5 - count / 2) * evidence.cell_size_m) / CELL_M + side / 2).astype(np.int64)
@@ -221,7 +218,8 @@ class KinnariMcl(ParticleFilter):
         """Return the tempered ratio of likelihoods, 0 beyond the map."""
         west_m, south_m, east_m, north_m = self._bounds_m
         is_inside = ((particles.place_m >= (west_m, south_m)) & (particles.place_m <= (east_m, north_m))).all(axis=1)
-        logs = features(surfaces(Template.of(query.evidence), self._mosaic, particles)) @ RATIO * TEMPER
+        # 0.5: views of a flight overlap, and share their errors
+        logs = features(surfaces(Template.of(query.evidence), self._mosaic, particles)) @ RATIO * 0.5
         return np.asarray(np.where(is_inside, np.exp(logs - logs.max()), 0.0))
 
     def estimate(self, particles: Particles) -> sgb.Fix:
@@ -240,4 +238,5 @@ class KinnariMcl(ParticleFilter):
         count = len(particles)
         if particles.effective_count >= LEAST_EFFECTIVE * count:
             return particles
-        return particles.resampled(min(count, max(FEWEST, math.floor(KEPT * count))), rng=rng)
+        # 0.7 of the particles at each resampling
+        return particles.resampled(min(count, max(FEWEST, math.floor(0.7 * count))), rng=rng)

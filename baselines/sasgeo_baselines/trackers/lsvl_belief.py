@@ -14,12 +14,10 @@ import sasgeo_bench as sgb
 from sasgeo_baselines.trackers.grid_filter import LEAST, Floats, GridFilter
 from sasgeo_baselines.trackers.lsvl_descriptors import CELL_M, SIDE, Described, Parts, Shares
 
-VIEW_M: Final = 192.0  # views that are expected; the map is described for others when the first one comes
 NEAR_M, NEAR_DEG = CELL_M / 2, 5.0  # of a match: half a cell, and half a step of heading
 WRONG: Final = 20  # other poses for each view
 BINS: Final = 24
 MOST: Final = 0.48  # distance of the last bin
-LEAST_PAIRS: Final = 50  # views below which a ratio is not fitted
 # Of `python benchmarks/fit_grid_trackers.py`, on made-up towns that are in no split: the ratio, and the temper and
 # doubt with the most belief near the truth. The temper is above 1, since the doubt bounds what a view says.
 TEMPER: Final = 2.0
@@ -119,13 +117,15 @@ class LsvlBelief(GridFilter):
     def learn(self, training: sgb.Training) -> str:
         """Fit the ratio to views of training places; without enough of them, return the one that ships."""
         right, wrong = distances(training)
-        return Ratio.fitted(right, wrong).to_text() if len(right) >= LEAST_PAIRS else TAUGHT
+        # 50 views below which a ratio is not fitted
+        return Ratio.fitted(right, wrong).to_text() if len(right) >= 50 else TAUGHT
 
     def read(self, region: sgb.Region, learned: str | None) -> sgb.Grid:
         """Describe a map."""
         self._ratio = Ratio.of(TAUGHT if learned is None else learned)
         self._shares = Shares.of(region)
-        self._described = self._shares.described(VIEW_M / SIDE)
+        # 192 m: views that are expected; the map is described for others when the first one comes
+        self._described = self._shares.described(192.0 / SIDE)
         return self._shares.grid
 
     def logs(self, query: sgb.Query, belief: sgb.GridBelief) -> Floats:

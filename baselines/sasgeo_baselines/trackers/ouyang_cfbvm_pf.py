@@ -17,8 +17,6 @@ COUNT: Final = 20_000
 FEWEST: Final = 1_000
 CREDIBLE: Final = 0.6
 HELD: Final = 3  # updates
-CLUSTER_M: Final = 30.0
-MEMBERS: Final = 20
 
 
 class OuyangCfbvmPf(ParticleFilter):
@@ -88,7 +86,7 @@ class OuyangCfbvmPf(ParticleFilter):
 
     def estimate(self, particles: Particles) -> sgb.Fix:
         """Return the mean of the heaviest cluster; accepted where it has been credible for some views."""
-        cluster = particles.heaviest_cluster(reach_m=CLUSTER_M, least=MEMBERS)
+        cluster = particles.heaviest_cluster(reach_m=30.0, least=20)
         chosen = particles.within(cluster.members)
         remaining = particles.spread_m / max(self.start_spread_m, 1.0)
         credibility = cluster.mass * max(0.0, 1.0 - remaining)

@@ -1,17 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """`satloc_layers`: retrieval as the absolute layer and odometry as the relative one, each by how sure it is."""
 
-from typing import Final
-
 import numpy as np
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.polar_vsc import PolarVsc
 from sasgeo_baselines.trackers.ekf_loose import EkfLoose, EkfPlan
 from sasgeo_baselines.trackers.window import Floats
-
-SURE: Final = "ks_share"  # diagnostic of the absolute layer, 0..1
-LEAST: Final = 0.1  # of it: below, a fix would count for nothing
 
 
 class SatlocLayers(EkfLoose):
@@ -43,5 +38,6 @@ class SatlocLayers(EkfLoose):
 
     def covariance_of(self, found: sgb.Match, query: sgb.Query) -> Floats:
         """Return the covariance of fixes as innovations have it, divided by the confidence of this one."""
-        sure = max(LEAST, min(1.0, found.diagnostics.get(SURE, 1.0)))
+        # 0.1 of it: below, a fix would count for nothing
+        sure = max(0.1, min(1.0, found.diagnostics.get("ks_share", 1.0)))  # diagnostic of the absolute layer, 0..1
         return np.asarray(super().covariance_of(found, query) / sure)

@@ -24,11 +24,7 @@ from sasgeo_baselines.trackers.window import (
     radius_95_m,
 )
 
-_DRIFT: Final = 0.015  # of a step, besides its covariance: errors of neighbouring steps are alike
 _ALIKE: Final = 2.0  # neighbouring anchors err alike: as if there were half as many
-_FADE: Final = 0.9  # weight of an anchor, against that of the next view
-_LATEST: Final = 6  # views of which half must have an anchor that counts, or the estimate is not accepted
-_ELSEWHERE_M: Final = 50.0  # another place, not the same one again
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -119,7 +115,8 @@ class Se2Trajectory(sgb.Follower):
         if smooth is None:
             return lost, False
         pose, covariance, counts = smooth
-        is_anchored = bool(counts[-_LATEST:].mean() >= 1 / 2)
+        # 6 views of which half must have an anchor that counts, or the estimate is not accepted
+        is_anchored = bool(counts[-6:].mean() >= 1 / 2)
         now = sgb.Belief(pose=pose, covariance=covariance, idle=0 if counts[-1] else lost.idle)
         return now, is_anchored and radius_95_m(covariance) <= NEAR_M
 
@@ -144,7 +141,7 @@ def place_of_path(views: Sequence[Seen], plan: TrajectoryPlan) -> sgb.Pose | Non
     firsts = np.flatnonzero(np.diff([-1, *(at for at, _, _ in told)]))
     support = np.maximum.reduceat(near, firsts, axis=1).sum(axis=1)
     best = int(support.argmax())
-    rival = float(support[away_m[best] > _ELSEWHERE_M].max(initial=0.0))
+    rival = float(support[away_m[best] > 50.0].max(initial=0.0))  # 50 m: another place, not the same one again
     is_found = support[best] >= max(plan.least_share * count, plan.least_lead * rival)
     return now[best] if is_found else None
 
@@ -197,7 +194,8 @@ def aligned_within(anchors: Anchors, now: sgb.Pose, plan: TrajectoryPlan) -> sgb
     Where too few are near, or a bound is passed, the pose stays.
     """
     off_m = np.hypot(*(now.to_map(anchors.places_m) - anchors.points_m).T)
-    recent = _FADE ** np.arange(len(off_m))[::-1] / (1 + np.square(off_m / plan.near_m))
+    # 0.9: weight of an anchor, against that of the next view
+    recent = 0.9 ** np.arange(len(off_m))[::-1] / (1 + np.square(off_m / plan.near_m))
     weights = np.where(off_m <= plan.bound_m, anchors.weights * recent, 0.0)
     laid = aligned(anchors.places_m, anchors.points_m, weights)
     if laid is None or (weights > 0).sum() < plan.least_views:
@@ -231,7 +229,8 @@ def smoothed(
     yaws_deg = base_deg + headings[:, 0]
     moved_m = np.array([sgb.rotation(yaw) @ step[:2] for yaw, step in zip(yaws_deg[:-1], told, strict=True)])
     flown_m2 = np.square(told[:, :2]).sum(axis=1)
-    slip_m2 = (own[:, 0, 0] + own[:, 1, 1]) / 2 + flown_m2 * (_DRIFT**2 + np.radians(math.sqrt(heading_deg2)) ** 2)
+    # 0.015: drift of a step, besides its covariance: errors of neighbouring steps are alike
+    slip_m2 = (own[:, 0, 0] + own[:, 1, 1]) / 2 + flown_m2 * (0.015**2 + np.radians(math.sqrt(heading_deg2)) ** 2)
     weight_m = np.where(fits, 1 / (_ALIKE * sigma_m**2), 0.0)
     places_m, place_m2 = chain(moved_m.reshape(-1, 2), slip_m2, anchors.points_m[:upto], weight_m)
     east_m, north_m = places_m[-1].tolist()

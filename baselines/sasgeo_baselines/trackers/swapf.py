@@ -24,22 +24,13 @@ UNLABELLED: Final = OTHER + 1
 
 SIDE_PX: Final = 400.0  # side of the square of the view that is compared, in the source's pixels
 TRUNCATION: Final = 100.0  # px: distances are truncated here
-RADIAL_PX: Final = 255.0  # px: weight of a cell = its distance from the middle, at most this, + 1
 BINS: Final = 100  # of heading
 LEAST_COST: Final = 10.0
-OUTSIDE_COST: Final = 1e5  # a pixel beyond the map
-SHRINK: Final = 0.8  # of the particles remain at each resampling
-LEAST: Final = 1000  # particles
-CONVERGED: Final = 0.1  # of the spread at the start
-REACH_M: Final = 30.0  # of a cluster
-MEMBERS: Final = 20
 MOST_CLUSTERS: Final = 4
 
 LATTICE: Final = 28  # cells a side at which the square is sampled: 4.8 m apart in a view of 192 m
 PX_M: Final = 0.34  # 400 px for the inner square of a view of 192 m
 _STEPS: Final = 250.0  # of a stored distance: uint8 holds TRUNCATION as so many
-_MOST_CELLS: Final = 32_000_000  # of a stored map of one label: larger maps are read in coarser cells
-_STRIP: Final = 512  # rows of a map whose distances are measured at once
 _BLOCK: Final = 1000  # particles weighed at once: what they read fits into the cache
 
 
@@ -54,14 +45,15 @@ class DistanceMaps:
     distance: NDArray[np.uint8]
 
     @classmethod
-    def of(cls, region: sgb.Region, *, most_cells: int = _MOST_CELLS) -> Self:
+    # At most 32 million cells of a stored map of one label: larger maps are read in coarser cells
+    def of(cls, region: sgb.Region, *, most_cells: int = 32_000_000) -> Self:
         """Measure the map at its own cells; keep every n-th, so that a whole country fits into 128 MB."""
         cell_m = region.grid.cell_size_m
         factor = max(1, round(2.0 / cell_m), math.ceil(math.sqrt(region.grid.rows * region.grid.cols / most_cells)))
         grid = region.grid.coarsen(factor)
         distance = np.empty((OTHER + 1, *grid.shape), dtype=np.uint8)
         reach = math.ceil(TRUNCATION * PX_M / cell_m)
-        strip = max(1, _STRIP // factor) * factor
+        strip = max(1, 512 // factor) * factor  # 512 rows of a map whose distances are measured at once
         labels_of_map = labels_of(region.known(), region.layer, region.classes)
         for top in range(0, region.grid.rows, strip):
             above, below = min(reach, top), top + strip + reach
@@ -130,10 +122,11 @@ class Square:
         cols = np.clip(np.floor(right_m / evidence.cell_size_m + width / 2), 0, width - 1).astype(np.int64)
         rows = np.clip(np.floor(height / 2 - up_m / evidence.cell_size_m), 0, height - 1).astype(np.int64)
         away_px = np.hypot(east_m, north_m) * SIDE_PX / side_m
+        # 255 px: weight of a cell = its distance from the middle, at most this, + 1
         return cls(
             offsets_m=np.stack([east_m, north_m], axis=1),
             labels=labels[rows, cols],
-            radial=np.minimum(away_px, RADIAL_PX) + 1.0,
+            radial=np.minimum(away_px, 255.0) + 1.0,
         )
 
 
@@ -159,7 +152,7 @@ def costs(square: Square, maps: DistanceMaps, particles: Particles) -> Floats:
     beyond_px = SIDE_PX**2 * _beyond(
         maps.grid, particles, reach_m=float(square.offsets_m.max()) * LATTICE / (LATTICE - 1)
     )
-    return np.asarray(found * (TRUNCATION / _STEPS * px) + LEAST_COST + OUTSIDE_COST * beyond_px)
+    return np.asarray(found * (TRUNCATION / _STEPS * px) + LEAST_COST + 1e5 * beyond_px)  # a pixel beyond the map
 
 
 def _beyond(grid: sgb.Grid, particles: Particles, *, reach_m: float) -> Floats:
@@ -217,17 +210,18 @@ class SwaPf(ParticleFilter):
 
     def estimate(self, particles: Particles) -> sgb.Fix:
         """Return the mean of the heaviest cluster; of all particles where there are more than four clusters."""
-        cluster = particles.heaviest_cluster(reach_m=REACH_M, least=MEMBERS)
+        cluster = particles.heaviest_cluster(reach_m=30.0, least=20)  # of a cluster
         chosen = particles.within(cluster.members) if cluster.count <= MOST_CLUSTERS else particles
         spread_m = particles.spread_m
         return sgb.Fix(
             pose=chosen.mean,
             covariance=chosen.covariance,
-            is_accepted=spread_m < max(CONVERGED * self.start_spread_m, NEAR_M),
+            is_accepted=spread_m < max(0.1 * self.start_spread_m, NEAR_M),  # of the spread at the start
             confidence=particles.share_near(chosen.mean),
             diagnostics={"spread_m": spread_m, "clusters": float(cluster.count), "particles": float(len(particles))},
         )
 
     def settled(self, particles: Particles, *, rng: np.random.Generator) -> Particles:
         """Resample a fifth fewer particles, at least 1,000."""
-        return particles.resampled_multinomial(max(int(SHRINK * len(particles)), LEAST), rng=rng)
+        # 0.8 of the particles remain at each resampling
+        return particles.resampled_multinomial(max(int(0.8 * len(particles)), 1000), rng=rng)  # 1000 particles

@@ -17,12 +17,9 @@ Floats = NDArray[np.float64]
 
 NEAR_M: Final = 25.0  # an estimate that may be relied on is so near in 95 of 100 cases
 KNOWN_M: Final = 50.0  # radius of 95 % beyond which one pose that fits does not tell the place
-CHI2_95: Final = 5.991  # of two dimensions
 _DRIFT: Final = 0.015  # of the distance flown: errors of neighbouring increments are alike, so they add up
-_TELLING: Final = 25.0  # m2: less spread of places tells no heading
 # A wrong pose lies anywhere in the searched disc, so that in a wide one few of them pass a narrow gate.
 _SEARCHED_M: Final = 120.0
-_LOST_M: Final = 2000.0  # radius that is searched when the place is lost
 _NO_WAY: Final = sgb.Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
 ASKED: Final = (
     "the poses of a view, from the raster of this package with stable classes, unknown cells silent, and no graph, "
@@ -48,7 +45,8 @@ class Raster(RasterMatcher):
 
 def asking(top_k: int) -> sgb.FollowPlan:
     """Return how a matcher is asked for poses of each view: in a wide disc, and in a far wider one when lost."""
-    return sgb.FollowPlan(patience=5, widen=2.0, top_k=top_k, least_radius_m=_SEARCHED_M, lost_radius_m=_LOST_M)
+    # 2000 m: radius that is searched when the place is lost
+    return sgb.FollowPlan(patience=5, widen=2.0, top_k=top_k, least_radius_m=_SEARCHED_M, lost_radius_m=2000.0)
 
 
 def radius_95_m(covariance: Floats) -> float:
@@ -57,7 +55,8 @@ def radius_95_m(covariance: Floats) -> float:
     >>> round(radius_95_m(np.diag([25.0, 100.0, 1.0])), 1)
     24.5
     """
-    return math.sqrt(CHI2_95 * max(0.0, float(np.linalg.eigvalsh(np.asarray(covariance)[:2, :2])[-1])))
+    # 5.991: 95 percent of chi2 of two dimensions
+    return math.sqrt(5.991 * max(0.0, float(np.linalg.eigvalsh(np.asarray(covariance)[:2, :2])[-1])))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,7 +144,7 @@ def aligned(places_m: Floats, points_m: Floats, weights: Floats) -> sgb.Pose | N
     from_m, into_m = places_m - place_m, points_m - point_m
     along = float(weights @ (from_m * into_m).sum(axis=1))
     across = float(weights @ (from_m[:, 1] * into_m[:, 0] - from_m[:, 0] * into_m[:, 1]))
-    if math.hypot(along, across) <= _TELLING * total:
+    if math.hypot(along, across) <= 25.0 * total:  # m2: less spread of places tells no heading
         return None
     yaw_deg = math.degrees(math.atan2(across, along))  # clockwise, from the axes to the map
     east_m, north_m = point_m - sgb.rotation(yaw_deg) @ place_m

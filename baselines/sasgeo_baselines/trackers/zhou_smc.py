@@ -16,13 +16,11 @@ from sasgeo_baselines.trackers.particles import TRAINED_ON, Floats, Noise, Parti
 
 YAWS: Final = 8  # headings for which the map has embeddings
 DIMENSIONS: Final = 16
-COUNT: Final = 20_000  # particles at the start
 FEWEST: Final = 5_000  # above it, resampling drops the least likely
 DROPPED: Final = 0.1
 LEAST_EFFECTIVE: Final = 2 / 3  # of the particles, below which they are resampled
 MOST_BYTES: Final = 128 * 10**6  # of the embeddings of a map, which are farther apart on larger maps
 STEP_M: Final = 12.0  # between them, at least
-ACCEPTED_M: Final = 60.0  # spread of the particles: less than that of a disc of 100 m
 
 _FULL: Final = 127.0  # of a component of an embedding in int8
 EMBEDDING: Final = Path(__file__).with_name("zhou_embedding.npz")
@@ -168,7 +166,7 @@ class ZhouSmc(ParticleFilter):
             "takes 1 km and more to find a place in a disc of 500 m; scale is ignored; the source rejects nothing"
         ),
     )
-    count = COUNT
+    count = 20_000  # particles at the start
     noise = Noise(place_m=10.0, yaw_deg=5.0)
 
     def read(self, region: sgb.Region) -> None:
@@ -192,7 +190,7 @@ class ZhouSmc(ParticleFilter):
         return sgb.Fix(
             pose=pose,
             covariance=particles.covariance,
-            is_accepted=spread_m <= ACCEPTED_M,
+            is_accepted=spread_m <= 60.0,  # m: spread of the particles: less than that of a disc of 100 m
             confidence=particles.share_near(pose),
             diagnostics={"spread_m": spread_m, "effective": particles.effective_count, "particles": len(particles)},
         )

@@ -3,7 +3,6 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,6 @@ from sasgeo_bench.search.view import View
 from sasgeo_bench.search.vote_search import VotePlan, VoteSearch, ranked
 from sasgeo_bench.search.votes import VoteGains, make_template
 from sasgeo_bench.tasks.query import Query
-
-MOST_PLACES: Final = 20  # modes of one answer at most
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +102,7 @@ class DenseMatcher(ABC):
         chart, view = self._chart, self._read(query.evidence, self._chart)
         search = VoteSearch(chart=chart, view=self._view(view, chart), prior=query.prior, plan=self.plan)
         check = self._check(view, chart)
-        count = min(top_k, MOST_PLACES)
+        count = min(top_k, 20)  # modes of one answer at most
         is_retrieval = query.track == "retrieval"
         found = search.candidates(query.candidates) if is_retrieval else search.places(count)
         modes = self.rescored([mode for mode in found.modes if mode is not None], check)

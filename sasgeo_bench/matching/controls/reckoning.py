@@ -20,7 +20,6 @@ Covariance = NDArray[np.float64]  # (3, 3): east, north, yaw in m2, m deg, deg2
 ANY_YAW_DEG: Final = 360.0 / math.sqrt(12)  # standard deviation of a heading of which nothing is known
 _LOST_M: Final = 1000.0  # added to a position where the odometer lost its way
 _LOST_DEG: Final = 90.0
-_FLOOR: Final = 1e-6  # m2 and deg2: keeps a covariance invertible
 
 
 def start_of(prior: Prior, grid: Grid) -> tuple[Pose, Covariance]:
@@ -102,7 +101,8 @@ class DeadReckoning:
             raise RuntimeError(f"{self.card.name}: call start() first, and step() with the views of a flight")
         self._belief = self._moved(*self._belief, query.step)
         pose, covariance = self._belief
-        return Fix(pose=pose, covariance=covariance + _FLOOR * np.eye(SIDE), is_accepted=False)
+        # 1e-6 m2 and deg2: keeps a covariance invertible
+        return Fix(pose=pose, covariance=covariance + 1e-6 * np.eye(SIDE), is_accepted=False)
 
     def _moved(self, pose: Pose, covariance: Covariance, step: Step) -> tuple[Pose, Covariance]:
         return advance(pose, covariance, step)

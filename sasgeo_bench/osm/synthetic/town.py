@@ -34,7 +34,6 @@ _RETAGS: Final = 0.08
 _BULK_SHARE: Final = 0.35
 _FIRST_NODE, _FIRST_WAY, _FIRST_RELATION = 1_000_001, 100_001, 10_001
 _NEW_IDS: Final = 5_000_000
-_GENERATOR: Final = "sasgeo-bench embedded town"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -224,7 +223,7 @@ def _write(elements: list[_Element], plan: TownPlan, path: Path) -> None:
     corners = [(-half_m, -half_m), (half_m, half_m)]
     (west, south), (east, north), *places = _lonlat(plan, [*corners, *(one.xy_m for one in unique if one.rank == 0)])
     header = osmium.io.Header()
-    header.set("generator", _GENERATOR)
+    header.set("generator", "sasgeo-bench embedded town")
     header.set("sorting", "Type_then_ID")
     header.add_box(osmium.osm.Box(west, south, east, north))
     path.unlink(missing_ok=True)

@@ -13,7 +13,6 @@ from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun
 from sasgeo_bench.sensing.rendering.plan import Picture
 from sasgeo_bench.sensing.rendering.texture import Field
 
-_LONGEST_M: Final = 160.0  # of a shadow; a low sun's shadows fade before
 _EXACT_STEPS: Final = 8
 _EPS_M: Final = 0.12
 _STEEPEST: Final = 1.4  # of a surface: the step from a roof to the ground is no slope
@@ -69,7 +68,7 @@ def cast_shadows(height_m: Field, cell_size_m: float, sun: Sun) -> Field:
     if up <= 0.02 or flat < 1e-6 or highest_m <= 0:
         return np.zeros_like(height_m) if up > 0.02 else np.full_like(height_m, highest_m + 1)
     fall_m = cell_size_m * up / flat
-    reach = min(highest_m / fall_m, _LONGEST_M / cell_size_m)
+    reach = min(highest_m / fall_m, 160.0 / cell_size_m)  # m of a shadow; a low sun's shadows fade before
     towards = (-north / flat, east / flat)  # rows, cols
     shade = np.zeros_like(height_m)
     for step in range(1, min(_EXACT_STEPS, math.ceil(reach)) + 1):

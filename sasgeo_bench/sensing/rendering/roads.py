@@ -29,7 +29,6 @@ from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, f
 # The larger ones last, which are painted over the smaller ones.
 STREETS: Final = tuple(name for name in load_taxonomy().painted if name in load_taxonomy().having("street"))
 _WHITE: Final = (206, 204, 198)
-_MARKED_M: Final = 5.8  # narrower roads have no line in the middle
 _BALLAST: Final = (122, 112, 102)
 _LAMP_SPACING_M: Final = 34.0
 
@@ -77,7 +76,8 @@ def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:
     _tint_each(canvas, numbers, colour, cover)
     canvas.kind[mask] = ROAD
     _wear(canvas, mask, np.concatenate([[True], is_paved])[numbers])
-    lined = is_paved & (shapes.width_m >= _MARKED_M) & (plan.chance("lines", shapes.key) < palette.markings)
+    # 5.8 m: narrower roads have no line in the middle
+    lined = is_paved & (shapes.width_m >= 5.8) & (plan.chance("lines", shapes.key) < palette.markings)
     _paint_markings(canvas, shapes.part(lined))
 
 

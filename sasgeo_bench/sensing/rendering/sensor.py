@@ -12,7 +12,6 @@ from sasgeo_bench.sensing.rendering.plan import Picture
 from sasgeo_bench.sensing.rendering.texture import Field
 
 _BANK: Final = 1024
-_VIGNETTE: Final = 0.14  # of the light is lost in the corners
 
 
 def expose_sensor(
@@ -54,7 +53,8 @@ def _vignette(height_px: int, width_px: int) -> Field:
     """Return the share of the light that reaches each pixel, shape (H, W, 1)."""
     down = np.linspace(-1, 1, height_px, dtype=np.float32)[:, None]
     right = np.linspace(-1, 1, width_px, dtype=np.float32)[None, :]
-    return np.asarray(1 - _VIGNETTE / 2 * (down**2 + right**2))[..., None]
+    # 0.14 of the light is lost in the corners
+    return np.asarray(1 - 0.14 / 2 * (down**2 + right**2))[..., None]
 
 
 def _curve(tone: Field) -> Field:

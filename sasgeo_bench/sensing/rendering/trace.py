@@ -20,11 +20,9 @@ _STRIDE: Final = 8  # pixels between the rays for which the highest thing is loo
 _STRIP_PX: Final = 96  # a multiple of the stride
 _STEP_CELLS: Final = 0.9
 _LOW_M: Final = 0.05  # what is lower casts no ray off its way
-_SIDE_M: Final = 0.6  # higher above the point that a ray meets, a cell shows its flank there
 _CHUNK: Final = 32_768  # rays followed at a time, so that they stay in the cache
 _AT_ONCE: Final = 4  # steps
 _AHEAD: Final = np.arange(_AT_ONCE, dtype=np.float32)[:, None]
-_FLATTEST: Final = 0.035  # a ray that falls less than this per metre sees no ground
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -132,7 +130,7 @@ def trace(camera: Camera, grid: Grid, heights: HeightPyramid, rows: slice) -> Hi
     matrix = camera.matrix.astype(np.float32)
     east, north, up = (right * matrix[0, axis] + down * matrix[1, axis] + matrix[2, axis] for axis in range(3))
     flat = np.hypot(east, north)
-    is_ground = up < -_FLATTEST * np.maximum(flat, 1e-6)
+    is_ground = up < -0.035 * np.maximum(flat, 1e-6)  # 0.035: a ray that falls less than this per metre sees no ground
     falling = np.where(is_ground, -up, 1.0).astype(np.float32)
     cell = np.float32(grid.cell_size_m)
     ahead = np.stack([east / falling / cell, -north / falling / cell])
@@ -230,7 +228,8 @@ def _follow(hits: Hits, raster: Field, pixel: NDArray[np.int64], top: Field) -> 
         hits.col.ravel()[at] = ended[0] - ended[2] * here_m
         hits.row.ravel()[at] = ended[1] - ended[3] * here_m
         hits.z_m.ravel()[at] = here_m
-        hits.is_side.ravel()[at] = found[step, chosen] - here_m > ended[5] + np.float32(_SIDE_M)
+        # 0.6 m: higher above the point that a ray meets, a cell shows its flank there
+        hits.is_side.ravel()[at] = found[step, chosen] - here_m > ended[5] + np.float32(0.6)
         left = np.flatnonzero(~has_met)
         pixel, rays = pixel[left], rays.take(left, axis=1)
         rays[4] -= _AT_ONCE * rays[5]

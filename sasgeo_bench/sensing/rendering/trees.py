@@ -17,7 +17,6 @@ from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, g
 BROAD, CONIFER, PALM, BUSH = range(4)
 _SPACING_M: Final = 3.5
 _RADII_M: Final = (0.6, 0.9, 1.3, 1.8, 2.4, 3.0, 3.7, 4.5, 5.5)
-_SHAPES: Final = 6  # different crowns of one size
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -131,7 +130,7 @@ def paint_trees(canvas: Canvas, trees: Trees) -> None:
     twigs = np.abs(grain(canvas.grid, 3 + canvas.plan.salt)) > 1.3
     order = np.argsort(trees.height_m, kind="stable")
     for tree in order.tolist():
-        shape = int(trees.luck[tree] * 1e6) % _SHAPES
+        shape = int(trees.luck[tree] * 1e6) % 6  # 6: different crowns of one size
         dome, tone = _crown(int(trees.form[tree]), int(sizes[tree]), shape, cell_m)
         half = dome.shape[0] // 2
         row, col = int(corner[tree, 0]) - half, int(corner[tree, 1]) - half

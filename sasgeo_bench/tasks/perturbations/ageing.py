@@ -22,12 +22,8 @@ from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
 _TRIES: Final = 12  # to find a free place for a new object
-_PIECE_M: Final = 40.0  # length of the pieces in which lines vanish, appear and are redrawn
-_NEAR_M: Final = 60.0  # largest distance of a new object from the one it copies
 _MOST_NEW: Final = 150  # of one class in one view
-_LARGEST_SHARE: Final = 0.1  # of the view, for an object to be copied
 _GROUPS: Final = 4  # of redrawn objects, each with its own shift
-_DOUBLINGS: Final = 5  # of shifts that are too small to lose as much ground as is to be lost
 _CLEARED: Final = dict.fromkeys(load_taxonomy().having("clears"), load_taxonomy().covering("land"))
 
 
@@ -152,7 +148,8 @@ class Ageing:
     ) -> None:
         """Add new objects in place, and clear the ground cover below them."""
         found = growth.objects
-        usable = np.flatnonzero(found.areas_cells <= _LARGEST_SHARE * found.labels.size)
+        # 0.1: largest share of the view, for an object to be copied
+        usable = np.flatnonzero(found.areas_cells <= 0.1 * found.labels.size)
         mean = np.expm1(self.rates[name].appear_per_year * self.years) * len(found.areas_cells)
         count = _MOST_NEW if growth.cells is not None else min(int(rng.poisson(mean)), _MOST_NEW)
         if not count or not len(usable):
@@ -197,7 +194,7 @@ def _far_enough(
     groups: Sequence[Mask], shifts_cells: NDArray[np.float64], lose_cells: float
 ) -> tuple[list[list[int]], int]:
     """Round shifts (groups, 2) to cells, doubled until they lose that much ground; return what they lose, too."""
-    for doubling in range(_DOUBLINGS + 1):
+    for doubling in range(6):  # up to 5 doublings of shifts that are too small to lose as much ground as is to be lost
         shifts: list[list[int]] = (shifts_cells * 2**doubling).round().astype(int).tolist()
         lost = sum(int((mask & ~_beside(mask, *shift)).sum()) for mask, shift in zip(groups, shifts, strict=True))
         if lost >= lose_cells:
@@ -226,7 +223,8 @@ def _objects_of(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng:
     """Return the components of an area class, or the pieces of a line class between sign changes of smooth noise."""
     if name not in load_taxonomy().lines:
         return find_objects(mask)
-    hills = pool.take(_PIECE_M / cell_size_m, rng) > 0
+    # 40 m: length of the pieces in which lines vanish, appear and are redrawn
+    hills = pool.take(40.0 / cell_size_m, rng) > 0
     high, low = find_objects(mask & hills), find_objects(mask & ~hills)
     labels = np.where(low.labels > 0, low.labels + len(high.areas_cells), high.labels)
     return Objects(
@@ -257,7 +255,8 @@ def _free_window(
     height, width = footprint.shape
     size = np.array(footprint.shape)
     middle = np.array([(part.start + part.stop) / 2 for part in box])
-    away = size.max() + rng.uniform(0, _NEAR_M / cell_size_m, size=(_TRIES, 1))
+    # 60 m: largest distance of a new object from the one it copies
+    away = size.max() + rng.uniform(0, 60.0 / cell_size_m, size=(_TRIES, 1))
     heading = rng.uniform(0, 2 * np.pi, size=_TRIES)
     corners = middle + away * np.column_stack((np.sin(heading), np.cos(heading))) - size / 2
     for row, col in corners.astype(int).tolist():

@@ -18,8 +18,6 @@ Field = NDArray[np.float32]
 Mask = NDArray[np.bool_]
 
 SIGMA: Final = 0.575  # standard deviation of smooth noise: interpolation removes the rest of the variance
-_MIRRORED: Final = (-1, 0, 1)  # flip codes of OpenCV: both axes, vertical, horizontal
-_FEWEST: Final = 4096  # values that place a threshold within half a percent
 
 
 def smooth_noise(shape: tuple[int, int], scale_cells: float, rng: np.random.Generator) -> Field:
@@ -62,7 +60,8 @@ class NoisePool:
         down, right, mirrored = rng.random(3).tolist()
         top, left = int(down * (spare_rows + 1)), int(right * (spare_cols + 1))
         window = whole[top : top + rows, left : left + cols]
-        return np.asarray(cv2.flip(window, _MIRRORED[int(mirrored * 3)]), dtype=np.float32).reshape(self._shape)
+        # Flip codes of OpenCV: both axes, vertical, horizontal
+        return np.asarray(cv2.flip(window, (-1, 0, 1)[int(mirrored * 3)]), dtype=np.float32).reshape(self._shape)
 
 
 def top_share(field: Field, share: float) -> Mask:
@@ -83,7 +82,7 @@ def highest(values: Field, count: float) -> float:
 def highest_within(field: Field, mask: Mask, count: float, rng: np.random.Generator) -> float:
     """Return `highest` of a field within a mask; of a sample of rows if the mask is large (to about half a percent)."""
     size = np.count_nonzero(mask)
-    step = size // _FEWEST
+    step = size // 4096  # values that place a threshold within half a percent
     if step < 2:  # a part must be smaller than the whole
         return highest(field[mask], count)
     first = int(rng.random() * step)

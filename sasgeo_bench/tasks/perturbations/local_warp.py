@@ -18,13 +18,8 @@ from sasgeo_bench.tasks.perturbations.fields import centres, resample
 _WAVELENGTH_M: Final = 90.0
 _WAVES: Final = 16
 _SPREAD: Final = 0.2  # relative spread of the wavelengths around their mean
-_STEPS: Final = 30  # of the iteration; ten suffice for a gentle field
 _ROW_WAVES: Final = 6  # of the shake of a camera
-_ACROSS_M: Final = (40.0, 120.0)  # its wavelengths on the ground: shifts along a row shear and never fold
-_ALONG_M: Final = (150.0, 400.0)  # shifts across the rows squeeze the view, so they change slowly
 _ALONG_SHARE: Final = 0.2  # of the mean square shift
-_HALVINGS: Final = 40  # of the interval that holds a tilt
-_MOST_TILT: Final = 0.9  # of the tilt at which the horizon reaches the view
 
 Floats = NDArray[np.float64]
 
@@ -106,7 +101,9 @@ class RowJitter(Warp):
         up_m = centres(shape, cell_size_m).up_m
         shares = (1 - _ALONG_SHARE, _ALONG_SHARE)
         shakes = []
-        for lengths_m, share in zip((_ACROSS_M, _ALONG_M), shares, strict=True):
+        # Its wavelengths on the ground: shifts along a row shear and never fold
+        # Shifts across the rows squeeze the view, so they change slowly
+        for lengths_m, share in zip(((40.0, 120.0), (150.0, 400.0)), shares, strict=True):
             phase = rng.uniform(0, 2 * np.pi, _ROW_WAVES)
             shake = np.sin(2 * np.pi * up_m / rng.uniform(*lengths_m, _ROW_WAVES) + phase).sum(axis=1, keepdims=True)
             shake -= shake.mean()
@@ -133,8 +130,9 @@ class Tilt(Warp):
         turn = rng.uniform(0, 2 * np.pi)
         ahead_m = at.right_m * np.cos(turn) + at.up_m * np.sin(turn)
         ground = at.right_m + 1j * at.up_m
-        low, high = 0.0, _MOST_TILT / max(float(ahead_m.max()), cell_size_m)
-        for _ in range(_HALVINGS):
+        # 0.9 of the tilt at which the horizon reaches the view
+        low, high = 0.0, 0.9 / max(float(ahead_m.max()), cell_size_m)
+        for _ in range(40):  # halvings of the interval that holds a tilt
             middle = (low + high) / 2
             left_m = _without_similarity(ground / (1 - middle * ahead_m), ground)
             is_more = float((np.abs(left_m) ** 2).mean()) > self.rms_m**2
@@ -164,7 +162,7 @@ def moved(points_m: Floats, field_m: Floats, cell_size_m: float) -> Floats:
     """
     rows, cols = field_m.shape[1:]
     shown = np.array(points_m, dtype=np.float64)
-    for _ in range(_STEPS):
+    for _ in range(30):  # steps of the iteration; ten suffice for a gentle field
         col = np.clip(np.floor(shown[:, 0] / cell_size_m + cols / 2).astype(np.intp), 0, cols - 1)
         row = np.clip(np.floor(rows / 2 - shown[:, 1] / cell_size_m).astype(np.intp), 0, rows - 1)
         shown += 0.7 * (points_m - field_m[:, row, col].T - shown)  # damped: a steep field would swing

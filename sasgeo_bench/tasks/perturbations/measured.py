@@ -25,19 +25,13 @@ MEASURED: Final[Mapping[str, MeasuredErrors]] = {item.name: item.measured for it
 
 QUALITY: Final = 0.35  # spread of the logarithm of the error over views, common to all classes
 CLASS_SPREAD: Final = 0.15  # spread beside it of each class in each view
-OUTLINE_M: Final = 25.0  # length of the stretches over which outlines bulge or shrink
 GROUND_M: Final = 60.0  # width of patches of ground that are called another class
-HIDDEN_M: Final = 30.0  # length of hidden stretches of lines
-PATCH_M: Final = 35.0  # width of false patches of area classes
-ALARM_M2: Final = 30.0  # median area of a false building
 BAND_M: Final = (12.0, 60.0)  # lengths of false lines
 YARD_M: Final = 4.5  # from a road or building
 FAR_SHARE: Final = 0.02  # how much rarer false roads and buildings are on ground farther away; a guess
-_ROUNDED_M: Final = 0.8  # corners are rounded by a blur of this deviation
 _PINHOLE_CELLS: Final = 1.5
 _MOST_ERROR: Final = 0.95
 _MOST_GROUND: Final = 0.5
-_OBJECT_SPREAD: Final = 2.0  # how far objects differ in what they look like, in deviations of the noise within them
 _TRIES: Final = 5  # draws of a false object for each that is expected
 
 
@@ -128,7 +122,8 @@ class _View:
     def outline(self, name: str, rng: np.random.Generator) -> Field:
         """Return the noise of a class's outline: it bulges where this is high, and shrinks where it is low."""
         if name not in self.outlines:
-            self.outlines[name] = self.noise(OUTLINE_M, rng)
+            # 25 m: length of the stretches over which outlines bulge or shrink
+            self.outlines[name] = self.noise(25.0, rng)
         return self.outlines[name]
 
     def any_of(self, names: tuple[str, ...]) -> Mask:
@@ -155,9 +150,10 @@ class _View:
         limit = errors.small_share * max(budget, 1.0)
         kept &= ~self._small(kept, errors.small_m2, min(factor, 1.0), limit, rng)
         if name in load_taxonomy().lines:
-            score = self.noise(HIDDEN_M, rng)
+            score = self.noise(30.0, rng)  # m: length of hidden stretches of lines
         else:
-            kept &= _rounded(mask, _ROUNDED_M * min(factor, 2.0) / self.cell_m)
+            # 0.8 m: corners are rounded by a blur of this deviation
+            kept &= _rounded(mask, 0.8 * min(factor, 2.0) / self.cell_m)
             score = -errors.bulge_m * self.outline(name, rng) - self._depth_m(mask)
         rest = lost * total - (total - np.count_nonzero(kept))
         return kept & (score < highest_within(score, kept, rest, rng)) if rest > 0 else kept
@@ -165,7 +161,8 @@ class _View:
     def _confused(self, mask: Mask, count: float, rng: np.random.Generator) -> Mask:
         """Return about `count` cells that look like another class: small objects as a whole, parts of large ones."""
         objects, looks = find_objects(mask), self.noise(GROUND_M, rng)
-        own = np.concatenate((np.zeros(1), _OBJECT_SPREAD * rng.standard_normal(len(objects.areas_cells))))
+        # 2: how far objects differ in what they look like, in deviations of the noise within them
+        own = np.concatenate((np.zeros(1), 2.0 * rng.standard_normal(len(objects.areas_cells))))
         is_small = objects.areas_cells * self.cell_m**2 < (GROUND_M / 2) ** 2
         share = count / max(1, int(np.count_nonzero(mask)))
         chosen = objects.mask_of(is_small & (rng.random(len(is_small)) < share))
@@ -217,7 +214,7 @@ class _View:
         elif name in load_taxonomy().lines and errors.alarms_on == "ground":
             self._add_bands(seen, free, left, errors.width_m, rng)
         else:
-            patch, beyond = self.noise(PATCH_M, rng), free & ~seen
+            patch, beyond = self.noise(35.0, rng), free & ~seen  # m: width of false patches of area classes
             seen |= beyond & (patch >= highest_within(patch, beyond, left, rng))
 
     def _alarms(self, errors: MeasuredErrors, count: int, factor: float) -> float:
@@ -232,7 +229,7 @@ class _View:
 
     def _add_blocks(self, seen: Mask, free: Mask, budget: float, rng: np.random.Generator) -> None:
         """Add false buildings, of any direction and smaller than most houses."""
-        median = ALARM_M2 / self.cell_m**2
+        median = 30.0 / self.cell_m**2  # 30 m2: median area of a false building
         tries = int(_TRIES * budget / median) + 1
         areas = median * rng.lognormal(0.0, 0.7, size=tries)
         slim = rng.uniform(0.7, 1.0, size=tries)

@@ -24,9 +24,6 @@ from sasgeo_bench.tasks.perturbations.fields import (
 )
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
-_DRAWS: Final = 256  # rectangles drawn at a time
-_SIDES: Final = (0.08, 0.35)  # smallest and largest side of a rectangle, as fractions of the view's side
-
 
 class Rectangles(Occlusion):
     """Hide the view behind rectangles that may overlap; exactly `share` of the cells, to the nearest one."""
@@ -52,7 +49,8 @@ class Rectangles(Occlusion):
 def _draw(shape: tuple[int, ...], rng: np.random.Generator) -> list[list[int]]:
     """Draw row, column, height and width of some rectangles; a corner may lie outside the view."""
     side = np.array(shape)
-    sizes = np.maximum(1, rng.uniform(*_SIDES, size=(_DRAWS, 2)) * side).astype(int)
+    # 256 rectangles at a time; their sides are 0.08 to 0.35 of the view's
+    sizes = np.maximum(1, rng.uniform(0.08, 0.35, size=(256, 2)) * side).astype(int)
     corners = np.floor(rng.uniform(-sizes / 2, side - sizes / 2)).astype(int)
     low = np.maximum(corners, 0)
     rectangles: list[list[int]] = np.hstack((low, sizes + np.minimum(corners, 0))).tolist()
@@ -130,9 +128,7 @@ def _score(shape: tuple[int, int], index: int) -> NDArray[np.float32]:
 
 
 HIDDEN: Final = tuple(name for name in load_taxonomy().lines if name in load_taxonomy().having("drawn"))
-_OVERHANG_M: Final = 4.0  # of crowns over the edge of green
 _SHADOW_M: Final = 8.0  # length of a building's shadow
-_PATCH_M: Final = 8.0  # width of a crown, or of a gap between crowns
 
 
 class CanopyAndShadow(Occlusion):
@@ -145,7 +141,8 @@ class CanopyAndShadow(Occlusion):
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
         """Return the part of the shade where the noise is strongest, for the line classes."""
         shade = shaded(evidence, rng.uniform(0, 360))
-        noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
+        # 8 m: width of a crown, or of a gap between crowns
+        noise = smooth_noise(evidence.shape, 8.0 / evidence.cell_size_m, rng)
         hidden = shade & (noise >= highest(noise[shade], self.share * np.count_nonzero(shade)))
         return np.asarray(hidden & np.isin(evidence.classes, HIDDEN)[:, None, None])
 
@@ -154,7 +151,8 @@ def shaded(evidence: Evidence, sun_deg: float) -> Mask:
     """Return where crowns and shadows can fall, shape (rows, cols); `sun_deg` is clockwise from the view's up."""
     shade = np.zeros(evidence.shape, dtype=bool)
     if "green" in evidence.classes:
-        shade |= dilated(evidence.layer("green") == PRESENT, _OVERHANG_M / evidence.cell_size_m)
+        # 4 m: overhang of crowns over the edge of green
+        shade |= dilated(evidence.layer("green") == PRESENT, 4.0 / evidence.cell_size_m)
     if "building" in evidence.classes and evidence.cell_size_m <= _SHADOW_M:
         building = evidence.layer("building") == PRESENT
         shade |= shadow(building, sun_deg, _SHADOW_M / evidence.cell_size_m)
@@ -174,8 +172,6 @@ def shadow(building: Mask, sun_deg: float, length_cells: float) -> Mask:
 
 
 _RADIUS_M: Final = 20.0
-_WATER_BONUS: Final = 1.5  # added to the strength of glare where all is water; the strength has a deviation of 0.575
-_RIM: Final = 0.15  # weight of a class's own noise: a tenth of what is hidden for one class is seen for another
 
 
 class Glare(Occlusion):
@@ -192,13 +188,12 @@ class Glare(Occlusion):
         if "water" in evidence.classes:
             water = (evidence.layer("water") == PRESENT).astype(np.float32)
             reach = max(1, round(radius_cells / 2))
-            strength += np.float32(_WATER_BONUS) * cv2.blur(water, (reach, reach))
+            # 1.5: added to the strength of glare where all is water; the strength has a deviation of 0.575
+            strength += np.float32(1.5) * cv2.blur(water, (reach, reach))
         pool = NoisePool(evidence.shape, streams)
         rims = (pool.take(2 * radius_cells, streams.of(name)) for name in evidence.classes)
-        return np.stack([top_share(strength + np.float32(_RIM) * rim, self.share) for rim in rims])
-
-
-_SPREAD: Final = 0.4  # weight of the sides against the far end: 0 cuts straight across, 1 cuts a corner of 90 degrees
+        # 0.15: weight of a class's own noise: a tenth of what is hidden for one class is seen for another
+        return np.stack([top_share(strength + np.float32(0.15) * rim, self.share) for rim in rims])
 
 
 class TiltWedge(Occlusion):
@@ -212,10 +207,8 @@ class TiltWedge(Occlusion):
 def far_side(evidence: Evidence, share: float, direction_deg: float) -> Mask:
     """Return the cells that lie farthest in a direction, clockwise from the view's up."""
     along, across = centres(evidence.shape, evidence.cell_size_m).along_and_across(direction_deg)
-    return top_share((along + _SPREAD * np.abs(across)).astype(np.float32), share)
-
-
-_RAGGEDNESS: Final = 0.04  # variation of the frame's width, in halves of the view's side
+    # 0.4: weight of the sides against the far end: 0 cuts straight across, 1 cuts a corner of 90 degrees
+    return top_share((along + 0.4 * np.abs(across)).astype(np.float32), share)
 
 
 class Border(Occlusion):
@@ -224,7 +217,8 @@ class Border(Occlusion):
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
         """Return the cells nearest to the edge."""
         nearness = -depth(evidence.shape)
-        nearness += _RAGGEDNESS * smooth_noise(evidence.shape, min(evidence.shape) / 12, rng)
+        # 0.04: variation of the frame's width, in halves of the view's side
+        nearness += 0.04 * smooth_noise(evidence.shape, min(evidence.shape) / 12, rng)
         return top_share(nearness, self.share)
 
 

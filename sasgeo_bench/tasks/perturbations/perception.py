@@ -32,8 +32,6 @@ from sasgeo_bench.tasks.perturbations.streams import Streams
 TOLERANCE_CELLS: Final = 1.5  # the eight neighbours
 EDGE_M: Final = 4.0  # width of ragged edges
 PATCH_M: Final = 12.0  # width of patches
-GAP_M: Final = 12.0  # width of gaps along lines
-STUB_M: Final = 25.0  # mean length of a false line
 SPREAD: Final = 0.3  # coefficient of variation of the error over views and classes
 SEEN_ANYWHERE: Final = 0.2  # fraction of the false alarms that occur whether or not the class is in view
 
@@ -42,10 +40,8 @@ ERRORS: Final[Mapping[str, ClassErrors]] = {item.name: item.published for item i
 
 _MOST_ERROR: Final = 0.95
 _SECOND_RING: Final = 0.8  # the noise must be stronger by this for a cell two from the edge than for one at the edge
-_DROPPABLE: Final = 0.25  # an object larger than this fraction of its class in view is frayed rather than dropped
 _MOST_TAKEN: Final = 0.6  # most of a class's false alarms that come from what other classes lose to it
 _FLAWLESS: Final = ClassErrors(recall=1.0, precision=1.0)
-_STUB_SPENDS: Final = 0.85  # of the cells of a false line; the others are present already or outside the view
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -160,7 +156,7 @@ class _Look:
 
     def _lose_line(self, mask: Mask, budget_cells: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
         """Cut gaps, then move the rest by a cell here and there; return what is left and the gaps."""
-        noise = self.noise(GAP_M, rng)
+        noise = self.noise(12.0, rng)  # m: width of gaps along lines
         # A gap counts only where no line is left within the tolerance, so its ends do not: rank the weakest noise
         # around each cell instead of its own.
         around = cv2.erode(np.ascontiguousarray(noise), np.ones((3, 3), dtype=np.uint8))
@@ -206,8 +202,9 @@ class _Look:
         # OpenCV draws thickness 1 one cell wide and even thicknesses one cell wider, diagonals included.
         thickness = max(1, 2 * int(self.errors.width_m / self.cell_size_m / 2 + 0.25))
         width_cells = thickness + (thickness > 1)
-        length_cells = STUB_M / self.cell_size_m
-        per_stub = _STUB_SPENDS * (length_cells + width_cells / 2) * width_cells
+        length_cells = 25.0 / self.cell_size_m  # m: mean length of a false line
+        # 0.85 of the cells of a false line; the others are present already or outside the view
+        per_stub = 0.85 * (length_cells + width_cells / 2) * width_cells
         count = int(budget_cells / per_stub + rng.random())  # random rounding, so that the mean is the budget
         if count > 0:
             stubs = np.zeros(seen.shape, dtype=np.uint8)
@@ -219,7 +216,8 @@ class _Look:
 def _drop(mask: Mask, budget_cells: float, rng: np.random.Generator) -> Mask:
     """Return whole objects to miss; never a large one."""
     objects = find_objects(mask)
-    small = objects.areas_cells <= _DROPPABLE * np.count_nonzero(mask)
+    # 0.25: an object larger than this fraction of its class in view is frayed rather than dropped
+    small = objects.areas_cells <= 0.25 * np.count_nonzero(mask)
     chosen = np.zeros(len(small), dtype=bool)
     chosen[small] = pick_up_to(objects.areas_cells[small], budget_cells, rng)
     return objects.mask_of(chosen)

@@ -21,10 +21,6 @@ Layers = dict[str, NDArray[np.uint8]]
 
 # Classes that a season changes, or hides.
 CHANGED: Final[dict[Kind, tuple[str, ...]]] = {kind: load_taxonomy().touched_by(kind) for kind in get_args(Kind)}
-_PATCH_M: Final = 25.0  # width of the patches that change; fields change as a whole
-_RETREAT_M: Final = 12.0  # of the waterline at strength 1, from a gentle bank
-_LARGEST_MEADOW: Final = 0.25  # of the view
-_REGROWN: Final = 0.3  # ratio of the fraction of green that looks like fields to that of fields that look like green
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +49,8 @@ class Season:
             return evidence
         cells = evidence.cells.copy()
         layers = dict(zip(evidence.classes, cells, strict=True))
-        noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
+        # 25 m: width of the patches that change; fields change as a whole
+        noise = smooth_noise(evidence.shape, 25.0 / evidence.cell_size_m, rng)
         if self.kind == "leaf_on":
             _clear(layers, CHANGED[self.kind], _strongest(noise, _of(layers, "green"), self.strength))
         elif self.kind == "snow":
@@ -75,7 +72,8 @@ class Season:
             # Water continues outside the view, so the edge of the view is no bank.
             from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * cell_size_m
             gentle = np.clip(1 + noise / 2, 0.2, 2.0)
-            _clear(layers, ("water",), water & (from_bank_m <= self.strength * _RETREAT_M * gentle))
+            # The waterline retreats by 12 m at strength 1, from a gentle bank
+            _clear(layers, ("water",), water & (from_bank_m <= self.strength * 12.0 * gentle))
         # A line within a lake or broad river does not fall dry before the water around it.
         _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
 
@@ -86,7 +84,9 @@ class Season:
         mown = _some_parcels(farmland, boundary, self.strength, streams.of("farmland"))
         # Green that fills the view is a wood or a mountain side, not a field.
         meadows = green & ~farmland
-        grown = _some_parcels(meadows, boundary, self.strength * _REGROWN, streams.of("green"), most=_LARGEST_MEADOW)
+        # 0.25: largest meadow of the view
+        # 0.3: ratio of the fraction of green that looks like fields to that of fields that look like green
+        grown = _some_parcels(meadows, boundary, self.strength * 0.3, streams.of("green"), most=0.25)
         for name, gained, lost in (("green", mown, grown), ("farmland", grown, mown)):
             if name in layers:
                 layers[name][lost] = ABSENT

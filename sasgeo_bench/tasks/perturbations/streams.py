@@ -2,13 +2,9 @@
 """Random numbers by name, so that what is drawn for one class depends on no other class."""
 
 import hashlib
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-
-VIEW: Final = "the whole view"  # the name of what is drawn once for all classes; no class has spaces in its name
-_WORDS: Final = 4
 
 
 class Streams:
@@ -27,7 +23,7 @@ class Streams:
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
-        self._root = rng.integers(0, 2**32, size=_WORDS, dtype=np.uint32).tolist()
+        self._root = rng.integers(0, 2**32, size=4, dtype=np.uint32).tolist()
         self._made: dict[str, np.random.Generator] = {}
 
     def of(self, name: str) -> np.random.Generator:
@@ -48,4 +44,5 @@ class Streams:
     @property
     def view(self) -> np.random.Generator:
         """Return the generator of what all classes share."""
-        return self.of(VIEW)
+        # The name of what is drawn once for all classes; no class has spaces in its name
+        return self.of("the whole view")

@@ -28,7 +28,6 @@ Outline = list[NDArray[np.int64]]  # rings of one polygon in whole cells, the ou
 TOLERANCES_CELLS: Final = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)  # of simplified outlines
 TILE_CELLS: Final = 16  # a side of a region of interest
 ARM_M: Final = 12.0  # of a road that is sent with a junction
-ARM_WIDTH_M: Final = 4.0  # of that road, where cells are made of it
 _ARM_STEPS: Final = 64  # directions of an arm: 5.6 degrees
 _PLACE_STEPS: Final = 256  # places along a side of the view: less than 1 m at 192 m
 _FORK: Final = 3
@@ -224,7 +223,7 @@ def _frame(evidence: Evidence) -> shapely.Polygon:
 def _drawn(evidence: Evidence, lines: Sequence[shapely.Geometry]) -> Evidence:
     cells = np.full(evidence.cells.shape, UNKNOWN, dtype=np.uint8)
     if lines and "road_minor" in evidence.classes:
-        near = shapely.union_all(lines).buffer(ARM_WIDTH_M / 2)
+        near = shapely.union_all(lines).buffer(4.0 / 2)  # 4 m: arm width of that road, where cells are made of it
         middles_m = cell_offsets_m(evidence.shape, evidence.cell_size_m)
         is_road = shapely.contains_xy(near, middles_m[:, 0], middles_m[:, 1]).reshape(evidence.shape)
         cells[evidence.classes.index("road_minor"), is_road] = PRESENT

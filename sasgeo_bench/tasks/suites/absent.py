@@ -27,7 +27,6 @@ from sasgeo_bench.tasks.suites.base import (
 PATCH_CELLS: Final = 24
 _TURNS: Final = 4
 _TRIES: Final = 256
-_MOST_DRAWN: Final = 0.003  # of the cells of a feature-poor view
 
 
 class AbsentSuite(Suite):
@@ -81,7 +80,7 @@ def _poor_place(shot: Shot) -> Site | None:
         point = rng.uniform((west, south), (east, north))
         if state.is_mapped(point, shot.scene.view_reach_m):
             density = _density(state, point, shot.variant)
-            if density <= _MOST_DRAWN:
+            if density <= 0.003:  # of the cells of a feature-poor view
                 return _moved(shot.site, point, density)
     return None
 

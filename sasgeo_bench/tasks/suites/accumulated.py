@@ -10,16 +10,14 @@ from sasgeo_bench.tasks.suites.pictures import ODOMETRY, STOPS_M, Flight, Pictur
 
 FRAMES: Final = (3.0, 9.0)
 FRAME, DRIFT = "P6 frames", "P6 drift"
-_HEIGHT_M: Final = 80.0
-_BAD: Final = 5.0  # times the drift
 _STANDING: Final = "standing still"
 
 
 def _flight(variant: Variant) -> Flight:
-    count, plain = int(variant.strength) or 1, Flight(height_m=_HEIGHT_M)
+    count, plain = int(variant.strength) or 1, Flight(height_m=80.0)
     if variant.kind == _STANDING:
         return replace(plain, stops_m=((0.0, 0.0),) * len(STOPS_M))
-    bad = _BAD if variant.kind == DRIFT else 1.0
+    bad = 5.0 if variant.kind == DRIFT else 1.0  # 5 times the drift
     return replace(
         plain,
         stops_m=STOPS_M[-count:],

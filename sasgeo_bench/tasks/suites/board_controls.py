@@ -18,9 +18,7 @@ from sasgeo_bench.tasks.suites.twins import TwinSuite
 VIEW_CELLS: Final = 96
 # Smaller than the distance to a site's twin, so that only one place fits a noise-free view.
 NEAR: Final = PriorGroup(radius_m=100.0, yaw="weak", scale_sigma=0.03)
-_TWIN_DRAWS: Final = 3  # queries of each pair of twins
 _PIECE_M: Final = 32.0
-_TRIES: Final = 400
 
 
 class ControlSuite(TwinSuite):
@@ -70,7 +68,7 @@ def _turned(shot: Shot) -> Pose:
     scene, here, rng = shot.scene, np.array(shot.site.en_m), shot.seeds.rng(TURNED)
     least_m = 2 * scene.view_reach_m
     west_m, south_m, east_m, north_m = scene.world.grid.bounds_m
-    points = rng.uniform((west_m, south_m), (east_m, north_m), (_TRIES, 2))
+    points = rng.uniform((west_m, south_m), (east_m, north_m), (400, 2))
     far = points[np.hypot(*(points - here).T) >= least_m]
     for place in far:
         if scene.world.is_mapped(place, scene.view_reach_m):
@@ -101,7 +99,7 @@ SUITE: Final = ControlSuite(
         *(Variant(role="falsifier", kind=kind, view_cells=VIEW_CELLS) for kind in (SHUFFLED, TURNED, BLIND)),
         *(
             Variant(role="falsifier", kind=TWINS, strength=float(number), view_cells=VIEW_CELLS)
-            for number in range(1, _TWIN_DRAWS + 1)
+            for number in range(1, 4)  # 3 queries of each pair of twins
         ),
     ),
     within_m=math.inf,  # twins are candidates, and lie outside the disc of all others

@@ -27,9 +27,6 @@ from sasgeo_bench.tasks.suites.twins import RIVAL_M
 from sasgeo_bench.tasks.twin import Paste, mirror
 
 _RIM_M: Final = 8.0  # copied beyond what views show: cells at the rim of a copy may differ
-_MOST_INSIDE: Final = 1.25  # of the stretch, that is flown over the copied ground: who comes back knows it by then
-_ON_PATH_M: Final = 1.0  # nearer to the stretch, a view sees what was copied
-_SHIFTS: Final = 2000  # tried for the copy
 
 
 class FlightAliasSuite(ChangedMapSuite):
@@ -52,9 +49,11 @@ class FlightAliasSuite(ChangedMapSuite):
         if not ground.admits(place_m):
             return None
         for stretch_m in stretches_m(float(flown_m[-1])):
-            hull = shapely.MultiPoint(place_m[flown_m <= stretch_m]).convex_hull.buffer(_ON_PATH_M)
+            # 1 m: nearer to the stretch, a view sees what was copied
+            hull = shapely.MultiPoint(place_m[flown_m <= stretch_m]).convex_hull.buffer(1.0)
             area = hull.buffer(ground.reach_m + _RIM_M)
-            is_left = lengths_within(hull, place_m, flown_m).sum() <= _MOST_INSIDE * stretch_m
+            # 1.25 of the stretch, at most, is flown over the copied ground: who comes back knows it by then
+            is_left = lengths_within(hull, place_m, flown_m).sum() <= 1.25 * stretch_m
             copy_m = _room(area, place_m, ground, rng) if is_left else None
             if copy_m is not None:
                 stress, falsifier = _pastes(area, copy_m)
@@ -72,7 +71,8 @@ def _room(
     area: shapely.Polygon, place_m: Floats, ground: Ground, rng: np.random.Generator
 ) -> tuple[float, float] | None:
     """Return how far east and north an area has room a second time: whole cells, so that its cells are the same."""
-    shifts_m = np.rint(rng.uniform(-RIVAL_M, RIVAL_M, (_SHIFTS, 2)) / ground.cell_m) * ground.cell_m
+    # 2000 are tried for the copy
+    shifts_m = np.rint(rng.uniform(-RIVAL_M, RIVAL_M, (2000, 2)) / ground.cell_m) * ground.cell_m
     if not ground.mapped.contains(shapely.union(area, _mirrored(area))):
         return None
     room_m = np.array(ground.mapped.bounds) - area.bounds  # west, south, east, north of it: the box is checked first

@@ -6,7 +6,6 @@ from typing import Final
 from sasgeo_bench.tasks.suites.base import SuiteCard, Variant
 from sasgeo_bench.tasks.suites.flights import AGAIN, SEQUENCE, START, FlightSuite, Mission
 
-PERFECT: Final = "perfect"
 PROFILES: Final = ("vo-mono-survey", "wheel-poor", "vio-stereo", "vio-mono")  # by their drift after kilometres
 _KIND: Final = "F1"
 
@@ -14,7 +13,7 @@ _KIND: Final = "F1"
 def _mission(variant: Variant) -> Mission:
     if variant.role == "stress":
         return Mission(profile=variant.kind.removeprefix(f"{_KIND} "))
-    return Mission(profile=PERFECT, draw=AGAIN if variant.role == "falsifier" else "")
+    return Mission(profile="perfect", draw=AGAIN if variant.role == "falsifier" else "")
 
 
 SUITE: Final = FlightSuite(

@@ -9,8 +9,6 @@ from sasgeo_bench.tasks.suites.base import SuiteCard, Variant
 from sasgeo_bench.tasks.suites.flights import SEQUENCE, START, FlightSuite
 from sasgeo_bench.tasks.suites.pictures import Flight, PictureSuite
 
-EVERY_M: Final = (80.0, 120.0)  # flown between two pictures, on average: rendering takes most of the time
-LONGEST_M: Final = 2000.0
 SEASONS: Final[tuple[Season, ...]] = ("autumn", "snow")  # of the stresses, in the order of their strength
 
 
@@ -47,6 +45,6 @@ SUITE: Final = FlightImageSuite(
         Variant(role="falsifier", kind="summer again"),
     ),
     flight=_flight,
-    every_m=EVERY_M,
-    longest_m=LONGEST_M,
+    every_m=(80.0, 120.0),  # flown between two pictures, on average: rendering takes most of the time
+    longest_m=2000.0,
 )

@@ -24,13 +24,7 @@ from sasgeo_bench.tasks.suites.flights import SEQUENCE, START
 OFF_MAP: Final = "off_map_m"  # measured: flown off the map
 LOST: Final = "lost_m2"  # measured: what the map lost
 _WITHIN: Final = (0.9, 1.2)  # of what is asked for, that the longest stretch measures: a hole's size comes in steps
-_MOST_TIMES: Final = 1.3  # the longest stretch, that all together measure: a flight passes through its hole once
-_MIDDLE: Final = (0.2, 0.8)  # of a flight, where it may be off the map
-_HOLES: Final = 40  # tried for each length
 _RADII: Final = np.linspace(0.4, 0.8, 9)  # of the hole, in lengths of the stretch: half, where it is straight
-_ASIDE: Final = 0.6  # of its radius, by which the middle of the hole may lie off the path
-_ELSEWHERE: Final = 400  # places tried for the hole of the falsifier
-_ARC_SEGMENTS: Final = 16
 
 
 class FlightOffMapSuite(ChangedMapSuite):
@@ -77,11 +71,12 @@ def _hole(
     """Return a disc that a flight passes through once for about a given length; None if none is found."""
     # Of several the one is taken of which the flight sees least at other times. The first and the last view see all of
     # their ground on the map.
-    low_m, high_m = (share * flown_m[-1] for share in _MIDDLE)
+    low_m, high_m = (share * flown_m[-1] for share in (0.2, 0.8))  # of a flight, where it may be off the map
     middles = np.flatnonzero((flown_m > low_m) & (flown_m < high_m))
     found: list[tuple[float, shapely.Polygon]] = []
-    for _ in range(_HOLES if len(middles) else 0):
-        middle, turn, aside = place_m[rng.choice(middles)], rng.uniform(0, 2 * np.pi), _ASIDE * rng.random()
+    for _ in range(40 if len(middles) else 0):  # tried for each length
+        # 0.6 of its radius, by which the middle of the hole may lie off the path
+        middle, turn, aside = place_m[rng.choice(middles)], rng.uniform(0, 2 * np.pi), 0.6 * rng.random()
         for radius_m in stretch_m * _RADII:
             center_m = middle + aside * radius_m * np.array([np.sin(turn), np.cos(turn)])
             off_m = np.hypot(*(place_m - center_m).T)
@@ -91,7 +86,8 @@ def _hole(
                 continue
             is_between = low_m <= flown_m[inside].min() and flown_m[inside].max() <= high_m
             is_on = min(off_m[0], off_m[-1]) > radius_m + ground.reach_m
-            if longest_m <= _WITHIN[1] * stretch_m and is_between and is_on and total_m <= _MOST_TIMES * longest_m:
+            # 1.3: the longest stretch, that all together measure: a flight passes through its hole once
+            if longest_m <= _WITHIN[1] * stretch_m and is_between and is_on and total_m <= 1.3 * longest_m:
                 hole = _disc(center_m, radius_m)
                 if ground.mapped.contains(hole) and ground.is_free(hole):
                     found.append((total_m - longest_m, hole))
@@ -112,7 +108,7 @@ def _elsewhere(
     """Return the disc of the size of a hole that lies nearest to a flight and out of its sight; None without one."""
     radius_m = math.sqrt(hole.area / math.pi)
     west, south, east, north = ground.mapped.bounds
-    centers_m = rng.uniform((west, south), (east, north), (_ELSEWHERE, 2))
+    centers_m = rng.uniform((west, south), (east, north), (400, 2))  # 400 places tried for the hole of the falsifier
     near_m = shapely.distance(shapely.points(centers_m), shapely.MultiPoint(place_m))
     for at in np.argsort(near_m):
         if near_m[at] > radius_m + ground.reach_m:
@@ -123,7 +119,7 @@ def _elsewhere(
 
 
 def _disc(center_m: Floats, radius_m: float) -> shapely.Polygon:
-    return shapely.Point(center_m).buffer(radius_m, quad_segs=_ARC_SEGMENTS)
+    return shapely.Point(center_m).buffer(radius_m, quad_segs=16)
 
 
 SUITE: Final = FlightOffMapSuite(

@@ -10,7 +10,6 @@ from sasgeo_bench.tasks.suites.flights import AGAIN, SEQUENCE, FlightSuite, Miss
 KNOWN: Final = PriorGroup(radius_m=100.0, yaw="known", scale_sigma=0.03)
 ANYWHERE: Final = "F3 anywhere"
 RADII_M: Final = (500.0, 2000.0)
-_DISC: Final = "F3 disc"
 
 
 def _mission(variant: Variant) -> Mission:
@@ -39,7 +38,7 @@ SUITE: Final = FlightSuite(
     ),
     variants=(
         Variant(role="control", kind="known start"),
-        *(Variant(role="stress", kind=_DISC, strength=radius_m) for radius_m in RADII_M),
+        *(Variant(role="stress", kind="F3 disc", strength=radius_m) for radius_m in RADII_M),
         Variant(role="stress", kind=ANYWHERE, strength=9999.0),
         Variant(role="falsifier", kind="known start again"),
     ),

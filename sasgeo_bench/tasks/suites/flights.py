@@ -17,7 +17,6 @@ LOITER_M: Final = 2_000.0  # of a loiter at most: more laps would see the same g
 EXTENT: Final = 2.5  # a flight is at most so many times as long as the square root of the ground's area
 START: Final = PriorGroup(radius_m=500.0, yaw="weak", scale_sigma=0.03)
 AGAIN: Final = "again"  # names other draws of perception and odometry, for falsifiers
-DRIFT: Final = "vo-mono-survey"  # profile of the odometer where a suite is not about drift
 SEQUENCE: Final[tuple[Track, ...]] = ("sequence",)  # tracks of all these suites
 
 
@@ -47,7 +46,7 @@ class Mission:
         Names other draws of perception and odometry: variants of one name have the same.
     """
 
-    profile: str = DRIFT
+    profile: str = "vo-mono-survey"  # profile of the odometer where a suite is not about drift
     belief: Belief = "honest"
     group: PriorGroup | None = None
     gaps_m: tuple[float, ...] = ()

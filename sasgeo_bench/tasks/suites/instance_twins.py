@@ -13,9 +13,7 @@ from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, with_neighbou
 from sasgeo_bench.tasks.twin import split_long
 from sasgeo_bench.tasks.vectors import instances_of_mask
 
-HOUSE_M: Final = 7.0
 LEAST_AREA_M2: Final = 160.0
-_NEAR_M: Final = 70.0
 
 
 def _halls(scene: Scene) -> NDArray[np.float64]:
@@ -23,7 +21,7 @@ def _halls(scene: Scene) -> NDArray[np.float64]:
     chosen = features[(features["class"] == "building").to_numpy() & features["is_visible"].to_numpy()]
     shapes = chosen.geometry.to_numpy()
     large = shapes[shapely.area(shapes) >= LEAST_AREA_M2]
-    return with_neighbours(shapely.get_coordinates(shapely.centroid(large)).reshape(-1, 2), within_m=_NEAR_M)
+    return with_neighbours(shapely.get_coordinates(shapely.centroid(large)).reshape(-1, 2), within_m=70.0)
 
 
 class InstanceTwins(TwinSuite):
@@ -53,7 +51,7 @@ SUITE: Final = InstanceTwins(
     ),
     variants=pair("no vectors", "G3", "instances of the mask"),
     change_of=lambda scene, site, rng: (  # noqa: ARG005 - the same at every site
-        lambda piece: split_long(piece, piece_m=HOUSE_M, least_area_m2=LEAST_AREA_M2)
+        lambda piece: split_long(piece, piece_m=7.0, least_area_m2=LEAST_AREA_M2)
     ),
     find=_halls,
     needs="no two buildings of at least 160 m2 near each other",

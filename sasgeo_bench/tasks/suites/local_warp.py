@@ -23,8 +23,6 @@ _WARPS: Final[Mapping[str, Callable[[float], Warp]]] = {
     ROWS: lambda rms_m: RowJitter(rms_m=rms_m),
     TILT: lambda rms_m: Tilt(rms_m=rms_m),
 }
-_STEP_M: Final = 8.0  # between vertices before a line is bent: an eighth of the shortest wave
-_STRAIGHT_M: Final = 0.3  # tolerance of simplification after bending: finer than the noise of the vectors
 
 
 class LocalWarpSuite(Suite):
@@ -51,9 +49,11 @@ class LocalWarpSuite(Suite):
 
 def bent(vectors: "gpd.GeoDataFrame", field_m: NDArray[np.float64], cell_size_m: float) -> "gpd.GeoDataFrame":
     """Move the vectors of a view as a warp moves its cells."""
-    dense = shapely.segmentize(vectors.geometry.to_numpy(), _STEP_M)
+    # 8 m: step between vertices before a line is bent: an eighth of the shortest wave
+    dense = shapely.segmentize(vectors.geometry.to_numpy(), 8.0)
     shapes = shapely.transform(dense, lambda at: moved(at, field_m, cell_size_m))
-    return round_vectors(vectors, shapely.simplify(shapes, _STRAIGHT_M))
+    # 0.3 m: tolerance of simplification after bending: finer than the noise of the vectors
+    return round_vectors(vectors, shapely.simplify(shapes, 0.3))
 
 
 SUITE: Final = LocalWarpSuite(

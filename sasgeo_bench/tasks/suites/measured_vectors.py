@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 Shapes = NDArray[np.object_]
 Points = NDArray[np.float64]
 
-_STEP_M: Final = 3.0  # between the points of a line at which it is hidden or not
 _LEAST_M: Final = 2.0
 _FIELD_WAVES: Final = 12
 
@@ -114,7 +113,8 @@ def _lines(
     missed, under = streams.chances(names, 2)
     seen, is_missed = missed >= _missed(lengths, noise.short_m), under < noise.bridge_missed
     canopy, shift = _field(noise.canopy_m, 1, streams.view), _field(noise.shift_wave_m, 2, streams.view)
-    points = [shapely.get_coordinates(shapely.segmentize(shape, _STEP_M)) for shape in shapes]
+    # 3 m: step between the points of a line at which it is hidden or not
+    points = [shapely.get_coordinates(shapely.segmentize(shape, 3.0)) for shape in shapes]
     heights = _heights(points, canopy, green, noise.under_green)
     limits = {name: _limit(list(compress(heights, names == name)), noise) for name in set(names.tolist())}
     found = []

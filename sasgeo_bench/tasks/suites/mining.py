@@ -32,7 +32,6 @@ _NODE_KINDS: Final = (
     *("intersection", "dead_end", "crossing", "building", "building_cluster", "level_crossing"),
     *("river_bend", "road_rail_crossing", "road_water_crossing"),
 )
-_SHORTLIST: Final = 400  # places whose best rotation is searched; the others are too different at any rotation
 Floats = NDArray[np.float32]
 
 
@@ -224,7 +223,8 @@ def _distances(windows: Windows, name: str, here: int, far: NDArray[np.int64]) -
         return np.asarray(np.linalg.norm(table[far] - table[here], axis=1))
     # The magnitude of the spectrum does not depend on rotation and gives the short list; there the best one counts.
     rough = np.linalg.norm(windows.spectrum[far] - windows.spectrum[here], axis=1)
-    short = np.argsort(rough, kind="stable")[:_SHORTLIST]
+    # 400 places whose best rotation is searched; the others are too different at any rotation
+    short = np.argsort(rough, kind="stable")[:400]
     ours, theirs = windows.polar[here], windows.polar[far[short]]
     turned = np.stack([np.roll(ours, turn, axis=1) for turn in range(_SECTORS)]).reshape(_SECTORS, -1)
     flat = theirs.reshape(len(short), -1)

@@ -35,11 +35,7 @@ ATTITUDE_SIGMA_DEG: Final = 1.0
 # percentile of 20 degrees, where 9.6 and 21.5 were measured (MARS-LVIG).
 BODY_SIGMA_DEG: Final = 8.2
 ODOMETRY: Final = Errors(position_share=0.01, yaw_deg_per_km=2.0)  # a nominal visual-inertial odometry
-_MOST_TILT_DEG: Final = 60.0  # of optical axes: the middle of a view must be seen
-_CELL_PX: Final = 1.4  # cells of paint in a pixel, about
 _FINEST_M, _COARSEST_M = 0.25, 1.0
-_KEPT: Final = 2  # painted windows
-_TALLEST: Final = 0.75  # of the flight's height: whoever flies there flies above everything
 _VIEW: Final = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
 # Stops of a flight around the last one, by which a view of twice the picture's width is covered.
 _AROUND: Final = ((-1, -1), (0, -1), (1, -1), (1, 0), (1, 1), (0, 1), (-1, 1), (-1, 0), (0, 0))
@@ -170,7 +166,8 @@ def stands_of(shot: Shot, flight: Flight) -> list[Stand]:
     found = []
     for stop, place, drawn in zip(flown, said, angles_deg, strict=True):
         body = BODY_SIGMA_DEG * drawn[:2] if flight.is_fixed else np.zeros(2)
-        tilt_deg, roll_deg = min(flight.tilt_deg + float(body[0]), _MOST_TILT_DEG), float(body[1])
+        # 60 degrees of tilt of optical axes: the middle of a view must be seen
+        tilt_deg, roll_deg = min(flight.tilt_deg + float(body[0]), 60.0), float(body[1])
         off = (ATTITUDE_SIGMA_DEG * drawn[2:]).tolist()
         distance_m = math.hypot(stop.easting_m, stop.northing_m)
         found.append(
@@ -205,10 +202,10 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
     family: Family = "shifted" if variant.detector == "shifted" else scene.looks[site.block]
     reach_m = _reach_m(flight, variant)
     pixel_m = flight.height_m / LENS.focal_px[0]
-    cell_m = min(max(pixel_m * _CELL_PX, _FINEST_M), _COARSEST_M)
+    cell_m = min(max(pixel_m * 1.4, _FINEST_M), _COARSEST_M)  # cells of paint in a pixel, about
     key = (site.en_m, family, flight.relief, flight.height_m, reach_m, round(cell_m, 3))
     if key not in scene.painted:
-        while len(scene.painted) >= _KEPT:
+        while len(scene.painted) >= 2:  # painted windows
             scene.painted.pop(next(iter(scene.painted)))
         side = 2 * math.ceil(reach_m / cell_m)
         window = Grid(
@@ -229,7 +226,8 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
             family=family,
             relief=flight.relief,
         )
-        scene.painted[key] = replace(made, below_m=_TALLEST * flight.height_m)
+        # 0.75 of the flight's height: whoever flies there flies above everything
+        scene.painted[key] = replace(made, below_m=0.75 * flight.height_m)
     return scene.painted[key]
 
 

@@ -11,7 +11,6 @@ from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard,
 
 AGES_YEARS: Final = (2.0, 5.0, 10.0)
 DAYS_PER_YEAR: Final = 365.25
-_LEAST_OF_AGE: Final = 0.8  # of the age of a variant, so that none of "10 years" is less than 8
 _MOST_OF_AGE: Final = 5 / 3
 
 
@@ -62,7 +61,8 @@ def has_age(scene: Scene, years: float) -> bool:
     """Return whether there is a state of about that age: not much younger, and less than twice as old."""
     if not scene.others:
         return False
-    return _LEAST_OF_AGE <= age_years(map_of_age(scene, years), scene.world) / years <= _MOST_OF_AGE
+    # 0.8 of the age of a variant, so that none of "10 years" is less than 8
+    return 0.8 <= age_years(map_of_age(scene, years), scene.world) / years <= _MOST_OF_AGE
 
 
 SUITE: Final = RealAgeSuite(

@@ -34,8 +34,6 @@ LEAD: Final = "rival_lead"  # score of the best rival minus that of the true pla
 CELL_M: Final = 2.0
 MODES: Final = 20
 NEAR_M: Final = 25.0  # from a place to the mode that stands for it
-_MARGIN_M: Final = 32.0  # around the largest view, for cells of the coarsest level
-_WIDEST: Final = 2.5  # standard deviations of the scale that the search tries (`search.plan.Plan.spread`)
 
 Place = tuple[float, float]
 
@@ -120,7 +118,9 @@ def plain_modes(state: State, seen: Evidence, prior: Prior) -> tuple[Mode, ...]:
     weights, known = 2 * (present - absent) / counted, (absent - present).sum(axis=0) / counted
     bands, frame = squares(np.concatenate((weights, known[None])), pool, cell_size_m=seen.cell_size_m)
     template = Template(weights=bands[:-1], known=bands[-1], cell_size_m=frame.cell_size_m)
-    reach_m = template.reach_m * (1 + _WIDEST * prior.scale_sigma) + _MARGIN_M
+    # 32 m: margin around the largest view, for cells of the coarsest level
+    # 2.5: standard deviations of the scale that the search tries (`search.plan.Plan.spread`)
+    reach_m = template.reach_m * (1 + 2.5 * prior.scale_sigma) + 32.0
     return search(field_of(state, seen.classes, prior, reach_m=reach_m), template, prior, count=MODES).modes
 
 

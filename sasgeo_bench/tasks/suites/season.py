@@ -9,14 +9,12 @@ from sasgeo_bench.tasks.perturbations.season import CHANGED, Season
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 
 STRENGTHS: Final = (0.3, 0.6, 0.9)
-SMALL_STRENGTHS: Final = (0.6, 0.9)
 NEEDS: Final[dict[Kind, tuple[str, ...]]] = {
     "leaf_on": ("green",),
     "snow": (),
     "low_water": CHANGED["low_water"],
     "harvest": ("farmland",),
 }
-_LEAST_SHARE: Final = 0.003  # of the mapped cells that the classes of a season cover
 
 
 class SeasonSuite(Suite):
@@ -33,11 +31,11 @@ class SeasonSuite(Suite):
         """Return the seasons whose classes the map has."""
         cells = float(scene.map.known.sum())
         shares = {name: float(scene.map.has(name).sum()) / max(1.0, cells) for name in scene.map.classes}
+        # 0.003 of the mapped cells that the classes of a season cover
         able = {
             kind
             for kind, names in NEEDS.items()
-            if shares.keys() & CHANGED[kind]
-            and (not names or sum(shares.get(name, 0.0) for name in names) > _LEAST_SHARE)
+            if shares.keys() & CHANGED[kind] and (not names or sum(shares.get(name, 0.0) for name in names) > 0.003)
         }
         return tuple(item for item in self.variants if item.role == "control" or item.kind in able)
 
@@ -64,7 +62,7 @@ SUITE: Final = SeasonSuite(
     ),
     variants=(
         *controls(),
-        *(variant for kind in NEEDS for variant in ladder(kind, STRENGTHS, small=SMALL_STRENGTHS)),
+        *(variant for kind in NEEDS for variant in ladder(kind, STRENGTHS, small=(0.6, 0.9))),
         *(Variant(role="falsifier", kind=kind) for kind in NEEDS),
     ),
 )

@@ -16,7 +16,6 @@ from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import Block
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Site, Suite
 
-_TRIES: Final = 400  # draws in a block before it counts as full
 _SCALE_CUT: Final = 2.0  # sigmas at which the scales of views are cut
 ANCHOR_SPREAD: Final = 0.2  # largest distance of a site from its anchor, as a fraction of the view's side
 
@@ -109,7 +108,7 @@ class _Ground:
         if near is not None and len(near) == 0:
             return
         spread_m, failed = ANCHOR_SPREAD * self.suite.main_side_m, 0
-        while failed < _TRIES:
+        while failed < 400:  # draws in a block before it counts as full
             point = rng.uniform((west, south), (east, north))
             if near is not None:
                 point = near[rng.integers(len(near))] + rng.uniform(-1, 1, 2) * spread_m

@@ -20,12 +20,10 @@ from sasgeo_bench.tasks.suites.twins import Places
 
 STABLE: Final = tuple(name for name in LAYERS if name in load_taxonomy().having("through"))
 VOLATILE: Final = {item.name: item.volatile for item in load_taxonomy().classes if item.volatile}  # and when it changes
-STEPS: Final = 6  # of the change: so many however many classes there are
 MOST_ALIASES: Final = 8
 
 _STEP_M: Final = 40.0
 _REACH_M: Final = 90.0  # along the line in both directions: most of a view of 192 m
-_STRAIGHT: Final = 0.995  # least ratio of chord and line
 _SAME_DEG: Final = 12.0
 _MOST_BUILT: Final = 0.03
 
@@ -63,7 +61,8 @@ class StableNotDistinctive(Suite):
     def draw(self, shot: Shot) -> Draft:
         """Mirror the layers of some volatile classes within the view: all of them at strength 1."""
         seen = shot.perceived()
-        after = mirrored(seen, round(shot.variant.strength * STEPS))
+        # 6 steps of the change: so many however many classes there are
+        after = mirrored(seen, round(shot.variant.strength * 6))
         return Draft(evidence=after, measured={"cells_changed": share_changed(seen, after)})
 
 
@@ -103,7 +102,7 @@ def _along(line: shapely.Geometry) -> NDArray[np.float64]:
         for shift in (-_REACH_M, 0.0, _REACH_M)
     )
     chord = after - before
-    is_straight = np.hypot(*chord.T) >= _STRAIGHT * 2 * _REACH_M
+    is_straight = np.hypot(*chord.T) >= 0.995 * 2 * _REACH_M  # 0.995: least ratio of chord and line
     bearings = bearing_deg(chord[:, 0], chord[:, 1])
     return np.asarray(np.column_stack((here, bearings))[is_straight])
 

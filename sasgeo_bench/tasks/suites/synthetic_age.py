@@ -13,7 +13,6 @@ from sasgeo_bench.tasks.vectors import VECTOR_CLASSES
 
 YEARS: Final = (2.0, 5.0, 10.0, 20.0, 40.0)
 _MOST_NEW_PER_OLD: Final = 1.0
-_MEDIAN_OF_SHIFT: Final = 1.1774  # of a length whose two components have standard deviation 1: sqrt(2 ln 2)
 
 
 class SyntheticAgeSuite(Suite):
@@ -49,12 +48,13 @@ def ageing_of(pooled: PooledRates, *, place: str) -> Ageing:
         )
         for name, item in pooled.classes.items()
     }
+    # 1.1774: median of a length whose two components have standard deviation 1: sqrt(2 ln 2)
     return Ageing(
         years=0.0,
         rates=classes,
         measured_in=pooled.places,
         place=place,
-        shift_m=float(np.median(shifts_m)) / _MEDIAN_OF_SHIFT if shifts_m else 0.0,
+        shift_m=float(np.median(shifts_m)) / 1.1774 if shifts_m else 0.0,
     )
 
 

@@ -9,7 +9,6 @@ from sasgeo_bench.tasks.perturbations.telemetry import Sent, junctions, outlines
 from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, SuiteCard, Variant, controls, ladder
 from sasgeo_bench.tasks.suites.vectors import site_vectors
 
-FULL_BYTES: Final = 4096  # a budget of strength 0; each step halves it
 OUTLINES, REGIONS, JUNCTIONS = "outlines", "regions of interest", "junctions"
 RUNS: Final = "runs"
 
@@ -20,7 +19,7 @@ def budget_bytes(strength: float) -> int:
     >>> [budget_bytes(strength) for strength in (1, 2, 5)]
     [2048, 1024, 128]
     """
-    return round(FULL_BYTES / 2**strength)
+    return round(4096 / 2**strength)  # 4096 bytes: a budget of strength 0; each step halves it
 
 
 class TelemetrySuite(Suite):

@@ -13,16 +13,13 @@ from sasgeo_bench.tasks.suites.base import Scene, Shot, Site, SuiteCard, pair
 from sasgeo_bench.tasks.suites.twins import TWIN_GROUP, TwinSuite, nodes_of, places_of, with_neighbours
 from sasgeo_bench.tasks.twin import Change, open_gaps, stagger
 
-GAP_M: Final = 2.0  # one or two cells: perception's own gaps are as wide
-OFFSET_M: Final = 5.0  # between two T-junctions: less than the width of a road
-_PAIR_M: Final = 125.0  # between two junctions that one view shows
 _SEEN_M: Final = 90.0
 _FEWEST_X: Final = 2
-_ONE_PATCH_CELLS: Final = 4  # differing cells within this distance belong to one junction
 
 
 def _junctions(scene: Scene) -> NDArray[np.float64]:
-    return with_neighbours(places_of(nodes_of(scene, ["intersection"], least_degree=3)), within_m=_PAIR_M)
+    # 125 m between two junctions that one view shows
+    return with_neighbours(places_of(nodes_of(scene, ["intersection"], least_degree=3)), within_m=125.0)
 
 
 def _near(scene: Scene, site: Site, *, least_degree: int) -> NDArray[np.float64]:
@@ -34,9 +31,11 @@ def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
     """Split X-junctions into two T-junctions at half of the sites that have some; open gaps at all others."""
     crossings = _near(scene, site, least_degree=4)
     if len(crossings) >= _FEWEST_X and rng.random() < 0.5:  # half of them
-        return lambda piece: stagger(piece, crossings, offset_m=OFFSET_M, rng=rng)
+        # 5 m between two T-junctions: less than the width of a road
+        return lambda piece: stagger(piece, crossings, offset_m=5.0, rng=rng)
     near = _near(scene, site, least_degree=3)
-    return lambda piece: open_gaps(piece, near, gap_m=GAP_M, rng=rng)
+    # 2 m: one or two cells: perception's own gaps are as wide
+    return lambda piece: open_gaps(piece, near, gap_m=2.0, rng=rng)
 
 
 class TopologyTwins(TwinSuite):
@@ -58,7 +57,8 @@ def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence
     """Take each patch of differing cells from one of two views, by lot."""
     differ = (own.cells != other.cells).any(axis=0)
     square = np.ones((3, 3), dtype=bool)
-    near = scipy.ndimage.binary_dilation(differ, structure=square, iterations=_ONE_PATCH_CELLS // 2)
+    # Differing cells within this distance belong to one junction
+    near = scipy.ndimage.binary_dilation(differ, structure=square, iterations=4 // 2)
     patch, count = scipy.ndimage.label(near, structure=square)
     is_other = np.concatenate(([False], rng.random(count) < 0.5))[patch]  # half of them
     return own.replace(np.where(is_other, other.cells, own.cells))

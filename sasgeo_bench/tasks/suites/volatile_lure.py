@@ -17,8 +17,6 @@ from sasgeo_bench.tasks.twin import mirror
 
 VOLATILE: Final = tuple(item.name for item in load_taxonomy().classes if item.volatile)
 STABLE: Final = tuple(item.name for item in load_taxonomy().classes if not item.volatile)
-CHANGED_M: Final = 60.0  # radius of what differs: a third of a view; the rest is the same at both places
-_NEAR_M: Final = 40.0
 
 
 def _mixed(scene: Scene) -> NDArray[np.float64]:
@@ -27,7 +25,7 @@ def _mixed(scene: Scene) -> NDArray[np.float64]:
     shapes = features.geometry.to_numpy()
     centres = shapely.centroid(shapes[(features["class"] == "building").to_numpy()])
     stable = shapely.STRtree(shapes[features["class"].isin(STABLE).to_numpy()])
-    near = np.unique(stable.query(centres, predicate="dwithin", distance=_NEAR_M)[0])
+    near = np.unique(stable.query(centres, predicate="dwithin", distance=40.0)[0])
     return np.asarray(shapely.get_coordinates(centres[near])).reshape(-1, 2)
 
 
@@ -46,7 +44,8 @@ class VolatileLure(TwinSuite):
         everything else as at the original.
         """
         plain = super().edit(scene, sites, seeds)
-        middle = partial(mirror, within_m=CHANGED_M)
+        # 60 m: radius of what differs: a third of a view; the rest is the same at both places
+        middle = partial(mirror, within_m=60.0)
         lures = [
             replace(item, change=partial(middle, classes=(*VOLATILE, *STABLE), center_m=item.source_m))
             for item in plain.map_pastes

@@ -126,7 +126,9 @@ class PlainFigure(Figure):
             self._words[body.supxlabel(about.below, fontsize=8.5)] = about.below
         if about.keys:
             width = max(_LEAST_WIDTH, about.columns * about.panel_inches[0])
-            across = _keys_across([str(key.get_label()) for key in about.keys], width)
+            # Number of legend entries in a row
+            names = [str(key.get_label()) for key in about.keys]
+            across = max(1, min(len(names), int(width / (0.6 + 0.075 * max(map(len, names))))))
             inner.legend(handles=about.keys, loc="outside upper left", ncols=across, frameon=False, handlelength=2.6)
         return inner
 
@@ -234,10 +236,6 @@ def broken(text: str, width_inches: float, points: float) -> str:
     """
     letters = max(1, int(width_inches * _LETTERS / points))
     return "\n".join(textwrap.fill(line, letters, break_on_hyphens=False) for line in text.split("\n"))
-
-
-def _keys_across(names: Sequence[str], width_inches: float) -> int:
-    return max(1, min(len(names), int(width_inches / (0.6 + 0.075 * max(map(len, names))))))
 
 
 def _rounded(svg: str) -> str:

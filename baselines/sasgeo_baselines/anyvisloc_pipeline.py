@@ -187,7 +187,13 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
     def _matched(self, view: Sight, tiles: Sequence[Pose], discs: Sequence[Disc], *, most: int) -> list[Mode | None]:
         """Return a mode for each of the `most` tiles that are most alike, None for the others."""
         # Its score is the number of inliers of the first `TOP` tiles; without any, minus the distance of descriptors.
-        away = self._distances(view, points_of(tiles))
+        # Distances of descriptors of tiles, shape (N,); infinite where the map is unknown
+        places_m = points_of(tiles)
+        counts = self._sums.squares(places_m, view.side_m)
+        squared = np.zeros(len(places_m))
+        for name, root in view.roots.items():
+            squared += (np.sqrt(counts[self._classes.index(name)] / np.maximum(counts[-1], 1)) - root) ** 2
+        away = np.where(counts[-1] > 0, np.sqrt(squared), np.inf)
         found: list[Mode | None] = [None] * len(tiles)
         for rank, at in enumerate(np.argsort(away, kind="stable")[:most].tolist()):
             if not math.isfinite(away[at]):
@@ -195,14 +201,6 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
             best = self._local(view, tiles[at], discs[at]) if rank < TOP else None
             found[at] = best or Mode(pose=tiles[at], score=-float(away[at]))
         return found
-
-    def _distances(self, view: Sight, places_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return distances of descriptors of tiles, shape (N,); infinite where the map is unknown."""
-        counts = self._sums.squares(places_m, view.side_m)
-        squared = np.zeros(len(places_m))
-        for name, root in view.roots.items():
-            squared += (np.sqrt(counts[self._classes.index(name)] / np.maximum(counts[-1], 1)) - root) ** 2
-        return np.where(counts[-1] > 0, np.sqrt(squared), np.inf)
 
     def _local(self, view: Sight, tile: Pose, disc: Disc) -> Mode | None:
         """Match a view with the features of a tile; None where too few agree, or on what the prior excludes."""

@@ -126,7 +126,11 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
         for tile in nlargest(64, self.tiles(view, disc), key=lambda tile: tile.bound):
             partners = sinkhorn(tile.likeness, slack=self.numbers["slack"])
             score = float((partners * tile.likeness).sum() / max(tile.likeness.shape))
-            pose, inliers = self._posed(view, tile, partners)
+            best = partners.argmax(axis=1)
+            share = partners[np.arange(len(best)), best]
+            kept = np.flatnonzero(share >= 0.1)  # least share of an object that a match must have
+            mapped_m = self.mapped.nodes.places_m[tile.rows[best[kept]]]
+            pose, inliers = posed(view.nodes.places_m[kept], mapped_m, share[kept])
             if pose is None or not view.allows(pose, disc):
                 pose, inliers = tile.pose, 0
             found.append(Matched(pose=pose, score=score, inliers=inliers))
@@ -172,13 +176,6 @@ class LiuObjectGraph(PlaceMatcher[Objects]):
             return found
         alike = _unit(np.array(counts)) @ np.bincount(view.nodes.kind, minlength=kinds)
         return [found[at] for at in np.sort(np.argsort(-alike, kind="stable")[:MOST_TILES])]
-
-    def _posed(self, view: Objects, tile: Tile, partners: Floats) -> tuple[Pose | None, int]:
-        best = partners.argmax(axis=1)
-        share = partners[np.arange(len(best)), best]
-        kept = np.flatnonzero(share >= 0.1)  # least share of an object that a match must have
-        mapped_m = self.mapped.nodes.places_m[tile.rows[best[kept]]]
-        return posed(view.nodes.places_m[kept], mapped_m, share[kept])
 
 
 def _taken(nodes: Nodes, rows: Ints) -> Nodes:
@@ -275,19 +272,16 @@ def posed(seen_m: Floats, mapped_m: Floats, weight: Floats) -> tuple[Pose | None
     """
     if len(seen_m) < FEWEST:
         return None, 0
-    chosen = _triples(len(seen_m))
+    # Rows of three different matches, shape (SAMPLES, 3): the same ones for the same number of matches
+    count = len(seen_m)
+    chance = np.random.default_rng(count).random((SAMPLES, count))
+    chosen = np.asarray(chance.argpartition(2, axis=1)[:, :3])
     agrees = _left_m(seen_m, mapped_m, chosen) <= AGREE_M
     best = agrees[(agrees @ weight).argmax()]
     if np.count_nonzero(best) < FEWEST:
         return None, 0
     pose, _ = fitted(seen_m[best], mapped_m[best], weight[best])
     return pose, int(np.count_nonzero(best))
-
-
-def _triples(count: int) -> Ints:
-    """Return rows of three different matches, shape (SAMPLES, 3): the same ones for the same number of matches."""
-    chance = np.random.default_rng(count).random((SAMPLES, count))
-    return np.asarray(chance.argpartition(2, axis=1)[:, :3])
 
 
 def _left_m(seen_m: Floats, mapped_m: Floats, chosen: Ints) -> Floats:

@@ -112,14 +112,12 @@ class Votes:
         for first in np.argsort(-total, kind="stable")[: 8 * count].tolist():
             if all(np.linalg.norm(at[first] - other) > 1.0 for other in middles):
                 rows = np.array(sorted(lists[first]), dtype=np.int64)
-                kept.append(Crowd(mode=self._mean(rows, score=float(total[first])), rows=rows))
+                # Mean of poses, with a score
+                weight = self.weight[rows]
+                east_m, north_m = weight @ self.poses[rows, :2] / weight.sum()
+                turn = complex(weight @ np.exp(1j * np.radians(self.poses[rows, 2])))
+                yaw_deg = float(np.degrees(np.angle(turn)))
+                pose = Pose(easting_m=float(east_m), northing_m=float(north_m), yaw_deg=yaw_deg)
+                kept.append(Crowd(mode=Mode(pose=pose, score=float(total[first])), rows=rows))
                 middles.append(at[first])
         return kept[:count]
-
-    def _mean(self, rows: Ints, *, score: float) -> Mode:
-        weight = self.weight[rows]
-        east_m, north_m = weight @ self.poses[rows, :2] / weight.sum()
-        turn = complex(weight @ np.exp(1j * np.radians(self.poses[rows, 2])))
-        yaw_deg = float(np.degrees(np.angle(turn)))
-        pose = Pose(easting_m=float(east_m), northing_m=float(north_m), yaw_deg=yaw_deg)
-        return Mode(pose=pose, score=score)

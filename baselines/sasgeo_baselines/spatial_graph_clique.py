@@ -64,7 +64,11 @@ class SpatialGraphClique(ObjectMatcher):
 
     def _at(self, pairs: Pairs, pose: Pose) -> Mode | None:
         """Return the pose of the largest clique of pairs near a pose; None if they are fewer than three."""
-        near = _around(pairs, pose, self.numbers["near_m"])
+        # Rows of the pairs that vote for a place near a pose, the nearest first
+        away_m = np.hypot(*(pairs.places_m(pose.yaw_deg) - (pose.easting_m, pose.northing_m)).T)
+        near = np.flatnonzero(away_m <= self.numbers["near_m"])
+        # At most 60 pairs of one peak, the nearest first: bounds the search for a clique
+        near = np.asarray(near[np.argsort(away_m[near], kind="stable")[:60]], dtype=np.int64)
         places_m, owner = (pairs.seen_m[near], pairs.mapped_m[near]), owners(pairs, near)
         clique = near[largest_clique(*places_m, owner, agree_m=self.numbers["agree_m"])]
         if len(clique) < 3:  # at least 3 of a clique: two pairs always agree with something
@@ -76,13 +80,6 @@ class SpatialGraphClique(ObjectMatcher):
         """Return the size of the largest clique."""
         del view
         return {"inliers": float(int(found[0].score))}
-
-
-def _around(pairs: Pairs, pose: Pose, near_m: float) -> Ints:
-    away_m = np.hypot(*(pairs.places_m(pose.yaw_deg) - (pose.easting_m, pose.northing_m)).T)
-    near = np.flatnonzero(away_m <= near_m)
-    # At most 60 pairs of one peak, the nearest first: bounds the search for a clique
-    return np.asarray(near[np.argsort(away_m[near], kind="stable")[:60]], dtype=np.int64)
 
 
 def owners(pairs: Pairs, chosen: Ints) -> Ints:

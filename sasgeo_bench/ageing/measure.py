@@ -350,7 +350,11 @@ def _is_near(stock: _Stock, verdict: Verdict, hints: Geometries) -> NDArray[np.b
 def _row(change: _Change, span: str, *, place: str, name: str) -> dict[str, object]:
     old, new = change.old, change.new
     amount_from, amount_to = float(old.amount.sum()), float(new.amount.sum())
-    moved, weight = _moved(old)
+    # Shift of each re-drawn thing, and the amount kept of it
+    left = old.amount - old.lost
+    kept = np.bincount(old.thing, weights=left, minlength=len(old.shift_m)).astype(np.float64)
+    is_redrawn = np.nan_to_num(old.shift_m) > REDRAWN_M
+    moved, weight = old.shift_m[is_redrawn], kept[is_redrawn]
     quantiles = _quantiles(moved, weight, (0.5, 0.9))
     return _rates([change], span, place=place, name=name) | {
         "n_from": change.n_from,
@@ -456,13 +460,6 @@ def _added_up(verdicts: Sequence[Verdict], cells: Sequence[Ints], blocks: Ints) 
 def _cells(xy_m: Floats) -> Ints:
     cells = np.floor(xy_m / BLOCK_M).astype(np.int64).reshape(-1, 2)
     return np.asarray(cells[:, 0] * 2**32 + cells[:, 1])
-
-
-def _moved(verdict: Verdict) -> tuple[Floats, Floats]:
-    left = verdict.amount - verdict.lost
-    kept = np.bincount(verdict.thing, weights=left, minlength=len(verdict.shift_m)).astype(np.float64)
-    is_redrawn = np.nan_to_num(verdict.shift_m) > REDRAWN_M
-    return verdict.shift_m[is_redrawn], kept[is_redrawn]
 
 
 def _quantiles(values: Floats, weights: Floats, levels: tuple[float, ...]) -> list[float]:

@@ -107,7 +107,10 @@ def _read(path: Path, size: int, changed_ns: int) -> _Code:
         return _Code(hashlib.sha256(data).digest())
     imports = _imports(tree)
     if ships(path):
-        _forget_modules(tree)
+        # Take out of a tree where the names of our own modules come from
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in SHIPPED_MODULES:
+                node.module = None
     return _Code(hashlib.sha256(_shape(tree).encode(errors="replace")).digest(), imports)
 
 
@@ -117,12 +120,6 @@ def _tree(data: bytes) -> ast.Module | None:
         return ast.parse(data)
     except (SyntaxError, ValueError, RecursionError, MemoryError):
         return None
-
-
-def _forget_modules(tree: ast.Module) -> None:
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.partition(".")[0] in SHIPPED_MODULES:
-            node.module = None
 
 
 def _shape(tree: ast.AST) -> str:

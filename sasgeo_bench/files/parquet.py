@@ -51,7 +51,12 @@ def table_writer(path: Path, schema: pa.Schema, **options: Any) -> Iterator["pq.
     with pq.ParquetWriter(path, schema.with_metadata(about), **{**CHECKED, **options}) as writer:
         writer.add_key_value_metadata({_SEAL.decode(): "0" * _DIGITS})
         yield writer
-    _seal(path)
+    # Write the CRC of the footer, computed with zeros in its place, where the writer left zeros
+    with path.open("r+b") as file:
+        footer = _read_footer(file)
+        at = footer.index(_MARK) + len(_MARK)
+        file.seek(at - len(footer), os.SEEK_END)
+        file.write(_crc_of(footer, at))
 
 
 def write_table(table: pa.Table, path: Path, *, row_group_size: int | None = None, **options: Any) -> None:  # noqa: ANN401
@@ -101,7 +106,12 @@ def open_table(
     import pyarrow.parquet as pq  # noqa: PLC0415
 
     try:
-        _check_footer(path)
+        # Refuse a file whose footer contradicts its CRC; one without a CRC passes
+        with plain_file(path).open("rb") as file:
+            footer = _read_footer(file)
+        at = footer.find(_MARK) + len(_MARK)
+        if at >= len(_MARK) and footer[at : at + _DIGITS] != _crc_of(footer, at):
+            raise pa.ArrowInvalid("its footer is damaged")
         with pq.ParquetFile(plain_file(path), **{**VERIFIED, **options}) as source:
             fault = size_fault(source.metadata, most_rows=most_rows, is_whole=is_whole)
             if fault is None and not options.get("read_dictionary"):  # who reads so has bounds of its own
@@ -267,23 +277,6 @@ def _size_of(chunk: "pq.ColumnChunkMetaData", leaf: "pq.ColumnSchema") -> int:
     """Return the bytes of a part of a column, also where a value of fixed length stands in the file but once."""
     fixed = chunk.num_values * leaf.length if chunk.physical_type == "FIXED_LEN_BYTE_ARRAY" else 0
     return max(int(chunk.total_uncompressed_size), int(fixed))
-
-
-def _seal(path: Path) -> None:
-    with path.open("r+b") as file:
-        footer = _read_footer(file)
-        at = footer.index(_MARK) + len(_MARK)
-        file.seek(at - len(footer), os.SEEK_END)
-        file.write(_crc_of(footer, at))
-
-
-def _check_footer(path: Path) -> None:
-    """Refuse a file whose footer contradicts its CRC; one without a CRC passes."""
-    with plain_file(path).open("rb") as file:
-        footer = _read_footer(file)
-    at = footer.find(_MARK) + len(_MARK)
-    if at >= len(_MARK) and footer[at : at + _DIGITS] != _crc_of(footer, at):
-        raise pa.ArrowInvalid("its footer is damaged")
 
 
 def _read_footer(file: BinaryIO) -> bytes:

@@ -70,19 +70,15 @@ def in_axes(flown: Trajectory, axes: Axes | None, path: Path) -> Trajectory:
     if axes is not None and axes not in AXES:
         raise FlightError(f"axes must be one of {', '.join(AXES)}, got {axes!r}")
     if axes == "camera":
-        flown = _out_of_camera(flown)
+        turns = np.matmul(np.matmul(_FRAME, flown.rotation.as_matrix()), _BODY)
+        flown = Trajectory(
+            time_s=flown.time_s,
+            position_m=flown.position_m @ _FRAME.T,
+            quaternion_xyzw=type(flown.rotation).from_matrix(turns).as_quat(),
+        )
     if axes != "up" and len(flown) >= 10:  # of fewer nothing can be said
         _check_upright(flown, axes, plain(str(path)))
     return flown
-
-
-def _out_of_camera(flown: Trajectory) -> Trajectory:
-    turns = np.matmul(np.matmul(_FRAME, flown.rotation.as_matrix()), _BODY)
-    return Trajectory(
-        time_s=flown.time_s,
-        position_m=flown.position_m @ _FRAME.T,
-        quaternion_xyzw=type(flown.rotation).from_matrix(turns).as_quat(),
-    )
 
 
 def _between_deg(first: NDArray[np.float64], second: NDArray[np.float64]) -> float:

@@ -213,7 +213,14 @@ def measure_drift(
     if not runs:
         raise FlightError("drift is measured on one run at least, got none")
     spacing_m = spacing_of(lengths_m)
-    _warn_of_spacing(runs, spacing_m)
+    # Warn where poses are so far apart that lines between them hide errors
+    steps_m = np.concatenate([np.diff(stretch.path_m) for run in runs for stretch in run.stretches])
+    if steps_m.any() and (typical_m := float(np.median(steps_m[steps_m > 0]))) > 1.01 * spacing_m:
+        message = (
+            f"poses are {typical_m:.1f} m apart, farther than a tenth of {_NODES * spacing_m:g} m: "
+            "errors over so short segments look smaller than they are, choose longer ones"
+        )
+        warnings.warn(message, stacklevel=3)
     rng = np.random.default_rng(seed)
     rows = [row for length in lengths_m for row in _length_rows(runs, length, spacing_m, draws, rng)]
     names = ["figure", "length_m", "value", "lo", "hi", "sequences", "segments"]
@@ -268,16 +275,6 @@ def _rate_rows(runs: Sequence[PairedRun]) -> Iterator[dict[str, object]]:
         lo, hi = poisson_interval(count)
         yield {"figure": figure, **rest} | ({"value": count / km, "lo": lo / km, "hi": hi / km} if km > 0 else {})
     yield {"figure": "lost_pct", **rest, "value": _PERCENT * lost_km / max(lost_km + tracked_km, 1e-9)}
-
-
-def _warn_of_spacing(runs: Sequence[PairedRun], spacing_m: float) -> None:
-    steps_m = np.concatenate([np.diff(stretch.path_m) for run in runs for stretch in run.stretches])
-    if steps_m.any() and (typical_m := float(np.median(steps_m[steps_m > 0]))) > 1.01 * spacing_m:
-        message = (
-            f"poses are {typical_m:.1f} m apart, farther than a tenth of {_NODES * spacing_m:g} m: "
-            "errors over so short segments look smaller than they are, choose longer ones"
-        )
-        warnings.warn(message, stacklevel=3)
 
 
 def _errors_of(part: Stretch, count: int, spacing_m: float) -> Segments:

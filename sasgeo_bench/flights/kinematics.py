@@ -296,7 +296,13 @@ def _move(path_m: Floats, cruise_mps: float, limits: Limits, step_s: float) -> _
     speed_mps = np.minimum(math.radians(limits.turn_rate_deg_s) / bend, np.sqrt(limits.side_mps2 / bend))
     # 0.5 m/s: a path with a sharper bend than any drone flies is crept round
     speed_mps = np.clip(speed_mps, 0.5, cruise_mps)
-    speed_mps = _within(speed_mps, np.diff(along_m), limits.acceleration_mps2)
+    # Lower speeds so that none is reached or left faster than the acceleration allows
+    squares, gains = (speed_mps**2).tolist(), (2 * limits.acceleration_mps2 * np.diff(along_m)).tolist()
+    for at, gain in enumerate(gains):
+        squares[at + 1] = min(squares[at + 1], squares[at] + gain)
+    for at in range(len(gains) - 1, -1, -1):
+        squares[at] = min(squares[at], squares[at + 1] + gains[at])
+    speed_mps = np.asarray(np.sqrt(squares))
     spent_s = np.append(0.0, np.cumsum(2 * np.diff(along_m) / (speed_mps[1:] + speed_mps[:-1])))
     count = max(2, math.floor(spent_s[-1] / step_s) + 1)
     time_s = np.arange(count) * min(step_s, spent_s[-1])
@@ -313,16 +319,6 @@ def _move(path_m: Floats, cruise_mps: float, limits: Limits, step_s: float) -> _
         speed_mps=now_mps,
         pull_mps2=gain_mps2[:, None] * ahead + now_mps[:, None] ** 2 * bent,
     )
-
-
-def _within(speed_mps: Floats, steps_m: Floats, acceleration_mps2: float) -> Floats:
-    """Lower speeds so that none is reached or left faster than the acceleration allows."""
-    squares, gains = (speed_mps**2).tolist(), (2 * acceleration_mps2 * steps_m).tolist()
-    for at, gain in enumerate(gains):
-        squares[at + 1] = min(squares[at + 1], squares[at] + gain)
-    for at in range(len(gains) - 1, -1, -1):
-        squares[at] = min(squares[at], squares[at + 1] + gains[at])
-    return np.asarray(np.sqrt(squares))
 
 
 def _lean(motion: _Motion, yaw_deg: Floats, limits: Limits, rng: np.random.Generator) -> tuple[Floats, Floats]:

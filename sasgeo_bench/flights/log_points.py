@@ -134,7 +134,11 @@ class FlightLog:
             If fewer than two points are left, a place is none on Earth or 0, 0 (no fix), time goes back, the flight is
             faster than 100 m/s, or a height or an angle is out of range.
         """
-        start = _first_fix(source, columns["lon_deg"], columns["lat_deg"])
+        # Index of the first point that is not at 0, 0, and warn of those before; 0 if there is none
+        lon_deg = columns["lon_deg"]
+        start = int(np.argmax((lon_deg != 0) | (columns["lat_deg"] != 0))) if len(lon_deg) else 0
+        if start:
+            tell_left_out(source, start, BEFORE_FIX)
         numbers, columns = numbers[start:], {name: column[start:] for name, column in columns.items()}
         _check_places(source, numbers, columns)
         is_new = np.append(True, _gained(columns) != 0)[: len(numbers)]
@@ -162,14 +166,6 @@ class FlightLog:
 def steps_m(lon_deg: Floats, lat_deg: Floats) -> Floats:
     """Return the distances between successive points on the ellipsoid, shape (N - 1,), metres."""
     return np.asarray(_WGS84.inv(lon_deg[:-1], lat_deg[:-1], lon_deg[1:], lat_deg[1:])[2])
-
-
-def _first_fix(source: LogSource, lon_deg: Floats, lat_deg: Floats) -> int:
-    """Return the index of the first point that is not at 0, 0, and warn of those before; 0 if there is none."""
-    first = int(np.argmax((lon_deg != 0) | (lat_deg != 0))) if len(lon_deg) else 0
-    if first:
-        tell_left_out(source, first, BEFORE_FIX)
-    return first
 
 
 def shown(text: str) -> str:

@@ -132,14 +132,22 @@ def draw_odometry(
     steps_m = path_steps_m(flown)
     step, law = _true_steps(flown), _Law(profile=profile, steps_m=steps_m)
     drift = law.draw(rng)
-    is_lost = _draw_lost(steps_m, profile, rng)
+    # Draw which steps are lost: any that touches a dropout
+    ends = np.cumsum(steps_m)
+    begins = np.sort(rng.uniform(0, ends[-1], size=rng.poisson(profile.dropouts.per_km * ends[-1] / _M_PER_KM)))
+    lengths = rng.exponential(profile.dropouts.length_m, size=len(begins))
+    first, after = np.searchsorted(ends, begins, side="right"), np.searchsorted(ends - steps_m, begins + lengths)
+    edges = np.zeros(len(steps_m) + 1, dtype=np.int64)
+    np.add.at(edges, first, 1)
+    np.add.at(edges, after, -1)
+    is_lost = np.asarray(np.cumsum(edges[:-1]) > 0)
     moved = step * np.exp(drift.log_length - 1j * drift.course_rad) + drift.jump_m
     # Of what the odometer takes for its way: covariances of the true steps would tell their length.
     believed = _Law(profile=profile, steps_m=np.abs(moved))
     # 3: an optimistic odometer believes a third of its standard deviations
     covariance = believed.covariance(moved, drift.resets) / (3.0**2 if belief == "optimistic" else 1.0)
     covariance[is_lost] = np.diag([LOST_M**2, LOST_M**2, LOST_DEG**2])
-    yaw_deg = wrap_deg(_turns_deg(flown) + np.degrees(drift.turn_rad) + drift.jump_deg)
+    yaw_deg = wrap_deg(wrap_deg(np.diff(flown.yaw_deg)) + np.degrees(drift.turn_rad) + drift.jump_deg)
     return Odometry(
         right_m=np.where(is_lost, 0.0, moved.real),
         up_m=np.where(is_lost, 0.0, moved.imag),
@@ -254,19 +262,3 @@ def _true_steps(flown: Trajectory) -> NDArray[np.complex128]:
     """Return right + i up of each step in the axes of the pose before, metres."""
     moved = np.diff(flown.position_m[:, :2], axis=0)
     return np.asarray((moved[:, 0] + 1j * moved[:, 1]) * np.exp(1j * np.radians(flown.yaw_deg[:-1])))
-
-
-def _turns_deg(flown: Trajectory) -> Floats:
-    return wrap_deg(np.diff(flown.yaw_deg))
-
-
-def _draw_lost(steps_m: Floats, profile: DriftProfile, rng: np.random.Generator) -> Bools:
-    """Draw which steps are lost: any that touches a dropout."""
-    ends = np.cumsum(steps_m)
-    begins = np.sort(rng.uniform(0, ends[-1], size=rng.poisson(profile.dropouts.per_km * ends[-1] / _M_PER_KM)))
-    lengths = rng.exponential(profile.dropouts.length_m, size=len(begins))
-    first, after = np.searchsorted(ends, begins, side="right"), np.searchsorted(ends - steps_m, begins + lengths)
-    edges = np.zeros(len(steps_m) + 1, dtype=np.int64)
-    np.add.at(edges, first, 1)
-    np.add.at(edges, after, -1)
-    return np.asarray(np.cumsum(edges[:-1]) > 0)

@@ -147,7 +147,13 @@ def _what_fits(wish: _Wish, kind: PlanKind, name: str, region: str, margin_m: fl
 
 def _survey(wish: _Wish, rng: np.random.Generator) -> Floats | None:
     """Draw parallel legs, along the longer side of their rectangle; long surveys lie along the area's longer side."""
-    longer_deg = _longer_side_deg(wish.area, rng)
+    # Bearing of the longer side of an area; of a square one, either
+    corners_m = shapely.get_coordinates(shapely.oriented_envelope(wish.area))[:3]
+    sides = np.diff(corners_m, axis=0)
+    lengths = np.hypot(*sides.T)
+    is_square = lengths.max() < 1.05 * lengths.min()  # sides as like as these have no longer one
+    at = int(rng.integers(2)) if is_square else int(np.argmax(lengths))
+    longer_deg = math.degrees(math.atan2(sides[at, 0], sides[at, 1]))
     radius_m = wish.limits.turn_radius_m
     saved_m = (4 - math.pi) * radius_m  # by the two rounded corners of each turn
     for draw in range(_DRAWS):
@@ -290,16 +296,6 @@ def _cut(line_m: Floats, most_m: float) -> Floats | None:
         return None
     end_m = [np.interp(most_m, along_m, axis) for axis in line_m.T]
     return np.vstack([line_m[along_m < most_m - 1e-6], end_m])  # m by which a place may lie outside
-
-
-def _longer_side_deg(area: shapely.Geometry, rng: np.random.Generator) -> float:
-    """Return the bearing of the longer side of an area; of a square one, either."""
-    corners_m = shapely.get_coordinates(shapely.oriented_envelope(area))[:3]
-    sides = np.diff(corners_m, axis=0)
-    lengths = np.hypot(*sides.T)
-    is_square = lengths.max() < 1.05 * lengths.min()  # sides as like as these have no longer one
-    at = int(rng.integers(2)) if is_square else int(np.argmax(lengths))
-    return math.degrees(math.atan2(sides[at, 0], sides[at, 1]))
 
 
 def _circle(radius_m: float, _: np.random.Generator) -> Floats:

@@ -104,7 +104,12 @@ def score_ranking(dataset: Dataset, ranking: Ranking) -> tuple[Report, ...]:
     keys = _keys(columns, ranking, by_height=by_height)
     reports = []
     for key in np.unique(keys, axis=0):
-        part = _part(ranking, np.flatnonzero((keys == key).all(axis=1)))
+        # Answers to some of the queries
+        which = np.flatnonzero((keys == key).all(axis=1))
+        lengths = np.diff(ranking.starts)[which]
+        keep = np.repeat(np.isin(np.arange(len(ranking.queries)), which), np.diff(ranking.starts))
+        starts = np.concatenate([[0], np.cumsum(lengths)])
+        part = Ranking(queries=ranking.queries[which], starts=starts, answers=ranking.answers[keep])
         reports.append(_report(dataset, columns, part, by_height=by_height))
     return tuple(reports)
 
@@ -155,13 +160,6 @@ def _keys(columns: _Columns, ranking: Ranking, *, by_height: bool) -> Ints:
             raise DatasetError(f"the answers to one query are of several {what}: rank one gallery for each query")
         found.append(least)
     return np.stack(found, axis=1)
-
-
-def _part(ranking: Ranking, which: Ints) -> Ranking:
-    lengths = np.diff(ranking.starts)[which]
-    keep = np.repeat(np.isin(np.arange(len(ranking.queries)), which), np.diff(ranking.starts))
-    starts = np.concatenate([[0], np.cumsum(lengths)])
-    return Ranking(queries=ranking.queries[which], starts=starts, answers=ranking.answers[keep])
 
 
 def _report(dataset: Dataset, columns: _Columns, ranking: Ranking, *, by_height: bool) -> Report:

@@ -33,7 +33,11 @@ def followed(belief: GridBelief, step: Step, *, diffuses: bool = True) -> GridBe
 def fix_of(belief: GridBelief, *, least: float) -> Fix:
     """Return the place with the most mass around it, accepted if that is at least `least`."""
     plane = belief.mass.sum(axis=0)
-    around = _around(plane, belief.grid.cell_size_m)
+    # Mass within `NEAR_M` of the middle of each cell
+    reach = int(NEAR_M / belief.grid.cell_size_m)
+    squares = np.arange(-reach, reach + 1) ** 2
+    disc = (squares[:, None] + squares <= (NEAR_M / belief.grid.cell_size_m) ** 2).astype(np.float32)
+    around: NDArray[np.float32] = np.asarray(cv2.filter2D(plane, -1, disc, borderType=cv2.BORDER_CONSTANT))
     peaks = _peaks(around, belief)
     pose, mass = _refined(belief, plane, peaks[0])
     modes = []
@@ -49,14 +53,6 @@ def fix_of(belief: GridBelief, *, least: float) -> Fix:
         modes=sorted(modes, key=lambda item: -item[1]),
         diagnostics={"cell_m": belief.grid.cell_size_m, "rows": belief.shape[0], "cols": belief.shape[1]},
     )
-
-
-def _around(plane: Floats, cell_m: float) -> Floats:
-    """Return the mass within `NEAR_M` of the middle of each cell."""
-    reach = int(NEAR_M / cell_m)
-    squares = np.arange(-reach, reach + 1) ** 2
-    disc = (squares[:, None] + squares <= (NEAR_M / cell_m) ** 2).astype(np.float32)
-    return np.asarray(cv2.filter2D(plane, -1, disc, borderType=cv2.BORDER_CONSTANT))
 
 
 def _peaks(around: Floats, belief: GridBelief) -> list[tuple[float, float]]:

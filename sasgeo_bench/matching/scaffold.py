@@ -157,7 +157,9 @@ def package_files(
     `group` is that of its entry point; `code`, `readme` and `card`, where it has one, are templates. `attribute` is
     what the entry point names, if that is not the class. Raise `ConfigError` if the name is not allowed, or taken.
     """
-    words = _words_of(name, group=group, imported=_imported_names(code))
+    # Words of the import lines of a module, which its own class must not be called
+    imported_names = frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", code, re.MULTILINE))))
+    words = _words_of(name, group=group, imported=imported_names)
     words["attribute"] = attribute or words["cls"]
     files = {
         "pyproject.toml": _PYPROJECT,
@@ -196,11 +198,6 @@ def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, 
         "cls": f"{own}{kind.capitalize()}" if own in imported or keyword.iskeyword(own) else own,
         "title": " ".join(words).capitalize(),
     }
-
-
-def _imported_names(text: str) -> frozenset[str]:
-    """Return the words of the import lines of a module, which its own class must not be called."""
-    return frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", text, re.MULTILINE))))
 
 
 def write_plugin(folder: Path, files: Mapping[str, str]) -> None:

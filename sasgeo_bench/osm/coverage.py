@@ -53,12 +53,6 @@ def estimate_coverage(lonlat: NDArray[np.float64]) -> shapely.Geometry:
     return shapely.simplify(scaled, float(step.mean()))
 
 
-def _disc(radius_m: float) -> NDArray[np.bool_]:
-    reach = int(radius_m / CELL_M)
-    rows, cols = np.ogrid[-reach : reach + 1, -reach : reach + 1]
-    return np.asarray(rows**2 + cols**2 <= reach**2 + 1)
-
-
 def _closed(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     reach = CLOSE_M / CELL_M / 2
     near = ndimage.distance_transform_edt(~cells) <= reach
@@ -67,7 +61,9 @@ def _closed(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 def _opened(cells: NDArray[np.bool_]) -> NDArray[np.bool_]:
     # 150 m: half the width of what is cut off: a road or stream kept whole beyond the edge
-    opened = np.asarray(ndimage.binary_opening(cells, _disc(150.0)))
+    reach = int(150.0 / CELL_M)
+    rows, cols = np.ogrid[-reach : reach + 1, -reach : reach + 1]
+    opened = np.asarray(ndimage.binary_opening(cells, np.asarray(rows**2 + cols**2 <= reach**2 + 1)))
     return opened if opened.any() else cells
 
 

@@ -307,7 +307,8 @@ def read_history(
     grid = _grid_around(frame, epsg)
     is_one_file = len(boxes) == 1
     states: list[State] = []
-    area = _projected_box(frame, epsg)
+    # 0.01 degrees: spacing of corners: a box's straight sides in degrees bend when projected
+    area = project(shapely.segmentize(shapely.box(*frame), 0.01), epsg)
     for item in dated:
         with _one_state(item) as plain:
             reading = read_extract(plain, grid, at=item.on)
@@ -378,11 +379,6 @@ def _common_frame(boxes: dict[Path, Box], bounds: Box | None) -> Box:
                 f"{path.name} covers {box_text(box)} (west, south, east, north) and has nothing in common with {what}"
             )
     return frame
-
-
-def _projected_box(frame: Box, epsg: int) -> shapely.Geometry:
-    # 0.01 degrees: spacing of corners: a box's straight sides in degrees bend when projected
-    return project(shapely.segmentize(shapely.box(*frame), 0.01), epsg)
 
 
 def _grid_around(frame: Box, epsg: int) -> Grid:

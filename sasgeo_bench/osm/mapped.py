@@ -43,7 +43,9 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
     >>> [float(shapely.area(faces).sum()) for faces in (shore.sea, shore.land)]
     [30.0, 70.0]
     """
-    lines = _plain_lines(coast)
+    # Single lines, joined where one ends and another begins
+    parts = shapely.get_parts(np.array(coast, dtype=object))
+    lines = np.asarray(shapely.get_parts(shapely.line_merge(shapely.multilinestrings(parts), directed=True)))
     lines = lines[shapely.intersects(lines, mapped)]
     if len(lines) == 0:
         return Shore(sea=lines, land=lines, unknown={})
@@ -51,7 +53,14 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
     links = _links(lines, mapped, edge)
     faces = shapely.get_parts(shapely.polygonize([shapely.unary_union([*lines, *links, edge])]))
     faces = faces[shapely.intersects(shapely.point_on_surface(faces), mapped)]
-    right_m, left_m = _coast_m(lines, faces, edge)
+    # Metres of coast that each face has on the right and on the left of the line
+    start, end = _segments(lines, edge)
+    ahead = end - start
+    length_m = np.hypot(*ahead.T)
+    to_right = np.column_stack((ahead[:, 1], -ahead[:, 0])) / length_m[:, None] * _OFFSET_M
+
+    middle = start + ahead / 2
+    right_m, left_m = _length_in(faces, middle + to_right, length_m), _length_in(faces, middle - to_right, length_m)
     # 0.01 of a face's coast: less of the other side is a loop of a badly drawn line
     slip_m = 0.01 * (right_m + left_m)
     is_wet, is_dry = right_m > slip_m, left_m > slip_m
@@ -67,11 +76,6 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
     return Shore(
         sea=_without(faces[is_wet & ~is_dry], doubt), land=_without(faces[is_dry & ~is_wet], doubt), unknown=unknown
     )
-
-
-def _plain_lines(coast: Sequence[shapely.Geometry] | Geometries) -> Geometries:
-    parts = shapely.get_parts(np.array(coast, dtype=object))
-    return np.asarray(shapely.get_parts(shapely.line_merge(shapely.multilinestrings(parts), directed=True)))
 
 
 def _without(faces: Geometries, doubt: shapely.Geometry) -> Geometries:
@@ -121,17 +125,6 @@ def _beyond(link: shapely.Geometry) -> shapely.Geometry:
 
 def _is_within(place: Sequence[float], mapped: shapely.Geometry) -> bool:
     return bool(shapely.contains_xy(mapped, *place))
-
-
-def _coast_m(lines: Geometries, faces: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats]:
-    """Return the metres of coast that each face has on the right and on the left of the line."""
-    start, end = _segments(lines, edge)
-    ahead = end - start
-    length_m = np.hypot(*ahead.T)
-    to_right = np.column_stack((ahead[:, 1], -ahead[:, 0])) / length_m[:, None] * _OFFSET_M
-
-    middle = start + ahead / 2
-    return _length_in(faces, middle + to_right, length_m), _length_in(faces, middle - to_right, length_m)
 
 
 def _length_in(faces: Geometries, points: Floats, length_m: Floats) -> Floats:

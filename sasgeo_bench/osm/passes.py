@@ -230,7 +230,10 @@ class _LostPass:
         if wkb is None or wkb[1] == SEVERAL_LINES:
             marks = scan.gaps if is_cut or (is_lost and labels) else self.gaps
             marks[way.id] = find_gaps(way)
-            wkb = _bridged(way)
+            # Line through the nodes that are there, closed if the way is: an area goes on across a gap
+            places = [(node.lon, node.lat) for node in way.nodes if node.location.valid()]
+            places += places[:1] if way.is_closed() and places and places[0] != places[-1] else []
+            wkb = bytes(shapely.to_wkb(shapely.linestrings(places))) if len(set(places)) > 1 else None
         if wkb is None:
             return
         line = self.lines[way.id] = shapely.from_wkb(wkb)
@@ -279,13 +282,6 @@ class _LostPass:
             scan.rows.append(ScanRow(wkb, kind, identifier, True, relation.version, relation.timestamp))  # noqa: FBT003
         if relation.is_old_style:
             scan.tally.notes["multipolygon of the old style: it has the tags of its outer ways"] += 1
-
-
-def _bridged(way: Any) -> bytes | None:  # noqa: ANN401
-    """Return a line through the nodes that are there, closed if the way is: an area goes on across a gap."""
-    places = [(node.lon, node.lat) for node in way.nodes if node.location.valid()]
-    places += places[:1] if way.is_closed() and places and places[0] != places[-1] else []
-    return bytes(shapely.to_wkb(shapely.linestrings(places))) if len(set(places)) > 1 else None
 
 
 def _ways_and_relations(path: Path, ways: set[int], relations: set[int]) -> Iterator[Any]:

@@ -23,7 +23,7 @@ from sasgeo_bench.osm.geojson import classless, scan_geojson
 from sasgeo_bench.osm.locate import CoverageSource
 from sasgeo_bench.osm.mapped import Mapped, box_text, lonlat_box, map_ground, project
 from sasgeo_bench.osm.passes import scan_file
-from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Box, Scan, ScanRow, Traits
+from sasgeo_bench.osm.scan import DEFAULT_BRIDGE_WIDTH_M, Scan, ScanRow, Traits
 from sasgeo_bench.osm.snapshot import Snapshot, open_snapshot, own_id
 from sasgeo_bench.osm.taxonomy import Label, Taxonomy, load_taxonomy
 
@@ -88,8 +88,12 @@ def read_extract(
             is_cut_by_box=cuts_by_box(snapshot.path, scan, objects),
         )
     mapped = _mapped(path.name, scan, grid, area=area, source=source, frame=header or _frame(objects))
-    told = _held_against(at, path.name, scan, header=snapshot.replicated_at)
-    return _reading(path.name, scan, grid, mapped, objects=objects, classes=classes, warnings=told).dated(snapshot)
+    # Warning if a file cannot be of the day `at`, as `misdated` says
+    newest = _newest(scan)
+    days = {"newest": newest and newest.date(), "header": snapshot.replicated_at and snapshot.replicated_at.date()}
+    warning = None if at is None else misdated(path.name, at, count=len(scan.rows), **days)
+    warnings = (warning,) if warning else ()
+    return _reading(path.name, scan, grid, mapped, objects=objects, classes=classes, warnings=warnings).dated(snapshot)
 
 
 def read_geojson(
@@ -183,7 +187,11 @@ def _reading(
     """Turn what one pass found into features."""
     taxonomy, grid_lonlat = load_taxonomy(), lonlat_box(grid)
     geometry = objects[: len(scan.rows)]
-    near = _meets(shapely.bounds(geometry), grid_lonlat)
+    bounds = shapely.bounds(geometry)
+    west, south, east, north = grid_lonlat
+    near = np.asarray(
+        (bounds[:, 0] <= east) & (bounds[:, 2] >= west) & (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
+    )
     features = _table(scan, np.flatnonzero(near), geometry[near], grid, taxonomy)
     features = _with_sea(features, mapped.sea, taxonomy)
     if classes is not None:
@@ -197,6 +205,9 @@ def _reading(
     kept = taxonomy.names if classes is None else classes
     built_up = project(shapely.from_wkb(np.array(scan.built_up, dtype=object)), grid.epsg)
     missing = missing_families(features, mapped.coverage, classes=kept, built_up=built_up)
+    # Count the ways of a class in the whole extract that lack nodes; empty if none does
+    partial = sum(bool(marks) for marks in scan.gaps.values())
+    found = {"ways that lack some nodes": partial, "ways that lack all nodes": len(scan.gaps) - partial}
     return Reading(
         features=features,
         coverage=mapped.coverage,
@@ -207,27 +218,12 @@ def _reading(
         notes=dict(scan.tally.notes.most_common()),
         warnings=(*warnings, *([missing] if missing else [])),
         unknown_m2=mapped.unknown_m2,
-        cuts=_cuts(scan),
+        cuts={what: count for what, count in found.items() if count},
     )
 
 
 def _newest(scan: Scan) -> dt.datetime | None:
     return max((row.timestamp for row in scan.rows if row.timestamp > _EPOCH), default=None)
-
-
-def _held_against(at: dt.date | None, name: str, scan: Scan, *, header: dt.datetime | None) -> tuple[str, ...]:
-    """Return a warning if a file cannot be of the day `at`, as `misdated` says."""
-    newest = _newest(scan)
-    days = {"newest": newest and newest.date(), "header": header and header.date()}
-    told = None if at is None else misdated(name, at, count=len(scan.rows), **days)
-    return (told,) if told else ()
-
-
-def _cuts(scan: Scan) -> dict[str, int]:
-    """Count the ways of a class in the whole extract that lack nodes; empty if none does."""
-    partial = sum(bool(marks) for marks in scan.gaps.values())
-    found = {"ways that lack some nodes": partial, "ways that lack all nodes": len(scan.gaps) - partial}
-    return {what: count for what, count in found.items() if count}
 
 
 def _check_nodes(name: str, scan: Scan) -> None:
@@ -239,13 +235,6 @@ def _check_nodes(name: str, scan: Scan) -> None:
             f"{name} lacks the nodes of {lost} of its {ways} ways: they were filtered away; filter again and keep the "
             "nodes that ways refer to (osmium tags-filter without -R; Overpass: (._;>;); out;)"
         )
-
-
-def _meets(bounds: NDArray[np.float64], box: Box) -> NDArray[np.bool_]:
-    west, south, east, north = box
-    return np.asarray(
-        (bounds[:, 0] <= east) & (bounds[:, 2] >= west) & (bounds[:, 1] <= north) & (bounds[:, 3] >= south)
-    )
 
 
 def _table(

@@ -104,7 +104,11 @@ def open_snapshot(path: Path, *, at: dt.date | None = None) -> Iterator[Snapshot
             warnings.append("elements were out of order and have been sorted ('osmium sort' does it for good)")
         if not survey.is_sorted or current.name == "plain.osm.pbf":
             source, current = current, scratch / "sorted.osm.pbf"
-            _sort(source, current)
+            merger = osmium.MergeInputReader()
+            with _one_type():
+                merger.add_file(str(source))
+            with osmium.SimpleWriter(str(current), overwrite=True) as writer, _one_type():
+                merger.apply(writer, simplify=True)
         yield Snapshot(
             path=current,
             boxes_lonlat=stated.boxes_lonlat,
@@ -305,28 +309,17 @@ def _survey(path: Path) -> _Survey:
     )
 
 
-def _sort(path: Path, target: Path) -> None:
-    merger = osmium.MergeInputReader()
-    with _one_type():
-        merger.add_file(str(path))
-    with osmium.SimpleWriter(str(target), overwrite=True) as writer, _one_type():
-        merger.apply(writer, simplify=True)
-
-
 def _cut_history(path: Path, target: Path, *, at: dt.date | None) -> None:
     """Write the last version of each object by the end of a day, or of all times, unless that one is deleted."""
     until = dt.datetime.combine(at or dt.date.max, dt.time.max, tzinfo=dt.UTC)
     kept = _versions_at(path, until=until)
-    with osmium.SimpleWriter(_with_places(target), overwrite=True) as writer:
+    # File to write to that keeps the places of nodes on ways, where there are any
+    with osmium.SimpleWriter(osmium.io.File(str(target), "pbf,locations_on_ways=true"), overwrite=True) as writer:
         position = 0
         for number, item in enumerate(elements(osmium.FileProcessor(str(path), OBJECTS))):
             if position < len(kept) and kept[position] == number:
                 writer.add(item)
                 position += 1
-
-
-def _with_places(target: Path) -> osmium.io.File:
-    return osmium.io.File(str(target), "pbf,locations_on_ways=true")
 
 
 def _write_plain(path: Path, target: Path) -> None:

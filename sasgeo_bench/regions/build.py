@@ -334,7 +334,9 @@ def build_made(spec: RegionFile, reading: Reading, *, out: Path) -> Path:
     from an extract. Raise `StoreError` if the folder cannot be written.
     """
     extract = spec.pick(None)
-    content = _content_sha256(reading.features)
+    # Hash every shape and its attributes; a fingerprint has only centroids
+    shapes = b"".join(shapely.to_wkb(reading.features.geometry.to_numpy()))
+    content = hashlib.sha256(fingerprint(reading.features).encode() + shapes).hexdigest()
     plan = BuildPlan(
         spec=spec,
         extract=extract,
@@ -347,12 +349,6 @@ def build_made(spec: RegionFile, reading: Reading, *, out: Path) -> Path:
     record = ExtractRecord(file=extract.file, sha256=content, bytes=0, date=extract.date, osm_timestamp=None)
     _write_unless_current(plan, lambda scratch: _write_into(scratch, plan, record, reading))
     return plan.folder
-
-
-def _content_sha256(features: gpd.GeoDataFrame) -> str:
-    """Hash every shape and its attributes; a fingerprint has only centroids."""
-    shapes = b"".join(shapely.to_wkb(features.geometry.to_numpy()))
-    return hashlib.sha256(fingerprint(features).encode() + shapes).hexdigest()
 
 
 def _write_unless_current(plan: BuildPlan, write: Callable[[Path], Manifest]) -> Manifest | None:

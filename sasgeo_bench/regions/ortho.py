@@ -79,7 +79,12 @@ def check_picture(path: Path, entry: ImageryEntry, grid: Grid) -> Picture:
             to_grid = Transformer.from_crs(source.crs.to_wkt(), grid.epsg, always_xy=True)
             bounds_m = to_grid.transform_bounds(*_box(source), densify_pts=21, errcheck=True)
             bands = find_bands(path, source)
-            gsd_m = max(_ground_resolution_m(source, to_grid), entry.gsd_m or 0.0)
+            # Side of a square with the ground area of the middle pixel, metres in the region's CRS
+            col, row = source.width / 2, source.height / 2
+            across, down = source.transform @ (np.array([col, col + 1, col]), np.array([row, row, row + 1]))
+            (x, across_x, down_x), (y, across_y, down_y) = to_grid.transform(across, down, errcheck=True)
+            area_m2 = abs((across_x - x) * (down_y - y) - (across_y - y) * (down_x - x))
+            gsd_m = max(math.sqrt(area_m2), entry.gsd_m or 0.0)
     except (CRSError, ProjError) as error:
         raise ImageryError(
             f"{path} cannot be projected to EPSG:{grid.epsg} ({error}): check its coordinate reference system"
@@ -132,15 +137,6 @@ def _box(source: rasterio.io.DatasetReader) -> tuple[float, float, float, float]
     cols, rows = np.array([0, source.width] * 2), np.repeat([0, source.height], 2)
     x, y = source.transform @ (cols, rows)
     return float(x.min()), float(y.min()), float(x.max()), float(y.max())
-
-
-def _ground_resolution_m(source: rasterio.io.DatasetReader, to_grid: Transformer) -> float:
-    """Return the side of a square with the ground area of the middle pixel, metres in the region's CRS."""
-    col, row = source.width / 2, source.height / 2
-    across, down = source.transform @ (np.array([col, col + 1, col]), np.array([row, row, row + 1]))
-    (x, across_x, down_x), (y, across_y, down_y) = to_grid.transform(across, down, errcheck=True)
-    area_m2 = abs((across_x - x) * (down_y - y) - (across_y - y) * (down_x - x))
-    return math.sqrt(area_m2)
 
 
 def _overlaps(one: tuple[float, float, float, float], two: tuple[float, float, float, float]) -> bool:

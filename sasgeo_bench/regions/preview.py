@@ -113,26 +113,13 @@ def _drawn(manifest: Manifest, overview: NDArray[np.uint8]) -> PlainFigure:
     extent = (west_m, west_m + side_m[0], north_m - side_m[1], north_m)  # what fills no whole cell lies south and east
     chart.imshow(paint_overview(manifest, overview), extent=extent, interpolation="antialiased")
     chart.set_anchor("NW")
-    _draw_edge(chart, manifest)
-    _draw_axes(chart, manifest)
-    m_per_inch = max(side_m[0] / width, side_m[1] / height)
-    _draw_strip(figure, total, width_m=side_m[0], m_per_inch=m_per_inch)
-    _words(figure, manifest, total)
-    _legend(figure, manifest, overview, left=(_LEFT_INCHES + width + 0.15) / total[0], top=1 - _TITLE_INCHES / total[1])
-    return figure
-
-
-def _draw_edge(chart: Axes, manifest: Manifest) -> None:
     west, south, east, north = manifest.bounds_m
     frame = shapely.boundary(shapely.box(west, south, east, north))
     edge = shapely.difference(shapely.boundary(shapely.from_wkt(manifest.coverage.wkt)), shapely.buffer(frame, 0.5))
     for line in shapely.get_parts(edge):
         chart.plot(*shapely.get_coordinates(line).T, color=_EDGE, lw=1.0)
     chart.set(xlim=(west, east), ylim=(south, north))
-
-
-def _draw_axes(chart: Axes, manifest: Manifest) -> None:
-    """Label the map with its coordinates, a few round ones a side, as a GIS shows them."""
+    # Label the map with its coordinates, a few round ones a side, as a GIS shows them
     for axis in (chart.xaxis, chart.yaxis):
         axis.set_major_locator(MaxNLocator(nbins=4, steps=[1, 2, 5, 10]))
     chart.ticklabel_format(style="plain", useOffset=False)
@@ -141,6 +128,11 @@ def _draw_axes(chart: Axes, manifest: Manifest) -> None:
     chart.set_ylabel("northing (m)", fontsize=8)
     for label in chart.get_yticklabels():
         label.set(rotation=90, va="center")
+    m_per_inch = max(side_m[0] / width, side_m[1] / height)
+    _draw_strip(figure, total, width_m=side_m[0], m_per_inch=m_per_inch)
+    _words(figure, manifest, total)
+    _legend(figure, manifest, overview, left=(_LEFT_INCHES + width + 0.15) / total[0], top=1 - _TITLE_INCHES / total[1])
+    return figure
 
 
 def _draw_strip(figure: Figure, total: tuple[float, float], *, width_m: float, m_per_inch: float) -> None:

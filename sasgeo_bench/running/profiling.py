@@ -26,7 +26,6 @@ from sasgeo_bench.running.runner import map_bytes
 from sasgeo_bench.running.sensors import EnergyMeter, clock_mhz, hottest_celsius, processor_name
 from sasgeo_bench.running.training import trained
 from sasgeo_bench.running.worker import Limits, Worker
-from sasgeo_bench.tasks.query import Query
 
 LEAST_FIXES: Final = 20  # whatever time they take: fewer have no percentiles
 MOST_ASKED: Final = 512  # queries, again and again: their rows are held
@@ -247,9 +246,14 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tupl
     found: list[bytes] = []
     for part in plan.parts:
         for query, blob, _ in part.task.some(part.task.asked.keys()):
-            reason = _far(query, request.radius_m) or lacks(
-                plan.card, query, is_taught=bool(request.train), is_pictured=is_pictured
+            # Why a prior is too wide, or None
+            radius_m = request.radius_m
+            far = (
+                None
+                if radius_m is None or (query.prior.radius_m is not None and query.prior.radius_m <= radius_m)
+                else f"no prior within {radius_m:g} m"
             )
+            reason = far or lacks(plan.card, query, is_taught=bool(request.train), is_pictured=is_pictured)
             if reason is None and len(found) < MOST_ASKED:
                 found.append(blob)
             reasons[reason or ""] += 1
@@ -259,13 +263,6 @@ def _asked(plan: RunPlan, request: ProfileRequest, *, is_pictured: bool) -> tupl
             f"{plan.card.name} can be asked none of the {counted(reasons.total(), 'query', 'queries')}: {why}"
         )
     return found, reasons[""]
-
-
-def _far(query: Query, radius_m: float | None) -> str | None:
-    """Return why a prior is too wide, or None."""
-    if radius_m is None or (query.prior.radius_m is not None and query.prior.radius_m <= radius_m):
-        return None
-    return f"no prior within {radius_m:g} m"
 
 
 @contextmanager

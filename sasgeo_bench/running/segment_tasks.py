@@ -16,7 +16,7 @@ from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.learned_file import write_learned
 from sasgeo_bench.matching.segmenter import check_text
 from sasgeo_bench.progress import reporting, spread, tell
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.recalibration import Said, recalibrated
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
@@ -26,7 +26,7 @@ from sasgeo_bench.sensing.image import AerialImage, LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frame_evidence import evidence_of
-from sasgeo_bench.tasks.frames import FrameLabels, read_labels
+from sasgeo_bench.tasks.frames import read_labels
 from sasgeo_bench.tasks.query import BY, RECALIBRATED, RENDERED, Query, Truth, base_of, view_id
 from sasgeo_bench.tasks.segmented import Segmented, segmented_file, write_segmented
 from sasgeo_bench.tasks.split import HALVES, Split
@@ -329,19 +329,16 @@ def _said(run: SegmenterRun, task: Task, faults: list[str]) -> Iterator[Said]:
     for query in task.queries():
         seen: list[Segmentation | None] = []
         for number in range(len(query.frames)):
-            of_frame = _next_labels(rows, query.query_id, number)
+            # Labels of a frame, which are the next ones of the file; raise `StoreError` if they are not
+            query_id = query.query_id
+            found = next(rows, None)
+            if found is None or found[:2] != (query_id, number):
+                raise StoreError(f"the labels of query {query_id} are missing or out of order: make the queries again")
+            of_frame = found[2]
             reply = run.segment(of_frame.labelled(_image(query, number), task.folder.name))
             faults += [] if reply.segmentation else [f"{query.query_id}: {reply.message} ({reply.status})"]
             seen.append(reply.segmentation)
         yield query, seen
-
-
-def _next_labels(rows: Iterator[tuple[str, int, FrameLabels]], query_id: str, number: int) -> FrameLabels:
-    """Return the labels of a frame, which are the next ones of the file; raise `StoreError` if they are not."""
-    found = next(rows, None)
-    if found is None or found[:2] != (query_id, number):
-        raise StoreError(f"the labels of query {query_id} are missing or out of order: make the queries again")
-    return found[2]
 
 
 def _with_evidence(
@@ -353,30 +350,24 @@ def _with_evidence(
     if query.frames:
         size_cells, cell_size_m = evidence.shape[0], evidence.cell_size_m
         found = evidence_of(query.frames, seen, size_cells=size_cells, cell_size_m=cell_size_m)
-        evidence = _for_classes(found, evidence)
-    asked = _renamed(query, segmenter)
+        # Evidence for the classes of a map, in their order: unknown where a segmenter tells nothing of one
+        cells = np.full(evidence.cells.shape, UNKNOWN, dtype=np.uint8)
+        confidence = np.zeros(evidence.cells.shape, dtype=np.uint8)
+        for index, name in enumerate(evidence.classes):
+            if found is not None and found.confidence is not None and name in found.classes:
+                at = found.classes.index(name)
+                cells[index], confidence[index] = found.cells[at], found.confidence[at]
+        evidence = evidence.replace(cells, confidence)
+    # Query with an id that follows from its own and the segmenter; views of a flight keep their order
+    step = query.step
+    old = query.query_id if step is None else step.sequence_id
+    new = hashlib.sha256(f"{old}/{segmenter}".encode()).hexdigest()[: len(old)]
+    asked = (
+        replace(query, query_id=new)
+        if step is None
+        else replace(query, query_id=view_id(new, step.frame), step=replace(step, sequence_id=new))
+    )
     return (
         replace(asked, suite=suite, evidence=evidence),
         replace(truth, query_id=asked.query_id, unknown_share=evidence.unknown_share),
     )
-
-
-def _renamed(query: Query, segmenter: str) -> Query:
-    """Return a query with an id that follows from its own and the segmenter; views of a flight keep their order."""
-    step = query.step
-    old = query.query_id if step is None else step.sequence_id
-    new = hashlib.sha256(f"{old}/{segmenter}".encode()).hexdigest()[: len(old)]
-    if step is None:
-        return replace(query, query_id=new)
-    return replace(query, query_id=view_id(new, step.frame), step=replace(step, sequence_id=new))
-
-
-def _for_classes(found: Evidence | None, empty: Evidence) -> Evidence:
-    """Return evidence for the classes of a map, in their order: unknown where a segmenter tells nothing of one."""
-    cells = np.full(empty.cells.shape, UNKNOWN, dtype=np.uint8)
-    confidence = np.zeros(empty.cells.shape, dtype=np.uint8)
-    for index, name in enumerate(empty.classes):
-        if found is not None and found.confidence is not None and name in found.classes:
-            at = found.classes.index(name)
-            cells[index], confidence[index] = found.cells[at], found.confidence[at]
-    return empty.replace(cells, confidence)

@@ -117,7 +117,12 @@ def risk_threshold(
         units, p_values = _by_block(
             chance, false, np.unique(np.asarray(blocks, dtype=str), return_inverse=True)[1], alpha
         )
-    at = _last_that_holds((p_values <= delta / len(_STARTS)) & (units > 0))
+    # Farthest threshold reached from one of the starts without a failure on the way
+    holds = (p_values <= delta / len(_STARTS)) & (units > 0)
+    failed = np.flatnonzero(~holds)
+    begun = [int(np.searchsorted(_THRESHOLDS, start)) for start in _STARTS]
+    ends = [int(failed[failed >= start].min(initial=len(holds))) - 1 for start in begun if holds[start]]
+    at = max(ends, default=None)
     counts = (0, 0, 0) if at is None else (int(accepted[at]), int(wrong[at]), int(units[at]))
     return RiskBound(
         threshold=0.0 if at is None else float(_THRESHOLDS[at]),
@@ -166,14 +171,6 @@ def _by_block(
     entropy = special.rel_entr(mean, alpha) + special.rel_entr(1.0 - mean, 1.0 - alpha)
     tail = math.e * scipy.stats.binom.cdf(np.ceil(total - 1e-9), units, alpha)
     return units, np.minimum(np.exp(-units * entropy), tail)
-
-
-def _last_that_holds(holds: NDArray[np.bool_]) -> int | None:
-    """Return the farthest threshold reached from one of the starts without a failure on the way."""
-    failed = np.flatnonzero(~holds)
-    begun = [int(np.searchsorted(_THRESHOLDS, start)) for start in _STARTS]
-    ends = [int(failed[failed >= start].min(initial=len(holds))) - 1 for start in begun if holds[start]]
-    return max(ends, default=None)
 
 
 RISKS: Final = (1e-2, 1e-3)

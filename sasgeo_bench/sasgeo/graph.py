@@ -104,14 +104,6 @@ def verify(
     return [judge.score(pose) for pose in poses]
 
 
-def _pull(places_m: Floats, stretch_m: Floats) -> Floats:
-    """Return the influence of each node on the shift of others, shape (N, N), 0 on the diagonal."""
-    distance_2 = ((places_m[:, None] - places_m[None]) ** 2).sum(axis=2)
-    pull = np.exp(-distance_2 / (2 * stretch_m[:, None] ** 2))
-    np.fill_diagonal(pull, 0.0)
-    return np.asarray(pull)
-
-
 @dataclass(frozen=True, kw_only=True)
 class _Stage:
     """A view at a pose: its nodes on the map, map nodes around, and the (negative) scores of unmatched nodes.
@@ -153,7 +145,11 @@ class _Judge:
     def of(cls, seen: ObservedGraph, mapped: MappedGraph, rules: GraphRules) -> Self:
         """Prepare a view: each drawing has rules of its own."""
         stretch_m = _by_kind(rules, "stretch_m")[seen.nodes.kind]
-        return cls(seen=seen, mapped=mapped, rules=rules, pull=_pull(seen.nodes.places_m, stretch_m))
+        # Influence of each node on the shift of others, shape (N, N), 0 on the diagonal
+        distance_2 = ((seen.nodes.places_m[:, None] - seen.nodes.places_m[None]) ** 2).sum(axis=2)
+        pull = np.exp(-distance_2 / (2 * stretch_m[:, None] ** 2))
+        np.fill_diagonal(pull, 0.0)
+        return cls(seen=seen, mapped=mapped, rules=rules, pull=np.asarray(pull))
 
     def score(self, pose: Pose) -> GraphScore:
         stage = self._stage(pose)
@@ -161,7 +157,17 @@ class _Judge:
 
     def matching(self, pose: Pose) -> Matching:
         stage = self._stage(pose)
-        return self._shown(stage, self._matched(stage))
+        # What matched nodes share, and counts
+        pairs = self._matched(stage)
+        ours, theirs = self.seen.nodes, self.mapped.nodes
+        own = _IS_DRAWN[ours.kind[pairs.seen]]
+        seen, mapped = ours.degree[pairs.seen[own]], theirs.degree[stage.around[pairs.mapped[own]]]
+        steps = degree_step(seen, mapped)[(seen > 0) & (mapped > 0)]
+        return Matching(
+            degrees=np.bincount(steps, minlength=len(self.rules.degrees)),
+            links=self._links(stage, pairs)[0],
+            kinds=self._counts(stage, pairs),
+        )
 
     def _matched(self, stage: _Stage) -> _Pairs:
         pairs = self._assigned(stage, np.zeros_like(stage.places_m))
@@ -324,17 +330,6 @@ class _Judge:
                     if other not in ours.get(here, _NONE) and not _passes(ours, here, other, matched=to_map):
                         found[row[here], 2] += 1
         return found
-
-    def _shown(self, stage: _Stage, pairs: _Pairs) -> Matching:
-        ours, theirs = self.seen.nodes, self.mapped.nodes
-        own = _IS_DRAWN[ours.kind[pairs.seen]]
-        seen, mapped = ours.degree[pairs.seen[own]], theirs.degree[stage.around[pairs.mapped[own]]]
-        steps = degree_step(seen, mapped)[(seen > 0) & (mapped > 0)]
-        return Matching(
-            degrees=np.bincount(steps, minlength=len(self.rules.degrees)),
-            links=self._links(stage, pairs)[0],
-            kinds=self._counts(stage, pairs),
-        )
 
     def _counts(self, stage: _Stage, pairs: _Pairs) -> Ints:
         """Return the counts of `Matching.kinds`."""

@@ -64,7 +64,14 @@ class JunctionPairs:
         order = np.lexsort((pairs[:, 1], pairs[:, 0], length_m))
         order = order[length_m[order] >= range_m[0]]
         ends, bearing = chosen[pairs[order]], bearing_deg(*along_m[order].T)
-        arms = _sectors(nodes.arms_deg[ends] - bearing[:, None, None])
+        # Bits of the sectors of angles of shape (..., A), shape (...); NaN has none
+        turned_deg = nodes.arms_deg[ends] - bearing[:, None, None]
+        finite = np.isfinite(turned_deg)
+        share = np.mod(np.where(finite, turned_deg, 0.0), 360.0) / 360.0
+        sector = np.minimum((share * SECTORS).astype(np.uint64), _LAST)
+        arms = np.asarray(
+            np.bitwise_or.reduce(np.where(finite, _ONE << sector, np.uint64(0)), axis=-1), dtype=np.uint64
+        )
         return cls(ends=ends, length_m=length_m[order], bearing_deg=bearing, arms=arms)
 
     def turned(self) -> Self:
@@ -80,23 +87,13 @@ class JunctionPairs:
     def like(self, arms: Bits, first: int, last: int) -> Ints:
         """Return rows from `first` to `last` whose arms, shape (2,), agree but for one more or less at each end."""
         theirs = self.arms[first:last]
-        common = np.bitwise_count(theirs & _widened(arms))
+        # Sectors and their neighbours
+        widened = np.asarray((arms | (arms << _ONE) | (arms >> _LAST) | (arms >> _ONE) | (arms << _LAST)) & _ALL)
+        common = np.bitwise_count(theirs & widened)
         count = np.bitwise_count(theirs).astype(np.int64)
         own = np.bitwise_count(arms).astype(np.int64)
         fits = (common >= np.minimum(count, own)) & (np.abs(count - own) <= 1)
         return np.asarray(first + np.flatnonzero(fits.all(axis=1)))
-
-
-def _sectors(turned_deg: Floats) -> Bits:
-    """Return bits of the sectors of angles of shape (..., A), shape (...); NaN has none."""
-    finite = np.isfinite(turned_deg)
-    share = np.mod(np.where(finite, turned_deg, 0.0), 360.0) / 360.0
-    sector = np.minimum((share * SECTORS).astype(np.uint64), _LAST)
-    return np.asarray(np.bitwise_or.reduce(np.where(finite, _ONE << sector, np.uint64(0)), axis=-1), dtype=np.uint64)
-
-
-def _widened(arms: Bits) -> Bits:
-    return np.asarray((arms | (arms << _ONE) | (arms >> _LAST) | (arms >> _ONE) | (arms << _LAST)) & _ALL)
 
 
 CROWD_M: Final = 150.0  # around a node, where its like are counted
@@ -130,10 +127,15 @@ class MappedGraph:
         plan = in_plan(ways)
         in_masks = out_of_water(nodes_of(build_graph(plan, bounds_m=grid.bounds_m), plan, "mask"), features)
         nodes = Nodes.joined((nodes_of(graph, ways, "vectors"), in_masks, patches_of(features)))
+        found = np.zeros(len(NODE_KINDS))
+        for kind in np.unique(nodes.kind):
+            places_m = nodes.places_m[nodes.kind == kind]
+            counts = cKDTree(places_m).query_ball_point(places_m, CROWD_M, return_length=True)
+            found[kind] = np.mean(counts) / (np.pi * CROWD_M**2)
         return cls(
             nodes=nodes,
             tree=cKDTree(_raised(nodes.places_m, nodes.kind)),
-            density_per_m2=_density(nodes),
+            density_per_m2=found,
             known=known,
             grid=grid,
         )
@@ -174,12 +176,3 @@ class MappedGraph:
 
 def _raised(places_m: Floats, kind: Ints) -> Floats:
     return np.column_stack((places_m, kind * _APART_M))
-
-
-def _density(nodes: Nodes) -> Floats:
-    found = np.zeros(len(NODE_KINDS))
-    for kind in np.unique(nodes.kind):
-        places_m = nodes.places_m[nodes.kind == kind]
-        counts = cKDTree(places_m).query_ball_point(places_m, CROWD_M, return_length=True)
-        found[kind] = np.mean(counts) / (np.pi * CROWD_M**2)
-    return found

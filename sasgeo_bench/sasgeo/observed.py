@@ -153,7 +153,9 @@ class ObservedGraph:
         is_cut = ~_looked_up(visible, nodes.places_m, nodes.kind, evidence.cell_size_m)
         keep = ~(is_cut & np.isin(nodes.kind, _FREE))
         nodes, is_cut = nodes.taken(keep), is_cut[keep]
-        is_cut |= _reaches_out(nodes, evidence)
+        # Which patches may extend beyond the view
+        half_m = np.array(evidence.size_m) / 2 - 1.0
+        is_cut |= np.asarray((np.abs(nodes.places_m) + nodes.radius_m[:, None] > half_m).any(axis=1))
         return cls(
             nodes=nodes,
             is_cut=is_cut,
@@ -259,9 +261,3 @@ def _looked_up(visible: Bools, places_m: Floats, kind: Ints, cell_size_m: float)
     row, col = view.to_cells(places_m).T
     inside = (row >= 0) & (row < rows) & (col >= 0) & (col < cols)
     return np.asarray(inside & visible[_VISIBLE_OF[kind], np.where(inside, row, 0), np.where(inside, col, 0)])
-
-
-def _reaches_out(nodes: Nodes, evidence: Evidence) -> Bools:
-    """Return which patches may extend beyond the view."""
-    half_m = np.array(evidence.size_m) / 2 - 1.0
-    return np.asarray((np.abs(nodes.places_m) + nodes.radius_m[:, None] > half_m).any(axis=1))

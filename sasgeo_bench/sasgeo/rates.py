@@ -214,7 +214,9 @@ def fit_rates(tallies: Sequence[Tally]) -> dict[str, ClassRates]:
 
 def _fitted(hand: ClassRates, ages_years: NDArray[np.float64], counts: NDArray[np.float64]) -> ClassRates:
     """Fit the rates of one class to counts of shape (blocks, ages, 4)."""
-    start = _to_vector(hand)
+    shares = np.clip([hand.hit, hand.false_alarm / hand.hit, hand.missing], _EDGE, 1 - _EDGE)
+    yearly = np.maximum([hand.vanish_per_year, hand.appear_per_year], _EDGE)
+    start = np.concatenate((special.logit(shares), np.log(yearly)))
 
     def loss(vector: NDArray[np.float64]) -> float:
         mapped, empty = _chances(vector, ages_years)
@@ -239,12 +241,6 @@ def _chances(
     came = np.where(ages_years > 0, 1 - (1 - missing) * np.exp(-appear * ages_years), 0.0)
     mapped, empty = (share * hit + (1 - share) * false_alarm for share in (stands, came))
     return np.clip(mapped, _EDGE, 1 - _EDGE), np.clip(empty, _EDGE, 1 - _EDGE)
-
-
-def _to_vector(rates: ClassRates) -> NDArray[np.float64]:
-    shares = np.clip([rates.hit, rates.false_alarm / rates.hit, rates.missing], _EDGE, 1 - _EDGE)
-    yearly = np.maximum([rates.vanish_per_year, rates.appear_per_year], _EDGE)
-    return np.concatenate((special.logit(shares), np.log(yearly)))
 
 
 def _to_rates(vector: NDArray[np.float64], *, mapped: float) -> ClassRates:

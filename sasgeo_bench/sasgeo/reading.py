@@ -20,7 +20,7 @@ from sasgeo_bench.sasgeo.class_weights import Rarity
 from sasgeo_bench.sasgeo.graph import GraphScore, verify
 from sasgeo_bench.sasgeo.joint import columns
 from sasgeo_bench.sasgeo.mapped import JUNCTIONS, JunctionPairs, MappedGraph
-from sasgeo_bench.sasgeo.nodes import Bools, Floats, Ints, Nodes
+from sasgeo_bench.sasgeo.nodes import Floats, Ints, Nodes
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.sasgeo.raster import CELL_M, RasterView, burnt, doubted, read_field
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
@@ -65,7 +65,13 @@ def proposals(
         raise ConfigError(f"scales are the least and the greatest scale, both positive and finite, got {scales!r}")
     cast = np.concatenate([np.zeros((0, 6)), *(_votes(seen.nodes, mapped, kind, scales) for kind in JUNCTIONS)])
     if prior is not None:
-        cast = cast[_may_be(cast, prior)]
+        # Which poses a prior allows
+        fits = np.ones(len(cast), dtype=bool)
+        if prior.center_m is not None and prior.radius_m is not None:
+            fits &= np.hypot(*(cast[:, :2] - prior.center_m).T) <= prior.radius_m + _PLACE_M
+        if prior.yaw_deg is not None and prior.yaw_sigma_deg is not None:
+            fits &= np.abs(wrap_deg(cast[:, 2] - prior.yaw_deg)) <= _SIGMAS * prior.yaw_sigma_deg
+        cast = cast[fits]
     return _counted(cast, count) if len(cast) and count > 0 else []
 
 
@@ -108,18 +114,17 @@ def _similarities(
     return np.column_stack((middle_m, yaw_deg, scale))
 
 
-def _may_be(cast: Floats, prior: Prior) -> Bools:
-    fits = np.ones(len(cast), dtype=bool)
-    if prior.center_m is not None and prior.radius_m is not None:
-        fits &= np.hypot(*(cast[:, :2] - prior.center_m).T) <= prior.radius_m + _PLACE_M
-    if prior.yaw_deg is not None and prior.yaw_sigma_deg is not None:
-        fits &= np.abs(wrap_deg(cast[:, 2] - prior.yaw_deg)) <= _SIGMAS * prior.yaw_sigma_deg
-    return fits
-
-
 def _counted(cast: Floats, count: int) -> list[Proposal]:
     """Return poses with the most votes, best first, no two for one place and heading."""
-    at = _spread(cast)
+    # Votes as points, shape (V, 5): those for one pose lie within 1 of each other, and headings wrap around
+    turn = np.radians(cast[:, 2:3])
+    at = np.column_stack(
+        (
+            cast[:, :2] / _PLACE_M,
+            np.concatenate((np.cos(turn), np.sin(turn)), axis=1) / math.radians(_YAW_DEG),
+            np.log(cast[:, 3]) / _LOG_SCALE,
+        )
+    )
     tree = cKDTree(at)
     # 10 cells of votes tried for each requested pose
     found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, 10 * count)]
@@ -128,18 +133,6 @@ def _counted(cast: Floats, count: int) -> list[Proposal]:
         if all(np.linalg.norm(place - other) > 2 * _REACH for _, other in kept):
             kept.append((proposal, place))
     return [proposal for proposal, _ in kept[:count]]
-
-
-def _spread(cast: Floats) -> Floats:
-    """Return votes as points, shape (V, 5): those for one pose lie within 1 of each other, and headings wrap around."""
-    turn = np.radians(cast[:, 2:3])
-    return np.column_stack(
-        (
-            cast[:, :2] / _PLACE_M,
-            np.concatenate((np.cos(turn), np.sin(turn)), axis=1) / math.radians(_YAW_DEG),
-            np.log(cast[:, 3]) / _LOG_SCALE,
-        )
-    )
 
 
 def _crowded(cast: Floats, at: Floats, most: int) -> Floats:

@@ -232,7 +232,10 @@ class SasgeoTrack:
         self._new_m = 0.0
         doubt = self.doubt if self.over_time.has_none else 0.0
         scored = _Scored(field=self._map.field, template=template, scale=self._scale.mean, weight=weight)
-        average = scored.of_average(_middle_m(belief))
+        # Mean place of a belief
+        plane = belief.mass.sum(axis=0, dtype=np.float64).ravel()
+        east_m, north_m = (plane @ belief.places_m / plane.sum()).tolist()
+        average = scored.of_average((east_m, north_m))
         logs = scored.on(belief, elsewhere=average)
         weighed = belief.weighed(logs, doubt=doubt)
         fix = fix_of(weighed, least=LEAST)
@@ -329,9 +332,3 @@ def _off(step: Step, before: Pose, after: Pose) -> float:
 def _evidence(belief: GridBelief, logs: Floats) -> float:
     top = float(logs.max())
     return top + math.log(max(float((belief.mass[belief.asked] * np.exp(logs - top)).sum(dtype=np.float64)), 1e-30))
-
-
-def _middle_m(belief: GridBelief) -> tuple[float, float]:
-    plane = belief.mass.sum(axis=0, dtype=np.float64).ravel()
-    east_m, north_m = (plane @ belief.places_m / plane.sum()).tolist()
-    return east_m, north_m

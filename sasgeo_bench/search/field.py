@@ -252,17 +252,11 @@ def warped(layer: NDArray[Value], to_layer: NDArray[np.float64], shape: tuple[in
     """Resample a raster, (rows, cols) or (rows, cols, bands), linearly, 0 beyond it; `to_layer` from `between`."""
     flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
     if max(layer.shape[:2]) > 32_766:  # 32_766 cells: OpenCV warps no larger raster
-        layer, to_layer = _near(layer, to_layer, shape)
+        # Part of a raster that lies under a view, and the affine map to it
+        far = np.array([(col, row, 1.0) for row in (0, shape[0] - 1) for col in (0, shape[1] - 1)]) @ to_layer.T
+        most = np.array(layer.shape[1::-1])
+        first = np.clip(np.floor(far.min(axis=0)).astype(np.int64) - 1, 0, most - 1)
+        last = np.clip(np.ceil(far.max(axis=0)).astype(np.int64) + 2, first + 1, most)
+        moved = to_layer - np.column_stack((np.zeros((2, 2)), first))
+        layer, to_layer = layer[first[1] : last[1], first[0] : last[0]], moved
     return np.asarray(cv2.warpAffine(layer, to_layer, shape[::-1], flags=flags), dtype=layer.dtype)
-
-
-def _near(
-    layer: NDArray[Value], to_layer: NDArray[np.float64], shape: tuple[int, int]
-) -> tuple[NDArray[Value], NDArray[np.float64]]:
-    """Return the part of a raster that lies under a view, and the affine map to it."""
-    far = np.array([(col, row, 1.0) for row in (0, shape[0] - 1) for col in (0, shape[1] - 1)]) @ to_layer.T
-    most = np.array(layer.shape[1::-1])
-    first = np.clip(np.floor(far.min(axis=0)).astype(np.int64) - 1, 0, most - 1)
-    last = np.clip(np.ceil(far.max(axis=0)).astype(np.int64) + 2, first + 1, most)
-    moved = to_layer - np.column_stack((np.zeros((2, 2)), first))
-    return layer[first[1] : last[1], first[0] : last[0]], moved

@@ -102,14 +102,23 @@ def surface(
     ((4, 17, 17), Pose(easting_m=25.5, northing_m=28.5, yaw_deg=90.0, scale=1.0))
     """
     yaws = np.atleast_1d(normalize_deg(yaws_deg))
-    _check(center_m, radius_m, yaws, scale)
+    if not (yaws.ndim == 1 and len(yaws) and np.isfinite(yaws).all()):
+        raise PoseError(f"yaws_deg must be at least one finite heading in a row, got an array of shape {yaws.shape}")
+    is_finite = all(map(math.isfinite, (*center_m, radius_m, scale)))
+    if not (is_finite and radius_m >= 0 and scale > 0):
+        raise PoseError(
+            "center_m must be finite, radius_m at least 0 and scale positive, "
+            f"got {center_m!r}, {radius_m!r} and {scale!r}"
+        )
     level = field.level(factor)
     tiles = tiles_of(level.grid, field.grid, Disc(center_m=center_m, radius_m=radius_m))
     if not tiles:
         raise PoseError(
             f"the square of {radius_m!r} m around {center_m!r} does not meet the map, {field.grid.bounds_m!r}"
         )
-    grid = _joined(level.grid, tiles)
+    # Cells of all tiles, of which the first one is at the top left
+    bottom, right = (max(first + side for first, side in _sides(tiles, axis)) for axis in (0, 1))
+    grid = level.grid.window(tiles[0].row, tiles[0].col, bottom - tiles[0].row, right - tiles[0].col)
     scores = np.zeros((len(yaws), *grid.shape), dtype=np.float32)
     if len(template.active):
         headings = _Headings.of(yaws, scale)
@@ -121,22 +130,6 @@ def surface(
                     _part(scores[yaw], tiles[0], tile)[:] = votes.score(spectra, at, quarter)
     scores.flags.writeable = False
     return Surface(grid=grid, yaws_deg=yaws, scores=scores)
-
-
-def _check(center_m: tuple[float, float], radius_m: float, yaws: NDArray[np.float64], scale: float) -> None:
-    if not (yaws.ndim == 1 and len(yaws) and np.isfinite(yaws).all()):
-        raise PoseError(f"yaws_deg must be at least one finite heading in a row, got an array of shape {yaws.shape}")
-    is_finite = all(map(math.isfinite, (*center_m, radius_m, scale)))
-    if not (is_finite and radius_m >= 0 and scale > 0):
-        raise PoseError(
-            "center_m must be finite, radius_m at least 0 and scale positive, "
-            f"got {center_m!r}, {radius_m!r} and {scale!r}"
-        )
-
-
-def _joined(grid: Grid, tiles: Sequence[Tile]) -> Grid:
-    bottom, right = (max(first + side for first, side in _sides(tiles, axis)) for axis in (0, 1))
-    return grid.window(tiles[0].row, tiles[0].col, bottom - tiles[0].row, right - tiles[0].col)
 
 
 def _sides(tiles: Sequence[Tile], axis: int) -> list[tuple[int, int]]:

@@ -236,7 +236,10 @@ class Board:
         for spectrum, waves in zip(self.spectrum.split(at_once), self.waves.split(at_once), strict=True):
             under = spectrum.unfold(2, side, 1).permute(0, 2, 1, 4, 3).flatten(2)
             factors = torch.einsum("foid,qhbrd->fqhoirb", waves, laid)
-            parts.append(_product(under, factors.reshape(len(waves), views * headings * 2, -1).mT))
+            # Products of matrices, summed and kept in single precision
+            other = factors.reshape(len(waves), views * headings * 2, -1).mT
+            product = torch.bmm(under, other, out_dtype=torch.float32) if under.is_cuda else torch.bmm(under, other)
+            parts.append(product)
         sums = parts[0] if len(parts) == 1 else torch.cat(parts)
         sums = torch.view_as_complex(sums.view(len(sums), rows, views * headings, 2))
         scores = torch.fft.irfft(sums, n=self.size, dim=0, norm="forward")
@@ -285,10 +288,6 @@ def _padded(view: Tensor, pose: Tensor, score: Tensor, shape: tuple[int, int]) -
     kept = at < table.score.shape[1]
     table.pose[view[kept], at[kept]], table.score[view[kept], at[kept]] = pose[kept], score[kept]
     return table
-
-
-def _product(one: Tensor, other: Tensor) -> Tensor:
-    return torch.bmm(one, other, out_dtype=torch.float32) if one.is_cuda else torch.bmm(one, other)
 
 
 def _double(rows: Sequence[Any], like: Tensor) -> Tensor:

@@ -155,7 +155,13 @@ def accumulate(
     >>> round(float(accumulate([frame, frame], [still]).probabilities[0, 2, 2]), 3)
     0.864
     """
-    _check(frames, steps, correlation, caution)
+    if not frames or len(steps) != len(frames) - 1:
+        raise ShapeError(f"n frames, at least one, have n - 1 steps between them, got {len(frames)} and {len(steps)}")
+    kinds = {(frame.classes, frame.probabilities.shape, frame.cell_size_m) for frame in frames}
+    if len(kinds) > 1:
+        raise ShapeError(f"frames have one lattice and the same classes, got {len(kinds)} kinds of them")
+    if not 0 <= correlation <= 1 or not 0 <= caution < math.inf:
+        raise CameraError(f"correlation is 0 to 1 and caution not negative, got {correlation!r} and {caution!r}")
     errors = errors or Errors()
     last = frames[-1]
     # 0.3826: mean distance of the points of a square from its middle, in sides
@@ -166,7 +172,10 @@ def accumulate(
     for index in range(len(frames) - 1, -1, -1):
         radius_m = 0.0
         if index < len(frames) - 1:
-            pose = _after(steps[index], pose)
+            # Pose given in the axes of another one in the axes of that one's own frame
+            first = steps[index]
+            place = first.to_map(np.array([[pose.easting_m, pose.northing_m]]))[0].tolist()
+            pose = Pose(easting_m=place[0], northing_m=place[1], yaw_deg=first.yaw_deg + pose.yaw_deg)
             distance_m += math.hypot(steps[index].easting_m, steps[index].northing_m)
             radius_m = caution * errors.apart_m(distance_m=distance_m, height_m=height_m, reach_m=reach_m)
         sure = _certain(frames[index].probabilities, radius_m / last.cell_size_m)
@@ -177,21 +186,6 @@ def accumulate(
     log_odds = total / (1 + np.maximum(count - 1, 0) * correlation)
     probabilities = np.where(count > 0, expit(log_odds), np.nan).astype(np.float32)
     return SoftView(classes=last.classes, probabilities=probabilities, cell_size_m=last.cell_size_m)
-
-
-def _check(frames: Sequence[SoftView], steps: Sequence[Pose], correlation: float, caution: float) -> None:
-    if not frames or len(steps) != len(frames) - 1:
-        raise ShapeError(f"n frames, at least one, have n - 1 steps between them, got {len(frames)} and {len(steps)}")
-    kinds = {(frame.classes, frame.probabilities.shape, frame.cell_size_m) for frame in frames}
-    if len(kinds) > 1:
-        raise ShapeError(f"frames have one lattice and the same classes, got {len(kinds)} kinds of them")
-    if not 0 <= correlation <= 1 or not 0 <= caution < math.inf:
-        raise CameraError(f"correlation is 0 to 1 and caution not negative, got {correlation!r} and {caution!r}")
-
-
-def _after(first: Pose, second: Pose) -> Pose:
-    place = first.to_map(np.array([[second.easting_m, second.northing_m]]))[0].tolist()
-    return Pose(easting_m=place[0], northing_m=place[1], yaw_deg=first.yaw_deg + second.yaw_deg)
 
 
 def _seen_from(pose: Pose, other: Pose) -> Pose:

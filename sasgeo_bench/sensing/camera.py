@@ -284,7 +284,10 @@ class Camera:
             return shapely.Polygon()
         reach_m = reach_m or 20.0 * above_m  # reach of a footprint, in heights above the ground
         seen = self._outline(ground, above_m / reach_m) if isinstance(ground, Plane) else self._patches(ground)
-        return _largest(seen.intersection(shapely.Point(self.east_m, self.north_m).buffer(reach_m, quad_segs=64)))
+        # Largest polygon of a geometry; an empty one if it holds none
+        shape = seen.intersection(shapely.Point(self.east_m, self.north_m).buffer(reach_m, quad_segs=64))
+        parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
+        return max(parts, key=shapely.area, default=shapely.Polygon())
 
     def _outline(self, ground: Plane, slope: float) -> shapely.Geometry:
         rays = self.rays(self.intrinsics.border_px(_MESH))
@@ -319,9 +322,3 @@ def _cut(rays: Points, slope: float) -> Points:
         if (here >= 0) != (there >= 0):
             kept.append(ray + (after - ray) * here / (here - there))
     return np.array(kept).reshape(-1, 3)
-
-
-def _largest(shape: shapely.Geometry) -> shapely.Polygon:
-    """Return the largest polygon of a geometry; an empty one if it holds none."""
-    parts = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
-    return max(parts, key=shapely.area, default=shapely.Polygon())

@@ -145,7 +145,13 @@ class Intrinsics:
         slopes = np.ascontiguousarray(slopes, dtype=np.float64)
         if not any(self.distortion):
             return slopes * self.focal_px + self.centre_px
-        outside = ~(np.hypot(*slopes.T) < _fold(self.distortion))
+        # Radius, as a slope, from which the radial polynomial no longer grows; infinite if it always does
+        k1, k2, _, _, k3 = self.distortion
+        slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])  # the derivative of r (1 + k1 r2 + k2 r4 + k3 r6), in r2
+        # 1e-15: moves no pixel of any lens; the division of a root by less would overflow
+        squares = np.roots(np.where(np.abs(slope) < 1e-15, 0.0, slope))
+        real = squares.real[(np.abs(squares.imag) < 1e-12) & (squares.real > 0)]  # rounding of a real root
+        outside = ~(np.hypot(*slopes.T) < (float(np.sqrt(real.min())) if len(real) else math.inf))
         safe = np.column_stack([np.where(outside[:, None], 0.0, slopes), np.ones(len(slopes))])
         if not len(safe):
             return slopes
@@ -170,13 +176,3 @@ class Intrinsics:
         # 1e-3 pixels: a point whose distortion cannot be undone this well has no ray
         missed = ~(np.abs(self.to_pixels(slopes) - points_px).max(axis=1) < 1e-3)
         return np.where(missed[:, None], np.nan, slopes)
-
-
-def _fold(distortion: Distortion) -> float:
-    """Return the radius, as a slope, from which the radial polynomial no longer grows; infinite if it always does."""
-    k1, k2, _, _, k3 = distortion
-    slope = np.array([7 * k3, 5 * k2, 3 * k1, 1.0])  # the derivative of r (1 + k1 r2 + k2 r4 + k3 r6), in r2
-    # 1e-15: moves no pixel of any lens; the division of a root by less would overflow
-    squares = np.roots(np.where(np.abs(slope) < 1e-15, 0.0, slope))
-    real = squares.real[(np.abs(squares.imag) < 1e-12) & (squares.real > 0)]  # rounding of a real root
-    return float(np.sqrt(real.min())) if len(real) else math.inf

@@ -160,14 +160,10 @@ def read_photo(path: Path, *, most_bytes: int = MOST_BYTES, most_pixels: int = 2
     Nothing is decoded; limits are on the bytes of the file and the pixels that its head announces. What a file does not
     say is None, so that a photo without pose is refused only where its pose is asked for (`Photo.camera`).
     """
-    _check_bytes(path, most_bytes)
-    return _photo_of(path.name, read_head(path), most_pixels)
-
-
-def _check_bytes(path: Path, most_bytes: int) -> None:
     size = path.stat().st_size if path.is_file() else 0  # what is no file is refused when it is opened
     if size > most_bytes:
         raise ImageError(f"{path} has {size} bytes, at most {most_bytes} are read: cut it, or scale it down, first")
+    return _photo_of(path.name, read_head(path), most_pixels)
 
 
 def _photo_of(name: str, head: PhotoHead, most_pixels: int) -> Photo:

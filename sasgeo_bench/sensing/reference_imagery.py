@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, ImageryError, SasgeoError, StoreError
 from sasgeo_bench.files.folders import file_record, fresh_folder, locked
@@ -102,7 +101,12 @@ def render_imagery(folder: Path, world: Path, look: Look) -> OrthoRecord:
                 return manifest.imagery
             features = region_files.read_features(world)  # without the layers, which take more memory than a tile
             rendering = _Rendering(folder, manifest, shown, features, look, picture)
-            _check_drawable(rendering)
+            # Refuse a map without a visible feature in the bounds
+            geometry = rendering.features.geometry.to_numpy()[rendering.features["is_visible"].to_numpy()]
+            if not shapely.intersects(geometry, shapely.box(*rendering.manifest.bounds_m)).any():
+                raise ImageryError(
+                    f"{rendering.folder.name} of {rendering.picture.date} shows nothing to draw: take another date"
+                )
             with fresh_folder(folder) as scratch:
                 return _render_into(scratch, rendering)
     except SasgeoError:
@@ -201,15 +205,6 @@ def _is_current(folder: Path, manifest: Manifest, picture: PictureRecord) -> boo
     return ORTHO in manifest.files and manifest.files[ORTHO] == file_record(path)
 
 
-def _check_drawable(rendering: _Rendering) -> None:
-    """Refuse a map without a visible feature in the bounds."""
-    geometry = rendering.features.geometry.to_numpy()[rendering.features["is_visible"].to_numpy()]
-    if not shapely.intersects(geometry, shapely.box(*rendering.manifest.bounds_m)).any():
-        raise ImageryError(
-            f"{rendering.folder.name} of {rendering.picture.date} shows nothing to draw: take another date"
-        )
-
-
 def _render_into(scratch: Path, rendering: _Rendering) -> OrthoRecord:
     """Fill the folder that replaces a region's: its other files, the image, and a manifest that says so."""
     folder, manifest = rendering.folder, rendering.manifest
@@ -222,7 +217,12 @@ def _render_into(scratch: Path, rendering: _Rendering) -> OrthoRecord:
     tiles = _tiles(rendering, grid)
     if not write_tiles(scratch / ORTHO, grid, tiles, attribution=ATTRIBUTION, licence=LICENCE):
         raise ImageryError(f"{folder.name} of {rendering.picture.date} has no mapped ground: take another date")
-    record = _measured(scratch, rendering, grid)
+    # Record with the share of the region's mapped ground that is shown
+    # There is no offset to measure: the image lies on the map that it shows.
+    record = OrthoRecord.unmeasured((rendering.picture,), grid)
+    imagery = Imagery(path=scratch / ORTHO, file=file_record(scratch / ORTHO), record=record, epsg=grid.epsg)
+    mapped = shapely.from_wkt(rendering.manifest.coverage.wkt)
+    record = record.model_copy(update={"share": share_shown(imagery, mapped, rendering.manifest.cell_size_m)})
     files = manifest.files | {ORTHO: file_record(scratch / ORTHO)}
     changed = manifest.model_copy(update={"files": dict(sorted(files.items())), "imagery": record})
     region_files.write_manifest(scratch, changed)
@@ -238,21 +238,16 @@ def _link(source: Path, target: Path) -> None:
     shutil.copy2(source, target)
 
 
-def _measured(scratch: Path, rendering: _Rendering, grid: Grid) -> OrthoRecord:
-    """Return the record with the share of the region's mapped ground that is shown."""
-    # There is no offset to measure: the image lies on the map that it shows.
-    record = OrthoRecord.unmeasured((rendering.picture,), grid)
-    imagery = Imagery(path=scratch / ORTHO, file=file_record(scratch / ORTHO), record=record, epsg=grid.epsg)
-    mapped = shapely.from_wkt(rendering.manifest.coverage.wkt)
-    return record.model_copy(update={"share": share_shown(imagery, mapped, rendering.manifest.cell_size_m)})
-
-
 def _tiles(rendering: _Rendering, grid: Grid) -> Generator[OrthoTile]:
     """Yield the image tile by tile: one painted window is in memory at a time."""
     conditions = rendering.look.conditions(rendering.place)
     for row, col, part in grid.windows(_TILE_PX):
         scene = _scene(rendering, part)
-        is_known = _is_mapped(scene, part)
+        # Which pixels show mapped ground, shape (rows, cols)
+        length = max(part.shape)
+        diagonal = scene.grid.to_cells(part.to_centres_m(np.column_stack([np.arange(length)] * 2).astype(np.int64)))
+        rows, cols = diagonal[: part.rows, 0], diagonal[: part.cols, 1]
+        is_known = np.asarray(scene.is_mapped[np.ix_(rows, cols)])
         if not is_known.any():
             continue
         rng = np.random.default_rng((seed_of(rendering.place, rendering.look.name), row, col))
@@ -274,11 +269,3 @@ def _scene(rendering: _Rendering, part: Grid) -> Scene:
         window=window,
         family=rendering.look.family,
     )
-
-
-def _is_mapped(scene: Scene, part: Grid) -> NDArray[np.bool_]:
-    """Return which pixels show mapped ground, shape (rows, cols)."""
-    length = max(part.shape)
-    diagonal = scene.grid.to_cells(part.to_centres_m(np.column_stack([np.arange(length)] * 2).astype(np.int64)))
-    rows, cols = diagonal[: part.rows, 0], diagonal[: part.cols, 1]
-    return np.asarray(scene.is_mapped[np.ix_(rows, cols)])

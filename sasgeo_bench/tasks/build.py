@@ -305,7 +305,13 @@ def put_task(pairs: Iterable[tuple[Query, Truth]], origin: TaskOrigin, hidden: T
     check_separate(task_folder, out / "truth")
     task_files.check_ours(task_folder, (task_files.QUERIES, task_files.TASK))
     task_files.check_ours(truth_folder, (task_files.TRUTH, task_files.TRUTH_OF, LABELS))
-    _check_unmixed(truth_folder, hidden)
+    # Refuse to draw with a public seed over queries of a private one, and the other way round
+    before = TruthManifest.read(truth_folder)
+    if before.model_fields_set and (before.private_seed is None) != (hidden.private_seed is None):
+        kinds = ("private", "public") if hidden.private_seed is None else ("public", "private")
+        raise StoreError(
+            f"{truth_folder} was drawn by a {kinds[0]} seed, and this one is {kinds[1]}: choose another --out"
+        )
     seeds = {"private_seed": hidden.private_seed, "sealed_seed": hidden.sealed_seed}
     origin = origin.model_copy(update={name: seed for name, seed in seeds.items() if seed is not None})
     try:
@@ -323,15 +329,6 @@ def put_task(pairs: Iterable[tuple[Query, Truth]], origin: TaskOrigin, hidden: T
             f"{task_folder} cannot be written ({error.strerror or error}): check the free space and your rights"
         ) from error
     return Task(task_folder, manifest, truth_folder, out)
-
-
-def _check_unmixed(truth_folder: Path, hidden: TruthManifest) -> None:
-    before = TruthManifest.read(truth_folder)
-    if before.model_fields_set and (before.private_seed is None) != (hidden.private_seed is None):
-        kinds = ("private", "public") if hidden.private_seed is None else ("public", "private")
-        raise StoreError(
-            f"{truth_folder} was drawn by a {kinds[0]} seed, and this one is {kinds[1]}: choose another --out"
-        )
 
 
 def _origin(

@@ -135,7 +135,8 @@ class Drawer:
             group = replace(group, radius_m=None)
         state = self.scene.state(self.map_of(job))
         pose = draft.pose or site.pose
-        rivals_m = self._rivals_m(job, draft)
+        # Twins that the disc of a query must hold: none for retrieval, whose candidates hold them
+        rivals_m = self._twins_m(job.site, draft) if self.suite.has_rivals and job.track == "localization" else ()
         prior = make_prior(pose, group, rng=seeds.rng("prior", group.name), rivals_m=rivals_m)
         if rivals_m:
             listed = self.rivals.measure(state, draft.evidence, prior, truth_m=site.en_m, rivals_m=rivals_m)
@@ -183,6 +184,8 @@ class Drawer:
         if changed is None:
             views = (variant.view(place, site.pose) for place in (world, state))
             changed = 0.0 if state is world else changed_share(*views)
+        # Mark queries at places where the searched map shows hardly any feature
+        is_blank = draft.has_pose and drawn_share(state, draft.pose or site.pose, variant) < LEAST_DRAWN
         return Truth(
             query_id=job.query_id,
             is_present=draft.is_present,
@@ -199,16 +202,10 @@ class Drawer:
             alias_index=decoys.alias_index if draft.has_pose and draft.pose is None else None,
             block=site.block,
             scene=",".join(self.scene.scenes),
-            measured=draft.measured
-            | self._twin(site, draft)
-            | _unanswerable(draft, state, draft.pose or site.pose, variant),
+            measured=draft.measured | self._twin(site, draft) | ({UNANSWERABLE: 1.0} if is_blank else {}),
             detector=variant.detector,
             labels=draft.labels,
         )
-
-    def _rivals_m(self, job: Job, draft: Draft) -> tuple[tuple[float, float], ...]:
-        """Return the twins that the disc of a query must hold: none for retrieval, whose candidates hold them."""
-        return self._twins_m(job.site, draft) if self.suite.has_rivals and job.track == "localization" else ()
 
     def _twins_m(self, site: Site, draft: Draft) -> tuple[tuple[float, float], ...]:
         """Return the twins of a site (easting, northing) if a draft shows the site and has twins."""
@@ -268,11 +265,6 @@ def drawn_share(state: State, pose: Pose, variant: Variant) -> float:
     return float((view.cells[layers] == PRESENT).any(axis=0).mean())
 
 
-def _unanswerable(draft: Draft, state: State, pose: Pose, variant: Variant) -> dict[str, float]:
-    is_blank = draft.has_pose and drawn_share(state, pose, variant) < LEAST_DRAWN
-    return {UNANSWERABLE: 1.0} if is_blank else {}
-
-
 def _clusters(
     truth: tuple[float, float],
     decoys_m: NDArray[np.float64],
@@ -306,7 +298,18 @@ def make_prior(
         center_m = _around(pose, reach_m * radius_share, turn)
         if rivals_m:
             places_m = np.array([(pose.easting_m, pose.northing_m), *rivals_m])
-            center_m = _holding(places_m, reach_m, rng=rng)
+            # Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre
+            low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
+            # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
+            # 1024 points drawn for a centre, of which one at least should fit
+            points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (1024, 2))
+            off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
+            fit = points[(off_m <= reach_m).all(axis=1)]
+            if len(fit) == 0:
+                raise ConfigError(
+                    f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior"
+                )
+            center_m = (round(float(fit[0, 0]), 1), round(float(fit[0, 1]), 1))
     sigma_deg = YAW_SIGMA_DEG[group.yaw]
     yaw_deg = None if sigma_deg is None else round(round(float(pose.yaw_deg + sigma_deg * yaw_noise), 1) % 360, 1)
     return Prior(
@@ -316,19 +319,6 @@ def make_prior(
         yaw_sigma_deg=sigma_deg,
         scale_sigma=group.scale_sigma,
     )
-
-
-def _holding(places_m: NDArray[np.float64], reach_m: float, *, rng: np.random.Generator) -> tuple[float, float]:
-    """Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre."""
-    low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
-    # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
-    # 1024 points drawn for a centre, of which one at least should fit
-    points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (1024, 2))
-    off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
-    fit = points[(off_m <= reach_m).all(axis=1)]
-    if len(fit) == 0:
-        raise ConfigError(f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior")
-    return (round(float(fit[0, 0]), 1), round(float(fit[0, 1]), 1))
 
 
 def away(

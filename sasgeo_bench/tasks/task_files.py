@@ -773,7 +773,10 @@ def write_task(
             asked = [asked_sha256(row, origin.map_hashes) for row in rows.to_pylist()]
             queries.write_table(rows.append_column(FILE_SCHEMA.field(ASKED), pa.array(asked)))
             truths.write_table(pa.Table.from_pylist([truth_row(truth) for _, truth in part], schema=TRUTH_SCHEMA))
-            of_frames = _label_rows(part)
+            # Labels of all frames of some queries as rows
+            of_frames = [
+                label_row(truth.query_id, number, item) for _, truth in part for number, item in enumerate(truth.labels)
+            ]
             if of_frames:
                 labels = labels or stack.enter_context(table_writer(truth_folder / LABELS, LABEL_SCHEMA))
                 labels.write_table(pa.Table.from_pylist(of_frames, schema=LABEL_SCHEMA), 1)
@@ -799,10 +802,6 @@ def write_task(
     _write_json(truth_folder / TRUTH_OF, {"queries_sha256": record.sha256, **more})
     _write_json(task_folder / TASK, content)
     return TaskManifest.model_validate(content)
-
-
-def _label_rows(part: Sequence[tuple[Query, Truth]]) -> list[dict[str, Any]]:
-    return [label_row(truth.query_id, number, item) for _, truth in part for number, item in enumerate(truth.labels)]
 
 
 def _write_json(path: Path, content: dict[str, Any]) -> None:

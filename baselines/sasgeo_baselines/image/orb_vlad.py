@@ -130,7 +130,12 @@ class OrbVlad:
         if len(seen) < LEAST_FEATURES or top >= bottom or left >= right:
             return sgb.WITHHELD
         tiles = self._tiles[top:bottom, left:right]
-        scores = tiles @ _of_view(seen, self._vocabulary)
+        # Normalized VLAD of a view, its features weighted as those of a tile, shape (WORDS * PARTS,)
+        nearest, offsets = self._vocabulary.residuals(seen.descriptors)
+        weights = np.exp(-(seen.points**2).sum(axis=1) / (2 * WINDOW_M**2)).astype(np.float32)
+        sums = np.zeros((WORDS, PARTS), dtype=np.float32)
+        np.add.at(sums, nearest, offsets * weights[:, None])
+        scores = tiles @ normalized(sums)
         field = Field(
             grid=self._grid.window(top, left, bottom - top, right - left),
             scores=np.where(tiles.any(axis=2), scores, -np.inf).astype(np.float32),
@@ -160,12 +165,3 @@ def centred(mode: sgb.Mode, field: Field, disc: sgb.Disc) -> sgb.Mode:
     east_m, north_m = field.grid.to_en_m(uv)[0].tolist()
     pose = replace(mode.pose, easting_m=east_m, northing_m=north_m)
     return replace(mode, pose=pose) if disc.has(pose) else mode
-
-
-def _of_view(seen: Features, vocabulary: Vocabulary) -> NDArray[np.float32]:
-    """Return the normalized VLAD of a view, its features weighted as those of a tile, shape (WORDS * PARTS,)."""
-    nearest, offsets = vocabulary.residuals(seen.descriptors)
-    weights = np.exp(-(seen.points**2).sum(axis=1) / (2 * WINDOW_M**2)).astype(np.float32)
-    sums = np.zeros((WORDS, PARTS), dtype=np.float32)
-    np.add.at(sums, nearest, offsets * weights[:, None])
-    return normalized(sums)

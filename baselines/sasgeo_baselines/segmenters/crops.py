@@ -77,7 +77,13 @@ class Crops:
             middle = self._place_of_a_class(picture, rng, middle)
         rows, cols = _turned_lattice(middle, rng)
         rgb = cv2.remap(picture.rgb, cols, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        labels = self._labels_at(picture, rows, cols)
+        # Labels at places of a picture; unknown beyond it
+        height, width = picture.rgb.shape[:2]
+        row, col = (np.rint(at).astype(np.int64) for at in (rows, cols))
+        inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
+        found = picture.labels[list(self.classes)][:, row.clip(0, height - 1), col.clip(0, width - 1)]
+        found[:, ~inside] = sgb.UNKNOWN
+        labels = np.asarray(found, dtype=np.uint8)
         light = Light.drawn(rng)
         balance = ColourBalance.of(lab_planes(light.on(picture.sample[None])))
         return input_planes(_blurred(light.on(np.asarray(rgb, dtype=np.uint8)), rng), balance), labels
@@ -90,15 +96,6 @@ class Crops:
             return otherwise
         places = np.flatnonzero(picture.labels[shown[int(rng.integers(len(shown)))]] == sgb.PRESENT)
         return np.array(np.divmod(places[int(rng.integers(len(places)))], picture.rgb.shape[1]), dtype=np.float64)
-
-    def _labels_at(self, picture: LearningPicture, rows: Plane, cols: Plane) -> NDArray[np.uint8]:
-        """Return labels at places of a picture; unknown beyond it."""
-        height, width = picture.rgb.shape[:2]
-        row, col = (np.rint(at).astype(np.int64) for at in (rows, cols))
-        inside = (row >= 0) & (row < height) & (col >= 0) & (col < width)
-        found = picture.labels[list(self.classes)][:, row.clip(0, height - 1), col.clip(0, width - 1)]
-        found[:, ~inside] = sgb.UNKNOWN
-        return np.asarray(found, dtype=np.uint8)
 
 
 def _turned_lattice(middle: NDArray[np.float64], rng: np.random.Generator) -> tuple[Plane, Plane]:

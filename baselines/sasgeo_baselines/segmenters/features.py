@@ -138,7 +138,10 @@ def _named(bands: Plane, pixel_m: float) -> Iterator[tuple[str, Plane]]:
             square = blurred(band * band, sigma_m / pixel_m)
             yield f"{name}_spread_{sigma_m:g}", np.sqrt(np.maximum(square - mean * mean, 0))
     for reach_m in (1.5, 3.0, 6.0):  # radii of openings and closings: roofs, roads, shadows beside them
-        kernel = _disc(reach_m / pixel_m)
+        # Mask of a disc, at least 3 pixels wide
+        reach = max(1, round(reach_m / pixel_m))
+        side = np.arange(-reach, reach + 1)
+        kernel = (side[:, None] ** 2 + side**2 <= (reach + 0.5) ** 2).astype(np.uint8)
         yield f"bright_{reach_m:g}", light - cv2.morphologyEx(light, cv2.MORPH_OPEN, kernel)
         yield f"dark_{reach_m:g}", cv2.morphologyEx(light, cv2.MORPH_CLOSE, kernel) - light
         yield f"darkest_{reach_m:g}", cv2.erode(light, kernel) - light
@@ -177,13 +180,6 @@ def _shape(smooth: Plane, sigma_px: float) -> Iterator[tuple[str, Plane]]:
     factor = np.float32(max(sigma_px, 1) ** 2)
     yield "ridge", np.asarray((half + turn) * factor, dtype=np.float32)
     yield "valley", np.asarray((half - turn) * factor, dtype=np.float32)
-
-
-def _disc(radius_px: float) -> NDArray[np.uint8]:
-    """Return the mask of a disc, at least 3 pixels wide."""
-    reach = max(1, round(radius_px))
-    side = np.arange(-reach, reach + 1)
-    return (side[:, None] ** 2 + side**2 <= (reach + 0.5) ** 2).astype(np.uint8)
 
 
 def has_data(rgb: NDArray[np.uint8], pixel_m: float) -> NDArray[np.bool_]:

@@ -66,7 +66,10 @@ class PixelForest:
             known = labels[:, at] != sgb.UNKNOWN
             present = labels[known, at] == sgb.PRESENT
             if min(present.sum(), (~present).sum()) >= _LEAST_PRESENT:
-                models[name] = _trees(values[known], present, weights[known])
+                # Boost the trees of one class; the same pixels give the same text
+                lightgbm = _lightgbm()
+                data = lightgbm.Dataset(values[known], label=present.astype(np.float32), weight=weights[known])
+                models[name] = str(lightgbm.train(_SETTINGS, data, num_boost_round=100).model_to_string())
         if not models:
             raise ValueError(
                 f"no class has {_LEAST_PRESENT} labelled pixels of either kind: give more pictures, or larger ones"
@@ -148,13 +151,6 @@ def _forest(learned: str) -> _Forest:
         features=content["features"],
         models={name: make(model_str=text) for name, text in content["models"].items()},
     )
-
-
-def _trees(values: Plane, present: NDArray[np.bool_], weights: NDArray[np.float64]) -> str:
-    """Boost the trees of one class; the same pixels give the same text."""
-    lightgbm = _lightgbm()
-    data = lightgbm.Dataset(values, label=present.astype(np.float32), weight=weights)
-    return str(lightgbm.train(_SETTINGS, data, num_boost_round=100).model_to_string())
 
 
 def _lightgbm() -> Any:  # noqa: ANN401 - a module

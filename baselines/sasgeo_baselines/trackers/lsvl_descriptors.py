@@ -78,7 +78,12 @@ class Shares:
 
     def described(self, part_m: float) -> "Described":
         """Average over discs as large as a part of a view, so that the heading does not matter."""
-        disc = _disc(part_m / math.sqrt(math.pi) / self.grid.cell_size_m)
+        # Round kernel with a sum of 1
+        radius = part_m / math.sqrt(math.pi) / self.grid.cell_size_m
+        reach = math.ceil(radius)
+        away = np.arange(-reach, reach + 1) ** 2
+        kernel = np.clip(radius + _HALF - np.sqrt(away[:, None] + away), 0.0, 1.0).astype(np.float32)
+        disc = np.asarray(kernel / kernel.sum())
         known = _averaged(self.known, disc)
         roots = np.zeros(self.present.shape, dtype=np.float32)
         for present, into in zip(self.present, roots, strict=True):
@@ -146,14 +151,6 @@ class Compared:
             total += sums[row : row + rows, col : col + cols]
             count += counts[row : row + rows, col : col + cols]
         return np.sqrt(total / np.where(count > 0, count, np.float32(np.nan)))
-
-
-def _disc(radius: float) -> Floats:
-    """Return a round kernel with a sum of 1."""
-    reach = math.ceil(radius)
-    away = np.arange(-reach, reach + 1) ** 2
-    kernel = np.clip(radius + _HALF - np.sqrt(away[:, None] + away), 0.0, 1.0).astype(np.float32)
-    return np.asarray(kernel / kernel.sum())
 
 
 def _share(layer: NDArray[np.bool_], grid: sgb.Grid, factor: int) -> NDArray[np.uint8]:

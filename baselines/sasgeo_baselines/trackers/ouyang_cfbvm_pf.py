@@ -74,15 +74,12 @@ class OuyangCfbvmPf(ParticleFilter):
         """Return the mixture and its floor, 0 beyond the map."""
         west_m, south_m, east_m, north_m = self._bounds_m
         is_inside = ((particles.place_m >= (west_m, south_m)) & (particles.place_m <= (east_m, north_m))).all(axis=1)
-        votes = self._votes(particles, query.evidence)
-        found = mixture_of(votes).at(particles.place_m, particles.yaw_deg) if len(votes) else 0.0
-        return np.asarray(np.where(is_inside, self.floor + found, 0.0))
-
-    def _votes(self, particles: Particles, evidence: sgb.Evidence) -> Floats:
         pose = particles.mean
         around = sgb.Disc(center_m=(pose.easting_m, pose.northing_m), radius_m=2.5 * particles.spread_m + 2 * REACH_M)
         yaws_deg = headings(pose.yaw_deg, float(np.sqrt(particles.covariance[2, 2])))
-        return self._town.votes(Seen.of(evidence), around, yaws_deg=yaws_deg)
+        votes = self._town.votes(Seen.of(query.evidence), around, yaws_deg=yaws_deg)
+        found = mixture_of(votes).at(particles.place_m, particles.yaw_deg) if len(votes) else 0.0
+        return np.asarray(np.where(is_inside, self.floor + found, 0.0))
 
     def estimate(self, particles: Particles) -> sgb.Fix:
         """Return the mean of the heaviest cluster; accepted where it has been credible for some views."""

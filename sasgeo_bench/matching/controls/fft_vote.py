@@ -101,14 +101,19 @@ class DenseMatcher(ABC):
             return WITHHELD
         chart, view = self._chart, self._read(query.evidence, self._chart)
         search = VoteSearch(chart=chart, view=self._view(view, chart), prior=query.prior, plan=self.plan)
-        check = self._check(view, chart)
+        # Prepare comparisons at single poses, in the classes that view or map hold
+        bands = _bands(view, chart)
+        chosen = self._used[bands] | (view.cells == PRESENT).any(axis=(1, 2))
+        check = PoseCheck(chart=chart, bands=bands[chosen], seen=view.cells[chosen], cell_size_m=view.cell_size_m)
         count = min(top_k, 20)  # modes of one answer at most
         is_retrieval = query.track == "retrieval"
         found = search.candidates(query.candidates) if is_retrieval else search.places(count)
         modes = self.rescored([mode for mode in found.modes if mode is not None], check)
         best = ranked(modes)
         diagnostics = {"known_share": 1.0 - query.evidence.unknown_share, "null_score": found.null_score}
-        diagnostics |= _margin(best) | (self.diagnose(best[0], check) if best else {})
+        # Number of modes and the margin of the best over the next, 0 where there is none
+        margin = best[0].score - best[1].score if len(best) > 1 else 0.0
+        diagnostics |= {"margin": margin, "modes": float(len(best))} | (self.diagnose(best[0], check) if best else {})
         if not is_retrieval:
             given = best[:count]
             poses, values = [mode.pose for mode in given], [mode.score for mode in given]
@@ -134,21 +139,10 @@ class DenseMatcher(ABC):
         chosen = [index for index, band in enumerate(bands) if self._used[band] and whole[index].any()]
         return View.of(seen, np.concatenate((whole[chosen], whole[-2:])), bands[chosen])
 
-    def _check(self, seen: Evidence, chart: Chart) -> PoseCheck:
-        bands = _bands(seen, chart)
-        chosen = self._used[bands] | (seen.cells == PRESENT).any(axis=(1, 2))
-        return PoseCheck(chart=chart, bands=bands[chosen], seen=seen.cells[chosen], cell_size_m=seen.cell_size_m)
-
 
 def _bands(evidence: Evidence, chart: Chart) -> NDArray[np.int64]:
     """Return indices of the classes of a view among those of the map, shape (C,)."""
     return np.array([chart.classes.index(name) for name in evidence.classes], dtype=np.int64)
-
-
-def _margin(modes: list[Mode]) -> dict[str, float]:
-    """Return the number of modes and the margin of the best over the next, 0 where there is none."""
-    margin = modes[0].score - modes[1].score if len(modes) > 1 else 0.0
-    return {"margin": margin, "modes": float(len(modes))}
 
 
 class FftVote(DenseMatcher):

@@ -86,7 +86,10 @@ def _old_town(sketch: Sketch) -> None:
     for ring, kind in zip(
         spots, ("pedestrian", "living_street", "residential", "residential", "residential", "secondary"), strict=True
     ):
-        sketch.street(_ring_road(ring), highway=kind)
+        # Closed smooth line through corners: one turn of a longer curve, so that it closes without a kink
+        line = curve([*ring[-2:], *ring, *ring[:3]])
+        start, end = np.flatnonzero(np.hypot(*(line - ring[0]).T) < 0.02)[[0, -1]]
+        sketch.street(np.vstack((line[start:end], line[start : start + 1])), highway=kind)
     for spoke in range(spokes):
         inner = [ring[spoke] for ring in spots[2 * (spoke % 2) :]]
         outwards = (1.19 * half * np.cos(angles[spoke]), 1.19 * half * np.sin(angles[spoke]))
@@ -95,7 +98,15 @@ def _old_town(sketch: Sketch) -> None:
         sketch.street(wobble(curve([*inner, clipped], step_m=25.0), 2.5, rng), **tags)
     wall = affinity.scale(shapely.Point(0, 0).buffer(0.78 * half), 1.0, 1.0)
     sketch.line(shapely.get_coordinates(wall.exterior)[:52], barrier="city_wall")
-    _market_square(sketch, 0.14 * half)
+    radius_m = 0.14 * half
+    nave = affinity.rotate(shapely.box(-0.3 * radius_m, -0.14 * radius_m, 0.3 * radius_m, 0.14 * radius_m), 20)
+    choir = affinity.translate(
+        shapely.Point(0, 0).buffer(0.14 * radius_m, quad_segs=4), 0.28 * radius_m, 0.1 * radius_m
+    )
+    sketch.ground(nave.union(choir), is_free=False, building="church")
+    square = shapely.Point(0, 0).buffer(0.7 * radius_m, quad_segs=5)
+    sketch.ground(square, is_free=False, highway="pedestrian", area="yes")
+    sketch.keep_free(square)
     streets = shapely.union_all([shapely.linestrings(way.line) for way in sketch.ways if "highway" in way.tags])
     faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.node(streets)).tolist()))
     for face in sorted(faces, key=lambda face: (round(face.centroid.x, 1), round(face.centroid.y, 1))):
@@ -105,24 +116,6 @@ def _old_town(sketch: Sketch) -> None:
         sketch,
         curve([(-half, -0.93 * half), (-0.3 * half, -0.9 * half), (0.4 * half, -0.96 * half), (half, -0.9 * half)]),
     )
-
-
-def _ring_road(corners: list[tuple[float, float]]) -> Line:
-    """Return a closed smooth line through corners: one turn of a longer curve, so that it closes without a kink."""
-    line = curve([*corners[-2:], *corners, *corners[:3]])
-    start, end = np.flatnonzero(np.hypot(*(line - corners[0]).T) < 0.02)[[0, -1]]
-    return np.vstack((line[start:end], line[start : start + 1]))
-
-
-def _market_square(sketch: Sketch, radius_m: float) -> None:
-    nave = affinity.rotate(shapely.box(-0.3 * radius_m, -0.14 * radius_m, 0.3 * radius_m, 0.14 * radius_m), 20)
-    choir = affinity.translate(
-        shapely.Point(0, 0).buffer(0.14 * radius_m, quad_segs=4), 0.28 * radius_m, 0.1 * radius_m
-    )
-    sketch.ground(nave.union(choir), is_free=False, building="church")
-    square = shapely.Point(0, 0).buffer(0.7 * radius_m, quad_segs=5)
-    sketch.ground(square, is_free=False, highway="pedestrian", area="yes")
-    sketch.keep_free(square)
 
 
 def _perimeter_block(sketch: Sketch, block: shapely.Geometry) -> None:
@@ -209,18 +202,15 @@ def _suburb(sketch: Sketch) -> None:
     for line in streets:
         sketch.houses_along(line, spacing_m=23.0, setback_m=9.0, size_m=(12.5, 10.0), kind="house")
         sketch.houses_along(line, spacing_m=31.0, setback_m=30.0, size_m=(6.0, 4.5), kind="garage", chance=0.45)
-    _hedges_between(sketch, 14.0)
-    _school(sketch, (0.7 * half, -0.45 * half))
-
-
-def _hedges_between(sketch: Sketch, reach_m: float) -> None:
+    # Draw a hedge at every fifth house, where nothing is in the way
     houses = [way for way in sketch.ways if way.tags.get("building") == "house"]
     for way in houses[::5]:
         box = shapely.Polygon(way.line).minimum_rotated_rectangle
-        corners = shapely.get_coordinates(affinity.scale(box, 1 + reach_m / 12, 1 + reach_m / 14))
+        corners = shapely.get_coordinates(affinity.scale(box, 1 + 14.0 / 12, 1 + 14.0 / 14))
         hedge = shapely.LineString(corners[:3])
         if not sketch.is_taken(hedge):
             sketch.line(corners[:3], barrier="hedge")
+    _school(sketch, (0.7 * half, -0.45 * half))
 
 
 def _school(sketch: Sketch, centre: tuple[float, float]) -> None:
@@ -228,12 +218,11 @@ def _school(sketch: Sketch, centre: tuple[float, float]) -> None:
     x, y = centre
     wing = shapely.union_all([shapely.box(x, y, x + 60, y + 16), shapely.box(x, y, x + 16, y + 46)])
     if not sketch.is_taken(wing):
-        sketch.areas.append(_building_relation(wing))
+        building_relation = Area(
+            outer=shapely.get_coordinates(wing.exterior), inner=(), tags={"building": "school"}, kind="building"
+        )
+        sketch.areas.append(building_relation)
         sketch.keep_free(wing)
-
-
-def _building_relation(outline: shapely.Polygon) -> Area:
-    return Area(outer=shapely.get_coordinates(outline.exterior), inner=(), tags={"building": "school"}, kind="building")
 
 
 def _industrial(sketch: Sketch) -> None:

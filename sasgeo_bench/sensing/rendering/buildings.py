@@ -54,7 +54,12 @@ def style_buildings(plan: Plan, relief: float) -> Buildings:
     key = shapes.key
     storeys = estimate_storeys(area_m2, crowding(shapes.geometry), seed=plan.seed("storeys"), key=key)
     fill = area_m2 / np.maximum(4 * half_m.prod(axis=1), 1e-6)
-    form = _forms(plan, key, area_m2, storeys, fill)
+    # Flat, gabled or hipped: what is large, high or small is flat, what is no rectangle is hipped
+    is_large = np.clip((np.log(np.maximum(area_m2, 1)) - np.log(350)) / np.log(4), 0, 1) * 0.85
+    flat = np.maximum(plan.palette.flat_share, np.where(storeys > 6, 1.0, is_large))
+    is_flat = (plan.chance("flat", key) < flat) | ((area_m2 < 30) & (plan.chance("shed", key) < 0.5))
+    is_gable = (fill > 0.86) & (plan.chance("gable", key) < 0.78)
+    form = np.where(is_flat, FLAT, np.where(is_gable, GABLE, HIP)).astype(np.uint8)
     low, high = plan.palette.roof_pitch
     pitch = np.where(form == FLAT, 0.0, low + (high - low) * plan.chance("pitch", key))
     pitch = np.minimum(pitch, _MOST_RISE_M / np.maximum(half_m[:, 1], 1e-6))
@@ -127,15 +132,6 @@ def estimate_storeys(area_m2: Numbers, crowded: Numbers, *, seed: int, key: NDAr
     is_tower = (area_m2 > 250) & (area_m2 < 1600) & (dense > 0.25) & (draw(seed + 1, key) < 0.04)
     storeys = np.where(is_tower, 8 + 9 * draw(seed + 2, key), storeys)
     return np.where(area_m2 < 30, 0.8, np.maximum(storeys, 0.9))
-
-
-def _forms(plan: Plan, key: NDArray[np.int64], area_m2: Numbers, storeys: Numbers, fill: Numbers) -> NDArray[np.uint8]:
-    """Return flat, gabled or hipped: what is large, high or small is flat, what is no rectangle is hipped."""
-    is_large = np.clip((np.log(np.maximum(area_m2, 1)) - np.log(350)) / np.log(4), 0, 1) * 0.85
-    flat = np.maximum(plan.palette.flat_share, np.where(storeys > 6, 1.0, is_large))
-    is_flat = (plan.chance("flat", key) < flat) | ((area_m2 < 30) & (plan.chance("shed", key) < 0.5))
-    is_gable = (fill > 0.86) & (plan.chance("gable", key) < 0.78)
-    return np.where(is_flat, FLAT, np.where(is_gable, GABLE, HIP)).astype(np.uint8)
 
 
 def _materials(plan: Plan, key: NDArray[np.int64], is_flat: Mask) -> tuple[Numbers, NDArray[np.uint8], Numbers]:

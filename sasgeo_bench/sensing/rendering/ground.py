@@ -273,7 +273,10 @@ def _paint_fields(canvas: Canvas) -> Mask:
         colour[numbers[cells]],
         np.asarray(0.82 + 0.12 * noise(canvas.grid, 12.0, 5 + plan.salt), dtype=np.float32),
     )
-    across = _field_rows_m(canvas, shapes, numbers)
+    # Distance across the rows of each field, which run along its longer side, metres
+    axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[numbers]
+    east, north = ground_m(canvas.grid, canvas.plan.corner_m)
+    across = np.asarray(axis[..., 0] * north[:, None] - axis[..., 1] * east[None, :], dtype=np.float32)
     pitch = np.concatenate([[1.0], 0.75 + 1.6 * luck])[numbers]
     wander = 0.5 * noise(canvas.grid, 25.0, plan.seed("wander"))
     rows = 0.06 * np.sin(2 * np.pi * (across + wander) / pitch)
@@ -298,13 +301,6 @@ def _paint_bare(canvas: Canvas) -> None:
     rough = np.concatenate([[0.0], np.where(is_rock, 0.2, 0.05)]).astype(np.float32)[numbers]
     rubble = fractal(canvas.grid, 3.0, seed + 1) + fractal(canvas.grid, 14.0, seed + 2)
     canvas.shade(cells, np.asarray(1 + rough * rubble, dtype=np.float32))
-
-
-def _field_rows_m(canvas: Canvas, shapes: Shapes, numbers: Cells) -> Field:
-    """Return the distance across the rows of each field, which run along its longer side, metres."""
-    axis = np.vstack([[1.0, 0.0], rectangles(shapes.geometry)[1]]).astype(np.float32)[numbers]
-    east, north = ground_m(canvas.grid, canvas.plan.corner_m)
-    return np.asarray(axis[..., 0] * north[:, None] - axis[..., 1] * east[None, :], dtype=np.float32)
 
 
 def _paint_water(canvas: Canvas) -> None:

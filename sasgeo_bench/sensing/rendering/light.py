@@ -38,10 +38,22 @@ def cast_light(height_m: Field, cell_size_m: float, sun: Sun) -> Light:
     shade_m = cast_shadows(height_m, cell_size_m, sun)
     lit = (height_m >= shade_m - _EPS_M).astype(np.float32)
     lit = np.asarray(cv2.GaussianBlur(lit, (0, 0), max(0.3 / cell_size_m, 0.4)), dtype=np.float32)
-    lit *= _facing(height_m, cell_size_m, sun)
+    # Cosine between the sun and the surface of each cell, not below 0
+    east, north, up = (np.float32(part) for part in sun.direction)
+    scale = 1 / (8 * cell_size_m)
+    slope_e = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 1, 0, scale=scale), -_STEEPEST, _STEEPEST)
+    slope_n = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 0, 1, scale=-scale), -_STEEPEST, _STEEPEST)
+    facing = up - east * slope_e - north * slope_n
+    facing /= np.sqrt(1 + slope_e * slope_e + slope_n * slope_n)
+    lit *= np.asarray(np.maximum(facing, 0), dtype=np.float32)
     shares = np.empty((*height_m.shape, 2), dtype=np.uint8)
     shares[..., 0] = np.clip(lit * 255, 0, 255)
-    shares[..., 1] = _sky(height_m, cell_size_m)
+    # Share of the sky seen from each cell, 0-255, from how far the surroundings rise above it
+    half = cv2.resize(height_m, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    around = cv2.GaussianBlur(half, (0, 0), 1.2 / cell_size_m)
+    around = cv2.resize(around, (height_m.shape[1], height_m.shape[0]), interpolation=cv2.INTER_LINEAR)
+    above = np.maximum(around - height_m, 0)
+    shares[..., 1] = np.asarray(255 * (0.35 + 0.65 / (1 + 0.45 * above)), dtype=np.uint8)
     return Light(sun=sun, shares=shares, shade_m=shade_m)
 
 
@@ -89,26 +101,6 @@ def _raise(shade: Field, other: Field, shift: tuple[int, int], fall_m: float) ->
     here = np.s_[max(0, -down) : rows - max(0, down), max(0, -right) : cols - max(0, right)]
     there = np.s_[max(0, down) : rows - max(0, -down), max(0, right) : cols - max(0, -right)]
     np.maximum(shade[here], other[there] - np.float32(fall_m), out=shade[here])
-
-
-def _facing(height_m: Field, cell_size_m: float, sun: Sun) -> Field:
-    """Return the cosine between the sun and the surface of each cell, not below 0."""
-    east, north, up = (np.float32(part) for part in sun.direction)
-    scale = 1 / (8 * cell_size_m)
-    slope_e = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 1, 0, scale=scale), -_STEEPEST, _STEEPEST)
-    slope_n = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 0, 1, scale=-scale), -_STEEPEST, _STEEPEST)
-    facing = up - east * slope_e - north * slope_n
-    facing /= np.sqrt(1 + slope_e * slope_e + slope_n * slope_n)
-    return np.asarray(np.maximum(facing, 0), dtype=np.float32)
-
-
-def _sky(height_m: Field, cell_size_m: float) -> Picture:
-    """Return the share of the sky seen from each cell, 0-255, from how far the surroundings rise above it."""
-    half = cv2.resize(height_m, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
-    around = cv2.GaussianBlur(half, (0, 0), 1.2 / cell_size_m)
-    around = cv2.resize(around, (height_m.shape[1], height_m.shape[0]), interpolation=cv2.INTER_LINEAR)
-    above = np.maximum(around - height_m, 0)
-    return np.asarray(255 * (0.35 + 0.65 / (1 + 0.45 * above)), dtype=np.uint8)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

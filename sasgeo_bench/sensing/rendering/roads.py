@@ -65,7 +65,12 @@ def _paint_streets(canvas: Canvas, shapes: Shapes, *, is_major: bool) -> None:
     is_paved = (plan.chance("paved", shapes.key) < palette.paved_share) | is_major | shapes.is_bridge
     numbers = burn_numbers(shapes.areas(), grid)
     mask = numbers > 0
-    _paint_verges(canvas, shapes, mask)
+    # Paint pavements in built-up quarters and worn strips elsewhere
+    beside = (burn_numbers(shapes.areas(2.2), canvas.grid) > 0) & ~mask & (canvas.kind != WATER)
+    is_town = canvas.built > 0.13 / max(canvas.plan.palette.paved_share, 0.1)
+    canvas.tint(beside & is_town, canvas.plan.palette.paving, 0.8)
+    worn = np.clip(0.35 + 0.6 * noise(canvas.grid, 3.0, canvas.plan.seed("verge")), 0, 0.8)
+    canvas.tint(beside & ~is_town, canvas.plan.palette.soil[1], np.asarray(worn, dtype=np.float32))
     tone = 1 + 0.1 * bell(plan.seed("asphalt"), shapes.key)
     paved = np.array(palette.asphalt) * tone[:, None]
     is_light = plan.chance("concrete", shapes.key) < 0.15
@@ -87,14 +92,6 @@ def _tint_each(canvas: Canvas, numbers: Cells, colours: Numbers, cover: Field) -
         reach = cover[strip] > 0.02
         number = np.where(numbers[strip] > 0, numbers[strip], grown[strip])[reach]
         part.tint(reach, colours[number], cover[strip])
-
-
-def _paint_verges(canvas: Canvas, shapes: Shapes, mask: Mask) -> None:
-    beside = (burn_numbers(shapes.areas(2.2), canvas.grid) > 0) & ~mask & (canvas.kind != WATER)
-    is_town = canvas.built > 0.13 / max(canvas.plan.palette.paved_share, 0.1)
-    canvas.tint(beside & is_town, canvas.plan.palette.paving, 0.8)
-    worn = np.clip(0.35 + 0.6 * noise(canvas.grid, 3.0, canvas.plan.seed("verge")), 0, 0.8)
-    canvas.tint(beside & ~is_town, canvas.plan.palette.soil[1], np.asarray(worn, dtype=np.float32))
 
 
 def _wear(canvas: Canvas, mask: Mask, is_paved: Mask) -> None:

@@ -35,7 +35,14 @@ def expose_sensor(
     if sigma > 0:
         tone += _noise(tone.shape[:2], rng) * np.float32(255 * sigma)
     picture = np.clip(tone, 0, 255, out=tone).astype(np.uint8)
-    return _stored(picture, conditions.jpeg_quality)
+    # Picture as JPEG gives it back, or as it is
+    if not conditions.jpeg_quality:
+        return picture
+    _, data = cv2.imencode(
+        ".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, conditions.jpeg_quality]
+    )
+    stored = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
+    return np.asarray(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), dtype=np.uint8)
 
 
 def _blurred(light: Field, conditions: Conditions) -> Field:
@@ -83,12 +90,3 @@ def _noise(shape: tuple[int, ...], rng: np.random.Generator) -> Field:
     row, col = rng.integers(0, _BANK, 2).tolist()
     rows, cols = (row + np.arange(shape[0])) % _BANK, (col + np.arange(shape[1])) % _BANK
     return np.asarray(_bank()[rows[:, None], cols[None, :]])
-
-
-def _stored(picture: Picture, quality: int) -> Picture:
-    """Return a picture as JPEG gives it back; `quality` 0 leaves it as it is."""
-    if not quality:
-        return picture
-    _, data = cv2.imencode(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, quality])
-    stored = np.asarray(cv2.imdecode(data, cv2.IMREAD_COLOR), dtype=np.uint8)
-    return np.asarray(cv2.cvtColor(stored, cv2.COLOR_BGR2RGB), dtype=np.uint8)

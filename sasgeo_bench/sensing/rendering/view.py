@@ -136,7 +136,8 @@ def _expose_rows(exposed: _Exposed, camera: Camera, hits: Hits, seen: Field) -> 
 def _shaded(exposed: _Exposed, hits: Hits) -> Field:
     """Return the light that comes from each hit, linear, float32 of shape (H, W, 3)."""
     painting, light, exposure = exposed.painting, exposed.light, exposed.exposure
-    albedo, shares = _sampled(painting.colours, hits), _light_shares(light, hits)
+    # Light of sun and sky at each hit, float32 of shape (H, W, 2), 0-1
+    albedo, shares = _sampled(painting.colours, hits), _linear(light.shares, hits) * np.float32(1 / 255)
     if hits.is_side.any():
         _paint_sides(exposed, hits, albedo, shares)
     seen = np.asarray(cv2.transform(shares, np.stack([exposure.sun, exposure.sky], axis=1)), dtype=np.float32)
@@ -180,12 +181,6 @@ def _linear(values: Field | Picture, hits: Hits, level: int = 0) -> Field:
     return np.asarray(found, dtype=np.float32)
 
 
-def _nearest(values: Picture, hits: Hits) -> Picture:
-    col, row = _maps(hits)
-    found = cv2.remap(values, col, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray(found, dtype=np.uint8)
-
-
 def _sampled(colours: tuple[Picture, ...], hits: Hits) -> Field:
     """Return the colour at each hit, float32 of shape (H, W, 3), 0-255, from the level as fine as the pixel."""
     level = np.clip(np.log2(np.maximum(hits.cells_px, 0.25)) + 0.3, 0, len(colours) - 1)
@@ -198,11 +193,6 @@ def _sampled(colours: tuple[Picture, ...], hits: Hits) -> Field:
         finer *= share
         found += finer
     return found
-
-
-def _light_shares(light: Light, hits: Hits) -> Field:
-    """Return light of sun and sky at each hit, float32 of shape (H, W, 2), 0-1."""
-    return _linear(light.shares, hits) * np.float32(1 / 255)
 
 
 def _paint_sides(exposed: _Exposed, hits: Hits, albedo: Field, shares: Field) -> None:
@@ -273,7 +263,9 @@ def _waves() -> tuple[Field, Field]:
 def _reflect(exposed: _Exposed, hits: Hits, seen: Field) -> None:
     """Mirror sky and sun in water that ripples."""
     exposure = exposed.exposure
-    at = np.flatnonzero((_nearest(exposed.painting.kind, hits) == WATER) & hits.is_ground)
+    col, row = _maps(hits)
+    found = cv2.remap(exposed.painting.kind, col, row, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    at = np.flatnonzero((np.asarray(found, dtype=np.uint8) == WATER) & hits.is_ground)
     if not len(at):
         return
     cell = np.float32(exposed.scene.grid.cell_size_m)

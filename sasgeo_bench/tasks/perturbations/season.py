@@ -60,22 +60,19 @@ class Season:
                 if name in layers:
                     layers[name][white] = UNKNOWN
         elif self.kind == "low_water":
-            self._dry(layers, noise, evidence.cell_size_m)
+            # Move the waterline inwards, more where the noise is strong, as from a gentle bank
+            water = _of(layers, "water")
+            if water.any():
+                # Water continues outside the view, so the edge of the view is no bank.
+                from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * evidence.cell_size_m
+                gentle = np.clip(1 + noise / 2, 0.2, 2.0)
+                # The waterline retreats by 12 m at strength 1, from a gentle bank
+                _clear(layers, ("water",), water & (from_bank_m <= self.strength * 12.0 * gentle))
+            # A line within a lake or broad river does not fall dry before the water around it.
+            _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
         else:
             self._harvest(layers, noise, Streams(rng))
         return with_cells(evidence, cells)
-
-    def _dry(self, layers: Layers, noise: Field, cell_size_m: float) -> None:
-        """Move the waterline inwards, more where the noise is strong, as from a gentle bank."""
-        water = _of(layers, "water")
-        if water.any():
-            # Water continues outside the view, so the edge of the view is no bank.
-            from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * cell_size_m
-            gentle = np.clip(1 + noise / 2, 0.2, 2.0)
-            # The waterline retreats by 12 m at strength 1, from a gentle bank
-            _clear(layers, ("water",), water & (from_bank_m <= self.strength * 12.0 * gentle))
-        # A line within a lake or broad river does not fall dry before the water around it.
-        _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
 
     def _harvest(self, layers: Layers, noise: Field, streams: Streams) -> None:
         """Exchange fields and green, each parcel as a whole, and remove the boundaries between them."""

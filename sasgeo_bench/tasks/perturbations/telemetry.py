@@ -106,7 +106,15 @@ def outlines(evidence: Evidence, *, budget_bytes: int) -> Sent:
         message = _largest(message, budget_bytes)
     cells = np.full(evidence.cells.shape, ABSENT, dtype=np.uint8)
     for (classes, state, _), some in zip(masks, message, strict=True):
-        filled = _filled(some, evidence.shape)
+        # Cells whose middles lie in one of the outlines
+        from rasterio.features import rasterize  # noqa: PLC0415 - suites are listed without it
+
+        polygons = [shapely.Polygon(rings[0], rings[1:]) for rings in some]
+        filled = (
+            np.zeros(evidence.shape, dtype=bool)
+            if not polygons
+            else np.asarray(rasterize(polygons, out_shape=evidence.shape) > 0)
+        )
         cells[classes] = np.where(filled, np.uint8(state), cells[classes])
     return Sent(evidence=evidence.replace(cells), bytes=length_of(_outline_bytes(message)))
 
@@ -160,15 +168,6 @@ def _largest(message: list[list[Outline]], budget_bytes: int) -> list[list[Outli
         return [[rings for at, rings in enumerate(some) if (layer, at) in chosen] for layer, some in enumerate(message)]
 
     return first(most_within(lambda count: length_of(_outline_bytes(first(count))), len(order), budget_bytes))
-
-
-def _filled(some: Sequence[Outline], shape: tuple[int, int]) -> Mask:
-    from rasterio.features import rasterize  # noqa: PLC0415 - suites are listed without it
-
-    polygons = [shapely.Polygon(rings[0], rings[1:]) for rings in some]
-    if not polygons:
-        return np.zeros(shape, dtype=bool)
-    return np.asarray(rasterize(polygons, out_shape=shape) > 0)
 
 
 def junctions(evidence: Evidence, vectors: "gpd.GeoDataFrame", *, budget_bytes: int) -> Sent:
@@ -247,7 +246,9 @@ def regions_of_interest(evidence: Evidence, shares: NDArray[np.float64], *, budg
     A run of known cells says -log2 of the share of its state on the map, however long it is, since its cells belong
     together; a square's bytes are those of its runs.
     """
-    corners = _squares(evidence.shape)
+    # First row and column of each square
+    shape = evidence.shape
+    corners = [(row, col) for row in range(0, shape[0], TILE_CELLS) for col in range(0, shape[1], TILE_CELLS)]
     parts = [_part(evidence.cells, corner) for corner in corners]
     worth = [information_bits(part, shares) / len(runs_of(part)) for part in parts]
     order = sorted(range(len(corners)), key=lambda at: (-worth[at], at))
@@ -260,10 +261,6 @@ def regions_of_interest(evidence: Evidence, shares: NDArray[np.float64], *, budg
     for at in order[:count]:
         _part(cells, corners[at])[:] = parts[at]
     return Sent(evidence=evidence.replace(cells), bytes=length_of(message(count)))
-
-
-def _squares(shape: tuple[int, int]) -> list[tuple[int, int]]:
-    return [(row, col) for row in range(0, shape[0], TILE_CELLS) for col in range(0, shape[1], TILE_CELLS)]
 
 
 def _part(cells: NDArray[np.uint8], corner: tuple[int, int]) -> NDArray[np.uint8]:

@@ -56,7 +56,13 @@ class FlightAliasSuite(ChangedMapSuite):
             is_left = lengths_within(hull, place_m, flown_m).sum() <= 1.25 * stretch_m
             copy_m = _room(area, place_m, ground, rng) if is_left else None
             if copy_m is not None:
-                stress, falsifier = _pastes(area, copy_m)
+                # Copy of an area, and the copy of its mirror image, both of the same outline
+                middle_m = _middle_m(area)
+                radius_m = float(shapely.hausdorff_distance(shapely.Point(middle_m), area)) + _RIM_M
+                target_m = (middle_m[0] + copy_m[0], middle_m[1] + copy_m[1])
+                plain = Paste(source_m=middle_m, target_m=target_m, radius_m=radius_m, outline=area)
+
+                stress, falsifier = plain, replace(plain, change=partial(mirror, classes=None, center_m=middle_m))
                 facts = {"copy_m": round(float(np.hypot(*copy_m)), 1)}
                 return Plot(
                     strength=stretch_m,
@@ -73,7 +79,8 @@ def _room(
     """Return how far east and north an area has room a second time: whole cells, so that its cells are the same."""
     # 2000 are tried for the copy
     shifts_m = np.rint(rng.uniform(-RIVAL_M, RIVAL_M, (2000, 2)) / ground.cell_m) * ground.cell_m
-    if not ground.mapped.contains(shapely.union(area, _mirrored(area))):
+    mirrored = shapely.affinity.scale(area, xfact=-1.0, yfact=1.0, origin=_middle_m(area))
+    if not ground.mapped.contains(shapely.union(area, mirrored)):
         return None
     room_m = np.array(ground.mapped.bounds) - area.bounds  # west, south, east, north of it: the box is checked first
     is_near = np.hypot(*shifts_m.T) < RIVAL_M
@@ -84,19 +91,6 @@ def _room(
         if is_apart and ground.mapped.contains(copy) and ground.is_free(copy, place_m):
             return (shift_m[0], shift_m[1])
     return None
-
-
-def _pastes(area: shapely.Polygon, copy_m: tuple[float, float]) -> tuple[Paste, Paste]:
-    middle_m = _middle_m(area)
-    radius_m = float(shapely.hausdorff_distance(shapely.Point(middle_m), area)) + _RIM_M
-    target_m = (middle_m[0] + copy_m[0], middle_m[1] + copy_m[1])
-    plain = Paste(source_m=middle_m, target_m=target_m, radius_m=radius_m, outline=area)
-
-    return plain, replace(plain, change=partial(mirror, classes=None, center_m=middle_m))
-
-
-def _mirrored(area: shapely.Polygon) -> shapely.Polygon:
-    return shapely.affinity.scale(area, xfact=-1.0, yfact=1.0, origin=_middle_m(area))
 
 
 def _middle_m(area: shapely.Polygon) -> tuple[float, float]:

@@ -81,25 +81,21 @@ def _hole(
             center_m = middle + aside * radius_m * np.array([np.sin(turn), np.cos(turn)])
             off_m = np.hypot(*(place_m - center_m).T)
             inside = off_m < radius_m
-            longest_m, total_m = _runs_m(inside, flown_m)
+            # How much is flown inside: in the longest run of views, and in all together
+            parts_m = _parts_m(inside, flown_m)
+            run = np.cumsum(~inside)[:-1]  # a step from or to a view outside belongs to the run that it touches
+            longest_m, total_m = float(np.bincount(run, parts_m).max()), float(parts_m.sum())
             if longest_m < _WITHIN[0] * stretch_m:
                 continue
             is_between = low_m <= flown_m[inside].min() and flown_m[inside].max() <= high_m
             is_on = min(off_m[0], off_m[-1]) > radius_m + ground.reach_m
             # 1.3: the longest stretch, that all together measure: a flight passes through its hole once
             if longest_m <= _WITHIN[1] * stretch_m and is_between and is_on and total_m <= 1.3 * longest_m:
-                hole = _disc(center_m, radius_m)
+                hole = shapely.Point(center_m).buffer(radius_m, quad_segs=16)
                 if ground.mapped.contains(hole) and ground.is_free(hole):
                     found.append((total_m - longest_m, hole))
             break
     return min(found, key=lambda item: item[0])[1] if found else None
-
-
-def _runs_m(inside: NDArray[np.bool_], flown_m: Floats) -> tuple[float, float]:
-    """Return how much is flown inside: in the longest run of views, and in all together."""
-    parts_m = _parts_m(inside, flown_m)
-    run = np.cumsum(~inside)[:-1]  # a step from or to a view outside belongs to the run that it touches
-    return float(np.bincount(run, parts_m).max()), float(parts_m.sum())
 
 
 def _elsewhere(
@@ -116,10 +112,6 @@ def _elsewhere(
             if ground.mapped.contains(other) and not other.intersects(hole) and ground.is_free(other, place_m):
                 return other
     return None
-
-
-def _disc(center_m: Floats, radius_m: float) -> shapely.Polygon:
-    return shapely.Point(center_m).buffer(radius_m, quad_segs=16)
 
 
 SUITE: Final = FlightOffMapSuite(

@@ -6,7 +6,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.regions.evidence import PRESENT, Evidence
+from sasgeo_bench.regions.evidence import PRESENT
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant, controls, ladder
 from sasgeo_bench.tasks.suites.twins import nodes_of, places_of
@@ -33,18 +33,14 @@ class GrowthSuite(Suite):
         clean = shot.clean()
         grown = growth(shot.variant.strength)(clean, shot.rng("growth"))
         seen = shot.perceived(grown, error_factor=ERROR_FACTOR)
-        return Draft.of_change(seen, clean, grown, new_per_old_area=_new_per_old(clean, grown))
+        old, new = (int((item.layer("building") == PRESENT).sum()) for item in (clean, grown))
+        return Draft.of_change(seen, clean, grown, new_per_old_area=(new - old) / old if old else 0.0)
 
 
 def growth(new_per_old: float) -> Ageing:
     """Return ageing in which so many buildings appear for each existing one, and nothing else happens."""
     building = Rates(vanish_per_year=0.0, appear_per_year=float(np.log1p(new_per_old)))
     return Ageing(years=1.0, rates={"building": building}, place="-")
-
-
-def _new_per_old(before: Evidence, after: Evidence) -> float:
-    old, new = (int((item.layer("building") == PRESENT).sum()) for item in (before, after))
-    return (new - old) / old if old else 0.0
 
 
 SUITE: Final = GrowthSuite(

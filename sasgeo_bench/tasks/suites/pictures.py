@@ -8,7 +8,6 @@ from functools import cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
@@ -120,6 +119,8 @@ class PictureSuite(Suite):
         pictures = [render(painted, stand.true, conditions, rng) for stand in stands]
         found = [labels(painted, stand.true, season=conditions.season) for stand in stands]
         state = shot.scene.world
+        is_there = "building" in state.classes
+        share = float((found[-1][state.classes.index("building")] == 1).mean()) if is_there else 0.0
         return Draft(
             evidence=_unseen(state.classes, variant.view_cells, variant.cell_size_m),
             frames=tuple(
@@ -141,7 +142,7 @@ class PictureSuite(Suite):
                 "brightness": round(float(np.mean(pictures)) / 255, 3),
                 "contrast": round(float(np.std(pictures[-1])) / 255, 3),
                 "hidden_share": round(float((found[-1] == UNKNOWN).mean()), 4),
-                "building_share": round(_share_of(found[-1], state.classes, "building"), 4),
+                "building_share": round(share, 4),
             },
         )
 
@@ -151,10 +152,6 @@ def _unseen(classes: tuple[str, ...], size_cells: int, cell_size_m: float) -> Ev
     """Return evidence that is all unknown, the same for all views: many are in memory at once."""
     cells = np.full((len(classes), size_cells, size_cells), UNKNOWN, dtype=np.uint8)
     return Evidence(classes=classes, cells=cells, cell_size_m=cell_size_m)
-
-
-def _share_of(found: NDArray[np.uint8], classes: tuple[str, ...], name: str) -> float:
-    return float((found[classes.index(name)] == 1).mean()) if name in classes else 0.0
 
 
 def stands_of(shot: Shot, flight: Flight) -> list[Stand]:
@@ -200,7 +197,11 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
     """Return the painted window of a shot, from the scene's store if it was painted just before."""
     scene, site, variant = shot.scene, shot.site, shot.variant
     family: Family = "shifted" if variant.detector == "shifted" else scene.looks[site.block]
-    reach_m = _reach_m(flight, variant)
+    # Half the side of the window that is painted: the view in any heading, and what a tilted camera sees
+    stops = max(math.dist(stop, (0.0, 0.0)) for stop in flight.stops_m)
+    half_picture_m = flight.height_m * LENS.width_px / LENS.focal_px[0] / math.sqrt(2)
+    tilted = flight.tilt_deg > 0 or flight.is_fixed
+    reach_m = round(1.1 * max(variant.side_m / math.sqrt(2), half_picture_m + stops) * (1.5 if tilted else 1.0), 1)
     pixel_m = flight.height_m / LENS.focal_px[0]
     cell_m = min(max(pixel_m * 1.4, _FINEST_M), _COARSEST_M)  # cells of paint in a pixel, about
     key = (site.en_m, family, flight.relief, flight.height_m, reach_m, round(cell_m, 3))
@@ -229,11 +230,3 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
         # 0.75 of the flight's height: whoever flies there flies above everything
         scene.painted[key] = replace(made, below_m=0.75 * flight.height_m)
     return scene.painted[key]
-
-
-def _reach_m(flight: Flight, variant: Variant) -> float:
-    """Return half the side of the window that is painted: the view in any heading, and what a tilted camera sees."""
-    stops = max(math.dist(stop, (0.0, 0.0)) for stop in flight.stops_m)
-    half_picture_m = flight.height_m * LENS.width_px / LENS.focal_px[0] / math.sqrt(2)
-    tilted = flight.tilt_deg > 0 or flight.is_fixed
-    return round(1.1 * max(variant.side_m / math.sqrt(2), half_picture_m + stops) * (1.5 if tilted else 1.0), 1)

@@ -15,7 +15,6 @@ from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
 from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import REAL, Detector, Role
-from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import Draft, Scene, Shot, Suite, SuiteCard, Variant
 
 CELL_M: Final = 0.5
@@ -71,9 +70,19 @@ class RealImageSuite(Suite):
         pose = _pose(shot)
         width_px = min(_MOST_PX, round(_PICTURE * variant.side_m / imagery.record.gsd_m))
         pixel_m = _PICTURE * variant.side_m / width_px
-        ground_m = _ground(pose, width_px, pixel_m)
+        # Easting and northing of each pixel, shape (H, W, 2)
+        right = (np.arange(width_px) + 0.5 - width_px / 2) * pixel_m
+        across, ahead = np.meshgrid(right, -right)
+        ground_m = pose.to_map(np.stack((across.ravel(), ahead.ravel()), axis=1)).reshape(width_px, width_px, 2)
         picture, is_known = _cut(imagery, ground_m)
-        found = _labels(state, ground_m, is_known)
+        # What the map says of each pixel, shape (C, H, W): UNKNOWN beyond its ground or the imagery
+        row, col = state.grid.to_cells(ground_m.reshape(-1, 2)).T
+        inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
+        bits = np.full(len(row), _UNKNOWN_BIT)
+        bits[inside] = state.bits.bits[row[inside], col[inside]]
+        states = [(bits >> np.uint32(at) & np.uint32(1)).astype(np.uint8) for at in range(len(state.classes))]
+        found = np.stack(states).reshape(-1, *is_known.shape)
+        found[:, ((bits & _UNKNOWN_BIT) > 0).reshape(is_known.shape) | ~is_known] = UNKNOWN
         cells = np.full((len(state.classes), variant.view_cells, variant.view_cells), UNKNOWN, dtype=np.uint8)
         frame = Frame(
             picture=encode_webp(picture),
@@ -124,13 +133,6 @@ def _camera(pixel_m: float, width_px: int) -> Camera:
     )
 
 
-def _ground(pose: Pose, width_px: int, pixel_m: float) -> NDArray[np.float64]:
-    """Return easting and northing of each pixel, shape (H, W, 2)."""
-    right = (np.arange(width_px) + 0.5 - width_px / 2) * pixel_m
-    across, ahead = np.meshgrid(right, -right)
-    return pose.to_map(np.stack((across.ravel(), ahead.ravel()), axis=1)).reshape(width_px, width_px, 2)
-
-
 def _cut(imagery: Imagery, ground_m: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Return the picture of some ground, shape (H, W, 3), and where the imagery shows it, shape (H, W)."""
     pixel_m = float(np.hypot(*(ground_m[0, 1] - ground_m[0, 0])))
@@ -141,18 +143,6 @@ def _cut(imagery: Imagery, ground_m: NDArray[np.float64]) -> tuple[NDArray[np.ui
     picture = cv2.remap(window.rgb, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
     known = cv2.remap(window.is_known.view(np.uint8), uv[..., 0], uv[..., 1], cv2.INTER_NEAREST)
     return np.asarray(picture, dtype=np.uint8), np.asarray(known > 0)
-
-
-def _labels(state: State, ground_m: NDArray[np.float64], is_known: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return what the map says of each pixel, shape (C, H, W): UNKNOWN beyond its ground or the imagery."""
-    row, col = state.grid.to_cells(ground_m.reshape(-1, 2)).T
-    inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
-    bits = np.full(len(row), _UNKNOWN_BIT)
-    bits[inside] = state.bits.bits[row[inside], col[inside]]
-    states = [(bits >> np.uint32(at) & np.uint32(1)).astype(np.uint8) for at in range(len(state.classes))]
-    found = np.stack(states).reshape(-1, *is_known.shape)
-    found[:, ((bits & _UNKNOWN_BIT) > 0).reshape(is_known.shape) | ~is_known] = UNKNOWN
-    return found
 
 
 def _variant(role: Role, kind: str, side_m: float) -> Variant:

@@ -16,7 +16,6 @@ from sasgeo_bench.tasks.perturbations.base import share_changed
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, SuiteCard, Variant
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import ANCHOR_SPREAD
-from sasgeo_bench.tasks.suites.twins import Places
 
 STABLE: Final = tuple(name for name in LAYERS if name in load_taxonomy().having("through"))
 VOLATILE: Final = {item.name: item.volatile for item in load_taxonomy().classes if item.volatile}  # and when it changes
@@ -53,7 +52,12 @@ class StableNotDistinctive(Suite):
             like = rng.permutation(places[turned <= _SAME_DEG, :2])
             like = like + rng.uniform(-spread_m, spread_m, like.shape)
             is_whole = [scene.map.is_mapped(place, self.clear_m(scene)) for place in like]
-            twins[site.index] = _spaced(like[is_whole], here, spacing_m)
+            # First few places that keep their distance from here and from each other
+            taken = [here]
+            for point in like[is_whole]:
+                if len(taken) <= MOST_ALIASES and np.hypot(*(np.array(taken) - point).T).min() >= spacing_m:
+                    taken.append(point)
+            twins[site.index] = tuple((float(x), float(y)) for x, y in taken[1:])
         return Edit(
             map_pastes=(), world_pastes=None, sites=tuple(site for site in sites if twins[site.index]), twins=twins
         )
@@ -64,14 +68,6 @@ class StableNotDistinctive(Suite):
         # 6 steps of the change: so many however many classes there are
         after = mirrored(seen, round(shot.variant.strength * 6))
         return Draft(evidence=after, measured={"cells_changed": share_changed(seen, after)})
-
-
-def _spaced(points: NDArray[np.float64], here: NDArray[np.float64], spacing_m: float) -> Places:
-    taken = [here]
-    for point in points:
-        if len(taken) <= MOST_ALIASES and np.hypot(*(np.array(taken) - point).T).min() >= spacing_m:
-            taken.append(point)
-    return tuple((float(x), float(y)) for x, y in taken[1:])
 
 
 def mirrored(evidence: Evidence, count: int) -> Evidence:

@@ -98,7 +98,7 @@ def drawn(
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """A view by the roots of the shares of its classes, by name, and by local features, (right, up) of its middle."""
 
     roots: dict[str, float]
@@ -107,7 +107,7 @@ class Sight:
     prior: Prior
 
 
-class AnyvislocPipeline(PlaceMatcher[Sight]):
+class AnyvislocPipeline(PlaceMatcher[PreparedView]):
     """The five most similar tiles, and the one in which most local features agree on a similarity."""
 
     open_numbers = {
@@ -151,7 +151,7 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         self._sums = Sums.of(region)
         self._features = map_features(Drawing.of_map(region), region.grid, per_m2=self.numbers["per_m2"])
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Return descriptor and features of a view; None where no class of the map is known in it."""
         seen = query.evidence
         found = zip(seen.classes, shares(seen.cells), strict=True)
@@ -161,7 +161,7 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         drawing = Drawing.of_view(seen, self._grid.cell_size_m)
         side_m = max(seen.size_m)
         features = view_features(drawing, self._grid, per_m2=self.numbers["per_m2"])
-        return Sight(roots=roots, features=features, side_m=side_m, prior=query.prior)
+        return PreparedView(roots=roots, features=features, side_m=side_m, prior=query.prior)
 
     def match(self, query: Query, *, top_k: int) -> Match:
         """Return the poses of the best tiles, and the number of inliers of the first."""
@@ -170,7 +170,7 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
             return found
         return replace(found, diagnostics={**found.diagnostics, "inliers": max(found.scores[0], 0.0)})
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses of the best tiles within a disc."""
         # 0.5: step of the side of a tile to the next: they overlap by half
         places_m = lattice_m(view.prior, self._grid, step_m=0.5 * view.side_m)
@@ -178,13 +178,15 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
         found = [mode for mode in self._matched(view, tiles, [disc] * len(tiles), most=TOP) if mode is not None]
         return thinned(sorted(found, key=lambda mode: -mode.score), APART_M, count)
 
-    def near(self, view: Sight, poses: Sequence[Pose]) -> list[Mode | None]:
+    def near(self, view: PreparedView, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the pose that the tile around each candidate gives; of all but the best it is the candidate's own."""
         tiles = [at_place((pose.easting_m, pose.northing_m), view.prior) for pose in poses]
         discs = [Disc(center_m=(pose.easting_m, pose.northing_m), radius_m=AROUND_M) for pose in poses]
         return self._matched(view, tiles, discs, most=len(tiles))
 
-    def _matched(self, view: Sight, tiles: Sequence[Pose], discs: Sequence[Disc], *, most: int) -> list[Mode | None]:
+    def _matched(
+        self, view: PreparedView, tiles: Sequence[Pose], discs: Sequence[Disc], *, most: int
+    ) -> list[Mode | None]:
         """Return a mode for each of the `most` tiles that are most alike, None for the others."""
         # Its score is the number of inliers of the first `TOP` tiles; without any, minus the distance of descriptors.
         # Distances of descriptors of tiles, shape (N,); infinite where the map is unknown
@@ -202,7 +204,7 @@ class AnyvislocPipeline(PlaceMatcher[Sight]):
             found[at] = best or Mode(pose=tiles[at], score=-float(away[at]))
         return found
 
-    def _local(self, view: Sight, tile: Pose, disc: Disc) -> Mode | None:
+    def _local(self, view: PreparedView, tile: Pose, disc: Disc) -> Mode | None:
         """Match a view with the features of a tile; None where too few agree, or on what the prior excludes."""
         away_m = np.abs(self._features.points - (tile.easting_m, tile.northing_m))
         mapped = self._features.chosen(np.asarray((away_m <= view.side_m / 2).all(axis=1)))

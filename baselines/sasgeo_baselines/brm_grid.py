@@ -140,14 +140,14 @@ class MaskOverlap(SchmidtSegcorr):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """A view: its shares at each heading that is tried, shape (headings, D), and the search by overlap of masks."""
 
     shares: Floats
     search: ShiftSearch
 
 
-class BrmGrid(PlaceMatcher[Sight]):
+class BrmGrid(PlaceMatcher[PreparedView]):
     """Building ratios name the best windows, overlap of masks the pose."""
 
     open_numbers = {
@@ -190,7 +190,7 @@ class BrmGrid(PlaceMatcher[Sight]):
             self._overlap = MaskOverlap(coarse_m=4.0, least_share=LEAST_MAPPED)  # of masks
             self._overlap.read(region, None)
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Return the ratios of a view; None where it shows no building, or the map has none."""
         seen = query.evidence
         if not self._is_built or CLASS not in seen.classes or not (seen.layer(CLASS) == PRESENT).any():
@@ -201,9 +201,9 @@ class BrmGrid(PlaceMatcher[Sight]):
         rings = ring_shares(seen)
         yaws_deg = headings_deg(query.prior, self.numbers["yaw_step_deg"])
         shares = [np.concatenate([grid_shares(seen, yaw_deg), rings]) for yaw_deg in yaws_deg]
-        return Sight(shares=np.array(shares), search=search)
+        return PreparedView(shares=np.array(shares), search=search)
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the best overlaps near the best windows."""
         places_m = self._ratios.best(view.shares, disc.wider(NEAR_M), count=int(self.numbers["windows"]))
         windows = [Pose(easting_m=east_m, northing_m=north_m, yaw_deg=0.0) for east_m, north_m in places_m.tolist()]
@@ -211,6 +211,6 @@ class BrmGrid(PlaceMatcher[Sight]):
         found = sorted((mode for mode in near if mode and disc.has(mode.pose)), key=lambda mode: -mode.score)
         return thinned(found, APART_M, count)
 
-    def near(self, view: Sight, poses: Sequence[Pose]) -> list[Mode | None]:
+    def near(self, view: PreparedView, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best overlap near each candidate."""
         return view.search.candidates(poses)

@@ -57,7 +57,7 @@ NEAR_M: Final = 12.0  # a made-up view lies so far from its tile, as the middle 
 NEAR_DEG: Final = 4.0  # half a step of headings
 _FORMAT: Final = "sasgeo-baselines embedding 2"
 _FULL: Final = 255.0
-_AT_ONCE: Final = 64  # tiles cut together: 16 MB; locations whose lessons are read together
+_AT_ONCE: Final = 64  # tiles cut together: 16 MB; locations whose examples are read together
 _SMALL: Final = 0.05  # standard deviation of a number of the descriptor that is noise
 _NOTHING: Final = 1e-6  # of the largest ratio of scatters: a direction in which locations do not differ
 
@@ -217,15 +217,15 @@ class Gallery:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """Features of a view, shape (H, F), turned north up from each of the headings that it may have."""
 
     yaws_deg: tuple[float, ...]
     features: Rows
 
 
-class EmbeddingMatcher(PlaceMatcher[Sight]):
-    """Cosine ranking of tiles of the map; a subclass says of which lessons its embedding is learned."""
+class EmbeddingMatcher(PlaceMatcher[PreparedView]):
+    """Cosine ranking of tiles of the map; a subclass says of which examples its embedding is learned."""
 
     copies = 1  # of the tile of a location, at as many headings
     heights: tuple[float, ...] = (1.0,)  # from which each view of a location is shown, relative to its own
@@ -245,7 +245,7 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         self._embedding = taught or _plain(rows)
         self._gallery = Gallery.of(region.grid, rows, self._embedding)
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Return the features of a view at the headings that it may have; None where nothing is known near its middle.
 
         Of headings at right angles to each other one is turned cell by cell, the others sector by sector. Classes that
@@ -271,14 +271,14 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         if np.isnan(np.stack([*found.values()])).all():
             return None
         means = [self._embedding.features(copies).mean(axis=0) for copies in found.values()]
-        return Sight(yaws_deg=tuple(found), features=unit(np.stack(means)))
+        return PreparedView(yaws_deg=tuple(found), features=unit(np.stack(means)))
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the most similar tiles."""
         places_m, features = self._gallery.within(disc)
         return self._ranked(view, places_m, features, most=count)
 
-    def near(self, view: Sight, poses: Sequence[Pose]) -> list[Mode | None]:
+    def near(self, view: PreparedView, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the heading at which the tile around each candidate is most similar."""
         upright = [replace(pose, yaw_deg=0.0, scale=1.0) for pose in poses]
         features = self._embedding.features(self._ground.tiles(upright))
@@ -287,7 +287,7 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         return [next(iter(modes), None) for modes in found]
 
     def _ranked(
-        self, view: Sight, places_m: NDArray[np.float64], features: NDArray[np.floating], *, most: int
+        self, view: PreparedView, places_m: NDArray[np.float64], features: NDArray[np.floating], *, most: int
     ) -> list[Mode]:
         if not len(places_m):
             return []
@@ -314,20 +314,20 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
         chosen = sorted(pairs[:: -(-len(pairs) // 1200) or 1], key=lambda pair: pair[0].region)
         shown = self.copies + len(self.heights) * self.made_up
         others = min(self.others, MOST_ROWS // (shown * max(1, len({query.region for query, _ in chosen}))))
-        lessons: list[Stored] = []
+        examples: list[Stored] = []
         for name, some in groupby(chosen, key=lambda pair: pair[0].region):
             region = training.regions[name]
             ground = Ground.of(region)
             seen = list(self._of_views(ground, list(some)))
-            errors = np.concatenate([lesson.errors for lesson in seen])
-            lessons.extend(lesson.rows for lesson in seen)
-            lessons.extend(self._of_others(ground, region.grid, others, errors, _rng(name)))
-        if len(lessons) < 2:  # two classes
-            raise ValueError(f"{self.card.name}: training shows {len(lessons)} locations, expected two at least")
-        return fitted(lessons, shrinkage=self.numbers["shrinkage"], size=int(self.numbers["size"])).to_text()
+            errors = np.concatenate([example.errors for example in seen])
+            examples.extend(example.rows for example in seen)
+            examples.extend(self._of_others(ground, region.grid, others, errors, _rng(name)))
+        if len(examples) < 2:  # two classes
+            raise ValueError(f"{self.card.name}: training shows {len(examples)} locations, expected two at least")
+        return fitted(examples, shrinkage=self.numbers["shrinkage"], size=int(self.numbers["size"])).to_text()
 
-    def _of_views(self, ground: Ground, pairs: Sequence[tuple[Query, Truth]]) -> Iterator["Lesson"]:
-        """Yield the lessons of each location that views of training show."""
+    def _of_views(self, ground: Ground, pairs: Sequence[tuple[Query, Truth]]) -> Iterator["TrainingExample"]:
+        """Yield the examples of each location that views of training show."""
         by_place: dict[tuple[float, float], list[tuple[Evidence, Pose]]] = {}
         for query, truth in pairs:
             if truth.pose is not None:
@@ -345,12 +345,14 @@ class EmbeddingMatcher(PlaceMatcher[Sight]):
             )
             level = self.heights.index(1.0) * len(shown) + np.arange(len(shown))
             errors = seen[level] - tiles[np.arange(len(shown)) % self.copies]
-            yield Lesson(rows=np.concatenate([tiles, seen]).astype(np.float16), errors=errors.astype(np.float16))
+            yield TrainingExample(
+                rows=np.concatenate([tiles, seen]).astype(np.float16), errors=errors.astype(np.float16)
+            )
 
     def _of_others(
         self, ground: Ground, grid: Grid, count: int, errors: Stored, rng: np.random.Generator
     ) -> Iterator[Stored]:
-        """Yield the lessons of locations anywhere on a map, seen from near their middles with such errors."""
+        """Yield the examples of locations anywhere on a map, seen from near their middles with such errors."""
         west_m, south_m, east_m, north_m = grid.bounds_m
         for _ in range(count):
             place_m = rng.uniform((west_m, south_m), (east_m, north_m))
@@ -384,7 +386,7 @@ def _from_height(evidence: Evidence, height: float) -> Evidence:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lesson:
+class TrainingExample:
     """Descriptors of one location: its tile and copies of it, then views; and how views differ from the tile there."""
 
     rows: Stored

@@ -30,7 +30,7 @@ _FORMAT: Final = f"{NAME} 1"
 _WIDTH: Final = 24  # channels between two convolutions
 _USUAL_M2: Final = 16_000.0  # that a view knows
 
-_PLACES: Final = 96  # a side of the square of places that a true one is told from
+_PLACES: Final = 96  # a side of the square of places that a true one is compared with
 _HEADINGS: Final = 12
 _LOOKS_EACH: Final = 4  # at a view, on average: more make it surer of the places it learns from, and worse on others
 _MOST_LOOKS: Final = 600
@@ -71,9 +71,9 @@ class Encoders:
         present, absent = view[: len(self.classes)], view[len(self.classes) :]
         each = present + absent
         known = each.amax(dim=0)
-        told = self._encoded("view", self.torch.cat([self._unusual(present, each), each]))
-        confidence = self.torch.sigmoid(told[CHANNELS])
-        return self.torch.cat([told[:CHANNELS] * confidence * known, known[None]])
+        reported = self._encoded("view", self.torch.cat([self._unusual(present, each), each]))
+        confidence = self.torch.sigmoid(reported[CHANNELS])
+        return self.torch.cat([reported[:CHANNELS] * confidence * known, known[None]])
 
     def features(self, mapped: Tensor, has: Tensor) -> Tensor:
         """Return the channels of a map, and its known cells.
@@ -124,8 +124,8 @@ def shapes(classes: int) -> dict[str, tuple[int, ...]]:
     ((24, 26, 3, 3), 19877)
     """
     found: dict[str, tuple[int, ...]] = {"usual": (2, classes), "sharpness": (2,)}
-    for side, given, told in (("view", 2 * classes, CHANNELS + 1), ("map", classes + 1, CHANNELS)):
-        for level, (into, out, size) in enumerate(((given, _WIDTH, 3), (_WIDTH, _WIDTH, 3), (_WIDTH, told, 1))):
+    for side, given, reported in (("view", 2 * classes, CHANNELS + 1), ("map", classes + 1, CHANNELS)):
+        for level, (into, out, size) in enumerate(((given, _WIDTH, 3), (_WIDTH, _WIDTH, 3), (_WIDTH, reported, 1))):
             found[f"{side}.{level}.kernel"] = (out, into, size, size)
             found[f"{side}.{level}.shift"] = (out,)
         found[f"{side}.straight.kernel"] = (CHANNELS, given, 1, 1)
@@ -312,7 +312,7 @@ def shares(planes: NDArray[np.uint8]) -> Floats:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Lesson:
+class TrainingExample:
     """A view, and the map around the place where it was taken.
 
     Parameters
@@ -369,7 +369,7 @@ class Lesson:
 class Scene:
     """A view and a square of map, which holds all of the view from each of its places, and `MARGIN` cells more.
 
-    `place`, row and column, counts from the centre of the first place; the rest is as in `Lesson`, shares
+    `place`, row and column, counts from the centre of the first place; the rest is as in `TrainingExample`, shares
     0..1.
     """
 
@@ -421,50 +421,50 @@ class Scene:
         return replace(self, view=view)
 
 
-def fitted(torch: Any, classes: tuple[str, ...], lessons: Sequence[Lesson]) -> Weights:  # noqa: ANN401 - a module
+def fitted(torch: Any, classes: tuple[str, ...], examples: Sequence[TrainingExample]) -> Weights:  # noqa: ANN401 - a module
     """Return the weights under which the true poses of views are least surprising, by AdamW.
 
-    The rate of learning rises, then falls as a cosine. The same lessons give the same weights on one machine and
+    The rate of learning rises, then falls as a cosine. The same examples give the same weights on one machine and
     thread: what is drawn depends on the names of views alone.
     """
-    weights = drawn_weights(len(classes)) | {"usual": usual_shares(lessons)}
+    weights = drawn_weights(len(classes)) | {"usual": usual_shares(examples)}
     arrays = {name: torch.tensor(values, requires_grad=name != "usual") for name, values in weights.items()}
     kernels = [values for name, values in arrays.items() if name.endswith(".kernel")]
     others = [values for name, values in arrays.items() if name.endswith((".shift", "sharpness"))]
     groups = [{"params": kernels, "weight_decay": _DECAY}, {"params": others, "weight_decay": 0.0}]
     optimizer = torch.optim.AdamW(groups, lr=_RATE)
     encoders = Encoders(torch=torch, classes=classes, arrays=arrays)
-    steps = max(1, min(_MOST_LOOKS, _LOOKS_EACH * len(lessons)) // _BATCH)
-    looks = _looks(lessons)
+    steps = max(1, min(_MOST_LOOKS, _LOOKS_EACH * len(examples)) // _BATCH)
+    looks = _looks(examples)
     for step in range(steps):
         for group in optimizer.param_groups:
             # 0.05 of all steps, in which the rate rises
             group["lr"] = _RATE * min((step + 1) / (0.05 * steps + 1), (1 + math.cos(math.pi * step / steps)) / 2)
         optimizer.zero_grad(set_to_none=True)
         for _ in range(_BATCH):
-            lesson, rng = next(looks)
-            (surprise(encoders, lesson.scene(rng), torch.from_numpy(lesson.has), rng) / _BATCH).backward()
+            example, rng = next(looks)
+            (surprise(encoders, example.scene(rng), torch.from_numpy(example.has), rng) / _BATCH).backward()
         torch.nn.utils.clip_grad_norm_([*kernels, *others], 5.0)  # norm of a gradient: a longer one is shortened to it
         optimizer.step()
     return {name: np.asarray(values.detach().numpy(), dtype=np.float32) for name, values in arrays.items()}
 
 
-def usual_shares(lessons: Sequence[Lesson]) -> Floats:
-    """Return mean and standard deviation of each class over known cells of the maps of lessons, shape (2, K)."""
-    sums = np.zeros((3, len(lessons[0].has)))
-    for lesson in lessons:
-        known = shares(lesson.mapped[:-1, lesson.mapped[-1] > 0])
-        sums += lesson.has * np.stack([known.sum(axis=1), (known**2).sum(axis=1), np.full(len(known), known.shape[1])])
+def usual_shares(examples: Sequence[TrainingExample]) -> Floats:
+    """Return mean and standard deviation of each class over known cells of the maps of examples, shape (2, K)."""
+    sums = np.zeros((3, len(examples[0].has)))
+    for example in examples:
+        known = shares(example.mapped[:-1, example.mapped[-1] > 0])
+        sums += example.has * np.stack([known.sum(axis=1), (known**2).sum(axis=1), np.full(len(known), known.shape[1])])
     mean, square = sums[:2] / np.maximum(sums[2], 1)
     # 0.01: least spread of a class: one that maps hardly hold would count without bounds
     return np.stack([mean, np.sqrt(np.maximum(square - mean**2, 0.01**2))]).astype(np.float32)
 
 
-def _looks(lessons: Sequence[Lesson]) -> Iterator[tuple[Lesson, np.random.Generator]]:
+def _looks(examples: Sequence[TrainingExample]) -> Iterator[tuple[TrainingExample, np.random.Generator]]:
     round_of = 0
     while True:
-        for lesson in sorted(lessons, key=lambda one: seed_of(f"{one.name} {round_of}")):
-            yield lesson, np.random.default_rng(seed_of(f"{lesson.name} {round_of} look"))
+        for example in sorted(examples, key=lambda one: seed_of(f"{one.name} {round_of}")):
+            yield example, np.random.default_rng(seed_of(f"{example.name} {round_of} look"))
         round_of += 1
 
 

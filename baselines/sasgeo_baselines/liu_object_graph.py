@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 
 from sasgeo_baselines.global_descriptor import lattice_m
-from sasgeo_baselines.object_matcher import FEWEST, LEFT_OUT, Floats, Ints, Sight, fitted
+from sasgeo_baselines.object_matcher import FEWEST, LEFT_OUT, Floats, Ints, PreparedView, fitted
 from sasgeo_baselines.place_matcher import PlaceMatcher
 from sasgeo_bench import (
     NODE_KINDS,
@@ -39,7 +39,7 @@ SAMPLES: Final = 200  # of three matches: with half of them wrong, all fail with
 
 
 @dataclass(frozen=True, kw_only=True)
-class Objects(Sight):
+class Objects(PreparedView):
     """Objects of a view, with what of it is known."""
 
     seen: ObservedGraph

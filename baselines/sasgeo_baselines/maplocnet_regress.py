@@ -40,7 +40,7 @@ COARSE_M: Final = 16.0  # of a cell of the surface: leaves a residual that a fin
 YAW_STEP_DEG: Final = 10.0  # moves the rim of a view by a cell of the surface
 LEAST_SHARE: Final = 0.5  # of the view's known cells that the map must know
 REACH: Final = 2  # cells to each side of the highest one whose scores are read, and one heading
-MOST_LESSONS: Final = 400
+MOST_EXAMPLES: Final = 400
 
 _FULL: Final = 255
 _FORMAT: Final = "maplocnet_regress 1"
@@ -62,7 +62,7 @@ class Peak:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """Template of a view, the number of classes known in each of its cells, and what is known of its pose."""
 
     template: Template
@@ -76,7 +76,7 @@ class Sight:
         return [base.yaw_deg + 90.0 * quarter for quarter in range(turns.quarters) for base in turns.bases]
 
 
-class MaplocnetRegress(PlaceMatcher[Sight]):
+class MaplocnetRegress(PlaceMatcher[PreparedView]):
     """Highest cell of a coarse surface, moved by a residual that is linear in the scores around it."""
 
     open_numbers = {"penalty": (0.1, 1.0, 10.0, 100.0, 1000.0, 10000.0)}  # of squared coefficients
@@ -114,15 +114,15 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
         self._factor = max(1, round(COARSE_M / self._field.grid.cell_size_m))
         self._field.level(self._factor)
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Return the template of a view; None where it shares no class with the map."""
         seen = query.evidence
         if not any(name in self._classes for name in seen.classes):
             return None
         template, counts = templates_of(seen, self._classes)
-        return Sight(template=template, counts=counts, prior=query.prior)
+        return PreparedView(template=template, counts=counts, prior=query.prior)
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the regressed pose alone."""
         del count
         peak = self.peak(view, disc)
@@ -140,7 +140,7 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
         )
         return [replace(peak.mode, pose=moved)]
 
-    def peak(self, view: Sight, disc: Disc) -> Peak | None:
+    def peak(self, view: PreparedView, disc: Disc) -> Peak | None:
         """Return the highest cell within a disc, or the nearest one to its middle."""
         west_m, south_m, east_m, north_m = self._field.grid.bounds_m
         center_m = disc.center_m or ((west_m + east_m) / 2, (south_m + north_m) / 2)
@@ -168,7 +168,7 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
     def learn(self, training: Training) -> str:
         """Return the coefficients, as JSON."""
         pairs = [pair for pair in training.pairs if pair[0].track == "localization" and pair[1].pose is not None]
-        chosen = sorted(pairs[:: -(-len(pairs) // MOST_LESSONS) or 1], key=lambda pair: pair[0].region)
+        chosen = sorted(pairs[:: -(-len(pairs) // MOST_EXAMPLES) or 1], key=lambda pair: pair[0].region)
         parts, residuals = [np.zeros((0, _SHAPE[0]))], [np.zeros((0, _SHAPE[1]))]
         for name, some in groupby(chosen, key=lambda pair: pair[0].region):
             self.prepare(training.regions[name], None)
@@ -179,7 +179,7 @@ class MaplocnetRegress(PlaceMatcher[Sight]):
                 place_m = (truth.pose.easting_m, truth.pose.northing_m)
                 peak = self.peak(view, Disc(center_m=place_m, radius_m=REACH * COARSE_M))
                 if peak is not None:
-                    turned, missed = lessons(peak, truth.pose)
+                    turned, missed = examples(peak, truth.pose)
                     # 1.5 cells or steps: a larger residual belongs to another peak, of which the part does not tell
                     if np.abs(missed).max() <= 1.5:
                         parts.append(turned)
@@ -253,14 +253,14 @@ def peak_of(scores: Floats, grid: Grid, yaws_deg: Floats, disc: Disc) -> Peak | 
     return Peak(mode=Mode(pose=pose, score=float(scores[yaw, row, col])), part=part / max(float(part.std()), 1e-9))
 
 
-def lessons(peak: Peak, truth: Pose) -> tuple[Floats, Floats]:
+def examples(peak: Peak, truth: Pose) -> tuple[Floats, Floats]:
     """Return the part of the surface as four rows, turned by right angles, and the residuals that belong to them.
 
     A true place to the east of the cell is one to the north of it, once the surface is turned counter-clockwise:
 
     >>> here = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=350.0)
     >>> peak = Peak(mode=Mode(pose=here, score=1.0), part=np.zeros((3, 5, 5)))
-    >>> lessons(peak, replace(here, easting_m=8.0, yaw_deg=355.0))[1][:2].tolist()
+    >>> examples(peak, replace(here, easting_m=8.0, yaw_deg=355.0))[1][:2].tolist()
     [[0.5, 0.0, 0.5], [0.0, 0.5, 0.5]]
     """
     pose = peak.mode.pose

@@ -27,7 +27,7 @@ from sasgeo_bench import (
     turns_of,
 )
 
-FEWEST: Final = 3  # objects of a view that can be told from chance
+FEWEST: Final = 3  # objects of a view that differ from chance
 CELL_M: Final = 8.0  # of votes
 PEAKS_APART_M: Final = 25.0  # neighbouring cells and headings of one place are one peak
 # Ends of roads are gaps of perception more often than ends; bends of rivers lie nowhere in particular.
@@ -40,7 +40,7 @@ Ints = NDArray[np.int64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """Objects of a view, (right, up) of its middle, and what is known of its heading."""
 
     nodes: Nodes
@@ -62,7 +62,7 @@ class Sight:
         return bool(allowed(np.array([[pose.easting_m, pose.northing_m, pose.yaw_deg]]), self.prior, disc)[0])
 
 
-class ObjectMatcher(PlaceMatcher[Sight]):
+class ObjectMatcher(PlaceMatcher[PreparedView]):
     """A matcher of objects: buildings, patches of ground, junctions and crossings, as the scorer's graph has them."""
 
     def read(self, region: Region, learned: str | None) -> None:
@@ -70,17 +70,17 @@ class ObjectMatcher(PlaceMatcher[Sight]):
         del learned
         self.mapped = MappedGraph.of(region)
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Return the whole objects of a view; None if they are fewer than three."""
         seen = ObservedGraph.of(query)
         nodes = seen.nodes.taken(~seen.is_cut & ~np.isin(seen.nodes.kind, LEFT_OUT))
-        return Sight(nodes=nodes, prior=query.prior) if len(nodes) >= FEWEST else None
+        return PreparedView(nodes=nodes, prior=query.prior) if len(nodes) >= FEWEST else None
 
-    def within(self, sight: Sight, disc: Disc) -> Ints:
+    def within(self, view: PreparedView, disc: Disc) -> Ints:
         """Return rows of the nodes of the map that a view from a disc may show."""
         if disc.center_m is None:
             return np.arange(len(self.mapped.nodes))
-        return self.mapped.around(np.array(disc.center_m), disc.radius_m + sight.reach_m)
+        return self.mapped.around(np.array(disc.center_m), disc.radius_m + view.reach_m)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -97,16 +97,16 @@ class Pairs:
     weight: Floats
 
     @classmethod
-    def of_kind(cls, sight: Sight, nodes: Nodes, rows: Ints) -> "Pairs":
+    def of_kind(cls, view: PreparedView, nodes: Nodes, rows: Ints) -> "Pairs":
         """Pair objects of one kind; a kind that is rare among the rows weighs more: by the logarithm of its share."""
-        mine, theirs = sight.nodes.kind, nodes.kind[rows]
+        mine, theirs = view.nodes.kind, nodes.kind[rows]
         counts = np.bincount(theirs, minlength=int(max(mine.max(initial=0), theirs.max(initial=0))) + 1)
         seen, at = np.nonzero(mine[:, None] == theirs[None, :])
         weight = np.log1p(len(rows) / np.maximum(counts[mine[seen]], 1))
         return cls(
             seen=seen,
             mapped=rows[at],
-            seen_m=sight.nodes.places_m[seen],
+            seen_m=view.nodes.places_m[seen],
             mapped_m=nodes.places_m[rows[at]],
             weight=weight,
         )

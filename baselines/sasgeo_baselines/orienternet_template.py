@@ -20,8 +20,8 @@ from sasgeo_baselines.learned_template import (
     NAME,
     Encoders,
     Floats,
-    Lesson,
     Tensor,
+    TrainingExample,
     agreement,
     cut,
     fitted,
@@ -56,7 +56,7 @@ from sasgeo_bench import (
 )
 
 APART_M: Final = 25.0  # between two modes; and the mass of a mode lies within
-MOST_LESSONS: Final = 200
+MOST_EXAMPLES: Final = 200
 
 _TILE: Final = 256  # places a side of a tile: bounds the memory of the transforms
 _ENCODED: Final = 256  # cells a side of a piece of map that is encoded at a time
@@ -80,7 +80,7 @@ class Peak(Mode):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """Template of a view (`Encoders.template`), the size of its cells, and what is known of its pose."""
 
     template: Tensor
@@ -283,7 +283,7 @@ class FeatureMap:
         return cut(self.layers, square.row - half, square.col - half, (side, side)).astype(np.float32)
 
 
-class OrienternetTemplate(PlaceMatcher[Sight]):
+class OrienternetTemplate(PlaceMatcher[PreparedView]):
     """Posterior over places and headings from a learned template of the view and learned channels of the map."""
 
     card = MatcherCard(
@@ -325,7 +325,7 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         self._classes = [name for name, there in zip(classes, has, strict=True) if there]
         self._map = FeatureMap.of(self._encoders, planes, has, grid)
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Return the template of a view; None where it knows no class of the map."""
         view, cells_m = view_planes(query.evidence, self._encoders.classes)
         at = [self._encoders.classes.index(name) for name in self._classes]
@@ -334,18 +334,18 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         torch = self._encoders.torch
         with torch.inference_mode():
             template = self._encoders.template(torch.from_numpy(shares(view)))
-        return Sight(template=template, cells_m=cells_m, prior=query.prior)
+        return PreparedView(template=template, cells_m=cells_m, prior=query.prior)
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the best modes of the posterior within a disc."""
         return list(self.posterior(view, list(self._map.squares(disc))).peaks(count))
 
-    def near(self, view: Sight, poses: Sequence[Pose]) -> list[Mode | None]:
+    def near(self, view: PreparedView, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best pose near each candidate, of one posterior around all of them."""
         posterior = self.posterior(view, [self._map.around(pose) for pose in poses])
         return [posterior.best(surface) for surface in posterior.surfaces]
 
-    def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
+    def diagnostics(self, view: PreparedView, found: Sequence[Mode]) -> dict[str, float]:
         """Return the probability around the first mode, and the entropy of the place."""
         del view
         first = found[0]
@@ -357,7 +357,7 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         mass = found.diagnostics.get("posterior_mass")
         return found if mass is None else replace(found, confidence=mass)
 
-    def posterior(self, view: Sight, squares: Sequence[Square]) -> Posterior:
+    def posterior(self, view: PreparedView, squares: Sequence[Square]) -> Posterior:
         """Return the posterior over squares of places, all of one size."""
         torch, yaws_deg = self._encoders.torch, view.yaws_deg
         with torch.inference_mode():
@@ -365,7 +365,7 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
                 self._add(view, squares, yaws_deg[first : first + _HEADINGS_KEPT], first)
         return Posterior(surfaces=[square.surface() for square in squares], yaws_deg=yaws_deg)
 
-    def _add(self, view: Sight, squares: Sequence[Square], yaws_deg: Sequence[float], first: int) -> None:
+    def _add(self, view: PreparedView, squares: Sequence[Square], yaws_deg: Sequence[float], first: int) -> None:
         torch, step_m = self._encoders.torch, self._map.grid.cell_size_m
         half, places = half_of(view.template.shape[1:], view.cells_m, step_m), squares[0].grid.rows
         side = places + 2 * half
@@ -388,18 +388,18 @@ class OrienternetTemplate(PlaceMatcher[Sight]):
         """Return the weights that views with true poses teach, as text."""
         torch = torch_module(self.card.name)
         pairs = [(query, truth) for query, truth in training.pairs if truth.is_present and truth.pose is not None]
-        chosen = sorted(pairs[:: -(-len(pairs) // MOST_LESSONS) or 1], key=lambda pair: pair[0].region)
+        chosen = sorted(pairs[:: -(-len(pairs) // MOST_EXAMPLES) or 1], key=lambda pair: pair[0].region)
         classes = tuple(dict.fromkeys(name for query, _ in chosen for name in query.evidence.classes))
-        lessons = [
-            lesson
+        examples = [
+            example
             for name, some in groupby(chosen, key=lambda pair: pair[0].region)
-            for lesson in lessons_of(training.regions[name], list(some), classes)
+            for example in examples_of(training.regions[name], list(some), classes)
         ]
-        if not lessons:
+        if not examples:
             raise ValueError(
                 f"{self.card.name}: no view of training lies on its map and knows a class of it: name other tasks"
             )
-        return weights_text(classes, fitted(torch, classes, lessons))
+        return weights_text(classes, fitted(torch, classes, examples))
 
 
 def view_planes(seen: Evidence, classes: Sequence[str]) -> tuple[Planes, tuple[float, float]]:
@@ -435,7 +435,9 @@ def map_planes(region: Region, classes: Sequence[str]) -> tuple[Planes, Floats, 
     return planes, has, field.grid
 
 
-def lessons_of(region: Region, pairs: Sequence[tuple[Query, Truth]], classes: Sequence[str]) -> Iterator[Lesson]:
+def examples_of(
+    region: Region, pairs: Sequence[tuple[Query, Truth]], classes: Sequence[str]
+) -> Iterator[TrainingExample]:
     """Yield what views teach, each with the part of the map around it: a whole country is never encoded.
 
     Views that know no class of the map are left out, and those whose place lies off it.
@@ -445,19 +447,19 @@ def lessons_of(region: Region, pairs: Sequence[tuple[Query, Truth]], classes: Se
         some = on_map[first : first + _CUT_AT_ONCE]
         parts = region.cuts([_box(query, truth, region.grid) for query, truth in some])
         for (query, truth), part in zip(some, parts, strict=True):
-            lesson = _lesson(part, query, _pose(truth), classes)
-            if lesson is not None:
-                yield lesson
+            example = _example(part, query, _pose(truth), classes)
+            if example is not None:
+                yield example
 
 
-def _lesson(part: Region, query: Query, pose: Pose, classes: Sequence[str]) -> Lesson | None:
+def _example(part: Region, query: Query, pose: Pose, classes: Sequence[str]) -> TrainingExample | None:
     """Return what a view teaches on a part of its map, if anything."""
     view, cells_m = view_planes(query.evidence, classes)
     mapped, has, grid = map_planes(part, classes)
     ((across, down),) = grid.to_uv(np.array([(pose.easting_m, pose.northing_m)])).tolist()
     if not mapped[-1, int(down), int(across)] or not view.reshape(2, len(classes), -1)[:, has > 0].any():
         return None
-    return Lesson(
+    return TrainingExample(
         name=query.query_id,
         view=view,
         cells_m=cells_m,

@@ -15,7 +15,7 @@ APART_M: Final = 25.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """A view as it is matched, and what is known of its pose."""
 
     seen: Seen
@@ -29,7 +29,7 @@ class Component(Mode):
     credibility: float
 
 
-class OuyangShapeVotes(PlaceMatcher[Sight]):
+class OuyangShapeVotes(PlaceMatcher[PreparedView]):
     """Components of the mixture of votes of a single view."""
 
     open_numbers = {"windows": (25, 50, 100), "bandwidth_m": (8.0, 12.0)}  # the most alike; of the mean shift of votes
@@ -68,12 +68,12 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
         west_m, south_m, east_m, north_m = region.grid.bounds_m
         self._reach_m = float(np.hypot(east_m - west_m, north_m - south_m) / 2)
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Return the buildings of a view; None where there is no whole one."""
         seen = Seen.of(query.evidence)
-        return Sight(seen=seen, prior=query.prior) if seen.is_judged else None
+        return PreparedView(seen=seen, prior=query.prior) if seen.is_judged else None
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the highest components of the mixture of the votes in a disc."""
         prior = view.prior
         # 180 degrees: standard deviation of a heading of which nothing is known
@@ -97,7 +97,7 @@ class OuyangShapeVotes(PlaceMatcher[Sight]):
         ]
         return thinned(found, APART_M, count)
 
-    def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
+    def diagnostics(self, view: PreparedView, found: Sequence[Mode]) -> dict[str, float]:
         """Return the credibility of the mixture, that around the first candidate in retrieval."""
         del view
         return {"credibility": found[0].credibility} if isinstance(found[0], Component) else {}

@@ -91,13 +91,13 @@ class PlaceMatcher(Tunable, ABC, Generic[View]):
             near = self.near(view, query.candidates)
             poses = [mode.pose if mode else pose for mode, pose in zip(near, query.candidates, strict=True)]
             best = sorted((mode for mode in near if mode), key=lambda mode: -mode.score)
-            told = self.diagnostics(view, best) if best else {}
+            reported = self.diagnostics(view, best) if best else {}
             scores = [mode.score if mode else None for mode in near]
-            return ranked_candidates(query, scores, top_k=top_k, poses=poses, diagnostics=told)
+            return ranked_candidates(query, scores, top_k=top_k, poses=poses, diagnostics=reported)
         disc = Disc(center_m=query.prior.center_m, radius_m=query.prior.radius_m or 0.0)
         found = self.modes(view, disc, count=max(2, min(top_k, MOST_PLACES)))
         if not found:
             return WITHHELD
         values = [mode.score for mode in found]
-        told = self.diagnostics(view, found) | ({"margin": values[0] - values[1]} if len(values) > 1 else {})
-        return Match(poses=[mode.pose for mode in found][:top_k], scores=values[:top_k], diagnostics=told)
+        reported = self.diagnostics(view, found) | ({"margin": values[0] - values[1]} if len(values) > 1 else {})
+        return Match(poses=[mode.pose for mode in found][:top_k], scores=values[:top_k], diagnostics=reported)

@@ -128,14 +128,14 @@ def vertices(before: Floats, here: Floats, after: Floats) -> NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """A view as it is matched, and what is known of its pose."""
 
     context: Context
     prior: Prior
 
 
-class PolarVsc(PlaceMatcher[Sight]):
+class PolarVsc(PlaceMatcher[PreparedView]):
     """Two stages: rings with the heading marginalised, gated by a test; then sectors."""
 
     open_numbers = {
@@ -179,12 +179,12 @@ class PolarVsc(PlaceMatcher[Sight]):
         del learned
         self._map = ContextMap.of(region)
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Describe a view; None where it knows no class that the map has."""
         context = Context.of_view(query.evidence, self._map.is_used)
-        return Sight(context=context, prior=query.prior) if context.sectors.known.any() else None
+        return PreparedView(context=context, prior=query.prior) if context.sectors.known.any() else None
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the best correlations of sectors around the places whose rings are alike."""
         start = self._turned(view, self._map.places_m[self._shortlist(view, disc)])
         # 16 places around which the best one is searched
@@ -194,7 +194,7 @@ class PolarVsc(PlaceMatcher[Sight]):
         wide = disc.wider(CELL_M)
         return thinned((mode for mode in found if wide.has(mode.pose)), APART_M, count)
 
-    def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
+    def diagnostics(self, view: PreparedView, found: Sequence[Mode]) -> dict[str, float]:
         """Return the least p-value of the rings at the best place, and the share of rings that pass there."""
         best = found[0].pose
         here = self._map.at(np.array([[best.easting_m, best.northing_m]])).rings
@@ -202,7 +202,7 @@ class PolarVsc(PlaceMatcher[Sight]):
         least = np.min(p_values, initial=1.0, where=np.isfinite(p_values))
         return {"ks_p": float(least), "ks_share": float(passing_share(p_values, self.numbers["alpha"])[0])}
 
-    def _shortlist(self, view: Sight, disc: Disc) -> Ints:
+    def _shortlist(self, view: PreparedView, disc: Disc) -> Ints:
         """Return the places in a disc where most rings pass the test, and of these the most similar by their rings."""
         near = np.flatnonzero(disc.wider(STRIDE * CELL_M).holds(self._map.places_m))
         seen = view.context.rings
@@ -220,7 +220,7 @@ class PolarVsc(PlaceMatcher[Sight]):
         passing = np.flatnonzero(share == share.max(initial=0.0))
         return near[passing[np.argsort(away[passing], kind="stable")[:200]]]  # places whose sectors are compared
 
-    def _turned(self, view: Sight, places_m: NDArray[np.float64]) -> list[Mode]:
+    def _turned(self, view: PreparedView, places_m: NDArray[np.float64]) -> list[Mode]:
         """Return places with their best headings, best first; without those of which the map knows too little."""
         if not len(places_m):
             return []

@@ -112,7 +112,7 @@ def same_arms(ours_deg: Floats, theirs_deg: Floats, *, turn_deg: float, least: i
 
 
 @dataclass(frozen=True, kw_only=True)
-class RoadSight:
+class RoadView:
     """Pairs of junctions of a view, by kind, its roads, and what is known of its heading."""
 
     pairs: dict[int, Tuples]
@@ -120,7 +120,7 @@ class RoadSight:
     prior: Prior
 
 
-class Road2Rit(PlaceMatcher[RoadSight]):
+class Road2Rit(PlaceMatcher[RoadView]):
     """Tuples of two junctions with tangents give poses; the roads around decide between them."""
 
     open_numbers = {
@@ -165,7 +165,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         self._pairs = {kind: Tuples.of(nodes, kind) for kind in JUNCTIONS}
         self._roads = MappedRoads.of(region)
 
-    def look(self, query: Query) -> RoadSight | None:
+    def look(self, query: Query) -> RoadView | None:
         """Return the junctions and the roads of a view; None if it has no pair of whole junctions, or hardly a road."""
         seen = ObservedGraph.of(query)
         nodes, roads = seen.nodes.taken(~seen.is_cut), SeenRoads.of(query)
@@ -173,24 +173,24 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         # At least 20 points along roads of a view
         if not any(len(found.length_m) for found in pairs.values()) or len(roads.points_m) < 20:
             return None
-        return RoadSight(pairs=pairs, roads=roads, prior=query.prior)
+        return RoadView(pairs=pairs, roads=roads, prior=query.prior)
 
-    def modes(self, view: RoadSight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: RoadView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses whose roads agree best."""
         return self._tested(view, self.poses(view, disc), disc)[:count]
 
-    def near(self, view: RoadSight, poses: Sequence[Pose]) -> list[Mode | None]:
+    def near(self, view: RoadView, poses: Sequence[Pose]) -> list[Mode | None]:
         """Return the best pose near each candidate; tuples are looked up once for all."""
         found = self.poses(view, Disc(center_m=None, radius_m=0.0))
         discs = [Disc(center_m=(pose.easting_m, pose.northing_m), radius_m=AROUND_M) for pose in poses]
         tested = (self._tested(view, found[allowed(found, view.prior, disc)], disc) for disc in discs)
         return [next(iter(modes), None) for modes in tested]
 
-    def poses(self, view: RoadSight, disc: Disc) -> Floats:
+    def poses(self, view: RoadView, disc: Disc) -> Floats:
         """Return the poses that tuples of the view and of the map name and the prior allows, shape (V, 3)."""
         return np.concatenate([np.zeros((0, 3)), *self._hypotheses(view, disc)])
 
-    def _hypotheses(self, view: RoadSight, disc: Disc) -> Iterator[Floats]:
+    def _hypotheses(self, view: RoadView, disc: Disc) -> Iterator[Floats]:
         turn_deg, bearings = self.numbers["turn_deg"], int(self.numbers["bearings"])
         for kind, ours in view.pairs.items():
             # 8 m of a length, or two standard deviations of the scale if that is more
@@ -206,7 +206,7 @@ class Road2Rit(PlaceMatcher[RoadSight]):
                         may = may[same_arms(own_deg, theirs.arms_deg[may, end], turn_deg=turn_deg, least=bearings)]
                     yield poses[may]
 
-    def _tested(self, view: RoadSight, poses: Floats, disc: Disc) -> list[Mode]:
+    def _tested(self, view: RoadView, poses: Floats, disc: Disc) -> list[Mode]:
         if not len(poses):
             return []
         points_m = view.roads.points_m
@@ -219,6 +219,6 @@ class Road2Rit(PlaceMatcher[RoadSight]):
         settled = [self._roads.settled(view.roads, mode.pose, disc.wider(SLACK_M)) for mode in best]
         return thinned(self._judged(view, settled), APART_M)
 
-    def _judged(self, view: RoadSight, poses: Sequence[Pose]) -> list[Mode]:
+    def _judged(self, view: RoadView, poses: Sequence[Pose]) -> list[Mode]:
         modes = [Mode(pose=pose, score=round(self._roads.agreement(view.roads, pose), 9)) for pose in poses]
         return sorted(modes, key=lambda mode: -mode.score)

@@ -280,17 +280,17 @@ class PopovRoadplane(Tunable):
         if not first.poses:
             return first
         found = self.alignment(query, first.poses[:STARTS])
-        told = {} if found is None else {"borders": found.share, "borders_before": found.before}
+        reported = {} if found is None else {"borders": found.share, "borders_before": found.before}
         answer = first
         least_share, least_gain = self.numbers["least_share"], self.numbers["least_gain"]
         if found is not None and found.share >= max(least_share, found.before + least_gain):
             answer = _better(first, self.inner.match(self._again(query, found), top_k=top_k), query)
-        told["is_straightened"] = float(answer is not first)
+        reported["is_straightened"] = float(answer is not first)
         return replace(
             answer,
             poses=answer.poses[:top_k],
             scores=answer.scores[:top_k],
-            diagnostics={**answer.diagnostics, **told},
+            diagnostics={**answer.diagnostics, **reported},
         )
 
     def _again(self, query: Query, found: Alignment) -> Query:

@@ -7,7 +7,7 @@ from typing import Final
 import networkx as nx  # type: ignore[import-untyped, unused-ignore]
 import numpy as np
 
-from sasgeo_baselines.object_matcher import Floats, Ints, ObjectMatcher, Pairs, Sight, fitted
+from sasgeo_baselines.object_matcher import Floats, Ints, ObjectMatcher, Pairs, PreparedView, fitted
 from sasgeo_bench import Disc, MatcherCard, Mode, Pose, thinned
 
 YAW_STEP_DEG: Final = 5.0
@@ -51,7 +51,7 @@ class SpatialGraphClique(ObjectMatcher):
         ),
     )
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses of the largest cliques."""
         pairs = Pairs.of_kind(view, self.mapped.nodes, self.within(view, disc))
         found = []
@@ -76,7 +76,7 @@ class SpatialGraphClique(ObjectMatcher):
         fit, error_m = fitted(pairs.seen_m[clique], pairs.mapped_m[clique])
         return Mode(pose=fit, score=len(clique) + 0.5 / (1.0 + error_m))
 
-    def diagnostics(self, view: Sight, found: Sequence[Mode]) -> dict[str, float]:
+    def diagnostics(self, view: PreparedView, found: Sequence[Mode]) -> dict[str, float]:
         """Return the size of the largest clique."""
         del view
         return {"inliers": float(int(found[0].score))}

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from sasgeo_baselines.object_matcher import LEFT_OUT, Sight
+from sasgeo_baselines.object_matcher import LEFT_OUT, PreparedView
 from sasgeo_baselines.place_matcher import PlaceMatcher
 from sasgeo_baselines.pose_votes import Floats, Ints, Votes, allowed, rigid_poses
 from sasgeo_baselines.roads import view_grid
@@ -117,13 +117,13 @@ def objects_of(nodes: Nodes) -> Nodes:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PatternSight(Sight):
+class PatternView(PreparedView):
     """Objects of a view, and the patterns of those whose neighbours are all seen."""
 
     patterns: Patterns
 
 
-class StfmCentroids(PlaceMatcher[PatternSight]):
+class StfmCentroids(PlaceMatcher[PatternView]):
     """Objects match by the pattern of their neighbours; matches vote for poses."""
 
     open_numbers = {
@@ -174,7 +174,7 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         """Keep the objects of a map."""
         self._nodes = objects_of(nodes)
 
-    def look(self, query: Query) -> PatternSight | None:
+    def look(self, query: Query) -> PatternView | None:
         """Return the objects of a view and their patterns; None if no object has all its neighbours in view."""
         seen = ObservedGraph.of(query)
         nodes = objects_of(seen.nodes.taken(~seen.is_cut))
@@ -184,14 +184,14 @@ class StfmCentroids(PlaceMatcher[PatternSight]):
         is_whole = found.reach_m < clear_m(query.evidence, found.corners_m[:, 0])
         if not is_whole.any():
             return None
-        return PatternSight(nodes=nodes, prior=query.prior, patterns=found.some(np.flatnonzero(is_whole)))
+        return PatternView(nodes=nodes, prior=query.prior, patterns=found.some(np.flatnonzero(is_whole)))
 
-    def modes(self, view: PatternSight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PatternView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses that most matches vote for."""
         crowds = self.votes(view, disc).crowds(count=24)  # poses that most matches vote for
         return thinned((crowd.mode for crowd in crowds), APART_M, count)
 
-    def votes(self, view: PatternSight, disc: Disc) -> Votes:
+    def votes(self, view: PatternView, disc: Disc) -> Votes:
         """Return the poses of the most alike objects that the prior allows."""
         within = disc.wider(view.reach_m).holds(self._nodes.places_m)
         nodes = self._nodes.taken(within & np.isin(self._nodes.kind, view.nodes.kind))

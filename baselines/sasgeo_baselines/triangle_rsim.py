@@ -10,7 +10,7 @@ from typing import Final, Self
 import numpy as np
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
-from sasgeo_baselines.object_matcher import FEWEST, Sight, fitted
+from sasgeo_baselines.object_matcher import FEWEST, PreparedView, fitted
 from sasgeo_baselines.place_matcher import PlaceMatcher
 from sasgeo_baselines.pose_votes import Floats, Ints, Votes, allowed, rigid_poses
 from sasgeo_bench import (
@@ -120,14 +120,14 @@ def differences(ratio: float, log_area: float) -> Floats:
 
 
 @dataclass(frozen=True, kw_only=True)
-class BuildingSight(Sight):
+class BuildingView(PreparedView):
     """Whole buildings of a view, all of one kind of node, and a comparison of its building cells with the map's."""
 
     kind: int
     check: PoseCheck
 
 
-class TriangleRsim(PlaceMatcher[BuildingSight]):
+class TriangleRsim(PlaceMatcher[BuildingView]):
     """Like triangles vote for poses; the overlap of all buildings decides between them."""
 
     open_numbers = {
@@ -175,7 +175,7 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
         self._nodes = {kind: nodes.taken(nodes.kind == kind) for kind in KINDS}
         self._triangles = {kind: Triangles.of(each.places_m, each.area_m2) for kind, each in self._nodes.items()}
 
-    def look(self, query: Query) -> BuildingSight | None:
+    def look(self, query: Query) -> BuildingView | None:
         """Return the whole buildings of a view; None if they are fewer than three."""
         if CLASS not in query.evidence.classes:
             return None
@@ -190,9 +190,9 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
             seen=query.evidence.layer(CLASS)[None],
             cell_size_m=query.evidence.cell_size_m,
         )
-        return BuildingSight(nodes=nodes, prior=query.prior, kind=kind, check=check)
+        return BuildingView(nodes=nodes, prior=query.prior, kind=kind, check=check)
 
-    def modes(self, view: BuildingSight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: BuildingView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses with most votes by the overlap of their buildings."""
         crowds = self.votes(view, disc).crowds(count=24)  # poses that most triangles vote for
         settled = (self._settled(view, crowd.mode.pose) for crowd in crowds)
@@ -200,12 +200,12 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
         modes = [Mode(pose=pose, score=round(view.check.agreement(pose), 9)) for pose in poses]
         return thinned(sorted(modes, key=lambda mode: -mode.score), APART_M, count)
 
-    def votes(self, view: BuildingSight, disc: Disc) -> Votes:
+    def votes(self, view: BuildingView, disc: Disc) -> Votes:
         """Return the poses of like triangles that the prior allows, the rarer a triangle the more weight."""
         cast = np.concatenate([np.zeros((0, 4)), *self._votes(view, disc)])
         return Votes.of(cast[:, :3], cast[:, 3])
 
-    def _votes(self, view: BuildingSight, disc: Disc) -> Iterator[Floats]:
+    def _votes(self, view: BuildingView, disc: Disc) -> Iterator[Floats]:
         nodes, theirs = self._nodes[view.kind], self._triangles[view.kind]
         middle_m = nodes.places_m[theirs.corners].mean(axis=1)
         within = np.flatnonzero(disc.wider(view.reach_m).holds(middle_m))
@@ -227,7 +227,7 @@ class TriangleRsim(PlaceMatcher[BuildingSight]):
             cast = np.column_stack([poses, np.log1p(len(within) / count)])
             yield cast[allowed(poses, view.prior, disc)]
 
-    def _settled(self, view: BuildingSight, pose: Pose) -> Pose:
+    def _settled(self, view: BuildingView, pose: Pose) -> Pose:
         """Fit a pose to the buildings that are the same from it: each the nearest of the other."""
         seen_m, places_m = view.nodes.places_m, self._nodes[view.kind].places_m
         around = Disc(center_m=(pose.easting_m, pose.northing_m), radius_m=view.reach_m + SAME_M)

@@ -17,7 +17,7 @@ from sasgeo_bench import PRESENT, UNKNOWN, Chart, Evidence, MatcherCard, Overlap
 
 FULL: Final = 255
 SHARP_CELLS: Final = 1.0  # standard deviation of the low-pass, in cells
-MOST_LESSONS: Final = 120
+MOST_EXAMPLES: Final = 120
 _NOTHING: Final = 1e-12
 
 
@@ -98,7 +98,7 @@ class VecmapPhasecorr(ShiftMatcher):
         """Return weights by how far each class stands out at the true places of views, as JSON."""
         found: dict[str, list[float]] = {}
         pairs = [pair for pair in training.pairs if pair[0].track == "localization" and pair[1].pose is not None]
-        step = max(1, len(pairs) // MOST_LESSONS)
+        step = max(1, len(pairs) // MOST_EXAMPLES)
         chosen = sorted(pairs[::step], key=lambda pair: pair[0].region)
         at = ""
         for query, truth in chosen:

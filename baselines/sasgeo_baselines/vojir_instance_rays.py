@@ -140,7 +140,7 @@ def open_ground(states: NDArray[np.uint8], *, cell_m: float, within_m: float) ->
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class PreparedView:
     """A view: its rays as they are compared, its waves, and what is known of its pose.
 
     `start_m` is where the rays begin, (right, up) of its middle.
@@ -152,7 +152,7 @@ class Sight:
     prior: Prior
 
 
-class VojirInstanceRays(PlaceMatcher[Sight]):
+class VojirInstanceRays(PlaceMatcher[PreparedView]):
     """Nearest places by waves of rays, then the turn and the place by the rays themselves."""
 
     open_numbers = {
@@ -218,7 +218,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         self._spread = spread_of(waves) if taught is None else taught
         self._waves = np.concatenate(waves) / self._spread
 
-    def look(self, query: Query) -> Sight | None:
+    def look(self, query: Query) -> PreparedView | None:
         """Cast rays from open ground at the middle of a view; None where they meet nothing."""
         seen = query.evidence
         if CLASS not in seen.classes:
@@ -233,9 +233,9 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         start_m = (start - np.array(seen.shape[::-1]) / 2) * (seen.cell_size_m, -seen.cell_size_m)
         few = cast(seen.layer(CLASS), start[None], INDEXED, cell_m=seen.cell_size_m)  # as on the map, for boundaries
         waves = Profiles.of(few, censors=self.censors).magnitudes()[0]
-        return Sight(profile=profile, waves=waves, start_m=start_m, prior=query.prior)
+        return PreparedView(profile=profile, waves=waves, start_m=start_m, prior=query.prior)
 
-    def modes(self, view: Sight, disc: Disc, *, count: int) -> list[Mode]:
+    def modes(self, view: PreparedView, disc: Disc, *, count: int) -> list[Mode]:
         """Return the poses with the least differences, from places with similar waves."""
         near = np.flatnonzero(disc.wider(float(np.hypot(*view.start_m)) + STEP_M).holds(self._places_m))
         away = np.square(self._waves[near] - view.waves / self._spread).sum(axis=1)
@@ -250,7 +250,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
         for places_m, rays in buildings.lattice(step, INDEXED):
             yield places_m, Profiles.of(rays, censors=self.censors).magnitudes()
 
-    def _turned(self, view: Sight, places_m: Points) -> list[Mode]:
+    def _turned(self, view: PreparedView, places_m: Points) -> list[Mode]:
         """Return the best pose whose rays begin at each place; minus infinity is the score of one that is not known."""
         turns = turns_within(view.prior, RAYS)
         mapped = Profiles.of(self._map.rays(places_m, RAYS), censors=self.censors)
@@ -264,7 +264,7 @@ class VojirInstanceRays(PlaceMatcher[Sight]):
             modes.append(Mode(pose=Pose(easting_m=east_m, northing_m=north_m, yaw_deg=yaw_deg), score=-off))
         return modes
 
-    def _refined(self, view: Sight, modes: list[Mode]) -> list[Mode]:
+    def _refined(self, view: PreparedView, modes: list[Mode]) -> list[Mode]:
         """Move each mode to the best place around it, in smaller and smaller steps."""
         for step_m in STEPS_M:
             around_m = step_m * np.array([(0, 0), *(way for way in product((-1, 0, 1), repeat=2) if any(way))])

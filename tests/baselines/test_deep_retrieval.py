@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from sasgeo_baselines.image import deep_retrieval
 from sasgeo_baselines.image.deep_retrieval import DeepRetrieval
-from sasgeo_baselines.image.sight import Ortho
+from sasgeo_baselines.image.view_image import Ortho
 from sasgeo_baselines.segmenters.features import ColourBalance, lab_planes
 
 from sasgeo_bench.geometry.grid import Grid

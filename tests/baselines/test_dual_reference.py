@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from sasgeo_baselines.image import hu_dual_reference
 from sasgeo_baselines.image.hu_dual_reference import (
-    MOST_LESSONS,
+    MOST_EXAMPLES,
     SHARES,
     HuDualReference,
     HuImageryOnly,
     HuMapOnly,
     centred,
-    lessons,
+    examples,
 )
 
 import sasgeo_bench as sgb
@@ -122,8 +122,8 @@ def test_a_class_says_nothing_where_it_is_unknown_and_others_are_known():
 def test_lessons_are_pairs_with_pictures_taken_evenly():
     shown, blind = (SimpleNamespace(track="localization", frames=frames) for frames in ((NOISE,), ()))
     pairs = [(blind if at % 10 else shown, SimpleNamespace(pose=TRUTH)) for at in range(600)]
-    assert len(lessons(sgb.Training(regions={}, pairs=pairs))) == MOST_LESSONS
-    assert len(lessons(sgb.Training(regions={}, pairs=[pairs[0]] * 119))) == MOST_LESSONS
+    assert len(examples(sgb.Training(regions={}, pairs=pairs))) == MOST_EXAMPLES
+    assert len(examples(sgb.Training(regions={}, pairs=[pairs[0]] * 119))) == MOST_EXAMPLES
 
 
 @pytest.mark.parametrize("text", ["x", "{}", "null", '{"share": 3}', '{"share": NaN}'])

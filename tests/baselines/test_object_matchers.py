@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sasgeo_baselines.object_matcher import Pairs, Sight, fitted
+from sasgeo_baselines.object_matcher import Pairs, PreparedView, fitted
 from sasgeo_baselines.spatial_graph_clique import SpatialGraphClique, largest_clique
 from scipy.spatial.distance import pdist
 
@@ -24,7 +24,7 @@ def scattered(count, *, half_m=90.0, seed=1):
 def test_peaks_lie_apart_so_that_no_place_takes_the_turn_of_another():
     seen = nodes(scattered(12))
     town = nodes(np.concatenate([HERE.to_map(seen.places_m), np.array(PRIOR.center_m) + scattered(40, half_m=200.0)]))
-    pairs = Pairs.of_kind(Sight(nodes=seen, prior=PRIOR), town, np.arange(len(town)))
+    pairs = Pairs.of_kind(PreparedView(nodes=seen, prior=PRIOR), town, np.arange(len(town)))
     peaks = pairs.peaks(DISC, [67.0, 72.0, 77.0, 82.0, 87.0], count=12)
     places_m = np.array([(mode.pose.easting_m, mode.pose.northing_m) for mode in peaks])
     assert len(peaks) > 6
@@ -34,7 +34,7 @@ def test_peaks_lie_apart_so_that_no_place_takes_the_turn_of_another():
 def test_only_objects_of_one_kind_pair_and_a_rare_kind_weighs_more():
     seen = nodes([[0, 0], [10, 0]], ["building patch", "mask intersection"])
     town = nodes([[0, 0], [5, 5], [9, 9], [10, 0]], ["building patch"] * 3 + ["mask intersection"])
-    pairs = Pairs.of_kind(Sight(nodes=seen, prior=PRIOR), town, np.arange(4))
+    pairs = Pairs.of_kind(PreparedView(nodes=seen, prior=PRIOR), town, np.arange(4))
     assert list(zip(pairs.seen.tolist(), pairs.mapped.tolist(), strict=True)) == [(0, 0), (0, 1), (0, 2), (1, 3)]
     assert pairs.weight[3] == pytest.approx(np.log(1 + 4))
     assert pairs.weight[0] == pytest.approx(np.log(1 + 4 / 3))
@@ -77,7 +77,7 @@ def test_the_largest_clique_is_the_pose():
     seen = nodes(scattered(12))
     lost = HERE.to_map(seen.places_m) + np.array([[0.0, 0.0]] * 9 + [[30.0, 0.0], [0.0, 30.0], [-30.0, 0.0]])
     matcher.mapped = MadeUpMap(nodes=nodes([*lost, *(np.array(PRIOR.center_m) + scattered(30, half_m=200.0))]))
-    first, *rest = matcher.modes(Sight(nodes=seen, prior=PRIOR), DISC, count=3)
+    first, *rest = matcher.modes(PreparedView(nodes=seen, prior=PRIOR), DISC, count=3)
     assert int(first.score) == 9
     assert np.hypot(first.pose.easting_m - HERE.easting_m, first.pose.northing_m - HERE.northing_m) < 1e-6
     assert first.pose.yaw_deg == pytest.approx(HERE.yaw_deg)

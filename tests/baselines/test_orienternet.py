@@ -15,7 +15,7 @@ from sasgeo_baselines.learned_template import (
     FULL,
     MARGIN,
     Encoders,
-    Lesson,
+    TrainingExample,
     agreement,
     drawn_weights,
     shapes,
@@ -31,7 +31,7 @@ from sasgeo_baselines.orienternet_template import (
     OrienternetTemplate,
     Posterior,
     Surface,
-    lessons_of,
+    examples_of,
     map_planes,
     view_planes,
 )
@@ -150,10 +150,10 @@ def test_views_and_maps_are_shares_of_cells_of_four_metres():
 def test_usual_shares_are_those_of_known_cells():
     mapped = np.array([[[255, 0, 255]], [[0, 0, 0]], [[255, 255, 0]]], dtype=np.uint8)
     has = np.array([1.0, 0.0], dtype=np.float32)
-    lesson = Lesson(
+    example = TrainingExample(
         name="", view=mapped, cells_m=(4.0, 4.0), mapped=mapped, step_m=4.0, has=has, place=(0.0, 0.0), yaw_deg=0.0
     )
-    np.testing.assert_allclose(usual_shares([lesson]), [[0.5, 0.0], [0.5, 0.01]], rtol=1e-5)
+    np.testing.assert_allclose(usual_shares([example]), [[0.5, 0.0], [0.5, 0.01]], rtol=1e-5)
 
 
 def test_the_mass_of_a_mode_is_that_of_all_places_near_it():
@@ -181,7 +181,7 @@ def test_the_mass_of_a_mode_is_that_of_all_places_near_it():
     assert posterior.entropy_bits == pytest.approx(-(shares * np.log2(shares)).sum())
 
 
-def marked_lesson(place=(100.25, 80.5), yaw_deg=30.0) -> Lesson:
+def marked_example(place=(100.25, 80.5), yaw_deg=30.0) -> TrainingExample:
     """A landmark 40 m north-east of the place, on the map, and in the view, which is 4 m out at most."""
     bearing = math.radians(45.0 - yaw_deg)
     view = np.zeros((2, 33, 33), dtype=np.uint8)
@@ -192,7 +192,7 @@ def marked_lesson(place=(100.25, 80.5), yaw_deg=30.0) -> Lesson:
     mapped[1] = FULL
     row, col = round(place[0] - 7.07), round(place[1] + 7.07)
     mapped[0, row - 1 : row + 2, col - 1 : col + 2] = FULL
-    return Lesson(
+    return TrainingExample(
         name="marked",
         view=view,
         cells_m=(4.0, 4.0),
@@ -207,7 +207,7 @@ def marked_lesson(place=(100.25, 80.5), yaw_deg=30.0) -> Lesson:
 @pytest.mark.parametrize("seed", range(6))
 def test_a_turned_and_mirrored_scene_is_still_seen_from_its_pose(torch, seed):
     """The landmark of the view, laid on the map at the true place and heading, meets that of the map."""
-    scene = marked_lesson().scene(RNG(seed), places=40)
+    scene = marked_example().scene(RNG(seed), places=40)
     scene = replace(scene, view=np.where(scene.view.any(axis=0), scene.view, 0))
     assert scene.places == 40
     laid = turned(torch, torch.from_numpy(scene.view.copy()), scene.cells_m, [scene.yaw_deg], step_m=4.0)[0, 0].numpy()
@@ -223,15 +223,15 @@ def test_a_part_of_a_map_is_all_that_a_view_is_taught_on(made, town):
     taught = {}
     for pose in (HERE, replace(HERE, easting_m=1004.0)):
         query = made.query_of(seen_from(made, town, pose), PRIOR, query_id=f"{pose.easting_m}")
-        (lesson,) = lessons_of(town, [(query, SimpleNamespace(pose=pose))], CLASSES)
-        taught[pose.easting_m] = lesson
-        row, col = lesson.place
+        (example,) = examples_of(town, [(query, SimpleNamespace(pose=pose))], CLASSES)
+        taught[pose.easting_m] = example
+        row, col = example.place
         assert col == pytest.approx((pose.easting_m - 1000.0) / 4 - 0.5)
         assert row == pytest.approx((9000.0 - pose.northing_m) / 4 - 0.5)
     off = replace(HERE, easting_m=900.0)
     query = made.query_of(seen_from(made, town, HERE), PRIOR)
-    assert not list(lessons_of(town, [(query, SimpleNamespace(pose=off))], CLASSES))
-    assert not list(lessons_of(town, [(query, SimpleNamespace(pose=HERE))], ("green",)))
+    assert not list(examples_of(town, [(query, SimpleNamespace(pose=off))], CLASSES))
+    assert not list(examples_of(town, [(query, SimpleNamespace(pose=HERE))], ("green",)))
 
 
 # With torch
@@ -265,7 +265,7 @@ def test_agreement_by_hand(torch):
 def test_poses_that_are_all_alike_surprise_by_the_logarithm_of_their_number(torch):
     weights = drawn_weights(1)
     weights["sharpness"][:] = -30.0, 0.0
-    scene = marked_lesson().scene(RNG(0), places=40)
+    scene = marked_example().scene(RNG(0), places=40)
     found = surprise(Encoders.of(torch, ("house",), weights), scene, torch.ones(1), RNG(0))
     assert float(found) == pytest.approx(math.log(40 * 40 * learned_template._HEADINGS), abs=1e-4)
 
@@ -309,12 +309,12 @@ def drawn(torch, town):
 
 def test_the_posterior_sums_to_one_however_the_places_are_cut(made, town, drawn, monkeypatch):
     anywhere = replace(PRIOR, center_m=None, radius_m=None)
-    sight = drawn.look(made.query_of(seen_from(made, town, HERE), anywhere))
+    view = drawn.look(made.query_of(seen_from(made, town, HERE), anywhere))
     disc = sgb.Disc(center_m=None, radius_m=0.0)
-    whole = drawn.posterior(sight, list(drawn._map.squares(disc)))
+    whole = drawn.posterior(view, list(drawn._map.squares(disc)))
     monkeypatch.setattr(orienternet_template, "_TILE", 31)
     monkeypatch.setattr(orienternet_template, "_HEADINGS_KEPT", 3)
-    tiled = drawn.posterior(sight, list(drawn._map.squares(disc)))
+    tiled = drawn.posterior(view, list(drawn._map.squares(disc)))
     assert len(tiled.surfaces) > 1 == len(whole.surfaces)
     for posterior in (whole, tiled):
         total = sum(np.exp(one.mass.astype(np.float64) - posterior.total).sum() for one in posterior.surfaces)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Matchers of tiles by a learned embedding: parts worked by hand, what each kind of lessons teaches, what they find."""
+"""Matchers of tiles by a learned embedding: parts worked by hand, what kinds of examples teach, what they find."""
 
 import json
 from dataclasses import replace
@@ -87,7 +87,7 @@ def test_a_feature_by_hand():
     assert not plain.features(mean[None]).any()
 
 
-def lessons(rng, count):
+def examples(rng, count):
     """Made-up locations of nine descriptors each; in 20 directions these differ more than locations do."""
     across = np.linalg.qr(np.random.default_rng(1).normal(size=(NUMBERS, 20)))[0].T
     own = rng.normal(0.5, 0.1, (count, 1, NUMBERS)) + rng.normal(0.0, 2.0, (count, 9, len(across))) @ across
@@ -96,7 +96,7 @@ def lessons(rng, count):
 
 def test_taught_it_ranks_new_locations_better_than_untaught():
     rng = np.random.default_rng(2)
-    known, new = lessons(rng, 150), np.stack(lessons(rng, 60))
+    known, new = examples(rng, 150), np.stack(examples(rng, 60))
     taught = fitted(known, shrinkage=0.3, size=128)
     plain = replace(taught, weights=None)
     likest = [(made.features(new[:, 1]) @ made.features(new[:, 0]).T).argmax(axis=1) for made in (taught, plain)]
@@ -108,7 +108,7 @@ def test_taught_it_ranks_new_locations_better_than_untaught():
 @pytest.mark.parametrize(("shrinkage", "size"), [(0.1, 64), (0.9, 128)])
 def test_directions_are_discriminants_whose_signs_are_decided(shrinkage, size):
     """Directions tell apart no more than the means of locations do, and of like variance within locations."""
-    known = lessons(np.random.default_rng(3), 70)
+    known = examples(np.random.default_rng(3), 70)
     found = fitted(known, shrinkage=shrinkage, size=size)
     assert found.weights.shape == (NUMBERS, min(size, len(known) - 1))
     assert (found.weights.max(axis=0) == np.abs(found.weights).max(axis=0)).all()

@@ -17,7 +17,7 @@ from sasgeo_baselines.anyvisloc_pipeline import (
     Drawing,
     drawn,
 )
-from sasgeo_baselines.maplocnet_regress import COARSE_M, MaplocnetRegress, Peak, field_of, lessons, templates_of
+from sasgeo_baselines.maplocnet_regress import COARSE_M, MaplocnetRegress, Peak, examples, field_of, templates_of
 from sasgeo_baselines.ubev_template import HEIGHTS, UbevTemplate, drawn_in, layers_of
 
 from sasgeo_bench.geometry.pose import Pose
@@ -116,7 +116,7 @@ def test_residuals_turn_with_the_surface():
     here = Pose(easting_m=100.0, northing_m=100.0, yaw_deg=355.0)
     part = np.zeros((3, 5, 5))
     part[1, 2, 3] = 1.0  # east of the middle
-    found, residuals = lessons(
+    found, residuals = examples(
         Peak(mode=Mode(pose=here, score=1.0), part=part), replace(here, easting_m=100.0 + COARSE_M, yaw_deg=0.0)
     )
     assert residuals.tolist() == [[1, 0, 0.5], [0, 1, 0.5], [-1, 0, 0.5], [0, -1, 0.5]]

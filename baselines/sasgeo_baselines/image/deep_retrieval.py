@@ -20,7 +20,7 @@ from sasgeo_baselines.image.dense import (
     turns_for,
 )
 from sasgeo_baselines.image.orb_vlad import centred
-from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, side_of, sight_of
+from sasgeo_baselines.image.view_image import LIMITS, PICTURE, Ortho, ViewImage, side_of, view_image
 from sasgeo_baselines.segmenters.features import ColourBalance, lab_planes
 from sasgeo_baselines.segmenters.network import MULTIPLE, card_with, encoded, input_planes, read_encoder, torch_module
 
@@ -182,20 +182,20 @@ class DeepRetrieval:
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         """Return the most similar tiles, or rank the candidates by the most similar one near each."""
-        sight = sight_of(query, gsd_m=PIXEL_M)
-        if self._whitening is None or sight is None:
+        seen_image = view_image(query, gsd_m=PIXEL_M)
+        if self._whitening is None or seen_image is None:
             return sgb.WITHHELD
-        field = self._field(query, sight)
+        field = self._field(query, seen_image)
         if field is None:
             return sgb.WITHHELD
-        diagnostics = {"peak": field.peak(), "seen_share": float(sight.is_seen.mean())}
+        diagnostics = {"peak": field.peak(), "seen_share": float(seen_image.is_seen.mean())}
         if query.track == "retrieval":
             return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
         most, disc = min(top_k, MOST_PLACES), disc_of(query.prior)
         modes = [centred(mode, field, disc) for mode in field.best(disc, most=most + 1)]
         return answer_places(modes, top_k=most, diagnostics=diagnostics)
 
-    def _field(self, query: sgb.Query, sight: Sight) -> Field | None:
+    def _field(self, query: sgb.Query, seen_image: ViewImage) -> Field | None:
         """Return the best score of every block that the query leaves open, over all headings; None if there is none."""
         top, left, bottom, right = bounds_of(query, self._grid)
         if top >= bottom or left >= right:
@@ -207,18 +207,18 @@ class DeepRetrieval:
         best = np.full((bottom - top, right - left), -np.inf, dtype=np.float32)
         which = np.zeros(best.shape, dtype=np.int32)
         for at, turn in enumerate(turns):
-            scores = self._scores(self._parts(sight, turn, reach_m), (top, left, bottom, right))
+            scores = self._scores(self._parts(seen_image, turn, reach_m), (top, left, bottom, right))
             better = scores > best
             best[better], which[better] = scores[better], at
         is_known = self._blocks[top:bottom, left:right].any(axis=2)
         grid = self._grid.window(top, left, bottom - top, right - left)
         return Field(grid=grid, scores=np.where(is_known, best, -np.inf).astype(np.float32), which=which, turns=turns)
 
-    def _parts(self, sight: Sight, turn: sgb.Pose, reach_m: float) -> Planes:
+    def _parts(self, seen_image: ViewImage, turn: sgb.Pose, reach_m: float) -> Planes:
         """Return the descriptors of the blocks of a view turned north up, shape (n, n, PARTS), n odd."""
         block_m = BLOCK_PX * PIXEL_M
         size = 2 * int(reach_m / block_m) + 1
-        view = sight.turned(turn, size * BLOCK_PX)
+        view = seen_image.turned(turn, size * BLOCK_PX)
         balance = ColourBalance.of(lab_planes(view.rgb[view.is_seen][None]))
         assert self._encoder is not None  # noqa: S101 - prepare() made both
         assert self._whitening is not None  # noqa: S101

@@ -12,7 +12,7 @@ from scipy import fft
 
 import sasgeo_bench as sgb
 from sasgeo_baselines.global_descriptor import separate
-from sasgeo_baselines.image.sight import Sight, side_of, sight_of
+from sasgeo_baselines.image.view_image import ViewImage, side_of, view_image
 
 Planes = NDArray[np.float32]
 Spectra = NDArray[np.complex64]
@@ -112,7 +112,7 @@ def bounds_of(query: sgb.Query, grid: sgb.Grid) -> Bounds:
 class Question:
     """A query to a dense search: its picture, the places that it leaves open, the headings and scales to try."""
 
-    sight: Sight
+    seen_image: ViewImage
     bounds: Bounds
     turns: tuple[sgb.Pose, ...]
 
@@ -122,11 +122,11 @@ class Question:
 
         None if the picture shows too little, or the query leaves no place of the lattice open.
         """
-        sight, bounds = sight_of(query, gsd_m=gsd_m), bounds_of(query, grid)
-        if sight is None or bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
+        seen_image, bounds = view_image(query, gsd_m=gsd_m), bounds_of(query, grid)
+        if seen_image is None or bounds[0] >= bounds[2] or bounds[1] >= bounds[3]:
             return None
         turns = turns_for(query, reach_m=side_of(query) / 2, step_m=step_m)
-        return cls(sight=sight, bounds=bounds, turns=turns)
+        return cls(seen_image=seen_image, bounds=bounds, turns=turns)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sasgeo_bench as sgb
-from sasgeo_baselines.image.sight import Ortho, Sight, grey_of
+from sasgeo_baselines.image.view_image import Ortho, ViewImage, grey_of
 
 PIXEL_M: Final = 0.5
 BITS: Final = 256  # of a descriptor
@@ -53,12 +53,14 @@ def detect(grey: NDArray[np.uint8], is_known: NDArray[np.bool_], *, most: int) -
     return Features(points=points, descriptors=np.asarray(descriptors, dtype=np.uint8))
 
 
-def view_features(sight: Sight, *, side_m: float) -> Features:
+def view_features(seen_image: ViewImage, *, side_m: float) -> Features:
     """Return the features of a view, as many to the area as the imagery has; places are (right, up), metres."""
     most = max(round(_PER_TILE * (side_m / (_TILE_PX * PIXEL_M)) ** 2 * 1.5), 100)
-    found = detect(sight.grey, sight.is_seen, most=most)
-    middle = len(sight.rgb) / 2
-    return Features(points=(found.points - middle) * (sight.gsd_m, -sight.gsd_m) + 0.0, descriptors=found.descriptors)
+    found = detect(seen_image.grey, seen_image.is_seen, most=most)
+    middle = len(seen_image.rgb) / 2
+    return Features(
+        points=(found.points - middle) * (seen_image.gsd_m, -seen_image.gsd_m) + 0.0, descriptors=found.descriptors
+    )
 
 
 def map_features(region: sgb.Region) -> tuple[Features, sgb.Grid] | None:

@@ -18,7 +18,7 @@ from sasgeo_baselines.image.dense import (
     disc_of,
     size_for,
 )
-from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, side_of
+from sasgeo_baselines.image.view_image import LIMITS, PICTURE, Ortho, side_of
 
 PIXEL_M: Final = 1.0
 CELL_PX: Final = 4  # pixels a side of a cell of the descriptor
@@ -121,9 +121,9 @@ class HogColour:
             return sgb.WITHHELD
         size = size_for(question.turns, side_of(query) / cell_m)
         search = Search.of(self._stack, self._grid, question.bounds, margin=size // 2)
-        turned = (question.sight.turned(turn, size * CELL_PX) for turn in question.turns)
+        turned = (question.seen_image.turned(turn, size * CELL_PX) for turn in question.turns)
         field = search.field(question.turns, (descriptors(view.rgb, view.is_seen) for view in turned))
-        diagnostics = {"peak": field.peak(), "seen_share": float(question.sight.is_seen.mean())}
+        diagnostics = {"peak": field.peak(), "seen_share": float(question.seen_image.is_seen.mean())}
         if query.track == "retrieval":
             return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
         most = min(top_k, MOST_PLACES)

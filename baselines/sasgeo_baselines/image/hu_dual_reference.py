@@ -26,14 +26,14 @@ from sasgeo_baselines.image.dense import (
     turns_for,
 )
 from sasgeo_baselines.image.ncc_gradient import directions
-from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, grey_of, side_of, sight_of
+from sasgeo_baselines.image.view_image import LIMITS, PICTURE, Ortho, ViewImage, grey_of, side_of, view_image
 from sasgeo_baselines.learned import read_learned, sound
 
 PIXEL_M: Final = 2.0
 SHARES: Final = (0.0, 0.2, 0.4, 0.5, 0.6, 0.8, 1.0)  # of the imagery in the sum, that learning tries
 UNTAUGHT: Final = 0.5
 RIGHT_M: Final = 25.0
-MOST_LESSONS: Final = 60
+MOST_EXAMPLES: Final = 60
 SLOW: Final = (
     "more than a second a view, since every place is tried at every heading and scale: pixels of 3 m would take a "
     "third of that and find as much on maps, but less in imagery"
@@ -179,7 +179,7 @@ class HuDualReference(_HuReference):
     def learn(self, training: sgb.Training) -> str:
         """Return the share of the imagery that is right most often; of equal ones the nearest to one half."""
         right, at = dict.fromkeys(SHARES, 0), ""
-        for query, truth in sorted(lessons(training), key=lambda pair: pair[0].region):
+        for query, truth in sorted(examples(training), key=lambda pair: pair[0].region):
             if query.region != at:
                 at, reference = query.region, Reference.of(training.regions[query.region], UNTAUGHT)
             pair = _Pair.of(query, reference)
@@ -218,14 +218,14 @@ class HuImageryOnly(_HuReference):
     )
 
 
-def lessons(training: sgb.Training) -> list[tuple[sgb.Query, sgb.Truth]]:
-    """Return at most `MOST_LESSONS` localization queries with pictures and poses, evenly from all of them."""
+def examples(training: sgb.Training) -> list[tuple[sgb.Query, sgb.Truth]]:
+    """Return at most `MOST_EXAMPLES` localization queries with pictures and poses, evenly from all of them."""
     pairs = [
         pair
         for pair in training.pairs
         if pair[0].track == "localization" and pair[0].frames and pair[1].pose is not None
     ]
-    return pairs[:: max(1, -(-len(pairs) // MOST_LESSONS))]
+    return pairs[:: max(1, -(-len(pairs) // MOST_EXAMPLES))]
 
 
 def _share(saved: dict[str, float]) -> float:
@@ -278,10 +278,10 @@ class _Pair:
         # 2 pixels at the edge of a view between two headings
         turns = turns_for(query, reach_m=side_of(query) / 2, step_m=2.0 * gsd_m)
         size_px = size_for(turns, side_of(query) / gsd_m)
-        sight = sight_of(query, gsd_m=gsd_m) if reference.pictured else None
+        seen_image = view_image(query, gsd_m=gsd_m) if reference.pictured else None
         laid = (
             (reference.drawn, _Drawn.of(query, reference.classes, gsd_m=gsd_m) if reference.drawn else None),
-            (reference.pictured, _Pictured(sight=sight) if sight else None),
+            (reference.pictured, _Pictured(seen_image=seen_image) if seen_image else None),
         )
         found = [
             _Part(search=Search.of(stack, reference.grid, bounds, margin=size_px // 2), view=view, size_px=size_px)
@@ -319,11 +319,11 @@ class _Pair:
 
 @dataclass(frozen=True, kw_only=True)
 class _Pictured:
-    sight: Sight
+    seen_image: ViewImage
 
     def turned(self, turn: sgb.Pose, size_px: int) -> Stack:
         """Return the directions of its gradients north up, if its heading and scale are those of `turn`."""
-        seen = self.sight.turned(turn, size_px)
+        seen = self.seen_image.turned(turn, size_px)
         return directions(seen.grey, seen.is_seen)
 
 

@@ -20,7 +20,7 @@ from sasgeo_baselines.image.dense import (
     disc_of,
     size_for,
 )
-from sasgeo_baselines.image.sight import LIMITS, PICTURE, Ortho, Sight, grey_of, side_of, sight_of
+from sasgeo_baselines.image.view_image import LIMITS, PICTURE, Ortho, ViewImage, grey_of, side_of, view_image
 
 COARSE_M: Final = 2.0  # pixels of the search
 FINE_M: Final = 1.0  # of the local one that follows
@@ -90,18 +90,18 @@ class NccGradient:
         if question is None:
             return sgb.WITHHELD
         field = _search(self._stack, self._grid, question)
-        diagnostics = {"peak": field.peak(), "seen_share": float(question.sight.is_seen.mean())}
+        diagnostics = {"peak": field.peak(), "seen_share": float(question.seen_image.is_seen.mean())}
         if query.track == "retrieval":
             return answer_candidates(query, field.near(query.candidates), top_k=top_k, diagnostics=diagnostics)
         disc = disc_of(query.prior)
         modes = field.best(disc, most=min(top_k, MOST_PLACES) + 1)
-        finer = sight_of(query, gsd_m=FINE_M)
+        finer = view_image(query, gsd_m=FINE_M)
         if finer is not None:
             step = _STEP * COARSE_M / (side_of(query) / 2)
             modes = [self._refined(mode, finer, step, disc) for mode in modes]
         return answer_places(modes, top_k=min(top_k, MOST_PLACES), diagnostics=diagnostics)
 
-    def _refined(self, mode: sgb.Mode, sight: Sight, step: float, disc: sgb.Disc) -> sgb.Mode:
+    def _refined(self, mode: sgb.Mode, seen_image: ViewImage, step: float, disc: sgb.Disc) -> sgb.Mode:
         """Return the best pose near a mode, on finer pixels and in finer steps."""
         assert self._grey is not None  # noqa: S101 - match() has looked
         pose = mode.pose
@@ -110,7 +110,7 @@ class NccGradient:
             for part in (-0.5, -0.25, 0.0, 0.25, 0.5)  # of a step of heading
             for more in (-0.4, 0.0, 0.4)  # of a step of scale
         )
-        reach, margin = round(4.0 / FINE_M), size_for(turns, len(sight.rgb)) // 2  # 4 m: reach of the local search
+        reach, margin = round(4.0 / FINE_M), size_for(turns, len(seen_image.rgb)) // 2  # 4 m: reach of the local search
         row, col = self._fine.to_cells(sgb.points_of([pose]))[0].tolist()
         whole = reach + margin + 2 * _RIM_PX
         top, left = max(row - whole, 0), max(col - whole, 0)
@@ -122,13 +122,13 @@ class NccGradient:
             *(max(at - reach, 0) for at in low),
             *(min(at + reach + 1, end) for at, end in zip(low, high, strict=True)),
         )
-        question = Question(sight=sight, bounds=(bounds[0], bounds[1], bounds[2], bounds[3]), turns=turns)
+        question = Question(seen_image=seen_image, bounds=(bounds[0], bounds[1], bounds[2], bounds[3]), turns=turns)
         found = _search(stack, part, question).best(disc, most=1)
         return found[0] if found else mode
 
 
 def _search(stack: Stack, grid: sgb.Grid, question: Question) -> Field:
-    size_px = size_for(question.turns, len(question.sight.rgb))
+    size_px = size_for(question.turns, len(question.seen_image.rgb))
     search = Search.of(stack, grid, question.bounds, margin=size_px // 2)
-    turned = (question.sight.turned(turn, size_px) for turn in question.turns)
+    turned = (question.seen_image.turned(turn, size_px) for turn in question.turns)
     return search.field(question.turns, (directions(view.grey, view.is_seen) for view in turned))

@@ -21,7 +21,7 @@ from sasgeo_baselines.image.dense import (
     disc_of,
 )
 from sasgeo_baselines.image.features import PIXEL_M, Features, map_features, view_features
-from sasgeo_baselines.image.sight import LIMITS, PICTURE, side_of, sight_of
+from sasgeo_baselines.image.view_image import LIMITS, PICTURE, side_of, view_image
 
 RATIO: Final = 0.85
 NEAR_M: Final = 3.0  # of a match from where the similarity puts it
@@ -115,12 +115,12 @@ class OrbHomography:
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         """Return the similarities with most matches, or rank the candidates by that of the window around each."""
-        sight = sight_of(query, gsd_m=PIXEL_M)
-        if self._features is None or sight is None:
+        seen_image = view_image(query, gsd_m=PIXEL_M)
+        if self._features is None or seen_image is None:
             return sgb.WITHHELD
         side_m = side_of(query)
-        seen = view_features(sight, side_m=side_m)
-        diagnostics = {"features": float(len(seen)), "seen_share": float(sight.is_seen.mean())}
+        seen = view_features(seen_image, side_m=side_m)
+        diagnostics = {"features": float(len(seen)), "seen_share": float(seen_image.is_seen.mean())}
         if query.track == "retrieval":
             found = [self._near(seen, pose, query.prior, side_m) for pose in query.candidates]
             return answer_candidates(query, found, top_k=top_k, diagnostics=diagnostics)

@@ -19,7 +19,7 @@ from sasgeo_baselines.image.dense import (
     disc_of,
 )
 from sasgeo_baselines.image.features import BITS, PIXEL_M, Features, map_features, view_features
-from sasgeo_baselines.image.sight import LIMITS, PICTURE, side_of, sight_of
+from sasgeo_baselines.image.view_image import LIMITS, PICTURE, side_of, view_image
 
 WINDOW_M: Final = 20.0  # standard deviation of the weight of a feature by its distance from the middle of a tile
 WORDS: Final = 32
@@ -122,10 +122,10 @@ class OrbVlad:
 
     def match(self, query: sgb.Query, *, top_k: int) -> sgb.Match:
         """Return the most similar tiles, or rank the candidates by the most similar one near each."""
-        sight = sight_of(query, gsd_m=PIXEL_M)
-        if self._vocabulary is None or sight is None:
+        seen_image = view_image(query, gsd_m=PIXEL_M)
+        if self._vocabulary is None or seen_image is None:
             return sgb.WITHHELD
-        seen = view_features(sight, side_m=side_of(query))
+        seen = view_features(seen_image, side_m=side_of(query))
         top, left, bottom, right = bounds_of(query, self._grid)
         if len(seen) < LEAST_FEATURES or top >= bottom or left >= right:
             return sgb.WITHHELD

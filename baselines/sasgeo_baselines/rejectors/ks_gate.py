@@ -45,12 +45,12 @@ class KsGate:
 
 
 def gate(prediction: Prediction) -> float:
-    """Return 1 - (ks_share + ks_p) / 2, and 1/2 where one of them is not told or no number from 0 to 1.
+    """Return 1 - (ks_share + ks_p) / 2, and 1/2 where one of them is missing or no number from 0 to 1.
 
     >>> gate(Prediction(query_id="q", diagnostics={"ks_share": 1.0, "ks_p": 0.5}))
     0.25
     >>> gate(Prediction(query_id="q"))
     0.5
     """
-    told = [prediction.diagnostics.get(name, math.nan) for name in ("ks_share", "ks_p")]
-    return 1 - sum(told) / 2 if all(0 <= value <= 1 for value in told) else 0.5
+    reported = [prediction.diagnostics.get(name, math.nan) for name in ("ks_share", "ks_p")]
+    return 1 - sum(reported) / 2 if all(0 <= value <= 1 for value in reported) else 0.5

@@ -150,7 +150,7 @@ class EkfLoose(sgb.Follower):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ScaleState:
-    """What the filter believes of the odometer's scale: true over told, less 1; variance, and covariance with the pose.
+    """Belief about the scale of the odometer: true over reported, less 1; variance, and covariance with the pose.
 
     `cross` has shape (3,), in m, m and deg.
     """
@@ -183,8 +183,8 @@ def predicted(
         return pose, covariance, replace(scale, cross=np.zeros(_BELOW) if step.frame else scale.cross)
     right_m, up_m, turn_deg = step.increment
     stretch = 1.0 + scale.value
-    told = replace(step, increment=(stretch * right_m, stretch * up_m, turn_deg))
-    pose, covariance = sgb.advance(belief.pose, belief.covariance, told)
+    reported = replace(step, increment=(stretch * right_m, stretch * up_m, turn_deg))
+    pose, covariance = sgb.advance(belief.pose, belief.covariance, reported)
     by_scale = np.array([*(sgb.rotation(belief.pose.yaw_deg) @ [right_m, up_m]), 0.0])
     by_yaw = np.eye(_BELOW)  # as in advance: a clockwise turn takes (east, north) to (north, -east)
     by_yaw[:2, 2] = np.radians([by_scale[1], -by_scale[0]]) * stretch

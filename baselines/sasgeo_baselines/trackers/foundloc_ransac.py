@@ -119,14 +119,14 @@ def _upper_half(found: sgb.Match) -> tuple[Sequence[sgb.Pose], Sequence[float]]:
 
 def _members(views: Sequence[Seen], plan: RansacPlan) -> list[tuple[Seen, sgb.Pose]]:
     """Return a place of each view in the cluster that most views have a place in: the best one of each."""
-    told = [(at, pose) for at, seen in enumerate(views) for pose in seen.poses]
-    if not told:
+    reported = [(at, pose) for at, seen in enumerate(views) for pose in seen.poses]
+    if not reported:
         return []
-    now = [views[at].carried(pose) for at, pose in told]
+    now = [views[at].carried(pose) for at, pose in reported]
     points_m = np.array([(pose.easting_m, pose.northing_m) for pose in now])
     labels = DBSCAN(eps=plan.cluster_m, min_samples=plan.least_members).fit_predict(points_m)
     clusters: dict[int, dict[int, sgb.Pose]] = {}
-    for (at, pose), label in zip(told, labels.tolist(), strict=True):
+    for (at, pose), label in zip(reported, labels.tolist(), strict=True):
         if label >= 0:
             clusters.setdefault(label, {}).setdefault(at, pose)  # poses of a view are best first
     chosen = max(clusters.values(), key=len, default={})

@@ -127,18 +127,18 @@ def place_of_path(views: Sequence[Seen], plan: TrajectoryPlan) -> sgb.Pose | Non
     Every pose that was found for a view leads to a present pose by odometry. Each of these is tried: a view supports it
     by the best of its own poses, by score within the view and nearness.
     """
-    told = [(at, pose, _merit(seen, rank)) for at, seen in enumerate(views) for rank, pose in enumerate(seen.poses)]
+    reported = [(at, pose, _merit(seen, rank)) for at, seen in enumerate(views) for rank, pose in enumerate(seen.poses)]
     count = sum(bool(seen.poses) for seen in views)
     if count < plan.least_views:
         return None
-    now = [views[at].carried(pose) for at, pose, _ in told]
+    now = [views[at].carried(pose) for at, pose, _ in reported]
     points_m = np.array([(pose.easting_m, pose.northing_m) for pose in now])
     yaws_deg = np.array([pose.yaw_deg for pose in now])
     away_m = np.hypot(*(points_m[:, None] - points_m[None]).transpose(2, 0, 1))
     turned_deg = sgb.wrap_deg(yaws_deg[:, None] - yaws_deg[None])
     near = np.exp(-(np.square(away_m / plan.near_m) + np.square(turned_deg / plan.near_deg)) / 2)
-    near *= np.array([merit for _, _, merit in told])
-    firsts = np.flatnonzero(np.diff([-1, *(at for at, _, _ in told)]))
+    near *= np.array([merit for _, _, merit in reported])
+    firsts = np.flatnonzero(np.diff([-1, *(at for at, _, _ in reported)]))
     support = np.maximum.reduceat(near, firsts, axis=1).sum(axis=1)
     best = int(support.argmax())
     rival = float(support[away_m[best] > 50.0].max(initial=0.0))  # 50 m: another place, not the same one again
@@ -219,7 +219,7 @@ def smoothed(
         return None
     upto = int(np.flatnonzero(counts)[-1]) + 1  # from the last anchor that counts the odometry leads on
     fits, steps = counts[:upto], [seen.step for seen in views[1:upto]]
-    told = np.array([step.increment for step in steps], dtype=np.float64).reshape(-1, 3)
+    reported = np.array([step.increment for step in steps], dtype=np.float64).reshape(-1, 3)
     own = np.array([step.covariance for step in steps], dtype=np.float64).reshape(-1, 3, 3)
     sigma_m = max(plan.sigma_m, float(np.sqrt(np.mean(np.square(off_m[counts])) / 2)) / 2)
     base_deg = anchors.turns_deg[:upto] + laid.yaw_deg  # differences from it are smoothed: no turn of a circle is lost
@@ -227,8 +227,8 @@ def smoothed(
     weight_deg = np.where(fits, 1 / (_ALIKE * plan.sigma_deg**2), 0.0)
     headings, heading_deg2 = chain(np.zeros((len(steps), 1)), own[:, 2, 2], rest_deg, weight_deg)
     yaws_deg = base_deg + headings[:, 0]
-    moved_m = np.array([sgb.rotation(yaw) @ step[:2] for yaw, step in zip(yaws_deg[:-1], told, strict=True)])
-    flown_m2 = np.square(told[:, :2]).sum(axis=1)
+    moved_m = np.array([sgb.rotation(yaw) @ step[:2] for yaw, step in zip(yaws_deg[:-1], reported, strict=True)])
+    flown_m2 = np.square(reported[:, :2]).sum(axis=1)
     # 0.015: drift of a step, besides its covariance: errors of neighbouring steps are alike
     slip_m2 = (own[:, 0, 0] + own[:, 1, 1]) / 2 + flown_m2 * (0.015**2 + np.radians(math.sqrt(heading_deg2)) ** 2)
     weight_m = np.where(fits, 1 / (_ALIKE * sigma_m**2), 0.0)

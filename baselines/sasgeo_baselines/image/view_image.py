@@ -27,7 +27,7 @@ LIMITS: Final = (
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sight:
+class ViewImage:
     """A picture on a square lattice: `rgb`, uint8 of shape (n, n, 3), and where it shows something, shape (n, n)."""
 
     rgb: Pixels
@@ -45,7 +45,7 @@ class Sight:
         >>> rgb = np.zeros((3, 3, 3), dtype=np.uint8)
         >>> rgb[0, 1] = 255  # ahead
         >>> east = sgb.Pose(easting_m=0.0, northing_m=0.0, yaw_deg=90.0)
-        >>> Sight(rgb=rgb, is_seen=np.ones((3, 3), dtype=bool), gsd_m=1.0).turned(east, 3).rgb[:, :, 0].tolist()
+        >>> ViewImage(rgb=rgb, is_seen=np.ones((3, 3), dtype=bool), gsd_m=1.0).turned(east, 3).rgb[:, :, 0].tolist()
         [[0, 0, 0], [0, 0, 255], [0, 0, 0]]
         """
         along, across = (how(math.radians(turn.yaw_deg)) / turn.scale for how in (math.cos, math.sin))
@@ -68,7 +68,7 @@ def side_of(query: sgb.Query) -> float:
     return float(query.evidence.cells.shape[-1] * query.evidence.cell_size_m)
 
 
-def sight_of(query: sgb.Query, *, gsd_m: float, size_px: int | None = None) -> Sight | None:
+def view_image(query: sgb.Query, *, gsd_m: float, size_px: int | None = None) -> ViewImage | None:
     """Return the newest picture of a query over its view, heading up; None if it shows too little to go by."""
     if not query.frames:
         return None
@@ -82,11 +82,11 @@ def sight_of(query: sgb.Query, *, gsd_m: float, size_px: int | None = None) -> S
         cell_size_m=gsd_m,
         pose=sgb.Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0),
     )
-    sight = Sight(rgb=rgb, is_seen=np.asarray(rgb.max(axis=2) > 0), gsd_m=gsd_m)
+    seen_image = ViewImage(rgb=rgb, is_seen=np.asarray(rgb.max(axis=2) > 0), gsd_m=gsd_m)
     # 2: standard deviation of the grey of a view, of 255: a flatter one shows nothing
-    if sight.is_seen.mean() < 0.1 or sight.grey[sight.is_seen].std() < 2.0:  # 0.1: least seen of a view
+    if seen_image.is_seen.mean() < 0.1 or seen_image.grey[seen_image.is_seen].std() < 2.0:  # 0.1: least seen of a view
         return None
-    return sight
+    return seen_image
 
 
 def grey_of(rgb: Pixels, is_known: NDArray[np.bool_]) -> Pixels:

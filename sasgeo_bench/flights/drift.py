@@ -220,7 +220,7 @@ def measure_drift(
             f"poses are {typical_m:.1f} m apart, farther than a tenth of {_NODES * spacing_m:g} m: "
             "errors over so short segments look smaller than they are, choose longer ones"
         )
-        warnings.warn(message, stacklevel=3)
+        warnings.warn(message, stacklevel=2)
     rng = np.random.default_rng(seed)
     rows = [row for length in lengths_m for row in _length_rows(runs, length, spacing_m, draws, rng)]
     names = ["figure", "length_m", "value", "lo", "hi", "sequences", "segments"]

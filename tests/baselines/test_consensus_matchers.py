@@ -16,9 +16,17 @@ from sasgeo_baselines.liu_object_graph import (
     posed,
     sinkhorn,
 )
-from sasgeo_baselines.patches import Patches, consensus, correlation, matches, mutual, soft_mutual
 from sasgeo_baselines.spatial_graph_clique import SpatialGraphClique
-from sasgeo_baselines.zhang_hier_consensus import ZhangHierConsensus, similarity
+from sasgeo_baselines.zhang_hier_consensus import (
+    Patches,
+    ZhangHierConsensus,
+    consensus,
+    correlation,
+    matches,
+    mutual,
+    similarity,
+    soft_mutual,
+)
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN

@@ -9,9 +9,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sasgeo_baselines.brm_grid import APART_M, SIDE, BrmGrid, RatioMap, grid_shares
 from sasgeo_baselines.polar import GROUPS
-from sasgeo_baselines.polar_vsc import STEP_DEG, PolarVsc, correlations, ring_p_values
+from sasgeo_baselines.polar_vsc import (
+    RINGS,
+    SECTORS,
+    STEP_DEG,
+    Context,
+    ContextMap,
+    PolarVsc,
+    Shares,
+    correlations,
+    ring_p_values,
+)
 from sasgeo_baselines.rejectors.ks_gate import KsGate
-from sasgeo_baselines.visual_context import RINGS, SECTORS, Context, ContextMap, Shares
 from scipy import special
 
 from sasgeo_bench.geometry.pose import Pose

@@ -17,8 +17,7 @@ from sasgeo_baselines.trackers import zhou_smc
 from sasgeo_baselines.trackers.ekf_loose import EkfLoose
 from sasgeo_baselines.trackers.foundloc_ransac import FoundlocRansac
 from sasgeo_baselines.trackers.kinnari_mcl import SHIFTS, Mosaic, Template, surfaces
-from sasgeo_baselines.trackers.lsvl_belief import TAUGHT, LsvlBelief, Ratio
-from sasgeo_baselines.trackers.lsvl_descriptors import Parts, Shares
+from sasgeo_baselines.trackers.lsvl_belief import TAUGHT, LsvlBelief, Parts, Ratio, Shares
 from sasgeo_baselines.trackers.particles import Particles
 from sasgeo_baselines.trackers.satloc_layers import SatlocLayers
 from sasgeo_baselines.trackers.se2_trajectory import Se2Trajectory

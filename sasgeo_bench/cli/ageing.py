@@ -84,7 +84,7 @@ def _read_box(text: str | None) -> Box | None:
         west, south, east, north = (float(part) for part in text.split(","))
     except ValueError:
         west, south, east, north = 0.0, 0.0, 0.0, 0.0
-    if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):  # noqa: PLR2004 - degrees on a sphere
+    if not (-180 <= west < east <= 180 and -90 <= south < north <= 90):  # degrees on a sphere
         raise ConfigError(
             f"--bounds must be west,south,east,north in degrees as in 9.47,47.05,9.64,47.27, got {text!r}"
         )

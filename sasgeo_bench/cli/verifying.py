@@ -122,7 +122,7 @@ def _shared_ground(target: str, out: Path, folders: list[Path]) -> tuple[list[st
     missing = [region for region in split.spec.region_ids if region not in built]
     if missing:
         tell(f"not searched, for not built: {', '.join(missing)}")
-    if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:  # noqa: PLR2004
+    if len({split.part_of(place) for place, blocks in split.blocks.items() if blocks[0].region in built}) < 2:
         raise ConfigError(
             f"{out / 'regions'} holds regions of fewer than two parts of split {split.spec.id!r}: build-region more"
         )

@@ -185,7 +185,7 @@ class Section:
 
 def sections_of(book: Book) -> tuple[Section, ...]:
     """Return the tables of a board's suites, those of one contestant last; prior groups are never mixed in one."""
-    alone = {key: len(set(names) - book.controls) < 2 for key, names in book.matchers.items()}  # noqa: PLR2004
+    alone = {key: len(set(names) - book.controls) < 2 for key, names in book.matchers.items()}
     return tuple(_section(book, key) for key in sorted(book.matchers, key=lambda key: (alone[key], key)))
 
 

@@ -270,7 +270,7 @@ def _reliable(chart: Axes, mine: pd.DataFrame) -> None:
     chart.plot(mine["predicted"], mine["observed"], color=colour, marker="o", ms=3.5, lw=0.8)
     before = -1.0
     for row in mine.sort_values("predicted").to_dict("records"):
-        is_close = row["predicted"] - before < 0.07  # noqa: PLR2004 - of an axis: numbers would run into each other
+        is_close = row["predicted"] - before < 0.07  # of an axis: numbers would run into each other
         before = before if is_close else row["predicted"]
         if not is_close:
             chart.annotate(

@@ -358,6 +358,6 @@ def _round_numbers(lo: float, hi: float) -> list[float]:
     powers = [10.0**power for power in range(math.floor(math.log10(lo)), math.ceil(math.log10(hi)) + 1)]
     for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8)):
         found = [step * power for power in powers for step in steps if lo <= step * power <= hi]
-        if len(found) > 2:  # noqa: PLR2004 - two ends and something between
+        if len(found) > 2:  # two ends and something between
             return found
     return found

@@ -152,7 +152,7 @@ def recall_frame(
         lists = {name: _lists(frame, predictions[name], truths) for name, frame in frames.items()}
         longest = max(count for count, _ in lists.values())
         steps = [k for k in RANKS if k <= longest]
-        if len(steps) < 2:  # noqa: PLR2004 - a point is no curve
+        if len(steps) < 2:  # a point is no curve
             continue
         text = "/".join((*panel, "recall"))
         for name, frame in frames.items():

@@ -53,7 +53,7 @@ def number_text(value: float) -> str:
         return "-"
     if math.isinf(value):
         return "inf"
-    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"  # noqa: PLR2004 - a digit less from ten on
+    return f"{value:.3f}" if abs(value) < 10 else f"{value:.1f}"  # a digit less from ten on
 
 
 def tally_text(value: float) -> str:
@@ -62,7 +62,7 @@ def tally_text(value: float) -> str:
     >>> tally_text(3072.0), tally_text(3.0), tally_text(0.13636)
     ('3072', '3', '0.136')
     """
-    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"  # noqa: PLR2004 - three digits either way
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"  # three digits either way
 
 
 def rank_text(row: Record) -> str:

@@ -84,7 +84,7 @@ def mcnemar_clustered(first: ArrayLike, second: ArrayLike, blocks: Sequence[str]
     each = np.bincount(code, weights=ours.astype(float) - theirs, minlength=1)
     count = len(each)
     squared = float((each**2).sum())
-    if count < 2:  # noqa: PLR2004 - one block cannot differ from itself
+    if count < 2:  # one block cannot differ from itself
         p_value = math.nan
     else:
         statistic = (count - 1) / count * float(each.sum()) ** 2 / squared if squared > 0 else 0.0
@@ -107,7 +107,7 @@ def sign_flip(sums: Floats) -> float:
     >>> sign_flip(np.array([1.0, 2.0, 1.0, 3.0, 1.0, 1.0]))  # 2 / 2^6
     0.03125
     """
-    if len(sums) < 2:  # noqa: PLR2004 - one place cannot differ from itself
+    if len(sums) < 2:  # one place cannot differ from itself
         return math.nan
     if not sums.any():
         return 1.0
@@ -132,12 +132,12 @@ def swap_places(first: Fixes, second: Fixes, place: Ints, name: str) -> float:
     area.
     """
     count = int(place.max(initial=-1)) + 1
-    if count < 2:  # noqa: PLR2004 - one place cannot differ from itself
+    if count < 2:  # one place cannot differ from itself
         return math.nan
     curve = Curve.of(_stacked(first, second), is_merged=True)
     cells = (np.ones(2 * len(place)), (np.concatenate((place, count + place)), np.arange(2 * len(place))))
     masses = (csr_array(cells, shape=(2 * count, 2 * len(place))) @ curve.sides).toarray()  # of each side at each place
-    swapped = np.random.default_rng(0).random((_SWAPS, count)) < 0.5  # noqa: PLR2004 - a fair coin
+    swapped = np.random.default_rng(0).random((_SWAPS, count)) < 0.5  # a fair coin
     swapped = np.vstack((np.zeros(count, dtype=bool), swapped))
     gaps = np.concatenate([_gaps(curve, masses, part, name) for part in np.array_split(swapped, 16)])
     if math.isnan(gaps[0]):  # as of AUROC without a false answer: no comparison holds, and p would be 0
@@ -201,7 +201,7 @@ def distinguishable(values: ArrayLike, draws: ArrayLike, *, better: Literal["hig
     [[False, False], [True, False]]
     """
     figures, table = np.asarray(values, dtype=np.float64), np.asarray(draws, dtype=np.float64)
-    if figures.ndim != 1 or table.ndim != 2 or table.shape[1:] != figures.shape or not len(table):  # noqa: PLR2004
+    if figures.ndim != 1 or table.ndim != 2 or table.shape[1:] != figures.shape or not len(table):
         raise MetricError(f"values have shape {figures.shape} and draws {table.shape}, expected (M,) and (D, M)")
     table = table[~np.isnan(table).any(axis=1)]
     if not (np.isfinite(figures).all() and np.isfinite(table).all() and len(table)):
@@ -253,7 +253,7 @@ def rank_intervals(is_better: ArrayLike) -> tuple[RankInterval, ...]:
     ['1-2', '1-3', '2-3']
     """
     table = np.asarray(is_better, dtype=bool)
-    if table.ndim != 2 or table.shape[0] != table.shape[1] or (table & table.T).any():  # noqa: PLR2004 - a table
+    if table.ndim != 2 or table.shape[0] != table.shape[1] or (table & table.T).any():  # a table
         raise MetricError(
             f"is_better has shape {table.shape}, expected (M, M) with no two methods better than each other"
         )
@@ -285,7 +285,7 @@ def intraclass_correlation(values: ArrayLike, blocks: Sequence[str] | Ints) -> f
         raise MetricError("values holds infinity: correlate hits or differences of hits")
     sizes, code = block_codes(blocks, len(column))
     count, total = len(sizes), len(column)
-    if count < 2 or total == count:  # noqa: PLR2004 - nothing within or nothing between
+    if count < 2 or total == count:  # nothing within or nothing between
         return math.nan
     means = np.bincount(code, weights=column) / sizes
     between = float((sizes * (means - column.mean()) ** 2).sum()) / (count - 1)

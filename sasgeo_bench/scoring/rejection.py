@@ -255,7 +255,7 @@ def _held_back(make: Make, calibration: pd.DataFrame, predictions: Mapping[str, 
     """
     unit = next((name for name in ("country", "place") if len(set(calibration[name])) > 1), "block")
     names = sorted(set(calibration[unit]))
-    if len(names) < 2:  # noqa: PLR2004 - one block cannot be left out
+    if len(names) < 2:  # one block cannot be left out
         return _apply(_fitted(make, calibration, predictions), calibration, predictions)[0]
     fold = calibration[unit].map({name: at % _PARTS for at, name in enumerate(names)}).to_numpy()
     found = np.full(len(calibration), np.nan)

@@ -95,7 +95,7 @@ def _drawn_areas(
 ) -> Mapping[tuple[str, str], Floats]:
     """Return every draw of the areas that have intervals, by mixture and name; nothing for a single cluster."""
     found: dict[tuple[str, str], list[Floats]] = {}
-    if drawn.units_count < 2:  # noqa: PLR2004 - one place cannot differ from itself
+    if drawn.units_count < 2:  # one place cannot differ from itself
         return {}
     curve, present = Curve.of(answers, is_merged=True), answers.is_present
     factors = {
@@ -163,7 +163,7 @@ def _drawn_shares(shares: Sequence[Share], drawn: ClusterDraws) -> Floats:
 
     For fewer than two clusters there are no draws.
     """
-    if not shares or drawn.units_count < 2:  # noqa: PLR2004 - one place cannot differ from itself
+    if not shares or drawn.units_count < 2:  # one place cannot differ from itself
         return np.empty((0, len(shares)))
     columns = [share.counted * share.mass for share in shares] + [share.mass for share in shares]
     top, bottom = np.hsplit(np.vstack(list(drawn.sums(np.column_stack(columns)))), 2)

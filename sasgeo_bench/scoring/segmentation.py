@@ -256,7 +256,7 @@ def _rows(group: str, name: str, counts: list[PixelCounts], draws: int) -> Itera
 
 def _drawn(table: Floats, blocks: list[str], seed: int, draws: int) -> Floats:
     """Return every metric of every draw, shape (metrics, D); NaN for a single image."""
-    if len(table) < 2:  # noqa: PLR2004 - there is nothing to draw
+    if len(table) < 2:  # there is nothing to draw
         return np.full((len(PIXEL_METRICS), 1), np.nan)
     sums = ClusterDraws(blocks=blocks, seed=seed, draws=draws).sums(table.reshape(len(table), -1))
     parts = (some.reshape(-1, 2, BYTES) for some in sums)

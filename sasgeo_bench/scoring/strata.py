@@ -179,7 +179,7 @@ def _ladders(queries: pd.DataFrame) -> Iterator[_Step]:
         stress = group[group["role"] == STRESS]
         suite, track, prior_group = map(str, key)
         for kind, mine in stress.groupby("kind", sort=True):
-            if mine["strength"].nunique() < 2:  # noqa: PLR2004 - one step is no ladder
+            if mine["strength"].nunique() < 2:  # one step is no ladder
                 continue
             step = partial(_Step, suite, track, prior_group, str(kind), str(mine["strength_unit"].iloc[0]))
             steps = sorted({*zip(mine["strength"], mine["view_cells"], strict=True)})

@@ -159,7 +159,7 @@ def _water(sketch: Sketch, heading: float, main: list[Line]) -> shapely.Geometry
     rng = sketch.rng
     shapes: list[shapely.Geometry] = []
     ponds = int(rng.integers(0, 2))
-    if rng.random() < 0.5:  # noqa: PLR2004 - one tile of two
+    if rng.random() < 0.5:  # one tile of two
         side = float(rng.choice((-1.0, 1.0)))
         line = _crossing(sketch, heading + float(rng.uniform(-0.4, 0.4)), side * float(rng.uniform(30, 85)), 22.0)
         shapes.append(shapely.buffer(shapely.linestrings(line), float(rng.uniform(5, 9))))
@@ -169,7 +169,7 @@ def _water(sketch: Sketch, heading: float, main: list[Line]) -> shapely.Geometry
     for _ in range(ponds):
         spot = shapely.Point(*rng.uniform(-105, 105, 2)).buffer(float(rng.uniform(8, 16)), quad_segs=5)
         pond = affinity.rotate(affinity.scale(spot, 1.0, float(rng.uniform(0.5, 1.0))), float(rng.uniform(0, 180)))
-        if shapely.distance(pond, roads) > 6:  # noqa: PLR2004 - metres
+        if shapely.distance(pond, roads) > 6:  # metres
             shapes.append(pond)
     # Each by itself: a union may have a hole, and what has one is no way.
     for part in shapely.get_parts(shapely.intersection(np.array(shapes, dtype=object), sketch.square)):
@@ -190,7 +190,7 @@ def _streets(sketch: Sketch, heading: float, village: shapely.Geometry, wet: sha
         for offset_m in _offsets(rng, least_m, most_m):
             line = wobble(_crossing(sketch, net_heading + turn, offset_m, 3.0), 1.0, rng)
             for part in _pieces(shapely.intersection(shapely.linestrings(line), ground)):
-                if rng.random() < 0.85:  # noqa: PLR2004 - of the streets are there
+                if rng.random() < 0.85:  # of the streets are there
                     found.append(part)  # noqa: PERF401 - each draws its chance
     centre = shapely.get_coordinates(village.centroid)[0]
     for number in rng.permutation(len(found))[: int(rng.integers(1, 3))]:
@@ -236,7 +236,7 @@ def _hedges(sketch: Sketch, heading: float, village: shapely.Geometry, wet: shap
             line = _crossing(sketch, heading + turn, offset_m, 5.0)
             free = shapely.difference(shapely.intersection(shapely.linestrings(line), sketch.square), taken)
             for part in _pieces(free):
-                if rng.random() < 0.85:  # noqa: PLR2004 - of the borders are hedged
+                if rng.random() < 0.85:  # of the borders are hedged
                     sketch.line(part, barrier="hedge")
 
 

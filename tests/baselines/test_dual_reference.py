@@ -71,7 +71,7 @@ def test_a_half_neither_learns_nor_reads_the_other(region, window, seen, monkeyp
     query = query_of(picture(window, TRUTH), evidence=seen(TRUTH))
     of_imagery = SimpleNamespace(grid=region.grid, classes=region.classes, imagery=region.imagery)
     assert off_m(prepared(HuImageryOnly, of_imagery).match(query, top_k=1).poses[0]) < 5.0
-    monkeypatch.delattr(hu_dual_reference, "sight_of")
+    monkeypatch.delattr(hu_dual_reference, "view_image")
     of_map = SimpleNamespace(grid=region.grid, classes=region.classes, known=region.known, layer=region.layer)
     assert off_m(prepared(HuMapOnly, of_map).match(query, top_k=1).poses[0]) < 5.0
 

@@ -13,7 +13,7 @@ DOCS_RUN ?= 1
 VENV_PYTHON := $(VENV)/bin/python
 PIP := $(VENV_PYTHON) -m pip --disable-pip-version-check
 SASGEO := $(VENV)/bin/sasgeo-bench
-SOURCES := sasgeo_bench baselines benchmarks tests docs
+SOURCES := sasgeo_bench baselines paper benchmarks tests docs
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
@@ -25,14 +25,14 @@ help: ## print this list
 	@printf '\nVariables: REGION=<id> PIPELINE=<id> RESULTS=<folder to store a board in> DATE=<yyyy-mm-dd> OF=<folder or file of tests> N=<sites> SEED=<number> OUT=<folder, default out> ARGS=<more flags> PYTHON=<default python3>\n'
 
 # Rebuilt when the lock or the packages' own metadata change; otherwise nothing runs, so a second call is quick.
-$(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml
+$(STAMP): requirements.lock pyproject.toml baselines/pyproject.toml paper/pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' 2>/dev/null || { \
 	  echo "$(PYTHON) is missing or older than 3.11: install Python >= 3.11, or name one: make PYTHON=/path/to/python" >&2; exit 1; }
 	@$(PYTHON) -c 'import ensurepip, venv' 2>/dev/null || { \
 	  echo "$(PYTHON) cannot make virtual environments: install its venv module (Debian, Ubuntu: apt install python3-venv)" >&2; exit 1; }
 	$(PYTHON) -m venv $(VENV)
 	$(PIP) install --quiet --require-hashes -r requirements.lock
-	$(PIP) install --quiet --no-deps --no-build-isolation -e . -e baselines
+	$(PIP) install --quiet --no-deps --no-build-isolation -e . -e baselines -e paper
 	@touch $@
 
 install: $(STAMP) ## set up .venv from requirements.lock (the other targets do it too)
@@ -99,7 +99,7 @@ test-oldest: ## run the tests of test-quick with the oldest dependencies that py
 	$(PYTHON) -m venv .venv-oldest
 	$(UV) pip compile --quiet --resolution lowest-direct --extra dask --extra publish --extra dev pyproject.toml -o .venv-oldest/oldest.txt
 	$(UV) pip install --quiet --python .venv-oldest/bin/python -r .venv-oldest/oldest.txt
-	$(UV) pip install --quiet --python .venv-oldest/bin/python --no-deps --no-build-isolation -e . -e baselines
+	$(UV) pip install --quiet --python .venv-oldest/bin/python --no-deps --no-build-isolation -e . -e baselines -e paper
 	.venv-oldest/bin/python -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" --hypothesis-profile=quick $(ARGS)
 
 # The wheels are built from the unpacked sdist, which then loses the code: the tests can find the installed packages alone.
@@ -111,13 +111,14 @@ test-wheel: $(STAMP) ## build the sdist and the wheels in dist/, and run the tes
 	tar -xzf dist/sasgeo_bench-*.tar.gz -C dist/unpacked --strip-components=1
 	cd dist/unpacked && $(CURDIR)/$(VENV_PYTHON) -m hatchling build -t wheel -d $(CURDIR)/dist
 	cd dist/unpacked/baselines && $(CURDIR)/$(VENV_PYTHON) -m hatchling build -d $(CURDIR)/dist
-	rm -r dist/unpacked/sasgeo_bench dist/unpacked/baselines/sasgeo_baselines
+	cd dist/unpacked/paper && $(CURDIR)/$(VENV_PYTHON) -m hatchling build -d $(CURDIR)/dist
+	rm -r dist/unpacked/sasgeo_bench dist/unpacked/baselines/sasgeo_baselines dist/unpacked/paper/sasgeo_paper
 	$(PYTHON) -m venv --clear .venv-wheel
 	.venv-wheel/bin/python -m pip --disable-pip-version-check install --quiet --require-hashes -r requirements.lock
 	.venv-wheel/bin/python -m pip --disable-pip-version-check install --quiet --no-deps dist/*.whl
 	.venv-wheel/bin/python -m pip check
 	cd dist/unpacked && $(CURDIR)/.venv-wheel/bin/python -m pytest -n 2 --dist loadfile -p no:benchmark -m "quick and not slow" \
-	  --hypothesis-profile=quick --ignore=tests/test_repository.py --ignore=tests/test_docs.py --pyargs sasgeo_bench tests $(ARGS)
+	  --hypothesis-profile=quick --ignore=tests/test_repository.py --ignore=tests/test_docs.py --pyargs sasgeo_bench sasgeo_paper tests $(ARGS)
 
 check: $(STAMP) ## ruff and mypy, as CI runs them
 	$(VENV_PYTHON) -m ruff check $(SOURCES)

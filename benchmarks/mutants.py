@@ -34,7 +34,7 @@ MUTANTS: Final = 400
 LONGEST_S: Final = 300
 # Faults that somebody might make: what bits have to do with is a type error at once, and unions are annotations.
 _LEFT_OUT: Final = re.compile(r"Bit(Or|And|Xor)|Shift|_(Mod|FloorDiv|Pow)$|RemoveDecorator|ExceptionReplacer")
-_COPIED: Final = ("sasgeo_bench", "tests", "baselines", "benchmarks", "pipelines", "regions", "splits", "docs",
+_COPIED: Final = ("sasgeo_bench", "tests", "baselines", "paper", "benchmarks", "pipelines", "regions", "splits", "docs",
                   "pyproject.toml", "README.md", "CONTRIBUTING.md")  # fmt: skip
 
 

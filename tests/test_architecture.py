@@ -2,6 +2,7 @@
 """The house (docs/README.md): folders in the order of the pipeline, each of which imports only those above it."""
 
 import ast
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -122,6 +123,11 @@ def sources() -> dict[str, str]:
 def test_every_file_has_a_room_and_imports_only_rooms_above_it(sources: dict[str, str]) -> None:
     faults = house_faults(sources, HOUSE)
     assert not faults, "\n".join(faults)
+
+
+def test_the_package_imports_nothing_that_is_built_on_it(sources: dict[str, str]) -> None:
+    built_on_it = re.compile(r"^\s*(?:from|import) sasgeo_(?:baselines|paper)\b", flags=re.MULTILINE)
+    assert [path for path, text in sources.items() if built_on_it.search(text)] == []
 
 
 def test_no_files_import_each_other_in_a_circle(sources: dict[str, str]) -> None:

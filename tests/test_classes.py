@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sasgeo_baselines
+import sasgeo_paper
 from sasgeo_baselines import anyvisloc_pipeline, polar, zilke_semantic_mi
 from sasgeo_baselines.trackers import kinnari_mcl, swapf
 
@@ -19,7 +20,7 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.sasgeo import class_weights
 from sasgeo_bench.sensing.rendering.roads import STREETS
 
-PACKAGES = tuple(Path(one.__file__).parent for one in (sgb, sasgeo_baselines))
+PACKAGES = tuple(Path(one.__file__).parent for one in (sgb, sasgeo_baselines, sasgeo_paper))
 # Files that name two classes or more in one literal, and why that is no list to be derived.
 ALLOWED = {
     "osm/geojson.py": "keys of OSM, not classes",
@@ -28,8 +29,8 @@ ALLOWED = {
     "osm/taxonomy.py": "parts of a graph, two of which are called as classes are",
     "sensing/tiny_images.py": "drawn pictures, which never change",
     "scoring/segmenter_tables.py": "the classes that a page shows by season and place",
-    "experiments/paper/tiles.py": "the five classes of the paper",
-    "experiments/paper/trials.py": "the five classes of the paper",
+    "tiles.py": "the five classes of the paper",
+    "trials.py": "the five classes of the paper",
     "anyvisloc_pipeline.py": "greys of its drawing; RECIPES below holds whom they leave out",
     "segmenters/colour_thresholds.py": "the classes that it can tell",
 }

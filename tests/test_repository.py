@@ -17,7 +17,7 @@ import pytest
 import yaml
 
 ROOT = Path(__file__).parents[1]
-CODE = ("sasgeo_bench", "baselines", "benchmarks", "tests")
+CODE = ("sasgeo_bench", "baselines", "paper", "benchmarks", "tests")
 LOCKS = ("requirements.lock", "requirements-docs.lock")
 SHIPPED = ("regions", "splits", "pipelines")
 # Made by commands, not by hand (.gitignore names them too).
@@ -190,7 +190,7 @@ def test_a_wheel_holds_the_types_the_taxonomy_and_the_shipped_folders(tmp_path: 
     for folder in SHIPPED:
         expected |= {f"sasgeo_bench/shipped/{folder}/{path.name}" for path in (ROOT / folder).iterdir()}
     assert expected - names == set()
-    assert [name for name in names if name.startswith(("tests/", "baselines/", "regions/"))] == []
+    assert [name for name in names if name.startswith(("tests/", "baselines/", "paper/", "regions/"))] == []
 
 
 # Commands
@@ -234,6 +234,7 @@ def test_the_changelog_and_the_package_say_the_version_it_is_released_under() ->
 def test_the_baselines_ask_for_the_package_by_its_name() -> None:
     asked = requirement_names(project("baselines/pyproject.toml")["dependencies"])
     assert asked == {project()["name"], "lightgbm", "networkx", "scikit-learn"}
+    assert project("paper/pyproject.toml")["dependencies"] == [f"{project()['name']}=={project()['version']}"]
 
 
 def test_every_citation_says_what_the_package_says_of_itself() -> None:
@@ -246,7 +247,8 @@ def test_every_citation_says_what_the_package_says_of_itself() -> None:
     assert zenodo["references"][0].endswith(f": {reference['title']}")
     for name, value in (("version", package["version"]), ("title", cff["title"])):
         assert re.search(rf"{name} += \{{(.*)\}}", read("README.md"))[1] == value
-    assert project("baselines/pyproject.toml")["version"] == package["version"]
+    for other in ("baselines", "paper"):
+        assert project(f"{other}/pyproject.toml")["version"] == package["version"], other
 
 
 def test_an_image_installs_from_the_lock_and_runs_as_a_user_without_rights() -> None:

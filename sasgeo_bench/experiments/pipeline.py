@@ -6,15 +6,11 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
-from itertools import product
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
-from sasgeo_bench.experiments.paper.board import paper_extra
 from sasgeo_bench.experiments.pipeline_plan import (
     MOST_LINES,
     PipelinePlan,
@@ -97,8 +93,8 @@ def run_pipeline(
         sealed=sealed,
         failed=failures.found,
     )
-    paper = () if plan.spec.paper is None else (partial(paper_extra, root=plan.out),)
-    scored = make_board(request, (*drawings(request, has_cases=has_cases), *paper))
+    more = () if plan.experiment is None else (partial(plan.experiment.extra, root=plan.out),)
+    scored = make_board(request, (*drawings(request, has_cases=has_cases), *more))
     if stored is not None:
         tell(pack_board(scored, request, stored).to_text())
     return scored
@@ -108,7 +104,9 @@ def draw_all(plan: PipelinePlan) -> tuple[list[Path], list[Path]]:
     """Draw what is missing of a pipeline's queries and of its controls, and return the folders of both."""
     drawn = _draw(plan.requests, jobs=plan.jobs)
     _render(plan)
-    tasks = [*_with_evidence(plan, drawn), *_draw_paper(plan)]
+    tasks = _with_evidence(plan, drawn)
+    if plan.spec.paper is not None and plan.experiment is not None:
+        tasks += plan.experiment.draw(plan.spec.paper, out=plan.out, private=plan.private)
     return tasks, _draw(plan.controls, jobs=1)
 
 
@@ -230,14 +228,3 @@ def _with_evidence(plan: PipelinePlan, tasks: Sequence[Path]) -> list[Path]:
         )
         found += segment_tasks(wanted)
     return found
-
-
-def _draw_paper(plan: PipelinePlan) -> list[Path]:
-    """Draw every seed and reading of the paper's experiment, unless up to date, and return the task folders."""
-    paper = plan.spec.paper
-    if paper is None:
-        return []
-    asked: dict[str, Any] = {"trials": paper.trials, "out": plan.out, "private": plan.private}
-    made, draw = partial(made_paper_task, **asked), partial(make_paper_task, **asked)
-    each = product(paper.crops.values(), paper.seeds)
-    return [made(seed=seed, crop=crop) or draw(seed=seed, crop=crop) for crop, seed in each]

@@ -5,14 +5,11 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
-from sasgeo_bench.experiments.paper import made_paper_task
-from sasgeo_bench.experiments.paper.task import region_name
+from sasgeo_bench.experiments.experiment import Experiment, find_experiment
 from sasgeo_bench.experiments.sealed import Seal, seal_of
 from sasgeo_bench.experiments.training_groups import TrainingGroups, needed, trains
 from sasgeo_bench.files.plugins import ORACLE, YARDSTICK, check_names, is_tracker
@@ -48,8 +45,9 @@ class PipelinePlan:
     """Steps of a pipeline; `requests` in the order of the file, `controls` those of every board.
 
     With a private seed, `out` is the root of private runs. `jobs` counts the processes of each matcher; `dask` names a
-    cluster to run on instead. `seal` tells of sealed places, None without any. `only` are the hashes of the queries to
-    ask, all without it; those whose answer was written before the stamp `since_ns` are asked again.
+    cluster to run on instead. `seal` tells of sealed places, `experiment` draws trials of its own, each None without
+    any. `only` are the hashes of the queries to ask, all without it; those whose answer was written before the stamp
+    `since_ns` are asked again.
     """
 
     spec: PipelineFile
@@ -60,6 +58,7 @@ class PipelinePlan:
     dask: str | None = None
     private: PrivateSeed | None = None
     seal: Seal | None = None
+    experiment: Experiment | None = None
     only: Mapping[str, str] | None = None
     since_ns: int = 0
 
@@ -176,24 +175,22 @@ def _stage(name: str, requests: Sequence[Request]) -> _Stage:
 def _paper_stage(plan: PipelinePlan) -> _Stage:
     """Return which tasks of the paper's experiment are up to date, one for each seed."""
     paper = plan.spec.paper
-    if paper is None:
+    if paper is None or plan.experiment is None:
         return _Stage(name="", made=(), lacking=())
-    made = partial(made_paper_task, trials=paper.trials, out=plan.out, private=plan.private)
-    asked = list(product(paper.crops.items(), paper.seeds))
-    found = {(suite, seed): made(seed=seed, crop=crop) for (suite, crop), seed in asked}
-    there = {(suite, seed): (plan.out / "tasks" / suite / region_name(seed)).is_dir() for (suite, _), seed in asked}
+    drawn = plan.experiment.drawn(paper, out=plan.out, private=plan.private)
+    there = {task for task in drawn if (plan.out / "tasks").joinpath(*task).is_dir()}
     return _Stage(
         name=f"the paper's experiment, {counted(paper.trials, 'trial')} of each seed",
-        made=tuple((made,) for made in found.values() if made is not None),
+        made=tuple((folder,) for folder in drawn.values() if folder is not None),
         lacking=tuple(
             _Lacking(
                 suite=suite,
-                region=region_name(seed),
-                why="drawn otherwise or damaged" if there[suite, seed] else "not there yet",
+                region=region,
+                why="drawn otherwise or damaged" if (suite, region) in there else "not there yet",
                 most=paper.trials,
             )
-            for (suite, seed), made in found.items()
-            if made is None
+            for (suite, region), folder in drawn.items()
+            if folder is None
         ),
     )
 
@@ -259,6 +256,7 @@ def plan_pipeline(
     `MatchError` for an unknown matcher or rejector.
     """
     check_names(matchers=(*spec.matchers, *CONTROL_MATCHERS, REFERENCE), rejectors=spec.rejectors)
+    experiment = find_experiment(spec)
     out, seed = root_of(out, private), private or spec.seed
     requests: list[Request] = []
     for number, task in enumerate(spec.task):
@@ -303,6 +301,7 @@ def plan_pipeline(
         controls=_plan_controls(seed, out, split),
         out=out,
         private=private,
+        experiment=experiment,
         seal=None if split is None else seal_of(split, kept, sealed, private, out=out),
     )
 

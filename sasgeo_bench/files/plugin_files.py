@@ -2,7 +2,7 @@
 """Where the code of a plugin lies, found as Python would import it, but without running any of it.
 
 Whoever installs a plugin, or puts it on PYTHONPATH, trusts it. What a name that ships stands for does not change by
-that: it is read from where sasgeo-bench and sasgeo-baselines are installed, or from nowhere.
+that: it is read from where sasgeo-bench, sasgeo-baselines and sasgeo-paper are installed, or from nowhere.
 """
 
 import json
@@ -23,8 +23,8 @@ from urllib.parse import unquote, urlsplit
 
 from sasgeo_bench.files.paths import plain_file
 
-SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines")  # the distributions whose names win
-SHIPPED_MODULES: Final = ("sasgeo_bench", "sasgeo_baselines")  # theirs
+SHIPPED: Final = ("sasgeo-bench", "sasgeo-baselines", "sasgeo-paper")  # the distributions whose names win
+SHIPPED_MODULES: Final = ("sasgeo_bench", "sasgeo_baselines", "sasgeo_paper")  # theirs
 _SITE_NAMES: Final = ("site-packages", "dist-packages")
 _HERE: Final = Path(__file__).resolve().parents[1]
 

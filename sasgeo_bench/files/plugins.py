@@ -25,6 +25,7 @@ TRACKERS: Final = "sasgeo_bench.trackers"
 REJECTORS: Final = "sasgeo_bench.rejectors"
 SEGMENTERS: Final = "sasgeo_bench.segmenters"
 SUITES: Final = "sasgeo_bench.suites"
+EXPERIMENTS: Final = "sasgeo_bench.experiments"
 CARD_FILE: Final = "card.toml"  # beside a plugin: the one description of a method
 YARDSTICK: Final = "oracle_"  # prefix of oracles, which use the truth and are never ranked
 # The runner's own controls, which are given the truth: no plugin can have their names.
@@ -38,6 +39,7 @@ KINDS: Final = {
     REJECTORS: "rejector",
     SEGMENTERS: "segmenter",
     SUITES: "suite",
+    EXPERIMENTS: "experiment",
 }
 
 

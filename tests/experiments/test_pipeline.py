@@ -388,6 +388,15 @@ def test_a_reading_of_the_crop_is_a_suite_that_all_matchers_are_asked_on_and_con
         parse_toml(wrong, PipelineFile, source="few.toml")
 
 
+def test_without_its_package_the_paper_is_refused_in_one_line_before_anything_is_drawn(tmp_path, monkeypatch):
+    monkeypatch.setattr("sasgeo_bench.experiments.experiment.list_entry_points", lambda _: {})
+    with pytest.raises(
+        ConfigError, match=r"^pipeline 'few' draws .* sasgeo-paper, is not installed: install the folder"
+    ):
+        plan_pipeline(parse_toml(PAPER, PipelineFile, source="few.toml"), out=tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -11,20 +11,6 @@ from typing import Any, Final
 
 import pandas as pd
 
-from sasgeo_bench.experiments.paper.plots import draw_ablation, draw_example, draw_risk, draw_robustness
-from sasgeo_bench.experiments.paper.readings import CROPS, TITLES, held_lines, with_gaps
-from sasgeo_bench.experiments.paper.tables import (
-    METRICS,
-    PUBLISHED,
-    example_of,
-    risk_frame,
-    robustness_frame,
-    summary_frame,
-    trials_frame,
-    used_interval,
-)
-from sasgeo_bench.experiments.paper.task import DATA, SUITE
-from sasgeo_bench.experiments.paper.tiles import CANDIDATES
 from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.leaderboard.tables import p_text
@@ -34,6 +20,20 @@ from sasgeo_bench.scoring.verdicts import Finding
 from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.sheet import Panel
 from sasgeo_bench.tasks.task_files import Task
+from sasgeo_paper.plots import draw_ablation, draw_example, draw_risk, draw_robustness
+from sasgeo_paper.readings import CROPS, TITLES, held_lines, with_gaps
+from sasgeo_paper.tables import (
+    METRICS,
+    PUBLISHED,
+    example_of,
+    risk_frame,
+    robustness_frame,
+    summary_frame,
+    trials_frame,
+    used_interval,
+)
+from sasgeo_paper.task import DATA, SUITE
+from sasgeo_paper.tiles import CANDIDATES
 
 
 def paper_markdown(
@@ -199,7 +199,7 @@ CAPTIONS: Final = {
 }
 
 
-def paper_extra(board: Scored, *, root: Path) -> Extra:
+def extra(board: Scored, *, root: Path) -> Extra:
     """Return the table next to the paper's, all trials, and figures; `root` holds tasks/, truth/ and regions/."""
     tasks = [Task.of(about, root) for about in board.tasks if about.suite == SUITE]
     by_id = {truth.query_id: truth for task in tasks for truth in task.truths}

@@ -14,10 +14,6 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from sasgeo_bench.experiments.paper.tables import METRICS, PUBLISHED
-from sasgeo_bench.experiments.paper.task import SUITE, VERSION, PaperDrawer
-from sasgeo_bench.experiments.paper.tiles import CANDIDATES, CELL_M, CLASSES, TILES, WINDOW_CELLS, Windows
-from sasgeo_bench.experiments.paper.trials import Around, draw_crops, draw_transformation, draw_view
 from sasgeo_bench.leaderboard.text import markdown_table
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, cell_offsets_m
 from sasgeo_bench.regions.region import Region
@@ -25,6 +21,10 @@ from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.intervals import bootstrap_means, percentile_interval, wilson_mean
 from sasgeo_bench.scoring.pose import Ranks, hits, reciprocal_ranks
 from sasgeo_bench.tasks.suites.base import Seeds
+from sasgeo_paper.tables import METRICS, PUBLISHED
+from sasgeo_paper.task import SUITE, VERSION, PaperDrawer
+from sasgeo_paper.tiles import CANDIDATES, CELL_M, CLASSES, TILES, WINDOW_CELLS, Windows
+from sasgeo_paper.trials import Around, draw_crops, draw_transformation, draw_view
 
 Chosen = Literal["counts", "unit", "rings"]
 Ranked = Literal["counts", "shares", "unit", "rings"]

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pandas as pd
 import pytest
+import sasgeo_paper
+from sasgeo_paper.board import extra
 
 from sasgeo_bench.config import parse_toml
-from sasgeo_bench.experiments import pipeline
-from sasgeo_bench.experiments.paper.board import paper_extra
 from sasgeo_bench.experiments.pipeline import run_pipeline
 from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
 from sasgeo_bench.leaderboard.board_files import check_board
@@ -57,9 +57,7 @@ def made(tmp_path_factory, few_controls, without_drawings, lay_towns):  # noqa: 
         lines = []
         one = planned(out, TEXT.replace('id = "few"', 'id = "one"').replace("[42, 43]", "[42]"))
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(
-                pipeline, "paper_extra", lambda *about, **more: replace(paper_extra(*about, **more), figures={})
-            )
+            patch.setattr(sasgeo_paper, "extra", lambda *about, **more: replace(extra(*about, **more), figures={}))
             with reporting(lines.append):
                 run_pipeline(one)
     return plan, board, one, lines, before
@@ -127,7 +125,7 @@ def test_several_seeds_are_resampled_by_seed_one_by_its_tiles(made):
 def test_figures_are_the_same_bytes_again_and_say_what_they_are_of(made, tmp_path):
     plan, board, *_ = made
     before = {path.name: path.read_bytes() for path in (board_folder(plan) / "figures").iterdir()}
-    for name, draw in paper_extra(board, root=plan.out).figures.items():
+    for name, draw in extra(board, root=plan.out).figures.items():
         draw(tmp_path / name)
         assert (tmp_path / name).read_bytes() == before[name]
     for name in FIGURES:

@@ -6,6 +6,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -13,28 +14,9 @@ import numpy as np
 import shapely
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.experiments.paper.tiles import (
-    CELL_M,
-    EPSG,
-    MARGIN_M,
-    TILES,
-    WINDOW_M,
-    Windows,
-    make_tiles,
-    mosaic_grid,
-    tile_boxes,
-)
-from sasgeo_bench.experiments.paper.trials import (
-    Transformation,
-    View,
-    draw_crops,
-    draw_transformation,
-    draw_view,
-    true_pose,
-)
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.geometry.projection import to_lonlat
-from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, Crop, paper_suite
+from sasgeo_bench.leaderboard.pipeline_spec import PAPER_SUITE, Crop, PaperSpec, paper_suite
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.osm.read import Reading
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -54,6 +36,25 @@ from sasgeo_bench.tasks.suites.mining import Windows as MinedWindows
 from sasgeo_bench.tasks.suites.mining import describe, mine
 from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
 from sasgeo_bench.tasks.task_plan import check_roots
+from sasgeo_paper.tiles import (
+    CELL_M,
+    EPSG,
+    MARGIN_M,
+    TILES,
+    WINDOW_M,
+    Windows,
+    make_tiles,
+    mosaic_grid,
+    tile_boxes,
+)
+from sasgeo_paper.trials import (
+    Transformation,
+    View,
+    draw_crops,
+    draw_transformation,
+    draw_view,
+    true_pose,
+)
 
 SUITE: Final = PAPER_SUITE  # names the draws of every reading of the crop, so that they share their trials
 VERSION: Final = 1
@@ -116,6 +117,24 @@ def made_paper_task(
     except StoreError:
         return None
     return folder if not faults and task.has_truths else None
+
+
+def drawn(spec: PaperSpec, *, out: Path, private: PrivateSeed | None = None) -> dict[tuple[str, str], Path | None]:
+    """Return the folder of each task by suite and region, None where it has to be drawn."""
+    return {
+        (suite, region_name(seed)): made_paper_task(seed=seed, out=out, trials=spec.trials, private=private, crop=crop)
+        for suite, crop in spec.crops.items()
+        for seed in spec.seeds
+    }
+
+
+def draw(spec: PaperSpec, *, out: Path, private: PrivateSeed | None = None) -> list[Path]:
+    """Draw every seed and reading of the crop, unless up to date, and return the folders of the tasks."""
+    folders = []
+    for crop, seed in product(spec.crops.values(), spec.seeds):
+        made = made_paper_task(seed=seed, out=out, trials=spec.trials, private=private, crop=crop)
+        folders.append(made or make_paper_task(seed=seed, out=out, trials=spec.trials, private=private, crop=crop))
+    return folders
 
 
 def _request_sha256(seed: int, trials: int, private: PrivateSeed | None, crop: Crop) -> str:

@@ -8,7 +8,6 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.experiments.paper.tiles import CELL_M, CLASSES, WINDOW_CELLS, Windows
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.pipeline_spec import Crop
 from sasgeo_bench.regions.evidence import ABSENT, UNKNOWN, Evidence
@@ -17,6 +16,7 @@ from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, hide
 from sasgeo_bench.tasks.perturbations.occlusion import CentralCrop
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import Seeds
+from sasgeo_paper.tiles import CELL_M, CLASSES, WINDOW_CELLS, Windows
 
 Around = Literal["anchor", "truth"]
 

@@ -12,11 +12,9 @@ from importlib.metadata import version
 import numpy as np
 import pytest
 import shapely
-
-from sasgeo_bench.errors import ConfigError, PerturbError
-from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task, task
-from sasgeo_bench.experiments.paper.task import VERSION, region_name
-from sasgeo_bench.experiments.paper.tiles import (
+from sasgeo_paper import made_paper_task, make_paper_task, task
+from sasgeo_paper.task import VERSION, region_name
+from sasgeo_paper.tiles import (
     CANDIDATES,
     CLASSES,
     GAP_M,
@@ -31,7 +29,7 @@ from sasgeo_bench.experiments.paper.tiles import (
     mosaic_grid,
     tile_centre_m,
 )
-from sasgeo_bench.experiments.paper.trials import (
+from sasgeo_paper.trials import (
     CHANGE_FACTORS,
     Transformation,
     draw_crops,
@@ -39,6 +37,8 @@ from sasgeo_bench.experiments.paper.trials import (
     map_change,
     rectangle,
 )
+
+from sasgeo_bench.errors import ConfigError, PerturbError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
@@ -428,7 +428,7 @@ def test_a_rectangle_covers_no_more_than_its_share_and_lies_in_the_view_whole():
 
 @pytest.mark.slow
 def test_another_process_makes_the_same_bytes_and_fewer_trials_are_the_first_of_more(out, tmp_path):
-    code = "import sys; from pathlib import Path; from sasgeo_bench.experiments.paper import make_paper_task as make\n"
+    code = "import sys; from pathlib import Path; from sasgeo_paper import make_paper_task as make\n"
     code += f"make(seed=42, out=Path(sys.argv[1]), trials={FEW})"
     environment = os.environ | {"PYTHONHASHSEED": "7", "OMP_NUM_THREADS": "1", "GDAL_NUM_THREADS": "1"}
     subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True, env=environment)  # noqa: S603 - our own code

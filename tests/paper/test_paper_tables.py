@@ -4,10 +4,9 @@
 import numpy as np
 import pandas as pd
 import pytest
-
-from sasgeo_bench.experiments.paper.board import difference_lines, paper_markdown
-from sasgeo_bench.experiments.paper.readings import with_gaps
-from sasgeo_bench.experiments.paper.tables import (
+from sasgeo_paper.board import difference_lines, paper_markdown
+from sasgeo_paper.readings import with_gaps
+from sasgeo_paper.tables import (
     PUBLISHED,
     example_of,
     risk_frame,
@@ -15,6 +14,7 @@ from sasgeo_bench.experiments.paper.tables import (
     summary_frame,
     trials_frame,
 )
+
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts

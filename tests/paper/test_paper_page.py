@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from sasgeo_paper.board import paper_markdown
+from sasgeo_paper.decoys import decoys_markdown
+from sasgeo_paper.tables import PUBLISHED
 
-from sasgeo_bench.experiments.paper.board import paper_markdown
-from sasgeo_bench.experiments.paper.decoys import decoys_markdown
-from sasgeo_bench.experiments.paper.tables import PUBLISHED
-
-PAGE = Path(__file__).parents[3] / "docs" / "concepts" / "paper.md"
+PAGE = Path(__file__).parents[2] / "docs" / "concepts" / "paper.md"
 ABOUT = {"trials": "220 trials", "made_by": "a test", "data": "made up"}
 CROPS = ("unknown", "absent", "smaller")
 DECOYS = ["chosen_by", "nearest_to", "windows", "ranked_by"]
@@ -25,7 +24,7 @@ def readings():
 
 @pytest.fixture(scope="module")
 def decoys():
-    """The table of benchmarks/paper_decoys.py."""
+    """The table of `python -m sasgeo_paper`."""
     return pd.read_parquet(PAGE.parent / "paper" / "decoys.parquet")
 
 

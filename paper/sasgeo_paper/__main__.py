@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's first variant under every reading of decoys and descriptor: no speed, and no figure of any board.
+"""`python -m sasgeo_paper`: the paper's first variant under every reading of decoys and descriptor.
 
 Draws the region if it is not there, and writes OUT/paper-decoys.parquet and OUT/paper-decoys.md. Takes a minute.
 """
@@ -7,11 +7,11 @@ Draws the region if it is not there, and writes OUT/paper-decoys.parquet and OUT
 import argparse
 from pathlib import Path
 
-from sasgeo_bench.experiments.paper import made_paper_task, make_paper_task
-from sasgeo_bench.experiments.paper.decoys import decoys_frame, decoys_markdown, every_reading
-from sasgeo_bench.experiments.paper.task import TRIALS, region_name
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
+from sasgeo_paper import made_paper_task, make_paper_task
+from sasgeo_paper.decoys import decoys_frame, decoys_markdown, every_reading
+from sasgeo_paper.task import TRIALS, region_name
 
 
 def main() -> None:
@@ -29,7 +29,7 @@ def main() -> None:
     text = decoys_markdown(table)
     table.to_parquet(words.out / "paper-decoys.parquet", index=False)
     (words.out / "paper-decoys.md").write_text(text, encoding="utf-8")
-    print(text)
+    print(text)  # noqa: T201 - its output
 
 
 if __name__ == "__main__":

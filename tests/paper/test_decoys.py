@@ -5,9 +5,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from sasgeo_baselines.global_descriptor import GlobalDescriptor
-
-from sasgeo_bench.experiments.paper import make_paper_task
-from sasgeo_bench.experiments.paper.decoys import (
+from sasgeo_paper import make_paper_task
+from sasgeo_paper.decoys import (
     RANKED,
     Decoys,
     Described,
@@ -17,9 +16,10 @@ from sasgeo_bench.experiments.paper.decoys import (
     every_reading,
     finding_lines,
 )
-from sasgeo_bench.experiments.paper.task import SUITE, VERSION, PaperDrawer
-from sasgeo_bench.experiments.paper.tiles import CLASSES, TILES
-from sasgeo_bench.experiments.paper.trials import draw_crops
+from sasgeo_paper.task import SUITE, VERSION, PaperDrawer
+from sasgeo_paper.tiles import CLASSES, TILES
+from sasgeo_paper.trials import draw_crops
+
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.suites.base import Seeds

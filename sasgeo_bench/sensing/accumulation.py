@@ -17,7 +17,6 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import cell_offsets_m
 from sasgeo_bench.sensing.birdseye import SoftView
-from sasgeo_bench.sensing.camera import Attitude, Camera
 
 Planes = NDArray[np.float32]
 
@@ -62,17 +61,6 @@ class Errors:
         walk = math.radians(self.yaw_deg_per_km) * math.sqrt(distance_m / _M_PER_KM)
         shares = (distance_m * self.position_share, distance_m * self.height_share)
         return math.hypot(height_m * turn, reach_m * turn, reach_m * walk, *shares)
-
-
-def believed_cameras(cameras: Sequence[Camera], errors: Errors, rng: np.random.Generator) -> list[Camera]:
-    """Return the cameras of a flight as they are believed: each turned by its own error, heights off by one share."""
-    share = errors.height_share * rng.standard_normal()
-    found = []
-    for camera in cameras:
-        roll_deg, pitch_deg, yaw_deg = (errors.attitude_deg * rng.standard_normal(3)).tolist()
-        turned = camera.turned(Attitude(roll_deg=roll_deg, pitch_deg=pitch_deg, yaw_deg=yaw_deg))
-        found.append(turned.moved(up_m=camera.height_m * share))
-    return found
 
 
 def steps_between(poses: Sequence[Pose]) -> list[Pose]:

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 LABELS: Final = "labels.parquet"  # beside the truths: what is on each pixel of each frame
 MOST_PICTURE_BYTES: Final = 150_000
-MOST_FRAMES: Final = 64
 _SIGMAS: Final = ("height_sigma_m", "attitude_sigma_deg", "position_sigma_m", "yaw_sigma_deg")
 
 FRAME: Final = pa.struct(

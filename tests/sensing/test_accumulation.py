@@ -11,10 +11,8 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import CameraError, ShapeError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, cell_offsets_m
-from sasgeo_bench.sensing.accumulation import Errors, accumulate, believed_cameras, believed_steps, steps_between
+from sasgeo_bench.sensing.accumulation import Errors, accumulate, believed_steps, steps_between
 from sasgeo_bench.sensing.birdseye import Reading, SoftView
-from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 
 SIZE = 64
 HERE = Pose(easting_m=0.0, northing_m=0.0, yaw_deg=0.0)
@@ -127,19 +125,6 @@ def test_drift_grows_with_the_distance_as_declared_and_without_error_there_is_no
         ends.append([sum(step.easting_m for step in drifted), sum(step.northing_m for step in drifted) - 200])
     assert np.std(ends, axis=0) == pytest.approx([4.0, 4.0], rel=0.15)
     assert believed_steps(steps, Errors(), np.random.default_rng(0)) == steps
-
-
-def test_believed_cameras_are_off_as_declared():
-    lens = Intrinsics.from_field_of_view(horizontal_deg=60.0, width_px=80, height_px=60)
-    camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=100.0, yaw_deg=10.0)
-    errors = Errors(attitude_deg=2.0, height_share=0.05)
-    found = [believed_cameras([camera] * 2, errors, np.random.default_rng(seed)) for seed in range(300)]
-    heights = np.array([[each.height_m for each in pair] for pair in found])
-    assert (heights[:, 0] == heights[:, 1]).all()
-    assert heights[:, 0].std() == pytest.approx(5.0, rel=0.15)
-    tilts = np.array([pair[0].tilt_deg for pair in found])
-    assert np.sqrt((tilts**2).mean()) == pytest.approx(2.0 * math.sqrt(2), rel=0.15)
-    assert believed_cameras([camera], Errors(), np.random.default_rng(0))[0].tilt_deg == pytest.approx(0.0, abs=1e-6)
 
 
 OTHER = SoftView(classes=("a",), probabilities=np.zeros((1, 3, 3), np.float32), cell_size_m=1.0)

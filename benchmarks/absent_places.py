@@ -31,14 +31,12 @@ import pandas as pd
 
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.leaderboard.board_files import read_board_manifest, read_scores
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.plugins import rejector_maker
-from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.publishing.archive_file import read_stored_predictions
 from sasgeo_bench.scoring.base import Floats
-from sasgeo_bench.scoring.decisions import Fixes, accept, presence_weights
-from sasgeo_bench.scoring.draws import seed_of_text
-from sasgeo_bench.scoring.integrity_metric import risk_coverage
-from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval
+from sasgeo_bench.scoring.decisions import Fixes, accept, presence_weights, risk_coverage
+from sasgeo_bench.scoring.intervals import BoardDraws, BoardInterval, seed_of_text
 from sasgeo_bench.scoring.rejection import OWN, turns
 from sasgeo_bench.scoring.rejection_rows import Share, share_intervals
 from sasgeo_bench.tasks.split import Split, find_split

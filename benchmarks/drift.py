@@ -14,12 +14,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.flights.drift import PairedRun, measure_drift, pair_run
-from sasgeo_bench.flights.drift_fit import FittedDrift, fit_profile, law_figures
+from sasgeo_bench.flights.drift import FittedDrift, PairedRun, fit_profile, law_figures, measure_drift, pair_run
 from sasgeo_bench.flights.drift_profile import DriftProfile, load_profile, write_drift_profile
 from sasgeo_bench.flights.odometry import dead_reckon, draw_odometry
-from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.flights.tum import read_tum
+from sasgeo_bench.flights.trajectory import Trajectory, read_tum
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 
 # File name, what it is, seconds without a pose that are a lost stretch: keyframes may be far from each other.

@@ -23,9 +23,8 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import Page, page
 from sasgeo_bench.errors import FlightError, SasgeoError
-from sasgeo_bench.flights.corridors import Ways
 from sasgeo_bench.flights.kinematics import crab_deg, fly, tilt_deg, yaw_rate_deg_s
-from sasgeo_bench.flights.plans import KINDS, PlanKind, plan_flight
+from sasgeo_bench.flights.plans import KINDS, PlanKind, Ways, plan_flight
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.preview import paint_overview

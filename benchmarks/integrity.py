@@ -14,7 +14,7 @@ from collections.abc import Callable
 import numpy as np
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.sasgeo.conformal import levels_of
 from sasgeo_bench.sasgeo.integrity import Modes, evidence_of
 from sasgeo_bench.sasgeo.rejectors import SasgeoBoosted, SasgeoLogistic

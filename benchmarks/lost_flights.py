@@ -21,9 +21,8 @@ import pandas as pd
 from sasgeo_bench.errors import SasgeoError, StoreError
 from sasgeo_bench.leaderboard.board_files import read_scores
 from sasgeo_bench.publishing.archive_file import read_stored_predictions, unpack_tasks
-from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
 from sasgeo_bench.scoring.flights import view_frame
-from sasgeo_bench.scoring.intervals import percentile_interval
+from sasgeo_bench.scoring.intervals import ClusterDraws, percentile_interval, seed_of_text
 from sasgeo_bench.tasks.query import SEQUENCE
 from sasgeo_bench.tasks.task_files import Task
 

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.photos import Photo, read_photo
 
 REDUCED = 4  # photos are matched at a quarter of their size

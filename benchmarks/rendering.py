@@ -27,8 +27,7 @@ from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.intrinsics import Intrinsics
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.rendering.conditions import Conditions, draw_conditions
 from sasgeo_bench.sensing.rendering.scene import Scene, make_scene
 from sasgeo_bench.sensing.rendering.view import render

@@ -17,9 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.sensing.camera import Attitude, Camera
+from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.tilt import join_parallel, refine_tilt, road_borders
 
 HEIGHT_M, SIDE_PX, WIDE_DEG = 120.0, 768, 70.0

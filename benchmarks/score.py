@@ -30,13 +30,13 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.publishing.archive import score_all
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.run_manifest import CardRecord, RunManifest
+from sasgeo_bench.running.prediction_files import CardRecord, RunManifest
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import Split, SplitFile, make_split

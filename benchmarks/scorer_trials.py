@@ -27,6 +27,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from sasgeo_bench.tasks.suites.measured_vectors import MeasuredVectorNoise, perceive_coarsely
 
 import sasgeo_bench as sgb
 from sasgeo_bench.sasgeo import raster
@@ -41,7 +42,6 @@ from sasgeo_bench.search.field import FULL, between, warped
 from sasgeo_bench.search.find import search
 from sasgeo_bench.search.plan import Plan
 from sasgeo_bench.tasks.query import base_of
-from sasgeo_bench.tasks.suites.measured_vectors import MeasuredVectorNoise, perceive_coarsely
 
 # Widths, metres, with bounds: both are changed about the values that ship, one at a time.
 PAIRS = [*product((24.0,), (1e3, 3e3, 1e4, 3e4)), *product((12.0, 48.0, 96.0), (3e3,))]

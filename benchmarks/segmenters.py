@@ -42,14 +42,20 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.matching.segmenter import LearningSegmenter
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.scoring.draws import seed_of_text
-from sasgeo_bench.scoring.segmentation_counts import PixelCounts, read_counts, write_counts
-from sasgeo_bench.scoring.segmenter_board import NOTHING, PLAIN, SegmenterBoard, SegmenterTrial, write_board
-from sasgeo_bench.scoring.segmenter_tables import page_tables, with_tables
-from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.image_bytes import SUFFIX, LabelledFiles, write_labelled
-from sasgeo_bench.sensing.intrinsics import Intrinsics
-from sasgeo_bench.sensing.region_views import part_bounds_m, region_views, split_bounds
+from sasgeo_bench.scoring.intervals import seed_of_text
+from sasgeo_bench.scoring.segmentation import PixelCounts, read_counts, write_counts
+from sasgeo_bench.scoring.segmenter_board import (
+    NOTHING,
+    PLAIN,
+    SegmenterBoard,
+    SegmenterTrial,
+    page_tables,
+    with_tables,
+    write_board,
+)
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
+from sasgeo_bench.sensing.image import SUFFIX, LabelledFiles, write_labelled
+from sasgeo_bench.sensing.reference_imagery import part_bounds_m, region_views, split_bounds
 from sasgeo_bench.sensing.rendering.conditions import draw_conditions
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import make_scene

@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.intervals import percentile_interval, wilson_share
+from sasgeo_bench.scoring.intervals import ClusterDraws, percentile_interval, seed_of_text, wilson_share
 
 LOOKS = ("published", "rendered", "shifted")
 VIEW = ["matcher", "suite", "pair_id", "role", "kind", "strength", "view_cells"]

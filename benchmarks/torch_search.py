@@ -34,8 +34,7 @@ from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.search.field import FULL, Field, Template, between, warped
 from sasgeo_bench.search.find import Search
 from sasgeo_bench.search.plan import Found, Mode, Plan
-from sasgeo_bench.search.torch_modes import torch
-from sasgeo_bench.search.torch_search import BatchSearch
+from sasgeo_bench.search.torch_search import BatchSearch, torch
 
 CELL_M = 2.0
 VIEW_CELLS = 96

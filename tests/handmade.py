@@ -11,14 +11,14 @@ import pandas as pd
 
 from sasgeo_bench.canvas import page
 from sasgeo_bench.leaderboard.board_files import ANSWER_SCHEMA, Extra, write_board
-from sasgeo_bench.leaderboard.board_plots import BoardPage
 from sasgeo_bench.leaderboard.manifests import BoardManifest
+from sasgeo_bench.leaderboard.plots import BoardPage
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, RUN_HERE, EntryLabel, Row, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION
 from sasgeo_bench.scoring.tables import leaderboard
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
 from tests.scoring.test_tables import scores
 
 HOSTILE = "<script>alert(1)</script>"

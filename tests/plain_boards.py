@@ -8,7 +8,7 @@ import pytest
 
 from sasgeo_bench.leaderboard import build
 from sasgeo_bench.scoring import rejection
-from sasgeo_bench.scoring.acceptance import acceptance_frame
+from sasgeo_bench.scoring.rejection import acceptance_frame
 
 
 @contextmanager

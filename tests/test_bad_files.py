@@ -34,13 +34,12 @@ from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.importers.kinds import read_dataset
-from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
+from sasgeo_bench.importers.retrieval import read_ranking
 from sasgeo_bench.leaderboard.manifests import PackManifest
 from sasgeo_bench.leaderboard.pipeline_spec import read_pipeline_file
-from sasgeo_bench.matching.card_file import read_card_file
-from sasgeo_bench.matching.learned_file import read_learned
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.cards import read_card_file, read_learned
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import AnsweredTask, Card, Submission, example_card
 from sasgeo_bench.osm.history import DatedExtract, read_history
 from sasgeo_bench.osm.read import read_extract
@@ -51,8 +50,7 @@ from sasgeo_bench.publishing.site_files import read_board_files
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import read_region_file
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA, prediction_row
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA, RunManifest, prediction_row
 from sasgeo_bench.running.testing import TinyPlace
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel as Learnt
 from sasgeo_bench.scoring.entries import find_entries

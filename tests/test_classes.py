@@ -28,7 +28,7 @@ ALLOWED = {
     "osm/synthetic/town.py": "keys of OSM, not classes",
     "osm/taxonomy.py": "parts of a graph, two of which are called as classes are",
     "sensing/tiny_images.py": "drawn pictures, which never change",
-    "scoring/segmenter_tables.py": "the classes that a page shows by season and place",
+    "scoring/segmenter_board.py": "the classes that a page shows by season and place",
     "tiles.py": "the five classes of the paper",
     "trials.py": "the five classes of the paper",
     "anyvisloc_pipeline.py": "greys of its drawing; RECIPES below holds whom they leave out",

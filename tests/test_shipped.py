@@ -11,7 +11,7 @@ from sasgeo_bench.config import shipped_dir
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RUN, RunManifest
+from sasgeo_bench.running.prediction_files import RUN, RunManifest
 from sasgeo_bench.running.worker import Limits
 
 

@@ -25,16 +25,15 @@ from sasgeo_bench.canvas import PlainFigure, page
 from sasgeo_bench.cli.console import Bars, errors, print_table, say, tell
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.board_files import write_board
-from sasgeo_bench.leaderboard.board_plots import BoardPage, line_keys
-from sasgeo_bench.leaderboard.case_plot import pixels_of
+from sasgeo_bench.leaderboard.cases import pixels_of
+from sasgeo_bench.leaderboard.plots import BoardPage, line_keys
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown
-from sasgeo_bench.matching.matcher import RejectorCard
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction, RejectorCard
 from sasgeo_bench.publishing.site import environment
 from sasgeo_bench.publishing.site_files import svg_fault
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks import task_files
@@ -318,7 +317,7 @@ def callers():
     [
         ("Figure", set()),
         ("Console", set()),
-        ("echo", {"cli/console.py", "cli/submissions.py"}),
+        ("echo", {"cli/console.py", "cli/entering.py"}),
         ("Environment", {"publishing/site.py"}),
         ("Markup", set()),
         ("to_csv", {"leaderboard/board_files.py"}),

@@ -16,7 +16,7 @@ from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import RegionFile, list_region_files, read_region_file
 from sasgeo_bench.tasks.split import Block, Split, find_split
-from sasgeo_bench.tasks.suites.real_age import DAYS_PER_YEAR
+from sasgeo_bench.tasks.suites.ages import DAYS_PER_YEAR
 
 SPLIT: Final = "places"
 LEAST_YEARS: Final = (8.0, 5.0, 2.0)

@@ -9,8 +9,7 @@ import numpy as np
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.intrinsics import Intrinsics
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import make_scene

@@ -20,7 +20,6 @@ from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.files.plugins import MATCHERS, REJECTORS, SEGMENTERS, list_entry_points
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.leaderboard.board_files import BOARD, SCHEMAS
-from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, TERMS
 from sasgeo_bench.leaderboard.pipeline_spec import (
     ContrastSpec,
     LearningSpec,
@@ -30,7 +29,8 @@ from sasgeo_bench.leaderboard.pipeline_spec import (
     find_pipeline_file,
     read_pipeline_file,
 )
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.leaderboard.tables import MARKS, MEANINGS, TERMS
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import Card, Submission
 from sasgeo_bench.osm.features import DTYPES
 from sasgeo_bench.osm.locate import Extract, TownEntry

@@ -15,10 +15,9 @@ from sasgeo_bench.leaderboard.board_files import Extra
 from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.leaderboard.tables import p_text
 from sasgeo_bench.leaderboard.text import markdown_table
+from sasgeo_bench.scoring.compare import Finding
 from sasgeo_bench.scoring.rows import is_unranked
-from sasgeo_bench.scoring.verdicts import Finding
-from sasgeo_bench.tasks.panels import panels
-from sasgeo_bench.tasks.sheet import Panel
+from sasgeo_bench.tasks.sheet import Panel, panels_of
 from sasgeo_bench.tasks.task_files import Task
 from sasgeo_paper.plots import draw_ablation, draw_example, draw_risk, draw_robustness
 from sasgeo_paper.readings import CROPS, TITLES, held_lines, with_gaps
@@ -253,7 +252,7 @@ def _in_words(seeds: list[int], trials: int) -> str:
 
 
 def _example(task: Task) -> Panel:
-    (panel,) = panels(task, query_id=example_of(task.truths).query_id)
+    (panel,) = panels_of(task, query_id=example_of(task.truths).query_id)
     return panel
 
 

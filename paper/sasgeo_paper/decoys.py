@@ -17,8 +17,14 @@ from numpy.typing import NDArray
 from sasgeo_bench.leaderboard.text import markdown_table
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, cell_offsets_m
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.scoring.draws import DRAWS, ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.intervals import bootstrap_means, percentile_interval, wilson_mean
+from sasgeo_bench.scoring.intervals import (
+    DRAWS,
+    ClusterDraws,
+    bootstrap_means,
+    percentile_interval,
+    seed_of_text,
+    wilson_mean,
+)
 from sasgeo_bench.scoring.pose import Ranks, hits, reciprocal_ranks
 from sasgeo_bench.tasks.suites.base import Seeds
 from sasgeo_paper.tables import METRICS, PUBLISHED

@@ -9,7 +9,7 @@ import pandas as pd
 
 from sasgeo_bench.leaderboard.pipeline_spec import Crop, paper_suite
 from sasgeo_bench.scoring.contrasts import Contrast, mean_finding
-from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_paper.tables import METRICS, PUBLISHED
 
 CROPS: Final[dict[str, Crop]] = {paper_suite(crop): crop for crop in get_args(Crop)}

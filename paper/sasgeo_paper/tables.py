@@ -10,10 +10,9 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.base import Bools
-from sasgeo_bench.scoring.decisions import Fixes
-from sasgeo_bench.scoring.integrity_metric import aurc, risk_coverage
+from sasgeo_bench.scoring.decisions import Fixes, aurc, risk_coverage
 from sasgeo_bench.scoring.intervals import Interval, wilson_mean
 from sasgeo_bench.scoring.metrics import ranks_of
 from sasgeo_bench.scoring.pose import hits, reciprocal_ranks

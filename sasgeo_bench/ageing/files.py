@@ -9,8 +9,7 @@ from typing import Final
 
 import pandas as pd
 
-from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, Ageing
-from sasgeo_bench.ageing.pairing import MATCH_IOU, NEAR_M, REDRAWN_M
+from sasgeo_bench.ageing.measure import DTYPES, LEAST_DAYS, MATCH_IOU, NEAR_M, REDRAWN_M, Ageing
 from sasgeo_bench.ageing.plots import draw_ageing
 from sasgeo_bench.ageing.ratebook import VERSION
 from sasgeo_bench.errors import ConfigError, StoreError

@@ -14,25 +14,21 @@ from sasgeo_bench.cli.options import Dask, ExtractFolders, Options, Out, RegionF
 from sasgeo_bench.cli.seeds import SealedSeedFile, SeedFile, private_seed, sealed_seed
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.head_start import packed_for, unpack_head_start
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
+from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.experiments.sealed import check_day
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_tables import Book
+from sasgeo_bench.leaderboard.board_tables import Book, contrast_table, risk_tables, summary
 from sasgeo_bench.leaderboard.manifests import SeedRecord
-from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, find_pipeline_file, read_pipeline_file
 from sasgeo_bench.leaderboard.private_board import check_public, read_private
-from sasgeo_bench.leaderboard.rejection_tables import risk_tables
 from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, warnings_of
-from sasgeo_bench.leaderboard.validity_tables import contrast_table
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, request_of, score_all
 from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.publishing.submissions import submissions_for
 from sasgeo_bench.running.failures import log_beside
-from sasgeo_bench.scoring.draws import DRAWS
+from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.tasks.task_files import TRUTH
 
 CONTROL_FAILED: Final = 3  # exit status

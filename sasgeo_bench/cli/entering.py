@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command that enters a matcher on a published board."""
+"""The commands that make a submission of answers, and enter a matcher on a published board."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +11,43 @@ from sasgeo_bench.cli.boards import check_controls, show_board
 from sasgeo_bench.cli.console import say, shown_progress
 from sasgeo_bench.cli.options import ExtractFolders, Options, Out, RegionFolders
 from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, failure_lines, plan_entry
+from sasgeo_bench.matching.submission import example_card
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.elsewhere import elsewhere_lines
+from sasgeo_bench.publishing.submissions import SubmitRequest, make_submission
+
+
+def submit_command(
+    *,
+    predictions: Annotated[
+        Path | None, typer.Option(help="predictions file, or the folder of a matcher's runs")
+    ] = None,
+    card: Annotated[Path | None, typer.Option(help="card, a .toml file (--example-card prints one)")] = None,
+    board: Annotated[
+        Path | None,
+        typer.Option(
+            "--for",
+            help="stored results of the board, as docs/results/systems-objects; leaderboard --results stores some",
+        ),
+    ] = None,
+    into: Annotated[Path | None, typer.Option(help="folder to write; default: submissions/BOARD/NAME")] = None,
+    example: Annotated[bool, typer.Option("--example-card", help="print a card to begin with, and stop")] = False,
+) -> None:
+    """Put predictions, card, versions and hashes into a folder that verify accepts: SUBMISSIONS/NAME."""
+    if example:
+        typer.echo(example_card(), nl=False)
+        return
+    if predictions is None or card is None or board is None:
+        needed = {"--predictions": predictions, "--card": card, "--for": board}
+        lacking = [flag for flag, value in needed.items() if value is None]
+        raise ConfigError(
+            f"submit needs {' and '.join(lacking)}: name the answers, the card and the stored results of the board"
+        )
+    folder = make_submission(SubmitRequest(predictions=predictions, card=card, board=board, into=into))
+    say(str(folder))
+    tell(f"next: verify {folder} --for {board}; then open a pull request with the folder")
 
 
 @dataclass(frozen=True, kw_only=True)

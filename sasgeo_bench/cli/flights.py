@@ -16,16 +16,13 @@ from sasgeo_bench.cli.options import Options
 from sasgeo_bench.errors import FlightError, counted
 from sasgeo_bench.files.folders import fresh_file
 from sasgeo_bench.files.parquet import write_frame
-from sasgeo_bench.flights.axes import Axes
-from sasgeo_bench.flights.drift import LOST_S, PairedRun, measure_drift, pair_run
-from sasgeo_bench.flights.drift_fit import fit_profile
+from sasgeo_bench.flights.drift import LOST_S, PairedRun, fit_profile, measure_drift, pair_run
 from sasgeo_bench.flights.drift_profile import write_drift_profile
 from sasgeo_bench.flights.log_points import FlightLog, steps_m
 from sasgeo_bench.flights.log_units import SPEED_MPS, AngleUnit, HeightUnit, LogFacts, PlaceUnit, TimeUnit
 from sasgeo_bench.flights.logs import gaps_of, is_tum, read_flight, read_log, read_poses
 from sasgeo_bench.flights.plans import MARGIN_M, SHORTEST_M
-from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.flights.tum import read_tum, write_tum
+from sasgeo_bench.flights.trajectory import Axes, Trajectory, read_tum, write_tum
 from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region_files import read_region
 

@@ -32,8 +32,8 @@ def import_dataset_command(
 ) -> None:
     """List queries and gallery of another benchmark's dataset, and score a ranking of them: OUT/datasets/KIND."""
     from sasgeo_bench.files.folders import sha256_of  # noqa: PLC0415
-    from sasgeo_bench.importers.rankings import read_ranking  # noqa: PLC0415
     from sasgeo_bench.importers.reports import score_ranking  # noqa: PLC0415
+    from sasgeo_bench.importers.retrieval import read_ranking  # noqa: PLC0415
     from sasgeo_bench.importers.tables import import_folder, write_items, write_reports  # noqa: PLC0415
 
     dataset = _read(folder, kind)
@@ -48,7 +48,7 @@ def import_dataset_command(
 
 def locate_dataset_command(folder: Folder, *, kind: Kind, regions: RegionFolders = None) -> None:
     """Say where a dataset lies, and which OpenStreetMap extracts cover it."""
-    from sasgeo_bench.importers.extents import find_extents  # noqa: PLC0415
+    from sasgeo_bench.importers.reader import find_extents  # noqa: PLC0415
 
     extents = find_extents(_read(folder, kind), folders=regions or ())
     table = Table("area", "items", "center_lonlat", "km", "west,south,east,north", box=None, pad_edge=False)

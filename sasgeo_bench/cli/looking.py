@@ -15,9 +15,8 @@ from sasgeo_bench.cli.options import Options, Out, RegionFolders
 from sasgeo_bench.cli.targets import find_built, find_task, is_split, no_target
 from sasgeo_bench.errors import ConfigError, counted
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest, read_scores
-from sasgeo_bench.leaderboard.case_plot import case_pixels, write_png
-from sasgeo_bench.leaderboard.cases import count_cases, sample_cases
-from sasgeo_bench.leaderboard.flight_maps import flight_map_pixels
+from sasgeo_bench.leaderboard.cases import case_pixels, count_cases, sample_cases, write_png
+from sasgeo_bench.leaderboard.flight_plots import flight_map_pixels
 from sasgeo_bench.leaderboard.run_cases import RunCases, find_flight, is_run, picture_of, read_run_cases
 from sasgeo_bench.leaderboard.strip_plot import best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.osm.taxonomy import load_taxonomy
@@ -29,10 +28,8 @@ from sasgeo_bench.regions.region_files import LAYERS, PREVIEW, differing_files, 
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.strata import STRESS
-from sasgeo_bench.tasks.flight_sheet import flight_panels, write_flight_sheet
-from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import BY, SEQUENCE_DIGITS
-from sasgeo_bench.tasks.sheet import write_sheet
+from sasgeo_bench.tasks.sheet import flight_panels, panels_of, write_flight_sheet, write_sheet
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
 from sasgeo_bench.tasks.split_map import write_split_map
 from sasgeo_bench.tasks.task_files import Task
@@ -129,7 +126,7 @@ def _inspect_task(task: Task, out: Path, *, query: str | None, rows: int) -> Non
     path = _sheet(out, *about.name, *([query] if query else []))
     is_of_view = query is not None and len(query) > SEQUENCE_DIGITS
     maps = flight_panels(task, count=rows, flight=query) if about.is_of_flights and not is_of_view else ()
-    chosen = () if maps else panels(task, count=rows, query_id=query)
+    chosen = () if maps else panels_of(task, count=rows, query_id=query)
     table = Table(box=None, show_header=False, pad_edge=False)
     for name, value in about.to_json().items():
         table.add_row(name, _text_of(value))

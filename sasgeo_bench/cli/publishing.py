@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Publish a board as a site: the function and its command."""
+"""Publish a board as a site, release its dataset, send and fetch folders: the functions and their commands."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,12 +9,19 @@ import typer
 
 from sasgeo_bench import progress
 from sasgeo_bench.cli.boards import check_controls
-from sasgeo_bench.cli.console import say, shown_progress
-from sasgeo_bench.cli.options import Options, Out, takes
+from sasgeo_bench.cli.console import read_date, say, shown_progress
+from sasgeo_bench.cli.options import ExtractFolders, Options, Out, takes
+from sasgeo_bench.cli.seeds import SealedSeedFile, sealed_seed
+from sasgeo_bench.errors import ConfigError, counted
+from sasgeo_bench.experiments.board_queries import BoardRequest, draw_board
+from sasgeo_bench.files.paths import given_path
+from sasgeo_bench.files.storage import Moved, fetch, send, shown
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing import build
 from sasgeo_bench.publishing.archive import board_of
+from sasgeo_bench.publishing.release import ReleaseRequest, check_place, make_release
+from sasgeo_bench.publishing.release_files import BoardTasks
 from sasgeo_bench.publishing.site_files import Written
 from sasgeo_bench.publishing.submissions import with_submissions
 
@@ -87,3 +94,114 @@ def publish_command(options: PublishOptions) -> None:
     say(written.folder / "index.html")
     if board is not None:
         check_controls(board)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReleaseOptions(Options):
+    """Flags of release."""
+
+    regions: Annotated[list[str] | None, typer.Option("--regions", help="id of a built region; may be repeated")] = None
+    board: Annotated[
+        Path | None,
+        typer.Option(
+            help="stored results of a board, as docs/results/towns: draw its queries and release exactly these"
+        ),
+    ] = None
+    pipeline: Annotated[
+        Path | None, typer.Option(help="file of the pipeline that made the board; default: the shipped one")
+    ] = None
+    extracts: ExtractFolders = None
+    sealed_seed_file: SealedSeedFile = None
+    jobs: Annotated[int, typer.Option(min=1, help="processes that draw the queries of a board")] = 1
+    suites: Annotated[
+        list[str] | None,
+        typer.Option("--suites", help="name from list suites; may be repeated; default: all there are queries of"),
+    ] = None
+    split: Annotated[str, typer.Option(help="id or file of the split that the queries were drawn by")] = "crossfit"
+    truth: Annotated[bool, typer.Option("--truth", help="put the truths of test queries into it too")] = False
+    into: Annotated[Path | None, typer.Option(help="folder of the release; default: OUT/release")] = None
+    date: Annotated[str | None, typer.Option(help="day of publication; default: that of the newest map")] = None
+    url: Annotated[str | None, typer.Option(help="address where the release will be found")] = None
+    out: Out = Path("out")
+
+
+def release_command(options: ReleaseOptions) -> None:
+    """Write regions and queries, or those of a board, as a dataset that others load without this program."""
+    day = read_date(options.date)
+    _check_flags(options)
+    into = given_path(options.into or options.out / "release")
+    check_place(into, options.out, url=options.url)
+    board = None if options.board is None else _queries_of(options, options.board)
+    request = ReleaseRequest(
+        regions=tuple(options.regions or ()) if board is None else board.regions,
+        suites=tuple(options.suites or ()),
+        split=options.split if board is None else board.split,
+        with_truth=options.truth,
+        out=options.out,
+        into=into,
+        published=None if day is None else day.isoformat(),
+        url=options.url,
+        board=board,
+    )
+    release = make_release(request)
+    maps, queries = counted(len(release.maps), "map"), counted(release.queries, "query", "queries")
+    suites_said = counted(len(release.suites), "suite")
+    say(f"{request.into}: {maps}, {queries} of {suites_said}, {release.bytes / 1e6:.1f} MB")
+
+
+def _check_flags(options: ReleaseOptions) -> None:
+    """Refuse flags that do not go together, before anything is drawn."""
+    if (options.board is None) != bool(options.regions) or (options.board and (options.truth or options.suites)):
+        raise ConfigError(
+            "release takes either --regions, with --suites and --truth, or --board: a board names its queries, and its "
+            "truths are in its stored results"
+        )
+
+
+def _queries_of(options: ReleaseOptions, board: Path) -> BoardTasks:
+    request = BoardRequest(
+        stored=board,
+        out=options.out,
+        pipeline=options.pipeline,
+        extract_folders=tuple(options.extracts or ()),
+        sealed=sealed_seed(options.sealed_seed_file),
+        jobs=options.jobs,
+    )
+    with shown_progress():
+        return draw_board(request)
+
+
+Url = Annotated[str, typer.Argument(help="place of the folder itself, as s3://bucket/regions/vaduz (fsspec)")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SendOptions(Options):
+    """Words of send."""
+
+    folder: Annotated[Path, typer.Argument(help="folder of a region, task, run or board, or all of an OUT")]
+    url: Url
+
+
+@dataclass(frozen=True, kw_only=True)
+class FetchOptions(Options):
+    """Words of fetch."""
+
+    url: Url
+    folder: Annotated[Path, typer.Argument(help="folder to write, in place of an older copy")]
+
+
+def send_command(options: SendOptions) -> None:
+    """Copy a finished folder into object storage; files that are there already are not sent again."""
+    moved = send(options.folder, options.url)
+    say(f"{shown(options.url)}: {_text(moved, 'sent')}")
+
+
+def fetch_command(options: FetchOptions) -> None:
+    """Copy a folder that was sent out of object storage, each file held against its hash."""
+    moved = fetch(options.url, options.folder)
+    say(f"{options.folder}: {_text(moved, 'fetched')}")
+
+
+def _text(moved: Moved, verb: str) -> str:
+    hidden = f"; {counted(moved.hidden, 'hidden file')} left out" if moved.hidden else ""
+    return f"{counted(moved.files, 'file')}, {moved.bytes / 1e6:.1f} MB, {moved.moved} {verb}{hidden}"

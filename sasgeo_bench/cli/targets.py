@@ -11,7 +11,7 @@ from sasgeo_bench.leaderboard.board_files import BOARD
 from sasgeo_bench.leaderboard.run_cases import is_run
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.regions.region_spec import list_region_files
-from sasgeo_bench.running.run_manifest import RUN
+from sasgeo_bench.running.prediction_files import RUN
 from sasgeo_bench.scoring.submission_files import SUBMISSION
 from sasgeo_bench.tasks.query import base_of
 from sasgeo_bench.tasks.split import list_split_files

@@ -13,7 +13,7 @@ from rich.table import Table
 from sasgeo_bench.cli.console import print_table, say
 from sasgeo_bench.cli.options import Out
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.matching.learned_file import WHERE, read_learned
+from sasgeo_bench.matching.cards import WHERE, read_learned
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import MANIFEST, read_region

@@ -8,8 +8,7 @@ from pathlib import Path
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.experiments.entry_cost import fetch_extracts
-from sasgeo_bench.experiments.pipeline import draw_all
-from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, plan_pipeline
+from sasgeo_bench.experiments.pipeline import PipelinePlan, draw_all, plan_pipeline
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile, find_pipeline_file, read_pipeline_file

@@ -12,12 +12,10 @@ from sasgeo_bench.config import LONGEST_LINE, check_document
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
 from sasgeo_bench.experiments import entry_cost
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, plan_board, same_queries
-from sasgeo_bench.experiments.pipeline import ask, draw_all
-from sasgeo_bench.experiments.pipeline_plan import PipelinePlan, Run, plan_runs
+from sasgeo_bench.experiments.pipeline import PipelinePlan, Run, ask, draw_all, plan_runs
 from sasgeo_bench.files.plugins import check_registered
 from sasgeo_bench.leaderboard.scored import Scored
-from sasgeo_bench.matching.matcher import MatcherCard
-from sasgeo_bench.matching.results import SOUND, Prediction
+from sasgeo_bench.matching.matcher import SOUND, MatcherCard, Prediction
 from sasgeo_bench.matching.submission import NONE, Card
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive_file import read_pack

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from sasgeo_bench.errors import ConfigError, ExtractError, StoreError, counted
-from sasgeo_bench.experiments.pipeline_plan import PipelinePlan
+from sasgeo_bench.experiments.pipeline import PipelinePlan
 from sasgeo_bench.files.parquet import read_table
 from sasgeo_bench.leaderboard.board_files import MEND, read_board_manifest, read_scores
 from sasgeo_bench.matching.matcher import is_followed

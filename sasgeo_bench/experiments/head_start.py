@@ -3,7 +3,7 @@
 
 An archive comes from whoever made it. So it holds answers alone, never maps, queries, truths or what was learned: these
 are made here, and an answer to another query than is drawn here counts for nothing. A pipeline file states the SHA-256
-of its archive. What is unpacked is marked for good (`run_manifest.PACKED`), so that no board says "run here" of it.
+of its archive. What is unpacked is marked for good (`prediction_files.PACKED`), so that no board says "run here" of it.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
 from sasgeo_bench.progress import tell
 from sasgeo_bench.running.leak_scan import PACKED
-from sasgeo_bench.running.run_manifest import RUN, mark_packed
+from sasgeo_bench.running.prediction_files import RUN, mark_packed
 from sasgeo_bench.texts import one_line
 
 FOLDER: Final = "runs"  # below the root of what is built

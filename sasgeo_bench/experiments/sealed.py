@@ -8,16 +8,16 @@ from pathlib import Path
 
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
-from sasgeo_bench.tasks.openings import (
+from sasgeo_bench.tasks.private_seed import (
     Opening,
     Openings,
+    PrivateSeed,
     SealedPlace,
     joined_openings,
     read_openings,
     record_openings,
     sealed_record,
 )
-from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_plan import Request
 

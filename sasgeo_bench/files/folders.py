@@ -2,6 +2,8 @@
 """Write folders whole or not at all, by one run at a time; remove them; compare their files with listed hashes."""
 
 import errno
+import fcntl
+import gc
 import hashlib
 import os
 import stat
@@ -9,6 +11,7 @@ import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
+from functools import cache
 from pathlib import Path
 from typing import Annotated, Final, NamedTuple
 
@@ -359,3 +362,69 @@ def check_room(folder: Path) -> None:
         raise StoreError(
             f"{folder} cannot be written ({error.strerror or error}): check your rights, or name another folder"
         ) from error
+
+
+PREFIX: Final = "sasgeo-scratch-"
+_NEW: Final = ".sasgeo-new-"  # until it is locked: nobody sweeps a folder of this name
+
+
+@contextmanager
+def scratch_folder(what: str, *, within: Path | None = None) -> Iterator[Path]:
+    """Yield an empty resolved folder, and remove it at the end, whatever is in it then.
+
+    The folder is locked while its program lives: an unlocked one is a leftover, and is removed when another program
+    makes its first one there. `what` is a word of the name, and `within` a folder other than the system's.
+    """
+    root = Path(tempfile.gettempdir() if within is None else within).resolve()
+    _sweep_once(root)
+    folder = Path(tempfile.mkdtemp(prefix=f"{_NEW}{what}-", dir=root))
+    lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):  # where a file system locks no folder, nothing is swept
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            folder = folder.rename(folder.with_name(PREFIX + folder.name.removeprefix(_NEW)))
+        yield folder
+    finally:
+        remove_tree(folder)
+        os.close(lock)
+
+
+def sweep(root: Path) -> int:
+    """Remove the scratch folders of programs that were killed; return how many. Those of other users stay."""
+    swept = 0
+    for folder in sorted(root.glob(f"{PREFIX}*")):
+        with suppress(OSError):  # a link, a file, another user's, locked, or gone meanwhile
+            lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+            try:
+                if os.fstat(lock).st_uid != os.geteuid():
+                    continue
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                remove_tree(folder)
+                swept += 1
+            finally:
+                os.close(lock)
+    return swept
+
+
+@cache
+def _sweep_once(root: Path) -> int:
+    return sweep(root)
+
+
+@contextmanager
+def uncollected() -> Iterator[None]:
+    """Stop the cyclic garbage collector while lists of objects grow: a tenth of a scan, half of reading answers.
+
+    >>> with uncollected():
+    ...     gc.isenabled()
+    False
+    >>> gc.isenabled()
+    True
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_enabled:
+            gc.enable()

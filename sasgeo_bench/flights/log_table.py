@@ -5,12 +5,14 @@ A unit is what the name of a column or the format says, else what `LogFacts` say
 guessed from the size of the values. Latitude and longitude without a unit are degrees.
 """
 
+import csv
 import math
 import re
 from array import array
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Final
@@ -18,12 +20,188 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sasgeo_bench.flights.log_clock import Clock, is_clock
-from sasgeo_bench.flights.log_formats import NUMBERING, PX4, QUANTITIES, Column, Format, Layout, find_layout, unread
+from sasgeo_bench.flights.log_formats import (
+    NUMBERING,
+    PX4,
+    QUANTITIES,
+    Column,
+    Format,
+    Layout,
+    find_layout,
+    key_of,
+    unread,
+)
 from sasgeo_bench.flights.log_points import BEFORE_FIX, FlightLog, LogSource, shown, tell_left_out
-from sasgeo_bench.flights.log_rows import Lines, read_lines
-from sasgeo_bench.flights.log_units import UNITS, LogFacts, choices_of
-from sasgeo_bench.texts import plain
+from sasgeo_bench.flights.log_units import UNITS, WORDS, LogFacts, choices_of
+from sasgeo_bench.texts import message_of, plain
+
+_DAY_S: Final = 86_400.0
+_WEEK_S: Final = 604_800.0
+_YEAR_FIRST: Final = re.compile(r"(\d{4})[-/:.](\d{1,2})[-/:.](\d{1,2})[ T]+(\d{1,2})(:.+)")
+_DAY_TIME: Final = re.compile(r"(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)\s*(?:([AaPp])\.?\s?[Mm]\.?)?Z?")
+_WEEK: Final = re.compile(r"(\d{3,4}) +(\d+(?:\.\d+)?)")
+_SPAN: Final = re.compile(r"(?:(\d+)h\s*)?(?:(\d+)m\s*)?(\d+(?:\.\d+)?)s")
+_ZONE: Final = re.compile(r"\s*(?:UTC|GMT)(?=[-+]|$)")  # which a time is in without a word, too
+_DATE: Final = re.compile(r"\d[-/.:]\d+[-/.:]\d|\dT\d")  # of a time that is no number, in any order
+
+
+@dataclass(slots=True, kw_only=True)
+class Clock:
+    """Turns the cells of a column of times, one after the other, into seconds.
+
+    A time of day goes on into the next day where the cell of its date changes, or where it falls by half a day.
+
+    >>> from pathlib import Path
+    >>> clock = Clock(source=LogSource(path=Path("a.csv"), unit="line"))
+    >>> [clock.seconds(text, "", 2) for text in ("11:59:59.5 PM", "12:00:01.5 AM")]
+    [86399.5, 86401.5]
+    """
+
+    source: LogSource
+    days: int = 0
+    last_s: float = 0.0
+    last_date: str = ""
+
+    def seconds(self, text: str, date: str, number: int) -> float:
+        """Return a cell in seconds; raise `FlightError` if it is none of the forms that are read."""
+        text = _ZONE.sub("", text.strip())
+        if match := _DAY_TIME.fullmatch(text):
+            return self._of_day(match, date.strip(), number)
+        if match := _WEEK.fullmatch(text):
+            return int(match[1]) * _WEEK_S + float(match[2])
+        if match := _SPAN.fullmatch(text):
+            return int(match[1] or 0) * 3600 + int(match[2] or 0) * 60 + float(match[3])
+        if match := _YEAR_FIRST.fullmatch(text):
+            text = f"{match[1]}-{int(match[2]):02}-{int(match[3]):02}T{int(match[4]):02}{match[5]}"
+        return self.source.moment(text, number)
+
+    def _of_day(self, match: "re.Match[str]", date: str, number: int) -> float:
+        hours, half = int(match[1]), (match[4] or "").lower()
+        if half:
+            is_right = 1 <= hours <= 12  # of a clock's face
+            hours = hours % 12 + (12 if half == "p" else 0)
+        else:
+            is_right = hours < 24  # of a day
+        seconds = float(match[3].replace(",", "."))
+        if not is_right or int(match[2]) > 59 or seconds >= 60:  # minutes and seconds
+            message = f"time is no time of day, {match[0]!r}: mend it"
+            raise self.source.fault(message, number)
+        time_s = hours * 3600 + int(match[2]) * 60 + seconds
+        is_next = date != self.last_date if date and self.last_date else time_s < self.last_s - _DAY_S / 2
+        self.days += is_next
+        self.last_s, self.last_date = time_s, date
+        return self.days * _DAY_S + time_s
+
+
+def is_clock(text: str) -> bool:
+    """Return whether a cell is a time that is no plain number.
+
+    >>> [is_clock(text) for text in ("2025-05-01T10:00:00Z", "1:02:03 PM", "2314 433341.5", "3m 5.2s", "1700000000.5")]
+    [True, True, True, True, False]
+    """
+    forms = (_DAY_TIME, _WEEK, _SPAN)
+    return _DATE.search(text) is not None or any(form.fullmatch(text.strip()) for form in forms)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lines:
+    """Header of a table, and number and cells of each line below."""
+
+    header: list[str]
+    rows: Iterable[tuple[int, list[str]]]
+
+
+def read_lines(source: LogSource) -> Lines:
+    """Return the lines of a table that have any cells."""
+    rows = _rows(source)
+    _, header = next(rows, (0, []))
+    while header and not header[-1].strip():
+        header = header[:-1]
+    first = next(rows, None)
+    if first is None:
+        return Lines(header=header, rows=())
+    if _is_units(header, first[1]):
+        cells = [*first[1], *[""] * len(header)]
+        header = [
+            f"{name} [{unit.strip(' []()')}]" if unit.strip() else name
+            for name, unit in zip(header, cells, strict=False)
+        ]
+        first = next(rows, None)
+    return Lines(header=header, rows=chain([first] if first else [], rows))
+
+
+def _is_units(header: Sequence[str], cells: Sequence[str]) -> bool:
+    """Return whether the cells below a header are units: one at least is, and none is a number."""
+    units = {word for known in WORDS.values() for word in known}
+    others = [cell for cell in cells if key_of(cell) not in units]
+    return bool(header) and len(others) < len(cells) and not any(re.match(r"\s*[-+.]?\d", cell) for cell in others)
+
+
+def _is_head(comment: Sequence[str], cells: Sequence[str]) -> bool:
+    """Return whether a comment has the names of the cells below, as `numpy.savetxt` writes them."""
+    starts = [re.match(r"\s*[-+.]?\d", cell) for cell in (*comment, *cells)]
+    return len(comment) == len(cells) and not any(starts[: len(comment)]) and any(starts[len(comment) :])
+
+
+def _rows(source: LogSource) -> Iterator[tuple[int, list[str]]]:
+    """Yield number and cells of each line that has any; the first is the header."""
+    source.check_size()
+    line = 0
+    try:
+        with source.path.open(encoding="utf-8-sig", newline="") as file:
+            head = next((text for text in file if text.strip() and not text.startswith("#")), "")
+            separator = re.fullmatch(r'"?sep=(.)"?\s*', head, flags=re.IGNORECASE)
+            if separator:
+                head = next((text for text in file if text.strip()), "")
+            file.seek(0)
+            if source.path.suffix.lower() == ".pos" or re.match(r"%\s", head):
+                yield from _position_rows(file)
+                return
+            delimiter = separator[1] if separator else max(",;\t", key=head.count)
+            reader = csv.reader(file, delimiter=delimiter, strict=True, skipinitialspace=True)
+            skip = separator is not None
+            comment, is_begun = (0, [""]), False
+            for row in reader:
+                line = reader.line_num
+                if not any(cell.strip() for cell in row):
+                    continue
+                if row[0].startswith("#"):
+                    comment = (line, [row[0].lstrip("# "), *row[1:]])
+                    continue
+                if skip:
+                    skip = False
+                    continue
+                if not is_begun and _is_head(comment[1], row):
+                    yield comment
+                is_begun = True
+                yield line, row
+    except (OSError, UnicodeDecodeError) as error:
+        raise source.fault(f"no text in UTF-8 ({message_of(error)}): export it anew") from error
+    except csv.Error as error:
+        message = f"no sound CSV ({message_of(error)}): mend the line"
+        raise source.fault(message, line + 1) from error
+
+
+def _position_rows(lines: Iterable[str]) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of a position file: the last line with "%" before the data has the names."""
+    names: list[str] = []
+    is_begun = False
+    for number, text in enumerate(lines, start=1):
+        if text.startswith("%"):
+            names = names if is_begun else _words(text[1:])
+        elif text.strip():
+            if not is_begun:
+                is_begun = True
+                yield number - 1, names
+            cells = _words(text)
+            if len(cells) == len(names) + 1:  # date and time of day, or week and seconds of the week
+                cells = [f"{cells[0]} {cells[1]}", *cells[2:]]
+            yield number, cells
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",")] if "," in text else text.split()
+
 
 Floats = NDArray[np.float64]
 

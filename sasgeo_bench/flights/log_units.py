@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Final, Literal
 
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights.axes import AXES, Axes
+from sasgeo_bench.flights.trajectory import AXES, Axes
 from sasgeo_bench.texts import plain
 
 TimeUnit = Literal["s", "ms", "us", "ns", "none"]
@@ -79,7 +79,7 @@ class LogFacts:
     place_unit : {"deg", "rad", "e7"}, optional
         Unit of latitude and longitude (e7: 1e-7 degrees).
     axes : {"up", "camera"}, optional
-        Axes of a TUM file (`sasgeo_bench.flights.axes`).
+        Axes of a TUM file (`sasgeo_bench.flights.trajectory`).
     speed_mps : float, optional
         Even speed of a log without times, 0.1 to 100 m/s; by default 10 m/s.
 

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import DatasetError
 from sasgeo_bench.importers import dense_uav, sues, visloc
 from sasgeo_bench.importers.items import Dataset, Item
-from sasgeo_bench.importers.rankings import Ranking
 from sasgeo_bench.importers.retrieval import (
     DENSE_PER_M,
     GTA_PER_M,
     PER_DEGREE,
     Floats,
     Ints,
+    Ranking,
     float32_degrees,
     geodesic_m,
     half_distance_m,

@@ -9,8 +9,7 @@ from typing import Final
 
 from sasgeo_bench.errors import DatasetError, counted, named
 from sasgeo_bench.importers.items import Attitude, Box, Dataset, DatasetCard, Item, Position
-from sasgeo_bench.importers.map_tiles import MapSheet, cut_tiles, read_size_px
-from sasgeo_bench.importers.reader import FolderReader, TableRow
+from sasgeo_bench.importers.reader import FolderReader, MapSheet, TableRow, cut_tiles, read_size_px
 
 CARD: Final = DatasetCard(
     kind="uav-visloc",

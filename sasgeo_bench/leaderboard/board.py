@@ -23,15 +23,13 @@ from sasgeo_bench.leaderboard.board_files import (
     write_board,
 )
 from sasgeo_bench.leaderboard.manifests import BoardManifest
-from sasgeo_bench.leaderboard.plot_tables import MOST_MATCHERS, ranked_matchers, risk_frame, shown_matchers
-from sasgeo_bench.leaderboard.plots import draw_risk
-from sasgeo_bench.leaderboard.pooled_plots import draw_contrasts, draw_tradeoff
-from sasgeo_bench.leaderboard.pooled_tables import price_frame
+from sasgeo_bench.leaderboard.plots import MOST_MATCHERS, draw_risk, ranked_matchers, risk_frame, shown_matchers
+from sasgeo_bench.leaderboard.pooled_plots import draw_contrasts, draw_tradeoff, price_frame
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.rejection import OWN, own_confidence
 from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.texts import html_facts
 
 _ALWAYS: Final = (LEADERBOARD, "scores", "contrasts", "falsifiers", "controls")  # tables that every board has

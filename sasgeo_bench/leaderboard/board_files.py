@@ -25,13 +25,13 @@ from sasgeo_bench.files.parquet import read_frame, read_schema, write_frame
 from sasgeo_bench.files.paths import read_bounded
 from sasgeo_bench.leaderboard.manifests import BoardManifest, parse_record
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.scoring.acceptance import ACCEPTANCE_SCHEMA
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, FALSIFIER_SCHEMA
 from sasgeo_bench.scoring.flights import SCORE_SCHEMA
 from sasgeo_bench.scoring.frames import Column, Schema
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA
+from sasgeo_bench.scoring.rejection import ACCEPTANCE_SCHEMA
 from sasgeo_bench.scoring.rows import LEADERBOARD_SCHEMA
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
 from sasgeo_bench.texts import csv_cell, json_text, one_line
 
 LEADERBOARD: Final = "leaderboard"

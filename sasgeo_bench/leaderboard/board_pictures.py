@@ -14,18 +14,21 @@ import pandas as pd
 
 from sasgeo_bench.errors import SasgeoError, StoreError, counted
 from sasgeo_bench.leaderboard.board_files import ANSWER_SCHEMA, ANSWERS, PICTURES_FILE, Extra
-from sasgeo_bench.leaderboard.case_plot import WEBP, case_pixels, fitted, pixels_of
 from sasgeo_bench.leaderboard.cases import (
     COLUMNS,
     MOST_CASES,
+    WEBP,
+    case_pixels,
     find_cases,
+    fitted,
     operating_rejector,
+    pixels_of,
     sample_cases,
     words_of,
 )
-from sasgeo_bench.leaderboard.flight_maps import MOST_TRACKERS, flight_map_pixels, shown_flight
+from sasgeo_bench.leaderboard.flight_plots import MOST_TRACKERS, flight_map_pixels, shown_flight
 from sasgeo_bench.leaderboard.manifests import FailedCase, MapBlock, Picture, PictureStrip, RegionMap
-from sasgeo_bench.leaderboard.plot_tables import ranked_matchers, shown_matchers
+from sasgeo_bench.leaderboard.plots import ranked_matchers, shown_matchers
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.scored import Scored
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, strip_pixels
@@ -40,9 +43,8 @@ from sasgeo_bench.scoring.base import Floats
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.pose import columns_of
 from sasgeo_bench.scoring.score import single_views
-from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import CONTROLS, Truth, base_of
-from sasgeo_bench.tasks.sheet import sheet_figure
+from sasgeo_bench.tasks.sheet import panels_of, sheet_figure
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import Task, TaskManifest
 from sasgeo_bench.texts import json_text, one_line
@@ -201,7 +203,7 @@ def _add_suites(found: _Found, asked: Mapping[tuple[str, str], Task], scored: Sc
 
 
 def _example(task: Task) -> bytes:
-    shown = panels(task, choose=control_and_stress)
+    shown = panels_of(task, choose=control_and_stress)
     title = f"{task.manifest.title}: {task.manifest.region}"
     return fitted(pixels_of(sheet_figure(title, shown, dpi=_SHEET_DPI)), SUITE_BYTES)
 

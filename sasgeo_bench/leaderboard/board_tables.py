@@ -3,37 +3,57 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
 import pandas as pd
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.columns import column, marks_of, prior_words, words
 from sasgeo_bench.leaderboard.manifests import BoardEntry
+from sasgeo_bench.leaderboard.private_board import SEEDS_NOTE
 from sasgeo_bench.leaderboard.tables import (
+    FEW,
     Cell,
+    Column,
     Key,
     Mark,
     Record,
     Row,
     Table,
     Tie,
+    column,
     figure_cell,
     file_stem,
+    interval_text,
+    marks_of,
     number_cell,
     number_text,
+    p_cell,
     page_names,
     plain_cell,
+    prior_words,
     rank_cell,
+    rank_text,
     records_of,
+    sort_key,
+    suite_card,
+    suite_words,
+    tally_text,
+    text_cells,
     ties_of,
+    words,
 )
+from sasgeo_bench.scoring.compare import LEAST_PLACES, Finding
+from sasgeo_bench.scoring.contrasts import AREAS
+from sasgeo_bench.scoring.controls import Falsifier, Verdict
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES
 from sasgeo_bench.scoring.metrics import CEILING, CHANCE, FALSE_ABSENT, WITHIN, primary_of
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, mixture_name
 from sasgeo_bench.scoring.rows import ALL_SUITES, is_unranked, name_alone
 from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, MOST_STEPS, STRESS, is_bin, is_step
-from sasgeo_bench.tasks.query import SEQUENCE
+from sasgeo_bench.scoring.tables import AS_USED, SCENES
+from sasgeo_bench.tasks.query import BY, SEQUENCE
 
 SHOWN_COSTS: Final = (  # and of the table of costs
     *("latency_p50", "latency_p95", "prepare", "peak_memory"),
@@ -389,7 +409,7 @@ def _cost(row: Record | None) -> float:
 def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None = None) -> Iterator[Table]:
     """Yield success along each ladder of strengths: a matcher a line, a step a column; strength 0 is the control.
 
-    `steps` is from `strata.steps_frame`; `ages`, from `plot_tables.age_names`, names steps that are ages of a map.
+    `steps` is from `strata.steps_frame`; `ages`, from `plots.age_names`, names steps that are ages of a map.
     """
     named = ages or {}
     for key, part in steps.groupby([*GROUP, "kind", "strength_unit"], sort=True):
@@ -416,3 +436,586 @@ def step_tables(steps: pd.DataFrame, ages: Mapping[tuple[Any, ...], str] | None 
             columns=(*words("matcher"), *(column(primary, title=title) for title in titles)),
             rows=rows,
         )
+
+
+AT_MOST: Final = "at most"  # the line of the ceiling
+
+
+def summary(book: Book, suites: Collection[str] = ()) -> Iterator[Table]:
+    """Yield who is good at what, of some suites or of all: a matcher a line, a suite a column, figure and rank.
+
+    Columns of false fixes at absent places follow those of the suites. The first lines say of each suite how many
+    queries count, what can be reached and what guessing and the controls reach. Suites with more ranked matchers come
+    first, so do matchers that were asked about more of them. A cell leads where its rank may be the first of several.
+    """
+    keys = [key for key in book.matchers if not suites or key[0] in suites]
+    for group in sorted({key[1:] for key in keys}):
+        yield _overview(book, [key for key in keys if key[1:] == group])
+
+
+def _overview(book: Book, keys: Sequence[Key]) -> Table:
+    """Return the table of the suites of one track and prior group."""
+    track, prior_group = keys[0][1:]
+    primary = primary_of(track).name
+    names = sorted({name for key in keys for name in book.matchers[key]})
+    by_suite = {key: {name: book.main(key, name, primary) for name in names} for key in keys}
+    ranked = {key: sum(map(_is_ranked, rows.values())) for key, rows in by_suite.items()}
+    shown = sorted((key for key in keys if any(by_suite[key].values())), key=lambda key: (-ranked[key], key))
+    absent = [key for key in shown if any(book.pick(key, name, FALSE_ABSENT.name) for name in names)]
+    found = {name: [by_suite[key][name] for key in shown] for name in names}
+    order = _order(book, found)
+    whole = {name for name in order if all(row is not None and row["is_applicable"] for row in found[name])}
+    weighed = [at for at, key in enumerate(shown) if ranked[key]]  # the others have too few places
+    has_mean = len(weighed) > 1 and len(whole - book.controls) > 1
+    rows = _overview_heads(book, shown, absent, primary, has_mean=has_mean)
+    for name in order:
+        cells = [short_cell(row, is_rivalled=ranked[key] > 1) for key, row in zip(shown, found[name], strict=True)]
+        cells += [short_cell(book.pick(key, name, FALSE_ABSENT.name), has_rank=False) for key in absent]
+        if has_mean:
+            cells.append(number_cell(_mean_value([found[name][at] for at in weighed]) if name in whole else math.nan))
+        tone = "head" if name in book.controls else "plain"
+        rows.append(Row(cells=(book.short_name(name), *cells), tone=tone))
+    columns = (
+        *(_suite_column(book, key, primary, has_absent=key in absent) for key in shown),
+        *(column("false fixes", title=f"{key[0]}: false fixes") for key in absent),
+        *([column("mean")] if has_mean else []),
+    )
+    return Table(
+        name=file_stem("summary", track, prior_group),
+        title=f"{primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+        columns=(*words("matcher"), *columns),
+        rows=tuple(rows),
+        notes=tuple(_overview_notes(primary, rows, has_absent=bool(absent), has_several=len(shown) > 1)),
+    )
+
+
+def _order(book: Book, found: Mapping[str, Sequence[Record | None]]) -> list[str]:
+    """Return controls, then matchers: who was asked about more suites first, then who is better on them."""
+    means = {name: _mean_value(rows) for name, rows in found.items()}
+    return sorted(
+        (name for name, rows in found.items() if any(row is not None for row in rows)),
+        key=lambda name: (name not in book.controls, -sum(map(bool, found[name])), -means[name], name),
+    )
+
+
+def _suite_column(book: Book, key: Key, primary: str, *, has_absent: bool) -> Column:
+    """Return the column of a suite, which says what is done in it, and what its figure pools: places on the map."""
+    counted = book.counted.get(key)
+    texts = (suite_words(key[0]), f"Counted, each query alike: {counted}" if counted else "")
+    meaning = " ".join(filter(None, texts)).removesuffix(".")
+    plain = column(primary, title=f"{key[0]}: on the map" if has_absent else key[0])
+    return replace(plain, meaning=meaning or plain.meaning)
+
+
+def _overview_notes(primary: str, rows: Sequence[Row], *, has_absent: bool, has_several: bool) -> Iterator[str]:
+    """Yield what the figures and the lines above the matchers are."""
+    yield f"{primary}: {column(primary).meaning}. Higher is better."
+    if has_several:
+        yield (
+            "Columns do not compare with each other: each pools all stresses of its suite, weak and strong ones, of "
+            "its own places."
+        )
+    if has_absent:
+        yield (
+            f"false fixes: {column('false fixes').meaning}. The figure of the suite itself is of its places that are "
+            "on the map."
+        )
+    if any(row.cells[0].text == AT_MOST for row in rows):
+        yield (
+            f"{AT_MOST}: what can be expected of a matcher that sees the view alone, as 1 in k where k places are the "
+            "same. An oracle is told the answer and passes it."
+        )
+
+
+def _is_ranked(row: Record | None) -> bool:
+    return row is not None and not is_unranked(str(row["matcher"])) and not pd.isna(row["rank_best"])
+
+
+def _mean_value(rows: Sequence[Record | None]) -> float:
+    values = [float(row["value"]) for row in rows if row is not None and not math.isnan(row["value"])]
+    return sum(values) / len(values) if values else -1.0
+
+
+def _overview_heads(
+    book: Book, keys: Sequence[Key], absent: Sequence[Key], primary: str, *, has_mean: bool
+) -> list[Row]:
+    """Return lines above the matchers: how many queries count, and a ceiling below 1 and chance where there is one."""
+    lines = {"queries": [plain_cell(_count(book, key, primary)) for key in keys]}
+    beside = {"queries": [plain_cell(_count(book, key, FALSE_ABSENT.name)) for key in absent]}
+    for title, metric in ((AT_MOST, CEILING.name), ("chance", CHANCE.name)):
+        rows = [next(filter(None, (book.main(key, name, metric) for name in book.matchers[key])), None) for key in keys]
+        lines[title] = [number_cell(math.nan if row is None else float(row["value"])) for row in rows]
+    nothing = [Cell(text="-")]
+    return [
+        Row(
+            cells=(Cell(text=title), *cells, *beside.get(title, nothing * len(absent)), *nothing * has_mean),
+            tone="head",
+        )
+        for title, cells in lines.items()
+        if any(cell.text not in ("-", "1.000") for cell in cells)
+    ]
+
+
+def _figure(book: Book, key: Key, matcher: str, metric: str) -> Record | None:
+    """Return a figure: false fixes are of all absent places, whichever stress made them so."""
+    return book.pick(key, matcher, metric) if metric == FALSE_ABSENT.name else book.main(key, matcher, metric)
+
+
+def _count(book: Book, key: Key, metric: str) -> int:
+    """Return how many queries count: a matcher that does not answer the track has a row of all, stressed or not."""
+    rows = [row for name in book.matchers[key] if (row := _figure(book, key, name, metric)) is not None]
+    return max(int(row["n"]) for row in [row for row in rows if row["is_applicable"]] or rows)
+
+
+def short_cell(row: Record | None, *, is_rivalled: bool = False, has_rank: bool = True) -> Cell:
+    """Return a figure, its interval and its rank as in "0.750 [0.30, 0.95] (2-3)".
+
+    It leads where it `is_rivalled` and may have the first rank.
+    """
+    if row is None:
+        return Cell(text="-")
+    if not row["is_applicable"]:
+        return Cell(text="n/a")
+    value, leads = float(row["value"]), is_rivalled and _is_ranked(row) and int(row["rank_best"]) == 1
+    ends = [] if math.isnan(row["lo"]) else [f"[{row['lo']:.2f}, {row['hi']:.2f}]"]
+    details = (*ends, *([f"({rank_text(row)})"] if has_rank else []))
+    return Cell(text=number_text(value), key=sort_key(value), tone="leading" if leads else "plain", details=details)
+
+
+_REJECTION: Final = (  # metrics of the tables of rejectors
+    *("aurc", "e_aurc", "auroc", "coverage_at_risk_0.05", "risk_reached_at_0.05"),
+    *("right_at_absent_0.05", "absent_reached_at_0.05", "ece", "cost_20"),
+)
+SHOWN_RISK: Final = 0.05
+COVERED: Final = "coverage_at_risk_0.05"
+REACHED: Final = "risk_reached_at_0.05"
+_RISK_NOTES: Final = (
+    "A matcher stands here with the rejector that orders its answers best on these very places, which flatters it.",
+    "Thresholds are of other places.",
+    "Rows with different n are of different queries: do not compare them. † marks Wilson's interval over sites.",
+)
+_BY_SUITE_NOTES: Final = (
+    "One threshold for all suites: where a suite is hard, more of its answers are false.",
+    "Controls and falsifiers of twins and of alias count, of which nobody can tell the two places apart.",
+)
+SHOWN_RATIO: Final = 20.0  # of the costs of a false fix and of withholding a right one
+_MIXTURES: Final = (AS_DRAWN, *map(mixture_name, PRESENT_SHARES))
+
+
+def rejection_tables(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Return matcher x rejector over all suites, a table for each track and prior group."""
+    found = _rejection_rows(board).groupby(["track", "prior_group"], sort=True)
+    return tuple(
+        _rejection_table(
+            part, file_stem("rejection", *map(str, key)), f"Rejection: {key[0]}, {prior_words(str(key[1]))}"
+        )
+        for key, part in found
+    )
+
+
+def risk_tables(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Return what ranked matchers answer where 5 % of the answers may be false, a table for each track and prior group.
+
+    A line is a matcher with the rejector that orders its answers best, by their area; `rejection_tables` have them all.
+    """
+    found = (_risk_table(best, *named) for best, _, *named in _groups(board, "risk"))
+    return tuple(table for table in found if table.rows)
+
+
+def risk_tables_by_suite(board: pd.DataFrame) -> tuple[Table, ...]:
+    """Return how many of the answers of `risk_tables` are false where more places are absent, and in each suite."""
+    found = (_risk_by_suite(best, part, *named) for best, part, *named in _groups(board, "risk-by-suite"))
+    return tuple(table for table in found if table.rows)
+
+
+Best = Mapping[tuple[str, str], Mapping[str, Record]]  # figures by matcher and rejector, then by metric
+
+
+def _groups(board: pd.DataFrame, stem: str) -> Iterator[tuple[Best, pd.DataFrame, str, str]]:
+    """Yield by track and prior group the best pairs, the rows of all, the name of a table, and what it is of."""
+    rows = board[(board["rejector"] != "") & ~board["matcher"].map(is_unranked).astype(bool)]
+    for (track, prior_group), part in rows.groupby(["track", "prior_group"], sort=True):
+        where = f"{track}, {prior_words(str(prior_group))}"
+        yield _best_pairs(_rejection_rows(part)), part, file_stem(stem, str(track), str(prior_group)), where
+
+
+def _best_pairs(part: pd.DataFrame) -> Best:
+    """Return the figures of each matcher with the rejector of the least area, in the order of that area."""
+    found = {(str(key[0]), str(key[1])): _by_metric(mine) for key, mine in part.groupby(["matcher", "rejector"])}
+    order = sorted((_area(by_name), key) for key, by_name in found.items())
+    best: dict[str, tuple[str, str]] = {}
+    for area, key in order:
+        if area < math.inf:
+            best.setdefault(key[0], key)
+    return {key: found[key] for key in best.values()}
+
+
+def _risk_table(best: Best, name: str, where: str) -> Table:
+    rows = [
+        Row(
+            cells=(
+                *text_cells(*key),
+                *(figure_cell(by_name.get(metric)) for metric in (COVERED, REACHED)),
+                Cell(text=_kept(by_name.get(REACHED))),
+                plain_cell(int(by_name["aurc"]["n"])),
+            )
+        )
+        for key, by_name in best.items()
+    ]
+    figures = (column(COVERED, title="answered"), column(REACHED, title="false of these"))
+    return Table(
+        name=name,
+        title=f"Answers where 5 % of them may be false fixes: {where}",
+        columns=(*words("matcher", "rejector"), *figures, *words("risk kept"), column("n")),
+        rows=tuple(rows),
+        notes=_RISK_NOTES,
+    )
+
+
+def _kept(row: Record | None) -> str:
+    """Return whether the interval of a reached risk shows that it was kept.
+
+    >>> [_kept({"lo": lo, "hi": hi}) for lo, hi in ((0.0, 0.04), (0.03, 0.07), (0.06, 0.2))], _kept(None)
+    (['yes', 'open', 'no'], '-')
+    """
+    if row is None or math.isnan(row["lo"]):
+        return "-"
+    if row["hi"] <= SHOWN_RISK:
+        return "yes"
+    return "no" if row["lo"] > SHOWN_RISK else "open"
+
+
+def _risk_by_suite(best: Best, part: pd.DataFrame, name: str, where: str) -> Table:
+    reached = part[part["metric"] == REACHED]
+    suites = sorted(set(reached["suite"]) - {ALL_SUITES})
+    shares = {mixture_name(share): f"{100 * (1 - share):.0f} % of places absent" for share in PRESENT_SHARES}
+    places = [(ALL_SUITES, mixture) for mixture in shares] + [(suite, AS_DRAWN) for suite in suites]
+    keys = zip(*(reached[field] for field in ("matcher", "rejector", "suite", "stratum")), strict=True)
+    by_key: dict[tuple[Any, ...], Any] = dict(zip(keys, reached.to_dict("records"), strict=True))
+    titles = [*(shares[mixture] for mixture in shares), *suites]
+    return Table(
+        name=name,
+        title=f"How many of these are false, by share of absent places and by suite: {where}",
+        columns=(*words("matcher", "rejector"), *(column(REACHED, title=title) for title in titles)),
+        rows=tuple(
+            Row(
+                cells=(*text_cells(*key), *(short_cell(by_key.get((*key, *place)), has_rank=False) for place in places))
+            )
+            for key in best
+        ),
+        notes=_BY_SUITE_NOTES,
+    )
+
+
+def _by_metric(part: pd.DataFrame) -> dict[str, Record]:
+    """Return the rows of one matcher and rejector by their metric."""
+    return {str(row["metric"]): row for row in records_of(part)}
+
+
+def _area(by_name: Mapping[str, Record]) -> float:
+    """Return the area that orders rejectors, infinite where there is none."""
+    area = by_name["aurc"]["value"] if "aurc" in by_name else math.nan
+    return math.inf if math.isnan(area) else float(area)
+
+
+def rejection_of(board: pd.DataFrame, matcher: str) -> Table | None:
+    """Return the rejectors of one matcher over all suites, every track and prior group a line; None without any."""
+    rows = _rejection_rows(board)
+    mine = rows[rows["matcher"] == matcher]
+    return None if mine.empty else _rejection_table(mine, "rejection", "Rejection, all suites", has_queries=True)
+
+
+def _rejection_rows(board: pd.DataFrame) -> pd.DataFrame:
+    return board[(board["rejector"] != "") & (board["suite"] == ALL_SUITES) & (board["stratum"] == AS_DRAWN)]
+
+
+def _rejection_table(part: pd.DataFrame, name: str, title: str, *, has_queries: bool = False) -> Table:
+    """Return rejectors, the best first and those of controls last, whose order of answers nobody earned.
+
+    `has_queries` adds a column of the track and prior group of each line.
+    """
+    rows = []
+    for key, mine in part.groupby(["matcher", "rejector", "track", "prior_group"], sort=True):
+        matcher, rejector, track, prior_group = map(str, key)
+        by_name = _by_metric(mine)
+        queries = text_cells(f"{track}, {prior_group}") if has_queries else ()
+        figures = [figure_cell(by_name.get(metric)) for metric in _REJECTION]
+        cells = (*text_cells(matcher, rejector), *queries, *figures, plain_cell(int(mine["n"].iloc[0])))
+        is_control = is_unranked(matcher)
+        row = Row(cells=cells, tone="control" if is_control else "plain")
+        rows.append((is_control, _area(by_name), matcher, rejector, row))
+    rows.sort(key=lambda row: row[:4])
+    return Table(
+        name=name,
+        title=title,
+        columns=(
+            *words("matcher", "rejector"),
+            *(words("queries") if has_queries else ()),
+            *(column(metric, order="ascending" if metric == "aurc" else "none") for metric in (*_REJECTION, "n")),
+        ),
+        rows=tuple(row for *_, row in rows),
+        notes=("ECE and costs have no interval on this board: they decide nothing.",),
+    )
+
+
+def acceptance_tables(acceptance: pd.DataFrame) -> tuple[Table, ...]:
+    """Return risk and coverage by the kind of absence, a table for each track and prior group; none without any.
+
+    `acceptance` is from `rejection.acceptance_frame`. One cost ratio is shown, and no controls.
+    """
+    if not len(acceptance):
+        return ()
+    shown = acceptance[(acceptance["cost_ratio"] == SHOWN_RATIO) & ~acceptance["matcher"].map(is_unranked).astype(bool)]
+    return tuple(
+        _acceptance_table(part, str(track), str(prior_group))
+        for (track, prior_group), part in shown.groupby(["track", "prior_group"], sort=True)
+    )
+
+
+def _acceptance_table(part: pd.DataFrame, track: str, prior_group: str) -> Table:
+    """Return risk and coverage, who has the least risk over all absences first, and an absence a line."""
+    rows: dict[tuple[str, ...], Row] = {}
+    risks: dict[tuple[str, ...], float] = {}
+    for names, mine in part.groupby(["matcher", "rejector", "absence"], sort=True):
+        key = tuple(map(str, names))
+        by_mixture = {str(row["mixture"]): row for row in records_of(mine)}
+        some = next(iter(by_mixture.values()))
+        absent = plain_cell(int(some["absent"]))
+        cells = [_cell(by_mixture.get(mixture), name) for mixture in _MIXTURES for name in ("risk", "coverage")]
+        rows[key] = Row(cells=(*text_cells(*key), absent, *cells))
+        if AS_DRAWN in by_mixture and not math.isnan(by_mixture[AS_DRAWN]["risk"]):
+            risks[key] = float(by_mixture[AS_DRAWN]["risk"])
+    order = sorted(rows, key=lambda key: (risks.get((*key[:2], "all"), math.inf), key))
+    titles = [
+        (term, f"{term.split()[0]}, {mixture if mixture == AS_DRAWN else f'{100 * (1 - share):.0f} % absent'}")
+        for mixture, share in zip(_MIXTURES, (math.nan, *PRESENT_SHARES), strict=True)
+        for term in ("risk of fixes", "coverage")
+    ]
+    return Table(
+        name=file_stem("acceptance", track, prior_group),
+        title=f"Risk and coverage by kind of absence: {track}, {prior_words(prior_group)}",
+        columns=(
+            *words("matcher", "rejector", "absence"),
+            column("absent"),
+            *(column(term, title=title) for term, title in titles),
+        ),
+        rows=tuple(rows[key] for key in order),
+        notes=(f"Fixes accepted by Eq. 14 at costs of {SHOWN_RATIO:g} to 1; acceptance.parquet holds other costs.",),
+    )
+
+
+def _cell(row: Mapping[Any, Any] | None, name: str) -> Cell:
+    if row is None:
+        return figure_cell(None)
+    value, lo, hi = (float(row[f"{name}{end}"]) for end in ("", "_lo", "_hi"))
+    return figure_cell({"value": value, "lo": lo, "hi": hi, "unit": "1", "interval": "", "is_applicable": True})
+
+
+_Found = Mapping[str, Mapping[str, Record]]  # kind of place -> matcher -> row
+
+
+def scene_tables(scenes: pd.DataFrame, book: Book) -> Iterator[Table]:
+    """Yield success by kind of place, a table for each suite, track and prior group; `scenes` is of `scene_frame`.
+
+    Those of most places come first. The first two lines count places and queries. Kinds with too few places to rank
+    anybody are marked.
+    """
+    groups = sorted(scenes.groupby(list(GROUP)), key=lambda group: (-int(group[1]["places"].max()), group[0]))
+    for key, part in groups:
+        found: dict[str, dict[str, Record]] = {}
+        for row in records_of(part):
+            found.setdefault(str(row["stratum"]), {})[str(row["matcher"])] = row
+        yield _table((str(key[0]), str(key[1]), str(key[2])), found, book)
+
+
+def _table(key: Key, found: _Found, book: Book) -> Table:
+    suite, track, prior_group = key
+    use = AS_USED[suite.partition(BY)[0]]
+    kinds = [kind for kind in (ALL, *SCENES) if kind in found]
+    primary = str(next(iter(found[ALL].values()))["metric"])
+    order = sorted(found[ALL], key=lambda name: (-_scene_value(found[ALL][name]), name))
+    rows = [
+        Row(
+            cells=(
+                book.short_name(name),
+                *(short_cell(found[kind].get(name), is_rivalled=len(order) > 1) for kind in kinds),
+            )
+        )
+        for name in order
+    ]
+    return Table(
+        name=file_stem("kinds", suite, track, prior_group),
+        title=f"With {use.words} ({suite}): {primary} [95 %] (rank), {track}, {prior_words(prior_group)}",
+        columns=(*words("matcher"), *(_column(kind, primary) for kind in kinds)),
+        rows=(*_scene_heads(found, kinds), *rows),
+        notes=tuple(_scene_notes(suite, use.strength)),
+    )
+
+
+def _scene_value(row: Record) -> float:
+    return -math.inf if math.isnan(row["value"]) else float(row["value"])
+
+
+def _column(kind: str, primary: str) -> Column:
+    """Return the column of a kind, which says what its figure is a share of."""
+    what = column("kind of place")
+    return replace(column(primary, title=kind), meaning=f"{what.meaning}. {primary}: {column(primary).meaning}")
+
+
+def _scene_heads(found: _Found, kinds: list[str]) -> Iterator[Row]:
+    """Yield the lines that count places and queries, those with too few places marked."""
+    first = [next(iter(found[kind].values())) for kind in kinds]
+    places = [
+        replace(plain_cell(int(row["places"])), marks=(FEW,) if row["places"] < LEAST_PLACES else ()) for row in first
+    ]
+    yield Row(cells=(Cell(text="places"), *places), tone="head")
+    yield Row(cells=(Cell(text="queries"), *(plain_cell(int(row["n"])) for row in first)), tone="head")
+
+
+def _scene_notes(suite: str, strength: float | None) -> Iterator[str]:
+    """Yield what is done in a suite, and which of its views are meant where these are not all."""
+    yield suite_words(suite)
+    card = suite_card(suite)
+    if card is not None and strength is not None:
+        yield f"Only views of strength {strength:g} ({card.strength_unit}), as they are expected in use."
+
+
+_CONTROLS_NOTE: Final = (
+    "The right score of these queries is known beforehand. At chance: views of a shuffled map, of a map turned by "
+    "half, and of one of two places that are the same."
+)
+_FALSIFIERS_NOTE: Final = (
+    "The entries of each contrast where the difference between them is taken away: at the same places without the "
+    "stress (`control`), and on the falsifiers of each suite. A gain here as well is not caused by what the contrast "
+    "is named for."
+)
+
+
+def seed_table(entries: Sequence[BoardEntry]) -> Table | None:
+    """Return figures on the public and on a private seed: of all suites, and whatever is shown to be worse.
+
+    None where no row was compared with a private seed.
+    """
+    rows = [
+        Row(
+            cells=text_cells(
+                entry.name,
+                item.suite,
+                item.track,
+                item.metric,
+                number_text(item.public),
+                number_text(item.private),
+                interval_text(item.difference, item.lo, item.hi),
+                f"{item.n_public} and {item.n_private}",
+                f"{item.blocks_public} and {item.blocks_private}, {item.blocks_shared} in both",
+                "worse" if item.is_worse else "not shown to be worse",
+            )
+        )
+        for entry in entries
+        for item in (() if entry.private is None else entry.private.figures)
+        if item.suite == ALL_SUITES or item.is_worse
+    ]
+    if not rows:
+        return None
+    numbers = tuple(map(column, ("public", "private", "private less public", "n", "blocks")))
+    columns = (*words("matcher", "suite", "track", "figure"), *numbers, *words("shown"))
+    title = "Public and private seed"
+    return Table(name="seeds", title=title, columns=columns, rows=tuple(rows), notes=(SEEDS_NOTE,))
+
+
+def control_table(verdicts: Sequence[Verdict]) -> Table | None:
+    """Return every control of every matcher; None where none was drawn."""
+    if not verdicts:
+        return None
+    rows = tuple(
+        Row(
+            cells=(
+                *text_cells(item.control, item.matcher),
+                plain_cell(item.n),
+                Cell(text=tally_text(item.found), key=item.found),
+                Cell(text=tally_text(item.expected), key=item.expected),
+                p_cell(item.p),
+                _limit_cell(item),
+                Cell(text="held" if item.holds else "FAILED"),
+            )
+        )
+        for item in verdicts
+    )
+    first = column("control query", is_number=False, title="control")
+    columns = (first, *words("matcher"), *map(column, ("n", "found", "expected", "p", "fails at")), *words("outcome"))
+    return Table(name="controls", title="Controls, one by one", columns=columns, rows=rows, notes=(_CONTROLS_NOTE,))
+
+
+def _limit_cell(verdict: Verdict) -> Cell:
+    """Return how many right answers fail a control against chance."""
+    if math.isnan(verdict.p):
+        return Cell(text="-")
+    limit = verdict.fails_at
+    return Cell(text="never") if limit is None else plain_cell(limit)
+
+
+def contrast_table(findings: Sequence[Finding]) -> Table:
+    """Return the registered contrasts; intervals by countries where places share some."""
+    has_countries = any(not math.isnan(item.lo_countries) for item in findings)
+    rows = tuple(
+        Row(
+            cells=(
+                Cell(text=item.name),
+                *_sides(item),
+                Cell(text=_ends_text(item.lo_blocks, item.hi_blocks)),
+                *((Cell(text=_ends_text(item.lo_countries, item.hi_countries)),) if has_countries else ()),
+                number_cell(item.attainable),
+                number_cell(item.least),
+                p_cell(item.p_holm),
+                Cell(text="-" if item.metric in AREAS else f"{item.first_only} and {item.second_only}"),
+                number_cell(item.detectable),
+                Cell(text=_counts_text(item), key=float(item.n)),
+                Cell(text=item.verdict),
+            )
+        )
+        for item in findings
+    )
+    names = (
+        *("first", "second", "difference", "by blocks", *(("by countries",) if has_countries else ())),
+        *("attainable", "matters", "p (Holm)", "discordant", "detectable", "n"),
+    )
+    columns = (*words("contrast"), *map(column, names), *words("verdict"))
+    return Table(name="contrasts", title="Registered contrasts", columns=columns, rows=rows)
+
+
+def falsifier_table(found: Sequence[Falsifier]) -> Table:
+    """Return the entries of each contrast where they should not differ."""
+    rows = tuple(
+        Row(
+            cells=(
+                *text_cells(item.contrast, item.suite, item.kind),
+                *_sides(item.finding),
+                Cell(text=f"{item.finding.first_only} and {item.finding.second_only}"),
+                Cell(text=_counts_text(item.finding), key=float(item.finding.n)),
+                Cell(text=item.verdict),
+            )
+        )
+        for item in found
+    )
+    numbers = tuple(map(column, ("first", "second", "difference", "discordant", "n")))
+    columns = (*words("contrast", "suite", "kind"), *numbers, *words("verdict"))
+    return Table(name="falsifiers", title="Falsifiers", columns=columns, rows=rows, notes=(_FALSIFIERS_NOTE,))
+
+
+def _sides(item: Finding) -> tuple[Cell, ...]:
+    """Return what both entries of a contrast reach, and their difference."""
+    return (
+        Cell(text=f"{item.first}: {number_text(item.first_value)}", key=sort_key(item.first_value)),
+        Cell(text=f"{item.second}: {number_text(item.second_value)}", key=sort_key(item.second_value)),
+        Cell(text=interval_text(item.difference, item.lo, item.hi), key=sort_key(item.difference)),
+    )
+
+
+def _ends_text(lo: float, hi: float) -> str:
+    """Return an interval by other clusters than places; "-" for none."""
+    return "-" if math.isnan(lo) else f"[{number_text(lo)}, {number_text(hi)}]"
+
+
+def _counts_text(item: Finding) -> str:
+    where = f"{item.n} in {counted(item.blocks, 'block')}, {counted(item.places, 'place')}"
+    return f"{where}, {counted(item.countries, 'country', 'countries')}" if 0 < item.countries < item.places else where

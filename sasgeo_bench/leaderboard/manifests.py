@@ -9,10 +9,10 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, PlainSeriali
 from sasgeo_bench.config import Record
 from sasgeo_bench.files.json import parse_json
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
-from sasgeo_bench.running.run_manifest import CardRecord
+from sasgeo_bench.running.prediction_files import CardRecord
+from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
-from sasgeo_bench.tasks.openings import SealedPlace
+from sasgeo_bench.tasks.private_seed import SealedPlace
 from sasgeo_bench.texts import FOLDER, one_line
 
 Model = TypeVar("Model", bound=BaseModel)

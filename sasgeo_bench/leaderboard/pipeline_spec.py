@@ -23,8 +23,7 @@ from sasgeo_bench.config import (
 )
 from sasgeo_bench.files.plugins import YARDSTICK
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
-from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.verdicts import (
+from sasgeo_bench.scoring.compare import (
     LESS,
     LOWER,
     OF_MATCHERS,
@@ -34,11 +33,12 @@ from sasgeo_bench.scoring.verdicts import (
     best_value,
     unreachable,
 )
+from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.sensing.reference_imagery import COARSEST_M, FINEST_M, Look
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.tasks.query import BY, CONTROLS, PROFILE, PUBLISHED, RENDERED, Detector, PriorGroup, Track
-from sasgeo_bench.tasks.suites.real_age import DAYS_PER_YEAR
+from sasgeo_bench.tasks.suites.ages import DAYS_PER_YEAR
 
 PAPER_SUITE: Final = "paper-poc"
 Crop = Literal["unknown", "absent", "smaller"]

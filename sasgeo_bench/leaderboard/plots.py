@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The figures of a board: each draws a table of `plot_tables` on a page, the same bytes for the same table.
+"""The figures of a board: each draws a table on a page, the same bytes for the same table.
 
 Each function writes a .svg or .png; `shown` are the matchers in the order of their looks.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -14,34 +16,385 @@ from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from sasgeo_bench.canvas import GREY, figure_of, page, panels
+from sasgeo_bench.canvas import GREY, Page, broken, figure_of, page, panels
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_plots import (
-    ACROSS,
-    FAINT,
-    HALVES,
-    INTERVALS,
-    PRIMARY,
-    BoardPage,
-    draw_bar_panels,
-    draw_line,
-    dress_share,
-    label_outer,
-    line_keys,
-    look_of,
-    of_which,
-    panels_across,
-    those_there,
-)
-from sasgeo_bench.leaderboard.columns import prior_words
-from sasgeo_bench.leaderboard.plot_tables import BEYOND_M, LEAST_M, MOST_M, stanford_areas, stanford_cells
+from sasgeo_bench.leaderboard.tables import prior_words
+from sasgeo_bench.regions.region import ATTRIBUTION
+from sasgeo_bench.scoring.base import Floats, Ints, codes_of
+from sasgeo_bench.scoring.compare import Finding
 from sasgeo_bench.scoring.contrasts import Contrast, PlaceDifference
-from sasgeo_bench.scoring.metrics import primary_of
+from sasgeo_bench.scoring.decisions import Fixes, aurc, equal_mass_bins, risk_coverage, stanford
+from sasgeo_bench.scoring.intervals import effective_count, wilson_share
+from sasgeo_bench.scoring.metrics import TRACKS, primary_of
 from sasgeo_bench.scoring.protection import ProtectionLevels
-from sasgeo_bench.scoring.rejection_rows import AS_DRAWN
-from sasgeo_bench.scoring.rows import ALL_SUITES
-from sasgeo_bench.scoring.verdicts import Finding
+from sasgeo_bench.scoring.rejection_rows import AS_DRAWN, answers_of, mixtures_of
+from sasgeo_bench.scoring.rows import ALL_SUITES, is_apart, is_unranked
+from sasgeo_bench.scoring.strata import ALL, CONTROL, GROUP, STRESS, primary_rows
+from sasgeo_bench.tasks.query import SEQUENCE
+
+MOST_MATCHERS: Final = 8  # more cannot be distinguished at a glance
+ARMS: Final = ("uniform", "hand", "oracle")  # parts of names of matchers that are shown with those of contrasts
+AGE: Final = "age_years"  # as measured by truths
+_MOST_POINTS: Final = 80  # of a curve: more cannot be seen, and make a file large
+_CELLS_PER_DECADE: Final = 8
+LEAST_M: Final = 0.1  # what is less is drawn here
+MOST_M: Final = 1000.0  # what is more, or infinite, is drawn beyond
+BEYOND_M: Final = 1500.0
+
+
+def ranked_matchers(table: pd.DataFrame) -> list[str]:
+    """Return the matchers that are neither controls nor set apart, in the order of the table."""
+    return [name for name in dict.fromkeys(table.loc[~is_apart(table), "matcher"]) if not is_unranked(name)]
+
+
+def shown_matchers(table: pd.DataFrame, contrasts: Sequence[Contrast]) -> tuple[str, ...]:
+    """Return the matchers that figures show, those of contrasts first, the second of each before the first.
+
+    Controls and entries that are set apart are not shown. Of more than `MOST_MATCHERS` only those of contrasts are, or
+    without contrasts the best on single views and the best on flights, and the `ARMS`.
+
+    >>> board = pd.DataFrame({"matcher": ["b", "a", "oracle_pose"], "rejector": "", "stratum": "all", "value": 0.5})
+    >>> shown_matchers(board.assign(metric="success_25m"), [Contrast(name="x", first="b", second="a", suites=())])
+    ('a', 'b')
+    """
+    there = ranked_matchers(table)
+    sides = [side.partition(" x ")[0] for item in contrasts for side in (item.second, item.first)]
+    named = [name for name in dict.fromkeys(sides) if name in there]
+    if len(there) <= MOST_MATCHERS:
+        return tuple(dict.fromkeys((*named, *sorted(there))))
+    if not named:
+        flown = primary_of(SEQUENCE).name
+        single = {primary_of(track).name for track in TRACKS} - {flown}
+        named = [*_best(table, there, single), *_best(table, there, {flown})]
+    related = sorted(name for name in there if any(part in name for part in ARMS))
+    return tuple(dict.fromkeys((*named, *related)))
+
+
+def _best(table: pd.DataFrame, there: Sequence[str], metrics: Collection[str]) -> list[str]:
+    """Return the matchers that are best by some metrics in the mean of all suites; who has none of them is left out."""
+    rows = table[(table["stratum"] == ALL) & table["metric"].isin(metrics)]
+    means = rows.groupby("matcher")["value"].mean()
+    return sorted((name for name in there if name in means), key=lambda name: (-means[name], name))[:MOST_MATCHERS]
+
+
+# --- success by what was done -----------------------------------------------------------------------------------------
+
+
+def ages_frame(steps: pd.DataFrame, queries: pd.DataFrame, measured: Mapping[str, Mapping[str, float]]) -> pd.DataFrame:
+    """Return the steps that are ages of a map, with age_years, the mean over their queries, and age_least and age_most.
+
+    `steps` is from `steps_frame`, `queries` from `queries_of`, `measured` the measurements of truths by query id.
+    """
+    ages = [measured.get(name, {}).get(AGE, np.nan) for name in queries["query_id"]]
+    known = queries.assign(age_years=ages)
+    known = known[known["age_years"].notna() & known["is_present"].to_numpy(bool)]
+    known = known[known["role"].isin([CONTROL, STRESS])]
+    found = known.groupby([*GROUP, "strength", "view_cells"])["age_years"].agg(["mean", "min", "max"]).reset_index()
+    names = {"mean": "age_years", "min": "age_least", "max": "age_most"}
+    keys = [*GROUP, "strength", "view_cells"]
+    found = found.rename(columns=names).astype({name: steps[name].dtype for name in keys})  # of no steps: no type yet
+    return steps.merge(found, on=keys, how="inner")
+
+
+def age_names(ages: pd.DataFrame) -> dict[tuple[Any, ...], str]:
+    """Return the range of ages of each step of `ages_frame`, by suite, track, prior group, strength and size of view.
+
+    >>> step = {"suite": "real-age", "track": "localization", "prior_group": "r500-weak-s3", "strength": 5.0}
+    >>> list(age_names(pd.DataFrame([step | {"view_cells": 192, "age_least": 3.58, "age_most": 6.0}])).values())
+    ['3.6 to 6.0 years']
+    """
+    columns = [ages[name] for name in (*GROUP, "strength", "view_cells", "age_least", "age_most")]
+    spans = {tuple(key): (f"{least:.1f}", f"{most:.1f}") for *key, least, most in zip(*columns, strict=True)}
+    return {key: f"{' to '.join(dict.fromkeys(ends))} years" for key, ends in spans.items()}
+
+
+def stress_frame(table: pd.DataFrame, shown: Sequence[str]) -> pd.DataFrame:
+    """Return the rows of the primary metric on the stresses of each suite."""
+    rows = table[(table["rejector"] == "") & table["matcher"].isin(list(shown)) & table["value"].notna()]
+    return primary_rows(rows[rows["stratum"] == STRESS])
+
+
+# --- what is known of the answers -------------------------------------------------------------------------------------
+
+
+class JudgedKey(NamedTuple):
+    """Whose answers, of which queries, by which rejector."""
+
+    track: str
+    prior_group: str
+    matcher: str
+    rejector: str
+
+
+def risk_frame(judged: Mapping[tuple[str, str], pd.DataFrame], shown: Sequence[str]) -> pd.DataFrame:
+    """Return risk against coverage by matcher and rejector, of each suite with absent places and of all together.
+
+    `judged` is from `rejection.judge` and `rejection.own_confidence`. The columns are suite, track, prior_group,
+    mixture, matcher, rejector, n, answered, aurc, coverage and risk: points of a curve by growing coverage. All suites
+    together also come in the declared mixtures of present and absent places.
+    """
+    rows: list[tuple[str | float, ...]] = []
+    for key, whole in _parts(judged, shown):
+        for suite, part in [(ALL_SUITES, whole), *whole.groupby("suite", sort=True)]:
+            is_pooled = suite == ALL_SUITES
+            if is_pooled or not part["is_present"].to_numpy(bool).all():
+                rows += _curves(str(suite), key, answers_of(part), is_pooled=is_pooled)
+    columns = [*GROUP, "mixture", "matcher", "rejector", "n", "answered", "aurc", "coverage", "risk"]
+    return pd.DataFrame(rows, columns=columns)
+
+
+def _curves(suite: str, key: JudgedKey, some: Fixes, *, is_pooled: bool) -> Iterator[tuple[str | float, ...]]:
+    """Yield rows of `risk_frame`."""
+    for mixture, mass in mixtures_of(some, is_pooled=is_pooled):
+        curve = risk_coverage(some, mass)
+        about = (suite, key.track, key.prior_group, mixture, key.matcher, key.rejector)
+        figures = (len(some), int(some.is_answered.sum()), aurc(some, mass))
+        for at in _thinned(curve.coverage):
+            yield (*about, *figures, curve.coverage[at], curve.risk[at])
+
+
+def _thinned(coverage: Floats) -> Ints:
+    """Return which points of a curve are drawn: all of a few, else those nearest to even steps, first and last."""
+    if len(coverage) <= _MOST_POINTS:
+        return np.arange(len(coverage))
+    even = np.linspace(0.0, coverage[-1], _MOST_POINTS)
+    return np.unique([0, len(coverage) - 1, *np.minimum(np.searchsorted(coverage, even), len(coverage) - 1)])
+
+
+def reliability_frame(
+    judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
+) -> pd.DataFrame:
+    """Return how often answers are false by stated chance, over all suites of a track and prior group.
+
+    `judged` is as for `risk_frame`, `calibrated` names the matchers and rejectors that give probabilities. The columns
+    are track, prior_group, matcher, rejector, predicted, observed, lo, hi, n and sites: bins of equal mass, of the
+    answers alone, with Wilson's intervals of as many trials as there are sites.
+    """
+    rows: list[tuple[str | float, ...]] = []
+    for key, part in calibrated_parts(judged, calibrated, shown):
+        answered = part[part["is_answered"].to_numpy(bool)]
+        p_false = 1.0 - answered["p_right"].to_numpy(float)
+        if len(answered) and not np.isnan(p_false).any():
+            rows.extend((*key, *one) for one in _bins(answered, p_false))
+    return pd.DataFrame(rows, columns=[*JudgedKey._fields, "predicted", "observed", "lo", "hi", "n", "sites"])
+
+
+def calibrated_parts(
+    judged: Mapping[tuple[str, str], pd.DataFrame], calibrated: Collection[tuple[str, str]], shown: Sequence[str]
+) -> Iterator[tuple[JudgedKey, pd.DataFrame]]:
+    """Yield the answers with probabilities by track and prior group, with their keys."""
+    yield from _parts({key: frame for key, frame in judged.items() if key in calibrated}, shown)
+
+
+def _parts(
+    judged: Mapping[tuple[str, str], pd.DataFrame], shown: Sequence[str]
+) -> Iterator[tuple[JudgedKey, pd.DataFrame]]:
+    for (matcher, rejector), frame in judged.items():
+        if matcher in shown:
+            for (track, prior_group), part in frame.groupby(["track", "prior_group"], sort=True):
+                yield JudgedKey(str(track), str(prior_group), matcher, rejector), part
+
+
+def _bins(answered: pd.DataFrame, p_false: Floats) -> Iterator[tuple[float, ...]]:
+    """Yield predicted, observed, lo, hi, n and sites of each bin."""
+    is_false = ~answered["is_right"].to_numpy(bool)
+    sites = codes_of(answered["pair_id"])
+    at = equal_mass_bins(1.0 - p_false)
+    for number in np.unique(at):
+        mine = at == number
+        share, trials = float(is_false[mine].mean()), effective_count(sites[mine])
+        found = wilson_share(share, trials)
+        predicted = float(p_false[mine].mean())
+        yield predicted, share, found.lo, found.hi, int(mine.sum()), trials
+
+
+# --- protection levels ------------------------------------------------------------------------------------------------
+
+
+def stanford_cells(levels: ProtectionLevels) -> pd.DataFrame:
+    """Count queries in cells of error_m and level_m, eight to a decade on each side; n of each middle of a cell.
+
+    Values that exceed `MOST_M` are at `BEYOND_M`.
+    """
+    cells = pd.DataFrame({"error_m": _middles(levels.error_m), "level_m": _middles(levels.level_m)})
+    return cells.groupby(["error_m", "level_m"]).size().rename("n").reset_index()
+
+
+def _middles(values_m: Floats) -> Floats:
+    """Return the middle of the cell of each value."""
+    within = np.log10(np.clip(values_m, LEAST_M, MOST_M))
+    step = np.minimum(np.floor(within * _CELLS_PER_DECADE), round(np.log10(MOST_M) * _CELLS_PER_DECADE) - 1)
+    middles = 10 ** ((step + 0.5) / _CELLS_PER_DECADE)
+    return np.asarray(np.where(values_m > MOST_M, BEYOND_M, middles))
+
+
+def stanford_areas(levels: ProtectionLevels, limit_m: float) -> dict[str, int]:
+    """Count queries that are available, unavailable, misleading and hazardously misleading.
+
+    Misleading ones are those within the alert limit, so that the four add up.
+    """
+    areas = stanford(levels.level_m, levels.error_m, limit_m)
+    return {
+        "available": int(areas.nominal.sum()),
+        "unavailable": int((areas.unavailable | areas.unavailable_misleading).sum()),
+        "misleading": int(areas.misleading.sum()),
+        "hazardous": int(areas.hazardous.sum()),
+    }
+
+
+# Okabe and Ito's colours without the yellow, which is too pale on white; dashes and marks differ, too.
+_COLOURS: Final = ("#000000", "#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
+_DASHES: Final = ("-", "--", "-.", ":")
+_MARKS: Final = ("o", "s", "^", "D", "v", "P", "X", "*", "<", ">", "h")
+FAINT: Final = "#dddddd"
+BoardPage: Final = partial(Page, data=ATTRIBUTION)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Look:
+    """Colour, dash and marker of one of several things drawn together."""
+
+    colour: str
+    dash: str
+    mark: str
+
+
+def look_of(number: int) -> Look:
+    """Return the look of the thing of a number; no two of the first 28 have colour and dash in common."""
+    return Look(
+        colour=_COLOURS[number % len(_COLOURS)],
+        dash=_DASHES[number % len(_DASHES)],
+        mark=_MARKS[number % len(_MARKS)],
+    )
+
+
+def line_keys(names: Sequence[str], *, has_marks: bool = True) -> list[Line2D]:
+    """Return the legend of lines of the looks 0, 1, ..."""
+    looks = [(name, look_of(number)) for number, name in enumerate(names)]
+    return [
+        Line2D(
+            [], [], color=look.colour, ls=look.dash, marker=look.mark if has_marks else "", ms=4.5, lw=1.5, label=name
+        )
+        for name, look in looks
+    ]
+
+
+PRIMARY: Final = {
+    "success_25m": "success (share of queries\nwithin 25 m and 5 deg)",
+    "distance_within_25m": "share of the flown distance\nwithin 25 m",
+    "recall_1": "recall@1\n(share of queries)",
+}
+INTERVALS: Final = (
+    "Bars: 95 % intervals as on the board (places, then blocks, then sites are drawn; never narrower than Wilson's "
+    "over sites). n: queries of each point."
+)
+ACROSS: Final = 4  # panels side by side
+_NAME_INCHES: Final = 2.6  # of a name next to its bar, before it is broken
+HALVES: Final = (0.0, 0.5, 1.0)
+
+
+def those_there(rows: pd.DataFrame, shown: Sequence[str]) -> list[str]:
+    """Return the matchers that have a row, in the order of their looks."""
+    return [name for name in shown if (rows["matcher"] == name).any()]
+
+
+def of_which(row: Mapping[str, Any] | pd.Series) -> str:
+    """Return the suite, track and prior group of a figure in words."""
+    return f"{row['suite']}, {row['track']}, {prior_words(str(row['prior_group']))}"
+
+
+def panels_across(count: int) -> tuple[int, int]:
+    """Return rows and columns of so many panels.
+
+    >>> panels_across(3), panels_across(9)
+    ((1, 3), (3, 4))
+    """
+    columns = max(1, min(ACROSS, count))
+    return -(-count // columns), columns
+
+
+def dress_share(chart: Axes) -> None:
+    """Set an axis of shares, with room below for numbers of queries."""
+    chart.set_ylim(-0.13, 1.04)
+    chart.set_yticks([0.0, 0.25, 0.5, 0.75, 1.0])
+    chart.grid(visible=True, axis="y", color=FAINT, lw=0.6)
+
+
+def draw_line(chart: Axes, mine: pd.DataFrame, at: Floats, number: int) -> None:
+    """Draw the line of one matcher with an interval at each point; `at` are the places across."""
+    if mine.empty:
+        return
+    look = look_of(number)
+    value, lo, hi = (mine[name].to_numpy(float) for name in ("value", "lo", "hi"))
+    chart.plot(at, value, color=look.colour, ls=look.dash, marker=look.mark, ms=4, lw=1.3)
+    chart.vlines(at, lo, hi, color=look.colour, lw=0.9, alpha=0.75)
+
+
+def label_outer(chart: Axes, number: int, columns: int, count: int, label: str) -> None:
+    """Label the axes of a panel where no other panel stands between them and the edge."""
+    is_left = number % columns == 0
+    chart.tick_params(labelleft=is_left, labelbottom=number + columns >= count)
+    if is_left:
+        chart.set_ylabel(label)
+
+
+def ticks_across(chart: Axes, ticks: Sequence[float], low: float, high: float) -> None:
+    """Set a logarithmic axis across from `low` to `high`, with numbers at some ticks."""
+    chart.set_xscale("log")
+    chart.set_xlim(low, high)
+    chart.xaxis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
+    chart.xaxis.set_ticks([], minor=True)
+
+
+def panel_title(chart: Axes, name: str, row: Mapping[str, Any] | pd.Series) -> None:
+    """Write a name and the numbers of queries and blocks of a row above a panel."""
+    chart.set_title(f"{name}\nn {row['n']:g}, {counted(int(row['blocks']), 'block')}")
+
+
+def draw_bar_panels(
+    path: Path, rows: pd.DataFrame, shown: Sequence[str], column: str, values: Sequence[str], *, title: str, note: str
+) -> None:
+    """Draw success as bars with intervals: a panel for each value of a column, a bar for each matcher."""
+    names, (down, across) = those_there(rows, shown), panels_across(len(values))
+    about = BoardPage(
+        title=title,
+        note=note,
+        below=PRIMARY[primary_of(str(rows["track"].iloc[0])).name].replace("\n", " "),
+        rows=down,
+        columns=across,
+        panel_inches=(1.9, 0.3 + 0.19 * len(names)),
+    )
+    with page(path, about) as charts:
+        for number, chart in panels(charts, len(values)):
+            mine = rows[rows[column] == values[number]]
+            panel_title(chart, values[number], mine.iloc[0])
+            draw_board_bars(chart, mine, names)
+            if number % across:
+                chart.set_yticklabels([])
+
+
+def draw_board_bars(chart: Axes, mine: pd.DataFrame, names: Sequence[str]) -> None:
+    """Draw a bar with its interval for each matcher, the first on top."""
+    for at, name in enumerate(names):
+        for row in mine[mine["matcher"] == name].to_dict("records"):
+            chart.barh(at, row["value"], height=0.72, color=look_of(at).colour, alpha=0.75)
+            chart.hlines(at, row["lo"], row["hi"], color="#000000", lw=1.0)
+            chart.vlines([row["lo"], row["hi"]], at - 0.18, at + 0.18, color="#000000", lw=1.0)
+            chart.text(1.03, at, f"{row['value']:.2f}", fontsize=6.5, va="center")
+    chart.set_yticks(range(len(names)), [broken(name, _NAME_INCHES, 8.5) for name in names])
+    chart.set_ylim(len(names) - 0.4, -0.6)
+    chart.set_xlim(0.0, 1.0)
+    chart.set_xticks([0.0, 0.5, 1.0], ["0", "0.5", "1"])
+    chart.grid(visible=True, axis="x", color=FAINT, lw=0.6)
+    chart.tick_params(axis="y", length=0)
+
+
+def dodged(values: Floats, number: int, count: int, *, by: float) -> Floats:
+    """Shift values on a logarithmic axis a little by the number of a line, so that intervals do not hide others."""
+    return np.asarray(values * (1.0 + by) ** (number - (count - 1) / 2))
+
 
 _DODGE: Final = 0.011  # of an axis, between two matchers at one step
 

@@ -25,15 +25,17 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.running.sandbox import keeps_truth
 from sasgeo_bench.scoring.base import Bools
-from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
+from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.entries import Entry
 from sasgeo_bench.scoring.intervals import (
     LEVEL,
+    ClusterDraws,
     Interval,
     bootstrap_means,
     difference_interval,
     effective_count,
     percentile_interval,
+    seed_of_text,
     wilson_share,
 )
 from sasgeo_bench.scoring.metric import MeanMetric
@@ -41,9 +43,7 @@ from sasgeo_bench.scoring.metrics import FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.rows import ALL_SUITES, NOT_REPRODUCED, PACKED, REPRODUCED, RUN_HERE, name_alone
 from sasgeo_bench.scoring.score import NOT_APPLICABLE, SCORER_VERSION
 from sasgeo_bench.scoring.strata import GROUP
-from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
-from sasgeo_bench.tasks.openings import SealedPlace
-from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS
+from sasgeo_bench.tasks.private_seed import REPRODUCING_BITS, SealedPlace
 from sasgeo_bench.tasks.query import TASK_VERSION
 from sasgeo_bench.tasks.task_files import TaskManifest
 

@@ -14,17 +14,22 @@ import pandas as pd
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart, disc_of, seen_at
-from sasgeo_bench.leaderboard.cases import find_cases, operating_rejector, words_of
-from sasgeo_bench.matching.matcher import SAME_PLACE_M
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.leaderboard.cases import (
+    CasePicture,
+    MapPart,
+    disc_of,
+    find_cases,
+    operating_rejector,
+    seen_at,
+    words_of,
+)
+from sasgeo_bench.matching.matcher import SAME_PLACE_M, Prediction
 from sasgeo_bench.progress import tell
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.layers import read_layers
 from sasgeo_bench.regions.region import Manifest
-from sasgeo_bench.running.prediction_files import Answers, read_ties
-from sasgeo_bench.running.run_manifest import RUN, RunManifest
+from sasgeo_bench.running.prediction_files import RUN, Answers, RunManifest, read_ties
 from sasgeo_bench.sasgeo.integrity import EVIDENCE
 from sasgeo_bench.scoring.controls import is_control
 from sasgeo_bench.scoring.entries import Entry, find_entries

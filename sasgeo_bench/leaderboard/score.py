@@ -31,17 +31,9 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.failures import Failures, log_beside, stops_all
-from sasgeo_bench.running.prediction_files import StoredAnswers
-from sasgeo_bench.running.run_manifest import CardRecord
+from sasgeo_bench.running.prediction_files import CardRecord, StoredAnswers
 from sasgeo_bench.running.sandbox import joined
-from sasgeo_bench.scoring.contestants import (
-    Contest,
-    open_tasks,
-    read_entry_answers,
-    rows_to_rank,
-    score_entries,
-    scored_rows,
-)
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding, with_causes
 from sasgeo_bench.scoring.contrasts import hold_contrasts
 from sasgeo_bench.scoring.controls import (
     CONTROL_SCHEMA,
@@ -55,13 +47,23 @@ from sasgeo_bench.scoring.controls import (
 )
 from sasgeo_bench.scoring.cost import COLUMNS as COST_COLUMNS
 from sasgeo_bench.scoring.cost import Costs
-from sasgeo_bench.scoring.entries import Entry, find_entries, leave_out, set_apart
+from sasgeo_bench.scoring.entries import (
+    Contest,
+    Entry,
+    find_entries,
+    leave_out,
+    open_tasks,
+    read_entry_answers,
+    rows_to_rank,
+    score_entries,
+    scored_rows,
+    set_apart,
+)
 from sasgeo_bench.scoring.protection import PROTECTION_SCHEMA, protection_frame
 from sasgeo_bench.scoring.rejection import RejectionResult, RejectionTask, Rule, evaluate_rejectors, rules_of
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, name_alone, with_entry_labels
 from sasgeo_bench.scoring.score import SCORER_VERSION, single_views
 from sasgeo_bench.scoring.tables import cost_figures, leaderboards
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding, with_causes
 from sasgeo_bench.tasks.query import SEQUENCE, TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import Task, TaskManifest

@@ -13,10 +13,10 @@ from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import Falsifier
-from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.entries import Entry
+from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.tasks.openings import SealedPlace
+from sasgeo_bench.tasks.private_seed import SealedPlace
 from sasgeo_bench.tasks.query import Truth
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import TaskManifest
@@ -27,7 +27,7 @@ class ScoreRequest:
     """A request for a board, written to the folder `board`.
 
     `predictions` are folders of runs, with runs at any depth, and files of predictions; `submissions` are folders that
-    are scored as files are, with more checks (`validate.submission_faults`). `tasks` are task folders; without any,
+    are scored as files are, with more checks (`submission_files.submission_faults`). `tasks` are task folders; without any,
     those that the runs and files answer. A matcher that was asked nothing of one of them has no figures on its suite.
     `root` holds tasks/ and truth/, `truth` is the folder of the truths where it is another one.
 
@@ -39,7 +39,7 @@ class ScoreRequest:
     `pipeline` is name and hash of the pipeline that requests the board, if one does, `title` its title. `private` is a
     board of a private seed of the same pipeline to compare rows with. `kept` is the manifest of stored results: it
     keeps the version of their maps, their title and their sealed places, and their results on a private seed where no
-    private board is named. `sealed` are the sealed places (`openings.sealed_record`). `failed` names entries that
+    private board is named. `sealed` are the sealed places (`private_seed.sealed_record`). `failed` names entries that
     failed before scoring, and why. `stored` is a board whose entries are not fitted again, `elsewhere` rows of other
     boards that asked the same queries.
     """

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.canvas import GREY, Page, new_figure, styled, without_ticks
 from sasgeo_bench.errors import ConfigError, counted
-from sasgeo_bench.leaderboard.case_plot import (
+from sasgeo_bench.leaderboard.cases import (
     ANSWERED,
     TRUE,
     CasePicture,
@@ -130,7 +130,7 @@ def strip_of(cases: RunCases, count: int) -> tuple[Strip, list[CasePicture]]:
 
 
 def strip_pixels(strip: Strip, rows: Sequence[CasePicture], *, title: str) -> NDArray[np.uint8]:
-    """Draw the rows of a strip; pixels as of `case_plot.pixels_of`, the same for the same rows."""
+    """Draw the rows of a strip; pixels as of `cases.pixels_of`, the same for the same rows."""
     columns = len(_COLUMNS)
     about = Page(
         title=title,

@@ -9,18 +9,24 @@ from typing import Any, Final
 import pandas as pd
 
 from sasgeo_bench.errors import counted, named
-from sasgeo_bench.leaderboard.board_tables import Book, cost_table, sections_of
-from sasgeo_bench.leaderboard.columns import NOTE, RANKS_NOTE, TERMS
+from sasgeo_bench.leaderboard.board_tables import (
+    Book,
+    contrast_table,
+    control_table,
+    cost_table,
+    falsifier_table,
+    rejection_tables,
+    sections_of,
+    seed_table,
+)
 from sasgeo_bench.leaderboard.manifests import BoardEntry, BoardManifest
 from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
-from sasgeo_bench.leaderboard.rejection_tables import rejection_tables
-from sasgeo_bench.leaderboard.tables import DAGGER, Table, text_of
-from sasgeo_bench.leaderboard.validity_tables import contrast_table, control_table, falsifier_table, seed_table
+from sasgeo_bench.leaderboard.tables import DAGGER, NOTE, RANKS_NOTE, TERMS, Table, text_of
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, MADE_UP, OLD_STYLE_DATA_VERSION
+from sasgeo_bench.scoring.compare import Finding
 from sasgeo_bench.scoring.controls import ALPHA, Falsifier, Verdict
 from sasgeo_bench.scoring.metrics import ANSWERED, FALSE_ABSENT, primary_of
 from sasgeo_bench.scoring.strata import ALL
-from sasgeo_bench.scoring.verdicts import Finding
 from sasgeo_bench.tasks.query import SEQUENCE
 from sasgeo_bench.texts import markdown, markdown_item, tex
 

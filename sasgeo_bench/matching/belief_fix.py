@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
 from sasgeo_bench.matching.tracker import Fix
-from sasgeo_bench.search.belief import Floats, GridBelief
-from sasgeo_bench.search.belief_motion import moved
+from sasgeo_bench.search.belief import Floats, GridBelief, moved
 from sasgeo_bench.tasks.query import Step
 
 NEAR_M: Final = 25.0  # the confidence of a fix is the mass so near to it

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import CARD_FILE, KINDS, MATCHERS, shipped_names
+from sasgeo_bench.files.plugins import CARD_FILE, KINDS, MATCHERS, SEGMENTERS, SUITES, TRACKERS, shipped_names
 from sasgeo_bench.matching.submission import EXAMPLE
+from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
 _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")
 _LONGEST: Final = 60
@@ -230,3 +231,288 @@ def _is_free(folder: Path) -> bool:
         raise StoreError(
             f"{folder} cannot be read ({error.strerror or error}): check your rights, or name another folder"
         ) from error
+
+
+_SEGMENTER: Final = '''\
+"""The segmenter {name}: here is where your method goes."""
+
+import json
+from functools import lru_cache
+
+import numpy as np
+from sasgeo_bench import ABSENT, PRESENT, AerialImage, ImageTraining, Segmentation, SegmenterCard
+
+SOFTNESS = 40.0  # of a colour, in steps of 255
+
+
+class {cls}:
+    """Compares single pixels with mean colours. A place to start from, no method to win with."""
+
+    card = SegmenterCard(
+        name="{name}",
+        version="0.1.0",
+        title="{title}",
+        source="original",
+        ours="all of it",
+        licence="MIT",
+        limits="looks at the colour of one pixel at a time; silent before it has learned",
+    )
+
+    def learn(self, training: ImageTraining) -> str:
+        """Mean colours of each class, where it is and where it is not; the text goes to every call of `segment`."""
+        sums = {{name: np.zeros((2, 4)) for name in training.classes}}
+        for labelled in training.images:
+            for name, labels in zip(labelled.classes, labelled.labels, strict=True):
+                for row, state in enumerate((ABSENT, PRESENT)):
+                    pixels = labelled.image.rgb[labels == state]
+                    sums[name][row] += [*pixels.sum(axis=0, dtype=np.float64), len(pixels)]
+        found = {{name: rows for name, rows in sums.items() if rows[:, 3].all()}}
+        return json.dumps({{name: (rows[:, :3] / rows[:, 3:]).round(2).tolist() for name, rows in found.items()}})
+
+    def segment(self, image: AerialImage, *, learned: str | None) -> Segmentation:
+        """Probability of each class at each pixel; NaN, as everywhere before it has learned, says nothing."""
+        colours = colours_of(learned) if learned else {{}}
+        if not colours:
+            silent = np.full((1, *image.shape), np.nan)
+            return Segmentation.of_probabilities(("building",), silent)
+        pixels = image.rgb.astype(np.float64)
+        planes = []
+        for absent, present in colours.values():
+            nearer = ((pixels - absent) ** 2).sum(axis=2) - ((pixels - present) ** 2).sum(axis=2)
+            planes.append(1 / (1 + np.exp(-np.clip(nearer / SOFTNESS**2, -30, 30))))
+        return Segmentation.of_probabilities(tuple(colours), np.stack(planes))
+
+
+@lru_cache(maxsize=1)  # every image comes with the same text
+def colours_of(learned: str) -> dict[str, np.ndarray]:
+    return {{name: np.array(rows) for name, rows in json.loads(learned).items()}}
+'''
+
+_SEGMENTER_README: Final = """\
+# {title}
+
+A segmenter for sasgeo-bench.
+
+```bash
+pip install -e .
+sasgeo-bench check {name}
+```
+
+Say in the card (`src/{module}/segmenter.py`) where the method comes from and what of it is yours; raise its version
+whenever answers change.
+"""
+
+
+def segmenter_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a segmenter, by its path.
+
+    `name` is that of the segmenter; raise `ConfigError` if it is not allowed, or taken.
+
+    >>> sorted(segmenter_files("my-segmenter"))[-1]
+    'tests/test_conforms.py'
+    """
+    return package_files(name, group=SEGMENTERS, code=_SEGMENTER, readme=_SEGMENTER_README)
+
+
+_SUITE: Final = '''\
+"""The suite {name}: here is where your stress goes."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from sasgeo_bench import VIEW_CELLS, Evidence, PlainSuite, SuiteCard, Variant, controls, hide, ladder
+
+
+@dataclass(frozen=True)
+class {cls}:
+    """Hides whole rows of the view. At strength 0 it changes no cell, and all chance comes from `rng`."""
+
+    share: float
+
+    def __call__(self, evidence: Evidence, rng: np.random.Generator) -> Evidence:
+        """Return the view with some rows unknown."""
+        rows, cols = evidence.shape
+        hidden = rng.permutation(rows) < round(self.share * rows)
+        return hide(evidence, np.broadcast_to(hidden[:, None], (rows, cols)))
+
+
+def change(variant: Variant, evidence: Evidence, rng: np.random.Generator) -> Evidence:
+    """Return what is left of a view under a variant; a control is not changed."""
+    return {cls}(share=variant.strength)(evidence, rng)
+
+
+SUITE = PlainSuite(
+    card=SuiteCard(
+        name="{name}",
+        version=1,  # raise it whenever the same seed gives another query
+        title="{title}",
+        what="Rows of the view are unknown.",
+        separates="Matchers that leave unknown cells out from those that take them for absent.",
+        falsifier="No row is hidden: scores as in the control.",
+        strength_unit="share of the view that is hidden",
+    ),
+    variants=(
+        *controls(views=VIEW_CELLS),
+        *ladder("rows", (0.2, 0.4, 0.6)),
+        Variant(role="falsifier", kind="none"),
+    ),
+    change=change,
+)
+'''
+
+_SUITE_README: Final = """\
+# {title}
+
+A suite for sasgeo-bench: queries under a stress of your own.
+
+```bash
+pip install -e .
+sasgeo-bench check {name}
+sasgeo-bench make-queries --suite {name} --regions town-riverside --n 2
+sasgeo-bench inspect {name}/town-riverside --rows 6
+```
+
+Say in the card (`src/{module}/suite.py`) what should differ before you run anything. A pipeline file names the suite in
+a `[[task]]` as it does those of sasgeo-bench.
+"""
+
+
+def suite_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a suite, by its path.
+
+    `name` is that of the suite; raise `ConfigError` if it is not allowed, or taken.
+
+    >>> sorted(suite_files("my-suite"))[-1]
+    'tests/test_conforms.py'
+    """
+    if name in EVERY_SUITE:
+        raise ConfigError(
+            f"{name!r} is a suite of sasgeo-bench itself, which would be used instead of yours; choose another"
+        )
+    return package_files(name, group=SUITES, code=_SUITE, readme=_SUITE_README, attribute="SUITE")
+
+
+_TRACKER: Final = '''\
+"""The tracker {name}: here is where your method goes."""
+
+from dataclasses import replace
+
+import numpy as np
+from sasgeo_bench import Fix, Pose, Prior, Query, Region, advance, load_matcher, read_card, start_of, wrap_deg
+
+FOUND = np.diag([5.0, 5.0, 3.0]) ** 2  # covariance of a pose that the search finds: m2, m2, deg2
+GATE = 3.4  # largest Mahalanobis distance of a pose that is taken: 99 of 100 right ones are nearer
+NEAR_M = 25.0  # an estimate is accepted while 95 % of its belief lies within
+LEAST_M = 80.0  # radius that is searched at least
+STREAK = 3  # poses taken in a row before the first estimate is accepted
+PATIENCE = 5  # poses refused in a row before no more is believed than at the start
+
+
+class {cls}:
+    """Odometry corrected by a search, in a Kalman filter. A place to start from, no method to win with."""
+
+    card = read_card(__file__)  # card.toml, beside this file
+
+    def __init__(self) -> None:
+        self.matcher = load_matcher("fft_vote")  # a search that ships; put your own here
+
+    def prepare(self, region: Region, learned: str | None) -> None:
+        """Index the map; called once for each one."""
+        self.matcher.prepare(region, learned)
+        self.grid = region.grid
+
+    def start(self, prior: Prior) -> None:
+        """Begin a flight with what is known of its first view; forget the one before."""
+        self.pose, self.covariance = start_of(prior, self.grid)
+        self.begun = self.covariance
+        west_m, south_m, east_m, north_m = self.grid.bounds_m
+        self.most_m = prior.radius_m or np.hypot(east_m - west_m, north_m - south_m) / 2
+        self.taken = self.refused = 0
+
+    def step(self, query: Query) -> Fix:
+        """Add the odometry up, search around the estimate, and correct it by what is found."""
+        self.pose, self.covariance = advance(self.pose, self.covariance, query.step)
+        asked = replace(query, track="localization", prior=self.prior(query), step=None)
+        found = self.matcher.match(asked, top_k=1)
+        if found.poses:
+            self.correct(found.poses[0])
+        spread_m = np.sqrt(5.99 * np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
+        is_accepted = bool(self.taken >= STREAK and spread_m <= NEAR_M)
+        return Fix(pose=self.pose, covariance=self.covariance, is_accepted=is_accepted)
+
+    def prior(self, query: Query) -> Prior:
+        """Three standard deviations of the belief, as the prior of a single view."""
+        radius_m = 3 * np.sqrt(np.linalg.eigvalsh(self.covariance[:2, :2])[-1])
+        return Prior(
+            center_m=(self.pose.easting_m, self.pose.northing_m),
+            radius_m=float(np.clip(radius_m, LEAST_M, max(LEAST_M, self.most_m))),
+            yaw_deg=self.pose.yaw_deg,
+            yaw_sigma_deg=float(np.sqrt(self.covariance[2, 2])),
+            scale_sigma=query.prior.scale_sigma,
+        )
+
+    def correct(self, found: Pose) -> None:
+        """Take a pose that fits the belief; after many that do not, believe no more than at the start."""
+        gap = np.array(
+            [
+                found.easting_m - self.pose.easting_m,
+                found.northing_m - self.pose.northing_m,
+                float(wrap_deg(found.yaw_deg - self.pose.yaw_deg)),
+            ]
+        )
+        joint = self.covariance + FOUND
+        if gap @ np.linalg.solve(joint, gap) > GATE**2:
+            self.taken, self.refused = 0, self.refused + 1
+            if self.refused > PATIENCE:
+                self.covariance, self.refused = self.begun, 0
+            return
+        gain = self.covariance @ np.linalg.inv(joint)
+        east_m, north_m, turn_deg = (gain @ gap).tolist()
+        self.pose = Pose(
+            easting_m=self.pose.easting_m + east_m,
+            northing_m=self.pose.northing_m + north_m,
+            yaw_deg=self.pose.yaw_deg + turn_deg,
+            scale=found.scale,
+        )
+        left = np.eye(3) - gain
+        self.covariance = left @ self.covariance @ left.T + gain @ FOUND @ gain.T
+        self.taken, self.refused = self.taken + 1, 0
+'''
+
+_CARD: Final = (
+    EXAMPLE.replace('["retrieval", "localization"]', '["sequence"]')
+    .replace(
+        "looks at a coarse lattice of places, with the heading of the prior alone",
+        "one hypothesis at a time: where a map repeats itself it may follow the wrong copy",
+    )
+    .replace('needs = ["position"]', "needs = []")
+)
+
+_TRACKER_README: Final = """\
+# {title}
+
+A tracker for sasgeo-bench.
+
+```bash
+pip install -e .
+sasgeo-bench check {name}
+sasgeo-bench make-queries --suite flight-clean --regions town-grid --n 1 --up-to
+sasgeo-bench run --matcher {name} --tasks out/tasks/flight-clean/town-grid
+```
+
+Say in the card (`src/{module}/card.toml`) where the method comes from and what of it is yours; raise its version
+whenever answers change.
+"""
+
+
+def tracker_files(name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a tracker, by its path.
+
+    `name` is that of the tracker; raise `ConfigError` if it is not allowed, or taken.
+
+    >>> sorted(tracker_files("my-tracker"))[-2:]
+    ['src/my_tracker/tracker.py', 'tests/test_conforms.py']
+    """
+    if name in shipped_names(MATCHERS):
+        raise ConfigError(f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another")
+    return package_files(name, group=TRACKERS, code=_TRACKER, readme=_TRACKER_README, card=_CARD)

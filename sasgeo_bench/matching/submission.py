@@ -49,7 +49,7 @@ TrainedOn = Annotated[str | list[str] | dict[str, list[str]], BeforeValidator(_t
 class Card(Document):
     """Author's description of a method: `card.toml`, and shown on the board as text.
 
-    A class has the same fields as its `MatcherCard`, by `card_file.read_card`, and needs `tracks`. `trained_on` is
+    A class has the same fields as its `MatcherCard`, by `cards.read_card`, and needs `tracks`. `trained_on` is
     "none", or places of the split; by halves, "a" lists the training places of the answers about half a.
     `trained_elsewhere` describes other training in a line. `api` is the version of the doors that it was written for.
     `uses` lists inputs besides the query and the map, as in

@@ -86,7 +86,7 @@ def choose_coverage(
     """Choose the mapped area of an extract, in degrees, and name its source.
 
     The region file's polygon (`stated`) comes first. The box of the file's header, or its boxes as one geometry, is
-    taken if the data fill it, or else if `is_cut_by_box` says so of the estimate and the box (`box_cut.cuts_by_box`).
+    taken if the data fill it, or else if `is_cut_by_box` says so of the estimate and the box (`read.cuts_by_box`).
     Otherwise the extract was cut along a border, and the estimate within the box is taken.
     """
     if stated is not None:

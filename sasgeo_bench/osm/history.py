@@ -18,7 +18,7 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError, CoverageError, ExtractError
-from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat
 from sasgeo_bench.osm.coverage import CLOSE_M

@@ -23,8 +23,7 @@ from pydantic import (
 
 from sasgeo_bench.config import Document, Line
 from sasgeo_bench.errors import ExtractError
-from sasgeo_bench.files.folders import sha256_of
-from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.files.folders import scratch_folder, sha256_of
 from sasgeo_bench.progress import QUIET
 
 FOLDERS_VARIABLE: Final = "SASGEO_EXTRACTS"

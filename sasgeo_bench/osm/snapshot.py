@@ -15,8 +15,8 @@ import osmium
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ExtractError, counted
+from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.osm.xml_text import NEW_IDS, Box, clean, has_several_streams, needs_cleaning, open_text, read_boxes
 
 SUFFIXES: Final = (".osm.pbf", ".pbf", ".osm", ".osm.gz", ".osm.bz2", ".osh.pbf", ".osh", ".osh.gz", ".osh.bz2")

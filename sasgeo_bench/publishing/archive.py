@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
+from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import check_registered
-from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.leaderboard.board_files import BOARD, read_board_manifest
 from sasgeo_bench.leaderboard.build import drawings, make_board
 from sasgeo_bench.leaderboard.manifests import PackManifest

@@ -42,18 +42,18 @@ from sasgeo_bench.files.paths import plain_file, read_bounded
 from sasgeo_bench.leaderboard.board_files import ANSWERS, BOARD, BOARD_FILES, LEADERBOARD
 from sasgeo_bench.leaderboard.board_files import MEND as BOARD_MEND
 from sasgeo_bench.leaderboard.manifests import PackManifest, VersionRecord, parse_record
-from sasgeo_bench.matching import learned_file
-from sasgeo_bench.matching.learned_file import TrainingRecord
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching import cards
+from sasgeo_bench.matching.cards import TrainingRecord
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.regions.region_files import MANIFEST
 from sasgeo_bench.running.prediction_files import (
+    RunManifest,
     differing_columns,
     prediction_row,
     predictions_of,
     row_faults,
     schema_of,
 )
-from sasgeo_bench.running.run_manifest import RunManifest
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import Detector, PriorGroup
 from sasgeo_bench.tasks.task_files import (
@@ -637,8 +637,8 @@ def _lay_runs(runs: pa.Table, answers: pa.Table, asked: Mapping[str, str], into:
         place = run / _folder_name(manifest.suite) / _folder_name(manifest.region)
         manifest.save(place)
         if row[LEARNED] is not None:
-            (run / learned_file.FOLDER).mkdir(exist_ok=True)
-            (run / learned_file.FOLDER / _learned_name(manifest.learned)).write_text(row[LEARNED], encoding="utf-8")
+            (run / cards.FOLDER).mkdir(exist_ok=True)
+            (run / cards.FOLDER / _learned_name(manifest.learned)).write_text(row[LEARNED], encoding="utf-8")
         part = answers.slice(start, count)
         ties = [asked_under(asked[name], manifest.key) for name in part["query_id"].to_pylist()]
         write_table(part.append_column(ASKED, pa.array(ties, pa.string())), place / "part-0.parquet")

@@ -14,8 +14,7 @@ import pandas as pd
 
 from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.folders import SITE, absolute, resolve_link
-from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.files.folders import SITE, absolute, resolve_link, scratch_folder
 from sasgeo_bench.leaderboard.board import Board, by_entry
 from sasgeo_bench.leaderboard.board_files import (
     BOARD_FILES,
@@ -40,8 +39,7 @@ from sasgeo_bench.publishing.site_files import (
     site_lock,
     write_site,
 )
-from sasgeo_bench.publishing.site_pages import places_on_map, regions_of
-from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
+from sasgeo_bench.publishing.site_pages import draw_places, draw_rates, places_on_map, regions_of
 from sasgeo_bench.publishing.site_source import (
     Download,
     SiteFigure,
@@ -50,10 +48,10 @@ from sasgeo_bench.publishing.site_source import (
 )
 from sasgeo_bench.regions.region_spec import list_region_files, read_region_file
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.draws import DRAWS
-from sasgeo_bench.scoring.scenes import scene_frame
+from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import GROUP
+from sasgeo_bench.scoring.tables import scene_frame
 from sasgeo_bench.tasks.split import find_split_file, read_split_file
 from sasgeo_bench.texts import one_line
 

@@ -10,9 +10,8 @@ from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.files.parquet import read_table
 from sasgeo_bench.leaderboard.board_files import MEND, read_board_manifest, read_leaderboard
 from sasgeo_bench.leaderboard.board_tables import Book
-from sasgeo_bench.leaderboard.columns import column
 from sasgeo_bench.leaderboard.manifests import Elsewhere, ElsewhereRow
-from sasgeo_bench.leaderboard.tables import Cell, Key, Row, Table, figure_cell, file_stem, interval_text
+from sasgeo_bench.leaderboard.tables import Cell, Key, Row, Table, column, figure_cell, file_stem, interval_text
 from sasgeo_bench.publishing.archive_file import is_pack
 from sasgeo_bench.scoring.metrics import primary_of
 

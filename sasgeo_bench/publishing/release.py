@@ -14,7 +14,6 @@ from typing import Final
 from sasgeo_bench.errors import ConfigError, StoreError, counted
 from sasgeo_bench.leaderboard.private_board import check_public, seed_of
 from sasgeo_bench.progress import tell
-from sasgeo_bench.publishing.dataset_card import CARD, DATASHEET, card_text, datasheet_text
 from sasgeo_bench.publishing.release_files import (
     BoardTasks,
     Release,
@@ -30,7 +29,15 @@ from sasgeo_bench.publishing.release_files import (
     write_sums,
     write_texts,
 )
-from sasgeo_bench.publishing.release_metadata import write_croissant, write_stac, write_zenodo
+from sasgeo_bench.publishing.release_metadata import (
+    CARD,
+    DATASHEET,
+    card_text,
+    datasheet_text,
+    write_croissant,
+    write_stac,
+    write_zenodo,
+)
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.layers import cog_faults

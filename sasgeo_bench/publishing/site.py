@@ -14,38 +14,55 @@ import pandas as pd
 from jinja2 import Environment, PackageLoader
 
 from sasgeo_bench.errors import counted
-from sasgeo_bench.leaderboard.board_tables import Book, Section, cost_table, sections_of
-from sasgeo_bench.leaderboard.cases import MEANINGS as FAILURE_MEANINGS
-from sasgeo_bench.leaderboard.columns import MARKS, MEANINGS, NOTE, RANKS_NOTE, column, suite_card
-from sasgeo_bench.leaderboard.manifests import FailedCase
-from sasgeo_bench.leaderboard.overview import summary
-from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
-from sasgeo_bench.leaderboard.rejection_tables import (
+from sasgeo_bench.leaderboard.board_tables import (
+    Book,
+    Section,
     acceptance_tables,
+    control_table,
+    cost_table,
     rejection_tables,
     risk_tables,
     risk_tables_by_suite,
+    scene_tables,
+    sections_of,
+    seed_table,
+    summary,
 )
-from sasgeo_bench.leaderboard.scene_tables import scene_tables
-from sasgeo_bench.leaderboard.tables import Bar, Record, Table, file_stem, interval_text, number_text, p_text
+from sasgeo_bench.leaderboard.cases import MEANINGS as FAILURE_MEANINGS
+from sasgeo_bench.leaderboard.manifests import FailedCase
+from sasgeo_bench.leaderboard.private_board import sealed_lines, seed_lines
+from sasgeo_bench.leaderboard.tables import (
+    MARKS,
+    MEANINGS,
+    NOTE,
+    RANKS_NOTE,
+    Bar,
+    Record,
+    Table,
+    column,
+    file_stem,
+    interval_text,
+    number_text,
+    p_text,
+    suite_card,
+)
 from sasgeo_bench.leaderboard.text import control_lines, map_lines, segmenter_lines, training_lines, warnings_of
-from sasgeo_bench.leaderboard.validity_tables import control_table, seed_table
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.publishing.elsewhere import elsewhere_tables
-from sasgeo_bench.publishing.site_maps import OUTCOMES as ANSWER_OUTCOMES
-from sasgeo_bench.publishing.site_maps import place_maps
+from sasgeo_bench.publishing.site_pages import OUTCOMES as ANSWER_OUTCOMES
 from sasgeo_bench.publishing.site_pages import (
     figures_by_kind,
     matchers_of,
+    place_maps,
     protection_tables,
     rate_table,
     region_table,
     suites_of,
 )
 from sasgeo_bench.publishing.site_source import SiteSource
+from sasgeo_bench.scoring.compare import LOWER
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import Verdict
-from sasgeo_bench.scoring.verdicts import LOWER
 from sasgeo_bench.tasks.query import SEQUENCE, base_of
 from sasgeo_bench.texts import plain
 

@@ -30,7 +30,7 @@ from sasgeo_bench.leaderboard.board_files import (
 )
 from sasgeo_bench.leaderboard.manifests import PackManifest, PicturesManifest, parse_record
 from sasgeo_bench.publishing.archive_file import is_pack, read_pack
-from sasgeo_bench.publishing.site_maps import MAPS
+from sasgeo_bench.publishing.site_pages import MAPS
 from sasgeo_bench.publishing.site_source import Download, SiteFigure
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.texts import json_text, one_line

@@ -74,7 +74,7 @@ class SiteSource:
     `title` is that of the board's pipeline where it is known. `reasons` states why
     each contrast was registered. `spots` are positions of regions, as far as they are known; `parts` holds place, and
     half or part of the split, of each region; `rates` is measured ageing. `scenes` is success by kind of place
-    (`scenes.scene_frame`).
+    (`tables.scene_frame`).
     """
 
     name: str

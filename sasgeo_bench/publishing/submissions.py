@@ -14,22 +14,28 @@ from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.manifests import BoardManifest, PackManifest
 from sasgeo_bench.leaderboard.scored import Scored, ScoreRequest
-from sasgeo_bench.matching.card_file import read_card_file
-from sasgeo_bench.matching.matcher import RejectorCard
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.cards import read_card_file
+from sasgeo_bench.matching.matcher import Prediction, RejectorCard
 from sasgeo_bench.matching.submission import SCHEMA_VERSION, AnsweredTask, Card, Submission
 from sasgeo_bench.progress import tell
 from sasgeo_bench.publishing.archive import board_of, laid_tasks, request_of, score_all, stored_among
 from sasgeo_bench.publishing.archive_file import is_pack, read_pack
 from sasgeo_bench.regions.region import ATTRIBUTION, DATA_VERSION, LICENCE
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.run_manifest import RUN, RunManifest
+from sasgeo_bench.running.prediction_files import RUN, RunManifest
 from sasgeo_bench.scoring.entries import check_name
 from sasgeo_bench.scoring.rejection import rules_of
 from sasgeo_bench.scoring.rows import name_alone
 from sasgeo_bench.scoring.score import SCORER_VERSION
-from sasgeo_bench.scoring.submission_files import is_submission, list_submissions, read_submission, write_submission
-from sasgeo_bench.scoring.validate import Violation, submission_faults, validate
+from sasgeo_bench.scoring.submission_files import (
+    Violation,
+    is_submission,
+    list_submissions,
+    read_submission,
+    submission_faults,
+    validate,
+    write_submission,
+)
 from sasgeo_bench.tasks.query import CONTROLS, TASK_VERSION, base_of
 from sasgeo_bench.tasks.split import Split, find_split
 from sasgeo_bench.tasks.task_files import Task

@@ -3,6 +3,7 @@
 
 import itertools
 import os
+import re
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -10,6 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pyarrow as pa
@@ -17,19 +19,356 @@ import rasterio
 import shapely
 from affine import Affine
 from numpy.typing import NDArray
+from rasterio.enums import ColorInterp, MaskFlags
 from rasterio.errors import RasterioError
 from rasterio.windows import Window
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import Delaunay
 from tifffile import TiffFile, TiffPage, TiffWriter
 
-from sasgeo_bench.errors import SasgeoError, StoreError
+from sasgeo_bench.errors import ImageryError, SasgeoError, StoreError
 from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
+from sasgeo_bench.geometry.pose import overlapping
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
+from sasgeo_bench.texts import one_line
 
 if TYPE_CHECKING:
     import geopandas as gpd
+
+_COLOURS: Final = (ColorInterp.red, ColorInterp.green, ColorInterp.blue)
+_SILENT: Final = frozenset({ColorInterp.undefined, ColorInterp.gray, ColorInterp.alpha})  # say nothing of a colour
+_WORD: Final = re.compile(r"\b(red|green|blue)\b(?!\W*edge)")  # not the red edge
+_LETTERS: Final[dict[str, str]] = {item.name[0]: item.name for item in _COLOURS}
+_BITS: Final = 8
+_SAMPLES: Final = 8  # blocks along each side of a picture that are looked at
+_SAMPLE_PX: Final = 1024  # of a block, where it is larger
+
+
+@dataclass(frozen=True, slots=True)
+class Bands:
+    """Numbers of the bands that are red, green and blue, from 1 on; and that of alpha, if there is one.
+
+    `note` is what whoever builds the region should know of the choice; empty where there was none.
+    """
+
+    rgb: tuple[int, int, int] = (1, 2, 3)
+    alpha: int | None = None
+    note: str = ""
+
+
+RGB: Final = Bands()
+
+
+def find_bands(path: Path, source: rasterio.io.DatasetReader) -> Bands:
+    """Find the colours of a GeoTIFF by its colour interpretation, else by the names of its bands.
+
+    Raise `ImageryError` if it has no red, green and blue of 8 bits, or says two things about them. Where it says
+    nothing, the first three bands are taken, and `note` says so. A few blocks of an alpha band are read: one that is
+    neither opaque nor transparent in many places holds a picture, as the near infrared of NAIP does.
+    """
+    colours = colour_bands(source.colorinterp, source.descriptions)
+    alphas = [band for band, is_what in enumerate(source.colorinterp, start=1) if is_what is ColorInterp.alpha]
+    kinds = {source.dtypes[band - 1] for band in colours.rgb or ()} or set(source.dtypes)
+    if not colours.rgb or kinds != {"uint8"} or len(alphas) > 1:
+        raise ImageryError(
+            f"{path} has {source.count} band(s) of {source.dtypes[0]}, imagery is 8-bit red, green and blue: convert "
+            "it (gdal_translate -ot Byte -scale, -expand rgb for a palette, -b for the bands, -colorinterp for their "
+            f"colours); {colours.fault or 'its bands are ' + _names(source.colorinterp)}"
+        )
+    bits = source.tags(colours.rgb[0], ns="IMAGE_STRUCTURE").get("NBITS", str(_BITS))
+    if bits != str(_BITS):
+        raise ImageryError(
+            f"{path} has colours of {bits} bits, imagery has 8: convert it (gdal_translate -ot Byte -scale)"
+        )
+    alpha, notes = alphas[0] if alphas else None, [colours.note] if colours.note else []
+    if alpha is not None and not _is_mask(source, alpha):
+        notes.append(f"its band {alpha} calls itself alpha and holds a picture, such as infrared: it hides nothing")
+        alpha = None
+    return Bands(rgb=colours.rgb, alpha=alpha, note="; ".join(notes))
+
+
+@dataclass(frozen=True, slots=True)
+class _Colours:
+    rgb: tuple[int, int, int] | None = None
+    note: str = ""
+    fault: str = ""
+
+
+def colour_bands(interpretation: Sequence[ColorInterp], names: Sequence[str | None]) -> _Colours:
+    """Return the bands that are red, green and blue, None if there are none; and a note on the choice, or the fault.
+
+    >>> colour_bands([ColorInterp.undefined, ColorInterp.blue, ColorInterp.green, ColorInterp.red], [None] * 4).rgb
+    (4, 3, 2)
+    >>> colour_bands([ColorInterp.gray, *[ColorInterp.undefined] * 3], ["blue", "green", "red", "red edge"]).rgb
+    (3, 2, 1)
+    """
+    words = [_colour_of(name or "") for name in names]
+    named, listed = _each_once(words), ", ".join(one_line(name or "")[:20] or "nothing" for name in names[:8])
+    told = _each_once([item.name if item in _COLOURS else "" for item in interpretation])
+    if told:
+        called = [(words[band - 1], item.name) for band, item in zip(told, _COLOURS, strict=True)]
+        if all(word in ("", colour) for word, colour in called) and named in (None, told):
+            return _Colours(told)
+        by_names = f"{named or listed} by their names"
+        return _Colours(fault=f"red, green and blue are {told} by their colour interpretation, {by_names}")
+    if len(interpretation) < len(_COLOURS) or not set(interpretation) <= _SILENT:
+        return _Colours()
+    if named or any(words):
+        return _Colours(named, fault=f"its bands are called {listed}")
+    first = [band for band, item in enumerate(interpretation, start=1) if item is not ColorInterp.alpha][:3]
+    if len(first) < len(_COLOURS):
+        return _Colours()
+    rgb = (first[0], first[1], first[2])
+    what = f"its bands are called {listed}" if any(names) else "it does not say what its bands show"
+    return _Colours(rgb, f"{what}: bands {rgb} are taken as red, green, blue")
+
+
+def _colour_of(name: str) -> str:
+    """Return the colour that a name of a band says, empty if it says none or several."""
+    text = name.replace("_", " ").strip().lower()
+    found: list[str] = _WORD.findall(text)
+    return _LETTERS.get(text, found[0] if len(found) == 1 else "")
+
+
+def _each_once(words: Sequence[str]) -> tuple[int, int, int] | None:
+    """Return the numbers of the bands called red, green and blue, if each is called so once."""
+    if any(words.count(item.name) != 1 for item in _COLOURS):
+        return None
+    red, green, blue = (words.index(item.name) + 1 for item in _COLOURS)
+    return red, green, blue
+
+
+def _names(interpretation: Sequence[ColorInterp]) -> str:
+    return ", ".join(item.name for item in interpretation[:8])
+
+
+def _is_mask(source: rasterio.io.DatasetReader, band: int) -> bool:
+    """Return whether an alpha band is opaque or transparent nearly everywhere, by blocks all over the picture."""
+    tall, wide = source.block_shapes[band - 1]
+    tops = np.unique(np.linspace(0, (source.height - 1) // tall, _SAMPLES).astype(int)) * tall
+    lefts = np.unique(np.linspace(0, (source.width - 1) // wide, _SAMPLES).astype(int)) * wide
+    low, high = 2, 249  # levels of an alpha that are neither transparent nor opaque; 1 is, in masks of 0 and 1
+    counts = np.zeros(2**_BITS, dtype=np.int64)
+    for top in tops.tolist():
+        for left in lefts.tolist():
+            rows, cols = min(tall, _SAMPLE_PX, source.height - top), min(wide, _SAMPLE_PX, source.width - left)
+            alpha = source.read(band, window=Window(left, top, cols, rows))
+            counts += np.bincount(alpha.ravel(), minlength=len(counts))
+    # 8 levels of a mask of any shares, of which one is opaque
+    is_of_few = np.count_nonzero(counts) <= 8 and counts[high + 1 :].any()
+    # 0.1 of the pixels of a mask, at its edges, are neither opaque nor transparent
+    return bool(is_of_few) or counts[low : high + 1].sum() <= 0.1 * counts.sum()
+
+
+def selected(source: rasterio.io.DatasetReader, bands: Bands) -> str | None:
+    """Return a virtual raster of the colours, and of alpha as the fourth band; None if the file is that already.
+
+    GDAL's warper knows an alpha band only where it is the last one, and takes every band of that name for alpha.
+    """
+    masks = set(source.mask_flag_enums[bands.rgb[0] - 1])
+    has_mask = MaskFlags.per_dataset in masks and MaskFlags.alpha not in masks
+    order = (*bands.rgb, *([bands.alpha] if bands.alpha else []))
+    if order == tuple(range(1, source.count + 1)) and not (has_mask and bands.alpha):
+        return None
+    root = ET.Element("VRTDataset", rasterXSize=str(source.width), rasterYSize=str(source.height))
+    ET.SubElement(root, "SRS", dataAxisToSRSAxisMapping="1,2").text = source.crs.to_wkt()
+    ET.SubElement(root, "GeoTransform").text = ", ".join(map(repr, source.transform.to_gdal()))
+    for number, (band, colour) in enumerate(zip(bands.rgb, _COLOURS, strict=True), start=1):
+        entry = _band(root, number, colour, {})
+        if source.nodatavals[band - 1] is not None:
+            ET.SubElement(entry, "NoDataValue").text = repr(source.nodatavals[band - 1])
+        _simple_source(entry, source.name, str(band))
+    hiding = [str(bands.alpha)] * bool(bands.alpha) + [f"mask,{bands.rgb[0]}"] * has_mask
+    if hiding:
+        both = {"subClass": "VRTDerivedRasterBand"} if len(hiding) > 1 else {}
+        entry = _band(root, 4, ColorInterp.alpha, both)
+        if both:
+            ET.SubElement(entry, "PixelFunctionType").text = "mul"
+        for band_of in hiding:
+            _simple_source(entry, source.name, band_of)
+    return ET.tostring(root, encoding="unicode")
+
+
+def _band(root: ET.Element, number: int, colour: ColorInterp, more: dict[str, str]) -> ET.Element:
+    entry = ET.SubElement(root, "VRTRasterBand", {"dataType": "Byte", "band": str(number), **more})
+    ET.SubElement(entry, "ColorInterp").text = colour.name.capitalize()
+    return entry
+
+
+def _simple_source(entry: ET.Element, name: str, band: str) -> None:
+    into = ET.SubElement(entry, "SimpleSource")
+    ET.SubElement(into, "SourceFilename", relativeToVRT="0", shared="0").text = str(Path(name).absolute())
+    ET.SubElement(into, "SourceBand").text = band
+
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Shapes = NDArray[np.object_]
+
+PLANE: Final = 2
+RING_CORNERS: Final = 5  # of a closed rectangle
+TRIANGLE: Final = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bends:
+    """Bends of lines."""
+
+    en_m: Floats  # shape (N, 2): place on the line, metres
+    line: Ints  # shape (N,): number of the line
+    at_m: Floats  # shape (N,): distance along it, metres
+    inward: Floats  # shape (N, 2): direction of the bisector of the two arms, towards the inside; any length
+
+
+def find_bends(
+    en_m: Floats, at_m: Floats, first: Ints, *, step_m: float, smoothing_m: float, window_m: float, turn_deg: float
+) -> Bends:
+    """Find where lines turn most, at most once within half a window; lines shorter than the window have no bend.
+
+    `en_m` and `at_m`, shapes (P, 2) and (P,), are the vertices of all lines, one line after the other, and the distance
+    of each along its line; `first`, shape (L + 1,), is the row where each line begins, and P. `step_m` is the spacing
+    of the samples, `smoothing_m` the length of the moving average, `window_m` the length within which a bend turns by
+    `turn_deg`.
+
+    >>> corner = np.array([[0.0, 0.0], [200.0, 0.0], [200.0, 200.0]])
+    >>> rules = {"step_m": 10.0, "smoothing_m": 60.0, "window_m": 120.0, "turn_deg": 45.0}
+    >>> find_bends(corner, np.array([0.0, 200.0, 400.0]), np.array([0, 3]), **rules).en_m.tolist()
+    [[200.0, 0.0]]
+    """
+    length_m = at_m[first[1:] - 1]
+    chosen = np.flatnonzero(length_m >= window_m)
+    if not len(chosen):
+        none = np.empty((0, PLANE))
+        return Bends(en_m=none, line=chosen, at_m=none[:, 0], inward=none)
+    # Equal steps, so that a line read backwards has the same samples.
+    steps = np.maximum(np.rint(length_m[chosen] / step_m).astype(np.int64), 1)
+    line = np.repeat(chosen, steps + 1)
+    start = np.repeat(np.cumsum(steps + 1) - steps - 1, steps + 1)
+    last = start + np.repeat(steps, steps + 1)
+    row = np.arange(len(line))
+    sample_m = (row - start) * np.repeat(length_m[chosen] / steps, steps + 1)
+    # One axis for all lines: each begins a metre after the end of the one before.
+    shift_m = np.cumsum(length_m + 1.0) - length_m
+    axis_m = at_m + np.repeat(shift_m, np.diff(first))
+    place = np.column_stack([np.interp(sample_m + shift_m[line], axis_m, part) for part in en_m.T]).reshape(-1, PLANE)
+
+    reach = round(smoothing_m / step_m / 2)
+    near = np.clip(row[:, None] + np.arange(-reach, reach + 1), start[:, None], last[:, None])
+    smooth = (place[near] - place[:, None]).mean(axis=1) + place
+    ahead = smooth[np.minimum(row + 1, last)] - smooth
+    behind = smooth - smooth[np.maximum(row - 1, start)]
+    turn = np.arctan2(behind[:, 0] * ahead[:, 1] - behind[:, 1] * ahead[:, 0], (behind * ahead).sum(axis=1))
+
+    reach = round(window_m / step_m / 2)
+    offset = np.arange(-reach, reach + 1)
+    near = row[:, None] + offset
+    is_on_line = (near >= start[:, None]) & (near <= last[:, None])
+    near = np.clip(near, start[:, None], last[:, None])
+    turns = np.where(is_on_line, turn[near], 0.0)
+    # A sharp corner turns the same in every window that holds it; the weights draw the peak to its middle.
+    # Rounded, so that the first of two equal samples is the peak in spite of rounding errors.
+    score = np.abs(turns @ (1.0 - np.abs(offset) / (reach + 1))).round(6)
+    rivals = np.where(is_on_line, score[near], -1.0)
+    is_peak = (rivals.argmax(axis=1) == reach) & (np.abs(turns.sum(axis=1)) >= np.radians(turn_deg))
+    peak = np.flatnonzero(is_peak)
+    arms = smooth[near[peak][:, [0, -1]]] - smooth[peak, None]
+    inward = (arms / np.maximum(np.linalg.norm(arms, axis=2, keepdims=True), np.finfo(float).tiny)).sum(axis=1)
+    return Bends(en_m=place[peak], line=line[peak], at_m=sample_m[peak], inward=inward)
+
+
+def centroids(shapes: Shapes) -> Floats:
+    """Return the centroid of each shape, shape (N, 2), metres; it need not lie inside."""
+    centre = shapely.centroid(shapes)
+    return np.column_stack([shapely.get_x(centre), shapely.get_y(centre)])
+
+
+def long_sides(shapes: Shapes) -> Floats:
+    """Return the vector along the long side of each minimum rotated rectangle, shape (N, 2), metres; or NaN."""
+    boxes = np.asarray(shapely.oriented_envelope(shapes), dtype=object)
+    found = np.flatnonzero(shapely.get_num_coordinates(boxes) == RING_CORNERS)
+    sides = np.full((len(boxes), PLANE), np.nan)
+    corners = shapely.get_coordinates(boxes[found]).reshape(-1, RING_CORNERS, PLANE)
+    side = corners[:, 1:3] - corners[:, 0:2]
+    sides[found] = side[np.arange(len(found)), np.linalg.norm(side, axis=2).argmax(axis=1)]
+    return sides
+
+
+def groups_within(shapes: Shapes, gap_m: float) -> Ints:
+    """Number the groups of shapes, shape (N,): shapes at most `gap_m` from each other share one.
+
+    >>> groups_within(shapely.box([0, 20, 99], 0, [9, 29, 109], 9), 15.0).tolist()
+    [0, 0, 1]
+    """
+    if not len(shapes):
+        return np.empty(0, dtype=np.int64)
+    left, right = _near_pairs(shapes, gap_m).T
+    is_near = shapely.dwithin(shapes[left], shapes[right], gap_m)
+    links = coo_array((is_near, (left, right)), shape=(len(shapes), len(shapes)))
+    links.eliminate_zeros()
+    return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+
+def touching_pairs(shapes: Shapes) -> Ints:
+    """Return rows of shapes that touch or overlap, shape (K, 2), smaller row first.
+
+    >>> touching_pairs(shapely.box([0, 9, 99], 0, [9, 29, 109], 9)).tolist()
+    [[0, 1]]
+    """
+    pairs = _near_pairs(shapes, 0.0)
+    shapely.prepare(shapes)
+    return np.asarray(pairs[shapely.intersects(shapes[pairs[:, 0]], shapes[pairs[:, 1]])])
+
+
+def _near_pairs(shapes: Shapes, gap_m: float) -> Ints:
+    grown = shapely.box(*(shapely.bounds(shapes) + np.array([-gap_m, -gap_m, gap_m, gap_m])).T)
+    pairs = overlapping(grown, shapes).T
+    return np.asarray(pairs[pairs[:, 0] < pairs[:, 1]], dtype=np.int64)
+
+
+def delaunay_pairs(en_m: Floats, longest_m: float) -> Ints:
+    """Return Delaunay neighbours no further apart than `longest_m`, shape (K, 2), smaller row first.
+
+    An edge that depends on the choice of the algorithm (a diagonal of four corners on one circle, as among houses on a
+    lattice) is left out, so that the pairs turn with the places.
+
+    >>> delaunay_pairs(np.array([[0.0, 0.0], [9.0, 0.0], [9.0, 9.0], [0.0, 9.0]]), 60.0).tolist()
+    [[0, 1], [0, 3], [1, 2], [2, 3]]
+    """
+    count = len(en_m)
+    if count < PLANE:
+        return np.empty((0, PLANE), dtype=np.int64)
+    centred = en_m - en_m.mean(axis=0)
+    _, spread, axes = np.linalg.svd(centred, full_matrices=False)
+    if count < TRIANGLE or spread[1] <= 1e-9 * spread[0]:
+        order = np.argsort(centred @ axes[0], kind="stable")  # all on one line: each next to the next
+        pairs = np.sort(np.column_stack([order[:-1], order[1:]]), axis=1)
+    else:
+        pairs = _strict_pairs(centred)
+    length_m = np.linalg.norm(en_m[pairs[:, 0]] - en_m[pairs[:, 1]], axis=1)
+    pairs = pairs[length_m <= longest_m]
+    return np.asarray(pairs[np.lexsort([pairs[:, 1], pairs[:, 0]])], dtype=np.int64)
+
+
+def _strict_pairs(en_m: Floats) -> Ints:
+    """Return edges of the triangulation whose two opposite angles sum to less than a half turn."""
+    corners = Delaunay(en_m).simplices.astype(np.int64)
+    tip = corners.ravel()
+    base = np.sort(np.stack([np.roll(corners, -1, axis=1), np.roll(corners, -2, axis=1)], axis=2).reshape(-1, PLANE))
+    arms = en_m[base] - en_m[tip][:, None]
+    twice_area = np.abs(arms[:, 0, 0] * arms[:, 1, 1] - arms[:, 0, 1] * arms[:, 1, 0])
+    with np.errstate(over="ignore"):  # the cotangent of a flat corner is infinite
+        cotangent = (arms[:, 0] * arms[:, 1]).sum(axis=1) / np.maximum(twice_area, np.finfo(float).tiny)
+    _, first, edge, uses = np.unique(
+        base[:, 0] * len(en_m) + base[:, 1], return_index=True, return_inverse=True, return_counts=True
+    )
+    is_hull = uses == 1
+    is_strict = np.bincount(edge, weights=cotangent) > 1e-6  # sum of two cotangents that counts as 0, dimensionless
+    return np.asarray(base[first][is_hull | is_strict])
+
 
 PRESENT: Final = 1
 OUTSIDE: Final = 255  # unknown: beyond the mapped area

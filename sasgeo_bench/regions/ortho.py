@@ -24,9 +24,8 @@ from sasgeo_bench.errors import GridError, ImageryError
 from sasgeo_bench.files.folders import file_record
 from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.regions.bands import RGB, Bands, find_bands, selected
-from sasgeo_bench.regions.imagery import BANDS, PictureRecord
-from sasgeo_bench.regions.imagery_files import ImageryEntry
+from sasgeo_bench.regions.imagery import BANDS, ImageryEntry, PictureRecord
+from sasgeo_bench.regions.layers import RGB, Bands, find_bands, selected
 from sasgeo_bench.texts import one_line
 
 MOST_PIXELS: Final = 4_000_000_000  # of a picture

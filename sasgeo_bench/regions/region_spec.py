@@ -24,7 +24,7 @@ from sasgeo_bench.geometry.grid import Grid, utm_epsg
 from sasgeo_bench.geometry.projection import from_lonlat, to_lonlat
 from sasgeo_bench.osm.locate import Extract
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.imagery_files import ImageryEntry
+from sasgeo_bench.regions.imagery import ImageryEntry
 
 MAX_LATITUDE_DEG: Final = 84.0  # where UTM ends
 MAX_LONGITUDE_DEG: Final = 180.0

@@ -17,8 +17,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
-from sasgeo_bench.running.root import SYSTEM
-from sasgeo_bench.sensing.packing import LABELLED
+from sasgeo_bench.running.sandbox import SYSTEM
+from sasgeo_bench.sensing.image import LABELLED
 from sasgeo_bench.tasks.private_seed import SUFFIX as SEED
 
 # A folder that holds all names of one of these reveals answers.

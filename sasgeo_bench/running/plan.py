@@ -11,24 +11,58 @@ from pathlib import Path
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError, counted
-from sasgeo_bench.files.plugins import ORACLE, check_card_name, list_entry_points
+from sasgeo_bench.files.plugins import (
+    MATCHERS,
+    ORACLE,
+    SEGMENTERS,
+    TRACKERS,
+    check_card_name,
+    list_entry_points,
+    plugin_code,
+)
+from sasgeo_bench.matching.cards import TrainingRecord, learned_path, read_learned
 from sasgeo_bench.matching.follower import follower_record
-from sasgeo_bench.matching.learned_file import TrainingRecord, learned_path, read_learned
-from sasgeo_bench.matching.matcher import MatcherCard
-from sasgeo_bench.matching.results import SOUND, STATUSES, Status, matcher_hash
+from sasgeo_bench.matching.matcher import SOUND, STATUSES, MatcherCard, Status, matcher_hash
 from sasgeo_bench.progress import check_jobs
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.code_hash import matcher_code
 from sasgeo_bench.running.oracle import CARD
-from sasgeo_bench.running.run_manifest import FollowerRecord, RunManifest
+from sasgeo_bench.running.prediction_files import FollowerRecord, RunManifest
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training, root_of
 from sasgeo_bench.running.worker import Limits, Reach, Worker
 from sasgeo_bench.tasks.query import flight_id
 from sasgeo_bench.tasks.split import Split
 from sasgeo_bench.tasks.task_files import Task, TaskManifest, asked_under, tie_key
 from sasgeo_bench.texts import MOST_CANDIDATES
+
+# Modules of this package that answers depend on, if a plugin imports them: after a change there, it is asked anew.
+TOOLS: Final = (
+    *("matching.controls", "matching.follower", "osm.taxonomy", "regions.evidence", "regions.graph", "regions.network"),
+    *("search", "sasgeo", "tasks.vectors"),
+)
+# The same of segmentations; whoever segments looks at pictures by all of them.
+SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera", "sensing.intrinsics")
+
+
+def matcher_code(spec: str) -> str:
+    """Return the SHA-256 of the code of a matcher or tracker (`files.code_hash.plugin_code`), and of the tools it uses.
+
+    >>> len(matcher_code("random")), matcher_code("random") == matcher_code("prior_centre")
+    (64, True)
+    """
+    # What every query is made of
+    return plugin_code(spec, MATCHERS, TRACKERS, tools=TOOLS, always=("regions.evidence",))
+
+
+def segmenter_code(spec: str) -> str:
+    """Return the SHA-256 of the code of a segmenter, and of all that pictures are looked at with.
+
+    >>> len(segmenter_code("colour_thresholds"))
+    64
+    """
+    return plugin_code(spec, SEGMENTERS, always=SEGMENTER_TOOLS)
+
 
 MOST_LINES: Final = 12  # tasks that are named; the others are counted
 MOST_TRAINED: Final = 2000  # pairs that travel to a process at once

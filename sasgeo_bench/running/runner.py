@@ -21,10 +21,9 @@ from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.imagery import ORTHO
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Watch, answer, pool_costs
-from sasgeo_bench.running.patience import Patience
+from sasgeo_bench.running.answers import LEAST_ITEMS, Cost, Patience, Watch, answer, pool_costs
 from sasgeo_bench.running.plan import MOST_LINES, RunPart, RunPlan, by_map, unit_of_task, whole_units
-from sasgeo_bench.running.run_manifest import CardRecord, RunManifest
+from sasgeo_bench.running.prediction_files import CardRecord, RunManifest
 from sasgeo_bench.running.training import trained
 
 if TYPE_CHECKING:

@@ -13,13 +13,13 @@ import numpy as np
 
 from sasgeo_bench.errors import ConfigError, StoreError, counted, named
 from sasgeo_bench.files.paths import plain_file
-from sasgeo_bench.matching.learned_file import write_learned
+from sasgeo_bench.matching.cards import write_learned
 from sasgeo_bench.matching.segmenter import check_text
 from sasgeo_bench.progress import reporting, spread, tell
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region_files import read_manifest, read_region
-from sasgeo_bench.running.recalibration import Said, recalibrated
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
+from sasgeo_bench.running.training import Said, recalibrated
 from sasgeo_bench.running.training_tasks import Lessons, TrainingSet, plan_training
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Final, Literal
 from pydantic import Field
 
 from sasgeo_bench.errors import ImageError, MatchError
-from sasgeo_bench.matching.results import Status
+from sasgeo_bench.matching.matcher import Status
 from sasgeo_bench.matching.segmenter import (
     MOST_TEXT_BYTES,
     SegmenterCard,
@@ -18,18 +18,17 @@ from sasgeo_bench.matching.segmenter import (
     check_text,
 )
 from sasgeo_bench.running import wire
-from sasgeo_bench.running.replies import (
+from sasgeo_bench.running.worker import (
     Failed,
     Line,
+    PluginProcess,
     PluginReply,
     Seconds,
     SentCard,
     Strictly,
     read_answer,
 )
-from sasgeo_bench.running.worker import PluginProcess
-from sasgeo_bench.sensing.image import AerialImage
-from sasgeo_bench.sensing.image_bytes import image_bytes
+from sasgeo_bench.sensing.image import AerialImage, image_bytes
 from sasgeo_bench.sensing.segmentation import MOST_CLASSES, Segmentation
 
 

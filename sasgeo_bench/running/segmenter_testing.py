@@ -10,22 +10,13 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import SEGMENTERS
-from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.segmenter import SegmenterCard
-from sasgeo_bench.running.checks import (
-    Check,
-    check_of,
-    kept_check,
-    listing_of,
-    loaded_check,
-    refusal_of,
-    taught_check,
-)
 from sasgeo_bench.running.segmenter_process import SegmenterProcess, SegmenterReply
+from sasgeo_bench.running.testing import Check, check_of, kept_check, listing_of, loaded_check, refusal_of, taught_check
 from sasgeo_bench.running.worker import Limits, Reach
-from sasgeo_bench.sensing.image import AerialImage, LabelledImage
-from sasgeo_bench.sensing.image_bytes import write_labelled
+from sasgeo_bench.sensing.image import AerialImage, LabelledImage, write_labelled
 from sasgeo_bench.sensing.segmentation import SILENT, Segmentation
 from sasgeo_bench.sensing.tiny_images import tiny_images, with_picture
 

@@ -10,19 +10,17 @@ from types import TracebackType
 from typing import Self
 
 from sasgeo_bench.errors import MatchError
+from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import ORACLE_SEGMENTER, SEGMENTERS, check_card_name
-from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.matching.segmenter import SegmenterCard
-from sasgeo_bench.running.code_hash import segmenter_code
+from sasgeo_bench.running.answers import Patience
 from sasgeo_bench.running.failures import LOG, guard, our_failure
-from sasgeo_bench.running.oracle_segmenter import CARD, ISOLATION, oracle_reply
-from sasgeo_bench.running.patience import Patience
-from sasgeo_bench.running.plan import TrainingResult, hidden_below
+from sasgeo_bench.running.oracle import ISOLATION, SEGMENTER_CARD, oracle_reply
+from sasgeo_bench.running.plan import TrainingResult, hidden_below, segmenter_code
 from sasgeo_bench.running.segmenter_process import SegmenterProcess, SegmenterReply
 from sasgeo_bench.running.training import failed_training
 from sasgeo_bench.running.worker import Limits, Reach
-from sasgeo_bench.sensing.image import AerialImage, LabelledImage
-from sasgeo_bench.sensing.image_bytes import LabelledFiles, write_labelled
+from sasgeo_bench.sensing.image import AerialImage, LabelledFiles, LabelledImage, write_labelled
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,7 +71,7 @@ class LoadedSegmenter:
 def load_card(request: SegmentRequest) -> LoadedSegmenter:
     """Load a segmenter in a process of its own; raise `MatchError` if that fails, or its name is not its own."""
     if request.spec == ORACLE_SEGMENTER:
-        return LoadedSegmenter(card=CARD, code="", learns=False)
+        return LoadedSegmenter(card=SEGMENTER_CARD, code="", learns=False)
     with SegmenterProcess(spec=request.spec, reach=request.reach(), limits=request.limits) as process:
         reply = process.load()
     if reply.status != "ok" or reply.card is None:

@@ -18,7 +18,7 @@ from sasgeo_bench.matching.segmenter import (
     check_text,
 )
 from sasgeo_bench.running.serve import Answer, PluginServer, package_of
-from sasgeo_bench.sensing.image_bytes import LabelledFiles, image_from
+from sasgeo_bench.sensing.image import LabelledFiles, image_from
 
 
 class SegmenterServer(PluginServer):

@@ -11,9 +11,9 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import ConfigError, SasgeoError
-from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.progress import reporting, silent
-from sasgeo_bench.running.checks import Check, check_of
+from sasgeo_bench.running.testing import Check, check_of
 from sasgeo_bench.tasks.build import check_task, make_tasks, plan_draw
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.sampling import Drawer

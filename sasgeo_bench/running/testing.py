@@ -2,31 +2,165 @@
 """The conformance kit: the rules that every matcher keeps, checked on a tiny place under the limits of a run."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import platform
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Literal
 
 import numpy as np
+import psutil
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files.plugins import MATCHERS
-from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.files.folders import scratch_folder
+from sasgeo_bench.files.plugins import MATCHERS, check_card_name
 from sasgeo_bench.matching.matcher import MatcherCard, candidates_at, check_match, lacks
+from sasgeo_bench.matching.segmenter import SegmenterCard
 from sasgeo_bench.progress import reporting, silent
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.running.checks import Check, kept_check, listing_of, loaded_check, refusal_of, taught_check
-from sasgeo_bench.running.replies import Reply
-from sasgeo_bench.running.worker import Limits, Reach, Worker
+from sasgeo_bench.running.worker import Limits, PluginReply, Reach, Reply, Worker
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import SEQUENCE, Query, Truth
 from sasgeo_bench.tasks.task_files import query_bytes
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
+
+Outcome = Literal["pass", "fail", "not applicable"]
+Listing = Mapping[str, tuple[int, int]]
+
+LEARNS: Final = "learns, the same text twice"  # a row of those that have a learn()
+_LOADS: Final = "loads, and has a card"
+_MOST_NAMED: Final = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Check:
+    """One row of the table."""
+
+    name: str
+    outcome: Outcome
+    found: str
+
+
+def check_of(name: str, fault: str | None, found: str) -> Check:
+    """Return a row that fails by a fault, or passes with what was found.
+
+    >>> check_of("the same answer twice", None, "4 images").outcome
+    'pass'
+    """
+    return Check(name=name, outcome="fail" if fault else "pass", found=fault or found)
+
+
+def loaded_check(spec: str, reply: PluginReply, card: MatcherCard | SegmenterCard | None, *, group: str) -> Check:
+    """Check that a plugin of a group of entry points was loaded, and that its card has a name of its own."""
+    if reply.status != "ok" or card is None:
+        return Check(name=_LOADS, outcome="fail", found=reply.message)
+    try:
+        check_card_name(spec, card.name, group=group)
+    except MatchError as error:
+        return Check(name=_LOADS, outcome="fail", found=str(error))
+    return Check(name=_LOADS, outcome="pass", found=f"{card.name} {card.version}")
+
+
+def taught_check(first: PluginReply, second: PluginReply, lessons: str) -> Check:
+    """Check that two trainings on the same lessons, each in a process of its own, gave the same text."""
+    lost = next((reply for reply in (first, second) if reply.learned is None), None)
+    fault = "another text the second time" if lost is None and first.learned != second.learned else ""
+    fault = fault if lost is None else f"{lost.status}: {lost.message}"
+    size = len((first.learned or "").encode())
+    return check_of(LEARNS, fault, f"{size} bytes from {lessons}, {first.seconds or 0.0:.2f} s")
+
+
+def refusal_of(reply: PluginReply) -> str:
+    """Return what a process was refused, in words; empty if nothing was."""
+    return reply.message if reply.status == "refused" else ""
+
+
+def listing_of(folder: Path) -> Listing:
+    """List everything below a folder, files with size and time of writing."""
+    found = {path.relative_to(folder).as_posix(): path for path in folder.rglob("*")}
+    status = {name: path.stat() for name, path in found.items() if path.is_file()}
+    return {name: (status[name].st_size, status[name].st_mtime_ns) if name in status else (0, 0) for name in found}
+
+
+def kept_check(refused: str, before: Listing, after: Listing, limited: str) -> Check:
+    """Check that nothing outside the scratch folder was refused, or written where no sandbox refuses it."""
+    changed = sorted(path for path in before.keys() | after.keys() if before.get(path) != after.get(path))
+    fault = f"wrote among maps and tasks: {', '.join(changed[:_MOST_NAMED])}" if changed else ""
+    fault = f"was refused what it asked for: {refused}" if refused else fault
+    return check_of(
+        "kept to its scratch folder", fault, limited or "not shut in: looked for files among maps and tasks alone"
+    )
+
+
+_SYS: Final = Path("/sys")
+_PER_DEGREE: Final = 1e3
+
+
+def hottest_celsius(root: Path = _SYS) -> float | None:
+    """Return the temperature of the hottest zone, degrees Celsius; of zones that say something possible."""
+    found = (_number(path) for path in (root / "class/thermal").glob("thermal_zone*/temp"))
+    celsius = (milli / _PER_DEGREE for milli in found if milli)
+    return max((value for value in celsius if -50 < value < 200), default=None)  # others are no sensor
+
+
+def clock_mhz() -> float | None:
+    """Return the present clock of the processor, the mean of its cores."""
+    found = psutil.cpu_freq()
+    return None if found is None or not found.current else float(found.current)
+
+
+class EnergyMeter:
+    """Counts the joules of all processor packages of this computer, whatever uses them.
+
+    Examples
+    --------
+    >>> EnergyMeter(Path("nowhere")).joules() is None
+    True
+    """
+
+    def __init__(self, root: Path = _SYS) -> None:
+        self._counters = [path for path in _packages(root) if _number(path / "energy_uj") is not None]
+        self._last = [_number(path / "energy_uj") or 0 for path in self._counters]
+        self._sum = 0
+
+    def joules(self) -> float | None:
+        """Return the joules since it was made; None without counters. Call it now and then: counters wrap around."""
+        if not self._counters:
+            return None
+        for at, path in enumerate(self._counters):
+            now = _number(path / "energy_uj") or 0
+            grown = now - self._last[at]
+            self._sum += grown if grown >= 0 else grown + (_number(path / "max_energy_range_uj") or 0)
+            self._last[at] = now
+        return self._sum / 1e6  # microjoules in a joule
+
+
+def processor_name(info: Path = Path("/proc/cpuinfo")) -> str:
+    """Return the name of the processor as its maker gives it, or the kind of machine."""
+    try:
+        lines = info.read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        lines = []
+    named = (line.partition(":")[2].strip() for line in lines if line.startswith(("model name", "Model", "Hardware")))
+    return next(filter(None, named), platform.machine())
+
+
+def _packages(root: Path) -> Iterator[Path]:
+    yield from (path for path in sorted((root / "class/powercap").glob("*:*")) if path.name.count(":") == 1)
+
+
+def _number(path: Path) -> int | None:
+    """Read a whole number, or None."""
+    try:
+        return int(path.read_text(encoding="ascii"))
+    except (OSError, ValueError):
+        return None
+
 
 TOWN: Final = "town-agricultural"  # the smallest that has room for candidates
 TOP_K: Final = 10

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 
 from sasgeo_bench.errors import counted
+from sasgeo_bench.files.folders import scratch_folder
 from sasgeo_bench.files.plugins import MATCHERS, TRACKERS
-from sasgeo_bench.files.scratch import scratch_folder
 from sasgeo_bench.geometry.pose import Prior
 from sasgeo_bench.matching.matcher import MatcherCard, is_followed, lacks
 from sasgeo_bench.progress import reporting, silent
@@ -21,9 +21,8 @@ from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.running.checks import Check, check_of, kept_check, listing_of, loaded_check, refusal_of
-from sasgeo_bench.running.replies import Reply
-from sasgeo_bench.running.worker import Limits, Reach, Worker
+from sasgeo_bench.running.testing import Check, check_of, kept_check, listing_of, loaded_check, refusal_of
+from sasgeo_bench.running.worker import Limits, Reach, Reply, Worker
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.query import Query, Step, Truth
 from sasgeo_bench.tasks.suites.base import Choice

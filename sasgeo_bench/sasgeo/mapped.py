@@ -12,8 +12,7 @@ from scipy.spatial import cKDTree
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg
-from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.regions.network import LAYERS
+from sasgeo_bench.regions.graph import LAYERS, build_graph
 from sasgeo_bench.regions.region import MapGraph, Region
 from sasgeo_bench.sasgeo.nodes import (
     INDEX,

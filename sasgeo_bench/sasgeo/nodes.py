@@ -14,10 +14,9 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
-from sasgeo_bench.regions.graph import RELATIONS
-from sasgeo_bench.regions.network import LAYERS, ROAD, VERTEX_M, find_crossings, make_chains, make_network
+from sasgeo_bench.regions.graph import LAYERS, RELATIONS, ROAD, VERTEX_M, find_crossings, make_chains, make_network
+from sasgeo_bench.regions.layers import centroids, groups_within
 from sasgeo_bench.regions.region import MapGraph
-from sasgeo_bench.regions.shapes import centroids, groups_within
 
 Drawing = Literal["vectors", "mask"]
 

@@ -16,9 +16,8 @@ from skimage.morphology import skeletonize
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import bearing_deg, wrap_deg
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence, cell_offsets_m
-from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.regions.network import LAYERS, ROAD, make_network
-from sasgeo_bench.regions.shapes import delaunay_pairs
+from sasgeo_bench.regions.graph import LAYERS, ROAD, build_graph, make_network
+from sasgeo_bench.regions.layers import delaunay_pairs
 from sasgeo_bench.sasgeo.nodes import (
     INDEX,
     NODE_KINDS,

@@ -11,7 +11,7 @@ import scipy
 from numpy.typing import NDArray
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.sasgeo.graph_rules import GraphRules
+from sasgeo_bench.sasgeo.graph import GraphRules
 from sasgeo_bench.sasgeo.joint import Blend
 from sasgeo_bench.sasgeo.raster import likeness_by_hand
 from sasgeo_bench.sasgeo.rates import FAR, ClassRates, Tally, fit_rates, hand_rates, likeness, missed_share

@@ -26,12 +26,10 @@ from sasgeo_bench.sasgeo.ablations import Switches
 from sasgeo_bench.sasgeo.learning import learn
 from sasgeo_bench.sasgeo.reading import Reader
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel
-from sasgeo_bench.search.belief import Floats, GridBelief
-from sasgeo_bench.search.belief_scores import known_on, surface_logs
-from sasgeo_bench.search.dense import LevelView
+from sasgeo_bench.search.belief import Floats, GridBelief, known_on, surface_logs
+from sasgeo_bench.search.dense import LevelView, surface
 from sasgeo_bench.search.field import Field, Template
 from sasgeo_bench.search.plan import Plan
-from sasgeo_bench.search.surface import surface
 from sasgeo_bench.tasks.query import Query, Step
 
 CELL_M: Final = 4.0  # of the map that is searched: of a whole country its layers take 0.3 GB

@@ -11,13 +11,13 @@ import pandas as pd
 
 from sasgeo_bench.errors import counted
 from sasgeo_bench.scoring.base import Bools, Floats
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, LEAST_PLACES, Finding
 from sasgeo_bench.scoring.contrasts import PRIMARY, Contrast, both_on, mean_finding
-from sasgeo_bench.scoring.draws import DRAWS
 from sasgeo_bench.scoring.frames import MATCHER, Column, Schema, Shown, row_columns
+from sasgeo_bench.scoring.intervals import DRAWS
 from sasgeo_bench.scoring.metrics import is_present, primary_of
 from sasgeo_bench.scoring.rows import UNRANKED, name_alone
 from sasgeo_bench.scoring.score import FIX_M, MISSING, NOT_APPLICABLE
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, LEAST_PLACES, Finding
 from sasgeo_bench.tasks.query import BLIND, CONTROLS, NOISE_FREE, SHUFFLED, TURNED, TWINS, PriorGroup
 
 ORACLE: Final = "oracle_pose"

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.scoring.score import NOT_APPLICABLE
 
 BYTES_PER_KB: Final = 1e3

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import reckon, wrap_deg
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.tracker import SIDE
 from sasgeo_bench.scoring.base import Bools, Floats
 from sasgeo_bench.scoring.frames import Schema, row_columns

@@ -12,8 +12,7 @@ import numpy as np
 
 from sasgeo_bench.errors import MetricError, named
 from sasgeo_bench.scoring.base import Floats
-from sasgeo_bench.scoring.segmentation import precision, recall_said, told_classes
-from sasgeo_bench.scoring.segmentation_counts import PixelCounts
+from sasgeo_bench.scoring.segmentation import PixelCounts, precision, recall_said, told_classes
 from sasgeo_bench.tasks.perturbations.perception_profile import ClassConfusions, PerceptionProfile
 
 _LEAST_SHARE: Final = 0.0005  # rarer confusions are left out

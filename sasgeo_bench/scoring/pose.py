@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose, wrap_deg
-from sasgeo_bench.matching.matcher import candidates_at
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction, candidates_at
 from sasgeo_bench.scoring.base import Bools, Floats, Ints, check_column
 from sasgeo_bench.tasks.query import Truth
 

@@ -11,14 +11,14 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.scoring.base import Floats, Ints, codes_of, weighted_mean
-from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Fixes, presence_weights
-from sasgeo_bench.scoring.draws import ClusterDraws, seed_of_text
-from sasgeo_bench.scoring.integrity_metric import Curve
+from sasgeo_bench.scoring.decisions import PRESENT_SHARES, Curve, Fixes, presence_weights
 from sasgeo_bench.scoring.intervals import (
     BoardDraws,
     BoardInterval,
+    ClusterDraws,
     effective_count,
     intervals_of_columns,
+    seed_of_text,
     share_interval,
 )
 from sasgeo_bench.scoring.metric import RejectionMetric, ThresholdMetric

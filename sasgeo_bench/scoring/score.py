@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.matching.matcher import SAME_PLACE_M
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import SAME_PLACE_M, Prediction
 from sasgeo_bench.running.prediction_files import AnswerColumns, Answers
 from sasgeo_bench.scoring.base import Bools, Floats, Ints
 from sasgeo_bench.scoring.frames import PRIOR_GROUP, TRACK, Shown, row_columns

@@ -289,7 +289,7 @@ def to_evidence(
 
     >>> from types import SimpleNamespace
     >>> from sasgeo_bench.sensing.ground import Plane
-    >>> from sasgeo_bench.sensing.intrinsics import Intrinsics
+    >>> from sasgeo_bench.sensing.camera import Intrinsics
     >>> lens = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=40, height_px=20)
     >>> camera = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=20.0, yaw_deg=0.0)
     >>> right = np.tile(np.arange(40) >= 20, (20, 1)).astype(np.float32)[None]

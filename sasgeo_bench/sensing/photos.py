@@ -3,24 +3,391 @@
 
 import datetime as dt
 import math
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
 import numpy as np
-from PIL import ExifTags
+from defusedxml.ElementTree import fromstring  # type: ignore[import-untyped]
+from PIL import ExifTags, Image, UnidentifiedImageError
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
+from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.errors import CameraError, ImageError
+from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.geometry.grid import utm_epsg
 from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.geometry.projection import from_lonlat
-from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
-from sasgeo_bench.sensing.intrinsics import Intrinsics
-from sasgeo_bench.sensing.photo_angles import DJI, PIX4D, SKYDIO, altitude_m, body_angles, camera_angles, height_above_m
-from sasgeo_bench.sensing.photo_heads import PhotoHead, Xmp, number_of, positive_of, read_head
-from sasgeo_bench.sensing.photo_lens import Lens, Size
-from sasgeo_bench.texts import one_line
+from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
+from sasgeo_bench.texts import message_of, one_line
+
+_TIFF_MARKS: Final = (b"II*\0", b"MM\0*")
+_WIDTH, _HEIGHT, _KIND, _PARTS, _XMP, _CROP = 256, 257, 254, 330, 700, 50720
+_FRAME: Final = ("adobe:ns:meta", "http://www.w3.org/1999/02/22-rdf-syntax-ns#")  # namespaces that hold no property
+
+Xmp = Mapping[tuple[str, str], str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PhotoHead:
+    """Metadata of a photo: `exif` is the first directory of tags, `inner` that of the camera.
+
+    `size_px` is the width and height as stored, before the orientation turns it; of a DNG those of the developed photo.
+    Keys of `xmp` are a namespace URI without its last "/", and a name; parts of a structure are named "Whole/Part".
+    """
+
+    size_px: tuple[int, int]
+    exif: Mapping[int, Any]
+    inner: Mapping[int, Any]
+    gps: Mapping[int, Any]
+    xmp: Xmp
+
+
+def read_head(path: Path) -> PhotoHead:
+    """Read the head of a photo; raise `ImageError` if it is no sound JPEG, TIFF or DNG."""
+    try:
+        with warnings.catch_warnings(), plain_file(path).open("rb") as file:
+            warnings.simplefilter("ignore")  # of Pillow: odd metadata; what is needed and odd is refused later
+            if file.read(4) in _TIFF_MARKS:
+                return _read_tiff(file)
+            with Image.open(plain_file(path), formats=("JPEG",)) as image:  # one of several (MPO) is one, too
+                return _head(image.size, image.getexif(), image.info.get("xmp"))
+    except ImageError:
+        raise
+    except (UnidentifiedImageError, Image.DecompressionBombError) as error:
+        raise ImageError(
+            f"{path} is no JPEG, TIFF or DNG of a size that can be read ({message_of(error)}): check the file"
+        ) from error
+    except FileNotFoundError as error:
+        raise ImageError(f"there is no photo {path}: check the path") from error
+    except Exception as error:  # Pillow and the reader of XML fail at damaged files with errors of many kinds
+        raise ImageError(f"{path} has damaged metadata ({message_of(error)}): copy it again from the drone") from error
+
+
+def _head(size_px: tuple[int, int], exif: Image.Exif, xmp: object) -> PhotoHead:
+    packet = xmp.encode() if isinstance(xmp, str) else xmp if isinstance(xmp, bytes) else b""
+    return PhotoHead(
+        size_px=size_px,
+        exif=exif,
+        inner=exif.get_ifd(ExifTags.IFD.Exif),
+        gps=exif.get_ifd(ExifTags.IFD.GPSInfo),
+        xmp=properties_of(packet),
+    )
+
+
+def _read_tiff(file: IO[bytes]) -> PhotoHead:
+    """Read a TIFF's or DNG's head: in a DNG the first picture is a preview, and others hang on its directory."""
+    file.seek(0)
+    exif = Image.Exif()
+    exif.load_from_fp(file)
+    first = dict(exif)
+    offsets = first.get(_PARTS, ())
+    parts: list[Mapping[int, Any]] = [first]
+    file.seek(0)
+    start = file.read(8)
+    for offset in (offsets if isinstance(offsets, tuple) else (offsets,))[:32]:  # at most 32 parts of a DNG
+        part = ImageFileDirectory_v2(start)
+        file.seek(int(offset))
+        part.load(file)
+        parts.append(dict(part))
+    # 1: bit of NewSubfileType: a preview of another picture in the file
+    whole = [part for part in parts if not int(part.get(_KIND, 0)) & 1] or parts
+    return _head(max(map(_size_px, whole), key=math.prod), exif, first.get(_XMP))
+
+
+def _size_px(part: Mapping[int, Any]) -> tuple[int, int]:
+    """Return width and height of a picture of a TIFF: of a raw one those that its maker crops it to."""
+    width, height = part.get(_CROP) or (part.get(_WIDTH, 0), part.get(_HEIGHT, 0))
+    return int(width), int(height)
+
+
+def properties_of(packet: bytes) -> dict[tuple[str, str], str]:
+    """Return the properties of an XMP packet, written as attributes or as elements, by namespace URI and name.
+
+    >>> found = properties_of(b'<x:xmpmeta xmlns:x="adobe:ns:meta/" xmlns:d="http://x.y/z/" d:Yaw="+9.0"/>')
+    >>> found["http://x.y/z", "Yaw"]
+    '+9.0'
+    """
+    packet = packet.strip(b"\0 \r\n")
+    found: dict[tuple[str, str], str] = {}
+    if packet:
+        for key, text in _properties(fromstring(packet), ()):
+            found.setdefault(key, text)
+    return found
+
+
+def _properties(element: Any, path: tuple[str, ...]) -> Iterator[tuple[tuple[str, str], str]]:  # noqa: ANN401 - untyped
+    uri, name = _split(element.tag)
+    here = path if uri in _FRAME else (*path, name)
+    if here != path and element.text and element.text.strip():
+        yield (uri, "/".join(here)), element.text.strip()
+    for attribute, value in element.attrib.items():
+        uri, name = _split(attribute)
+        if uri and uri not in _FRAME:
+            yield (uri, "/".join((*here, name))), value
+    for child in element:
+        yield from _properties(child, here)
+
+
+def _split(name: str) -> tuple[str, str]:
+    """Return the namespace URI of a name without its last "/", and the local name."""
+    uri, _, local = name.rpartition("}")
+    return uri.removeprefix("{").rstrip("/"), local
+
+
+def number_of(value: Any) -> float | None:  # noqa: ANN401 - whatever metadata hold
+    """Return a finite number out of EXIF or XMP, which may hold text, fractions of zero or nothing.
+
+    >>> number_of("+12.50"), number_of("7/2"), number_of("0/0"), number_of(None)
+    (12.5, 3.5, None, None)
+    """
+    try:
+        parts = value.split("/") if isinstance(value, str) else [value]
+        number = float(parts[0]) / float(parts[1]) if len(parts) == 2 else float(value)  # a fraction
+    except (TypeError, ValueError, ZeroDivisionError):
+        return None
+    return number if math.isfinite(number) else None
+
+
+def positive_of(value: Any) -> float | None:  # noqa: ANN401 - as above
+    """Return a finite number above 0 out of EXIF or XMP, None for anything else."""
+    number = number_of(value)
+    return number if number is not None and number > 0 else None
+
+
+DJI: Final = "http://www.dji.com/drone-dji/1.0"
+AUTEL: Final = "http://www.autelrobotics.com/drone/1.0"
+SKYDIO: Final = "https://www.skydio.com/drone-skydio/1.0"
+PIX4D: Final = "http://pix4d.com/camera/1.0"
+SENSEFLY: Final = "http://ns.sensefly.com/Camera/1.0"
+
+_GIMBAL: Final = ("GimbalRollDegree", "GimbalPitchDegree", "GimbalYawDegree")
+_CAMERA: Final[Mapping[str, tuple[str, str, str]]] = {  # makers before Pix4D, whose tags several of them write as well
+    DJI: _GIMBAL,
+    AUTEL: _GIMBAL,
+    "http://www.parrot.com/drone-parrot/1.0": ("CameraRollDegree", "CameraPitchDegree", "CameraYawDegree"),
+    SKYDIO: ("CameraOrientationNED/Roll", "CameraOrientationNED/Pitch", "CameraOrientationNED/Yaw"),
+    PIX4D: ("Roll", "Pitch", "Yaw"),
+    SENSEFLY: ("Roll", "Pitch", "Yaw"),
+}
+_ABOVE_GROUND: Final = ((DJI, "RelativeAltitude"), (AUTEL, "RelativeAltitude"), (SKYDIO, "RelativeAltitude"),
+                  (PIX4D, "AboveGroundAltitude"), (SENSEFLY, "AboveGroundAltitude"))  # fmt: skip
+_ALTITUDE: Final = tuple((uri, "AbsoluteAltitude") for uri in (DJI, AUTEL, SKYDIO))
+_STRAIGHT_DOWN: Final = Attitude(pitch_deg=-90.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Angles:
+    """Attitude of a camera, its forward being the optical axis; or why what the file says is not understood."""
+
+    attitude: Attitude | None = None
+    fault: str = ""
+
+
+def camera_angles(xmp: Xmp, make: str) -> Angles:
+    """Return the attitude of a photo's camera; without one and without a fault if the file says nothing.
+
+    Pix4D's angles are those of the body on which a camera looks straight down; all others are of the optical axis.
+
+    >>> pix4d = {(PIX4D, "Yaw"): "90", (PIX4D, "Pitch"): "30", (PIX4D, "Roll"): "0"}
+    >>> found = camera_angles(pix4d, "Sentera").attitude
+    >>> round(found.pitch_deg), round(found.yaw_deg)
+    (-60, 90)
+    """
+    for uri, names in _CAMERA.items():
+        found = _attitude(xmp, uri, names)
+        if found is None:
+            continue
+        if uri in (PIX4D, SENSEFLY):
+            return _pix4d(found, make)
+        return _autel(found) if uri == AUTEL or "autel" in make.lower() else Angles(attitude=found)
+    return Angles()
+
+
+def body_angles(xmp: Xmp) -> Attitude | None:
+    """Return the attitude of the drone's body, None if the file does not say it."""
+    names = ("FlightRollDegree", "FlightPitchDegree", "FlightYawDegree")
+    return _attitude(xmp, DJI, names) or _attitude(xmp, AUTEL, names)
+
+
+def height_above_m(xmp: Xmp) -> float | None:
+    """Return the height above the place of take-off (Pix4D's: above ground), metres."""
+    return _first(xmp, _ABOVE_GROUND)
+
+
+def altitude_m(xmp: Xmp) -> float | None:
+    """Return the height above the sea, metres."""
+    return _first(xmp, _ALTITUDE)
+
+
+def _first(xmp: Xmp, keys: tuple[tuple[str, str], ...]) -> float | None:
+    return next((value for key in keys if (value := number_of(xmp.get(key))) is not None), None)
+
+
+def _attitude(xmp: Xmp, uri: str, names: tuple[str, str, str]) -> Attitude | None:
+    roll_deg, pitch_deg, yaw_deg = (number_of(xmp.get((uri, name))) for name in names)
+    if roll_deg is None or pitch_deg is None or yaw_deg is None:
+        return None
+    return Attitude(roll_deg=roll_deg, pitch_deg=pitch_deg, yaw_deg=yaw_deg)
+
+
+def _autel(found: Attitude) -> Angles:
+    """Autel counts the pitch downwards in some firmware, upwards in other; the gimbals rise by 30 degrees at most."""
+    if found.pitch_deg <= 0:
+        return Angles(attitude=found)
+    if found.pitch_deg > 30.0:  # degrees to which Autel's gimbals rise above the horizon
+        return Angles(attitude=Attitude(roll_deg=found.roll_deg, pitch_deg=-found.pitch_deg, yaw_deg=found.yaw_deg))
+    return Angles(
+        fault=f"a pitch of {found.pitch_deg:+g} degrees, which Autel counts from the horizon upwards or downwards"
+    )
+
+
+def _pix4d(found: Attitude, make: str) -> Angles:
+    """Pix4D: pitch 0 is straight down, 90 ahead; senseFly turns the sign of the roll."""
+    # -20 degrees: no camera that looks down at 0 leans back more, but one that counts from the horizon
+    if found.pitch_deg < -20.0:
+        return Angles(
+            fault=f"a pitch of {found.pitch_deg:+g} degrees in Camera:Pitch, where 0 is straight down and 90 ahead: it "
+            "seems to count from the horizon"
+        )
+    roll_deg = -found.roll_deg if make.lower() == "sensefly" else found.roll_deg
+    body = Attitude(roll_deg=roll_deg, pitch_deg=found.pitch_deg, yaw_deg=found.yaw_deg)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # straight down yaw and roll are one turn: scipy leaves roll at 0
+        turn = Rotation.from_matrix(body.matrix @ _STRAIGHT_DOWN.matrix)
+        yaw_deg, pitch_deg, roll_deg = turn.as_euler("ZYX", degrees=True).tolist()
+    return Angles(attitude=Attitude(roll_deg=roll_deg, pitch_deg=pitch_deg, yaw_deg=yaw_deg))
+
+
+Size = tuple[float, float]
+
+_FILM_DIAGONAL_MM: Final = math.hypot(36.0, 24.0)
+_WIDEST_SENSOR: Final = 1.55  # width / height; a wider photo is cut out of a sensor of 4 : 3
+_CUTS: Final = (3 / 2, 16 / 9)  # width / height that cameras cut out of a higher sensor
+_SAME: Final = 0.02  # difference of two aspects that are one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lens:
+    """Lens of a photo, as its file says it; None where it does not. Sizes are width and height as stored.
+
+    `film_mm` is the focal length on 35 mm film. `calibrated_px` belongs to a picture of `calibrated_size_px` (twice the
+    optical centre). `sensor_px_mm` are pixels of the sensor to a millimetre, of a picture of `native_size_px`, which is
+    the size that EXIF names. `zoom` is the digital one. `projection` is empty for a pinhole, else such as "fisheye".
+    """
+
+    focal_mm: float | None = None
+    film_mm: float | None = None
+    calibrated_px: float | None = None
+    calibrated_size_px: Size | None = None
+    sensor_px_mm: float | None = None
+    native_size_px: Size | None = None
+    zoom: float | None = None
+    make: str = ""
+    projection: str = ""
+
+    def focal_px(self, name: str, size_px: Size) -> float:
+        """Return the focal length in pixels of a picture of a size; raise `CameraError` if there is none for it.
+
+        A calibrated one comes first, then that on film, then that by the pixels of the sensor; the latter two must
+        agree, and with a calibrated one whose picture has no size. A picture scaled down keeps its field of view; one
+        that was cut does not say of what.
+
+        >>> lens = Lens(calibrated_px=3666.67, calibrated_size_px=(4000.0, 3000.0))
+        >>> lens.focal_px("a.jpg", (2000, 1500))
+        1833.335
+        """
+        if self.projection:
+            raise CameraError(
+                f"{name} is a {self.projection} picture, which no pinhole describes: give the camera's intrinsics"
+            )
+        calibrated, film = self._by_calibration(name, size_px), self._by_film(name, size_px)
+        sensor = self._by_sensor(name, size_px)
+        by, other = "the pixels of its sensor", sensor
+        if calibrated is not None:
+            is_sized = self.calibrated_size_px or self.native_size_px
+            by, other = "calibration", None if is_sized else calibrated
+        # 0.15: difference of two focal lengths; that on film is rounded to millimetres
+        if film is not None and other is not None and abs(film / other - 1) > 0.15:
+            raise CameraError(
+                f"{name} has two focal lengths, {film:.0f} px by 35 mm film and {other:.0f} px by {by}: it was cut or "
+                "resized; use the drone's own file, or give the camera's intrinsics"
+            )
+        found = next((focal_px for focal_px in (calibrated, film, sensor) if focal_px is not None), None)
+        if found is None:
+            raise CameraError(f"{name} has no focal length on 35 mm film: give the camera's intrinsics")
+        zoom = self.zoom or 1.0
+        # Makers whose focal length on film leaves digital zoom out
+        leaves_out = calibrated is None and film is not None and self.make.lower() in ("dji", "hasselblad")
+        if zoom < 1.0 or (zoom > 1.0 and not leaves_out):
+            raise CameraError(
+                f"{name} has a digital zoom of {zoom:g}, which its focal length may count or not: give the camera's "
+                "intrinsics"
+            )
+        return found * zoom
+
+    def _by_calibration(self, name: str, size_px: Size) -> float | None:
+        if self.calibrated_px is None:
+            return None
+        low, high = 0.3, 20.0  # in widths of the picture: limits of a calibrated focal length that can be meant
+        side_px = max(self.calibrated_size_px or size_px)
+        if not low * side_px <= self.calibrated_px <= high * side_px:
+            return None
+        return self.calibrated_px * self._scale(name, size_px, self._reference(name, size_px))
+
+    def _reference(self, name: str, size_px: Size) -> Size:
+        """Return the size of the picture that the calibrated focal length belongs to."""
+        native, middle = self.native_size_px, self.calibrated_size_px
+        if middle is None:
+            return native or size_px
+        if _is_near(middle, size_px) and (native is None or _is_near(native, middle)):
+            return size_px
+        if native is not None and _is_near(native, middle):
+            return native
+        if native is None or _is_near(native, size_px):
+            return middle
+        raise CameraError(
+            f"{name} of {_lens_text(size_px)} pixels was one of {_lens_text(native)} by its EXIF, and is calibrated "
+            f"for {_lens_text(middle)}: use the drone's own file, or give the camera's intrinsics"
+        )
+
+    def _by_film(self, name: str, size_px: Size) -> float | None:
+        """Compare diagonals of sensors; a picture of 16 : 9 is taken for a cut out of a sensor of 4 : 3 as wide."""
+        if self.film_mm is None:
+            return None
+        native_px = self.native_size_px or size_px
+        scale = self._scale(name, size_px, native_px)
+        long_px, short_px = max(native_px), min(native_px)
+        sensor_px = math.hypot(long_px, short_px if long_px <= _WIDEST_SENSOR * short_px else long_px * 3 / 4)
+        return scale * self.film_mm * sensor_px / _FILM_DIAGONAL_MM
+
+    def _by_sensor(self, name: str, size_px: Size) -> float | None:
+        if self.focal_mm is None or self.sensor_px_mm is None:
+            return None
+        return self._scale(name, size_px, self.native_size_px or size_px) * self.focal_mm * self.sensor_px_mm
+
+    def _scale(self, name: str, size_px: Size, of_px: Size) -> float:
+        """Return pixels of a picture to a pixel of the one that it was; raise `CameraError` if it was cut or turned."""
+        across, down = size_px[0] / of_px[0], size_px[1] / of_px[1]
+        is_cut = down < across and any(abs(size_px[0] / size_px[1] / aspect - 1) <= _SAME for aspect in _CUTS)
+        if abs(across / down - 1) > _SAME and not (is_cut and of_px[0] / of_px[1] < _WIDEST_SENSOR):
+            raise CameraError(
+                f"{name} of {_lens_text(size_px)} pixels is cut out of a picture of {_lens_text(of_px)}, or turned: "
+                "use the drone's own file, or give the camera's intrinsics"
+            )
+        return across
+
+
+def _is_near(one: Size, two: Size) -> bool:
+    # 0.05 of a picture's size, by which an optical centre lies beside its middle
+    return all(abs(a / b - 1) <= 0.05 for a, b in zip(one, two, strict=True))
+
+
+def _lens_text(size_px: Size) -> str:
+    return f"{size_px[0]:.0f} x {size_px[1]:.0f}"
+
 
 MOST_BYTES: Final = 64 * 2**20  # of a photo
 
@@ -61,7 +428,7 @@ class Photo:
     gimbal: Attitude | None = None
     gimbal_fault: str = ""
     flight: Attitude | None = None
-    lens: Lens = Lens()  # noqa: RUF009 - it is frozen
+    lens: Lens = Lens()
     taken_at: dt.datetime | None = None
     model: str = ""
 

@@ -11,8 +11,7 @@ from scipy.optimize import brentq
 from scipy.special import expit, logit
 
 from sasgeo_bench.errors import ImageError
-from sasgeo_bench.sensing.image import check_classes
-from sasgeo_bench.sensing.packing import pack_parts, split_parts, unpack_body
+from sasgeo_bench.sensing.image import check_classes, pack_parts, split_parts, unpack_body
 
 SILENT: Final = 255  # the byte of a pixel of which nothing is said
 CERTAIN: Final = 254  # the byte of P(present) = 1

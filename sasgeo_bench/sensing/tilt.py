@@ -89,7 +89,7 @@ def refine_tilt(
     --------
     Two streets of a grid, 60 m apart each way, correct a tilt that is 5 degrees off:
 
-    >>> from sasgeo_bench.sensing.intrinsics import Intrinsics
+    >>> from sasgeo_bench.sensing.camera import Intrinsics
     >>> lens = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=800, height_px=800)
     >>> true = Camera.pointed(intrinsics=lens, east_m=0.0, north_m=0.0, height_m=100.0, yaw_deg=0.0, tilt_deg=25.0)
     >>> ends = np.array([[[-30, 10], [-30, 90]], [[30, 10], [30, 90]], [[-40, 20], [40, 20]], [[-40, 80], [40, 80]]])

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import UNKNOWN
-from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, Picture
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 
 CLASSES: Final = ("road_minor", "building", "water", "green")
 PLACES: Final = ("drawn-east", "drawn-west")

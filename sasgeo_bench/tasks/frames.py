@@ -177,8 +177,7 @@ def frame_row(frame: Frame) -> dict[str, Any]:
 
 def frame_of(row: Mapping[str, Any]) -> Frame:
     """Return the frame of a row of `FRAME`; raise as `Frame` and its camera do."""
-    from sasgeo_bench.sensing.camera import Camera  # noqa: PLC0415 - see above
-    from sasgeo_bench.sensing.intrinsics import Intrinsics  # noqa: PLC0415 - see above
+    from sasgeo_bench.sensing.camera import Camera, Intrinsics  # noqa: PLC0415 - see above
 
     lens = Intrinsics(
         width_px=row["width_px"],

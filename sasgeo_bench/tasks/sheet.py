@@ -2,28 +2,40 @@
 """Contact sheets: the views of queries, the map at the true place, the difference, and the map at a twin or decoy."""
 
 import math
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import wrap
-from typing import Final
+from typing import Any, Final, Self
 
 import cv2
 import numpy as np
 import shapely
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
 from numpy.typing import NDArray
 
-from sasgeo_bench.canvas import PlainFigure
+from sasgeo_bench.canvas import Page, PlainFigure, page, panels, without_ticks
+from sasgeo_bench.errors import ConfigError, StoreError, counted
+from sasgeo_bench.geometry.pose import Pose, reckon
 from sasgeo_bench.osm.taxonomy import load_taxonomy
+from sasgeo_bench.regions import region_files
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.regions.preview import GROUND, PAINT_ORDER
-from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, PriorGroup, Query, Truth
+from sasgeo_bench.regions.layers import read_layers, read_overview
+from sasgeo_bench.regions.preview import GROUND, PAINT_ORDER, paint_overview
+from sasgeo_bench.regions.region import ATTRIBUTION, Manifest
+from sasgeo_bench.tasks.build import built_anew
+from sasgeo_bench.tasks.query import PUBLISHED, TWIN_EAST, TWIN_NORTH, PriorGroup, Query, Truth, flight_id
+from sasgeo_bench.tasks.state import State
+from sasgeo_bench.tasks.suites.base import changed_share
+from sasgeo_bench.tasks.suites.mining import describe, mine
 from sasgeo_bench.tasks.suites.rivals import IN_DISC, LEAD, LISTED, RIVALS, TRUTH_LISTED
+from sasgeo_bench.tasks.task_files import QUERIES, Task, read_batches
 
 HIDDEN: Final = "#9e9e9e"
 ONLY_SEEN: Final = "#c2185b"
@@ -226,3 +238,440 @@ def _text(panel: Panel) -> tuple[str, ...]:
         f"measured: {measured}" if measured else "",
         f"{truth.block}, {query.query_id[:8]}",
     )
+
+
+SOME_IDS: Final = 3  # that the refusal of an unknown id names
+
+
+def panels_of(
+    task: Task,
+    *,
+    count: int = 12,
+    query_id: str | None = None,
+    choose: Callable[[Sequence[Truth]], Sequence[Truth]] | None = None,
+) -> tuple[Panel, ...]:
+    """Choose up to `count` queries of a task for a contact sheet: each kind and strength of a site, site by site.
+
+    With `query_id` only the query whose id begins so is shown; `choose` selects and
+    orders the truths instead.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing, the truths are those of other queries, or the map has been rebuilt since.
+    ConfigError
+        If there is no such query.
+    """
+    name = task.manifest.region
+    region = region_files.read_region(task.region)
+    if not task.manifest.is_of_map(region.manifest):
+        raise StoreError(built_anew(name))
+    state = State.of(region, name=name)
+    truths = {truth.query_id: truth for truth in task.truths}
+    strangers = StoreError(f"{task.truth} does not hold the truths of {task.folder}: make the queries again")
+    chosen = _for_sheet(list(truths.values()), count) if choose is None else list(choose(list(truths.values())))
+    if query_id is not None:
+        chosen = [truth for truth in truths.values() if truth.query_id.startswith(query_id)][:1]
+        if not chosen:
+            raise _no_query(task.folder, query_id, sorted(truths))
+    ids = {truth.query_id for truth in chosen}
+    queries = {}
+    rivals: dict[Pose, tuple[Pose, ...]] = {}
+    poses = {truth.pose for truth in chosen}
+    for query in task.queries():
+        truth = truths.get(query.query_id)
+        if truth is None:
+            raise strangers
+        if query.query_id in ids:
+            queries[query.query_id] = query
+        if query.candidates and truth.pose in poses and truth.pose is not None:
+            rivals.setdefault(truth.pose, _others(query, truth))
+    if ids != set(queries):
+        raise strangers
+    return tuple(_panel(queries[truth.query_id], truth, state, rivals) for truth in chosen)
+
+
+def _no_query(task_folder: Path, query_id: str, known: Sequence[str]) -> ConfigError:
+    message = (
+        f"{task_folder} holds no query {query_id!r}: it has {counted(len(known), 'query', 'queries')}, "
+        f"as {', '.join(known[:SOME_IDS])}; the column query_id of {QUERIES} lists all"
+    )
+    return ConfigError(message)
+
+
+def _for_sheet(truths: Sequence[Truth], count: int) -> list[Truth]:
+    """Return queries of as few sites as needed to show every variant, then more; controls first."""
+    first = {truth.pair_id: truth.block for truth in sorted(truths, key=lambda item: item.pair_id)}
+    rank = {"control": 0, "falsifier": 1, "stress": 2}
+    order = sorted(
+        truths, key=lambda item: (list(first).index(item.pair_id), rank[item.role], item.kind, item.strength)
+    )
+    seen: set[tuple[str, float, float, str]] = set()
+    chosen = []
+    for truth in order:
+        blank = round(truth.unknown_share, 0) if truth.role == "falsifier" else 0.0
+        variant = (truth.kind, truth.strength, blank, truth.detector)
+        if variant not in seen:
+            seen.add(variant)
+            chosen.append(truth)
+    rest = [truth for truth in order if truth not in chosen]
+    return (chosen + rest)[:count]
+
+
+def _others(query: Query, truth: Truth) -> tuple[Pose, ...]:
+    return tuple(pose for at, pose in enumerate(query.candidates) if at != truth.candidate)
+
+
+def _panel(query: Query, truth: Truth, state: State, rivals: Mapping[Pose, tuple[Pose, ...]]) -> Panel:
+    """Return a panel with the map at the truth and at its twin; without a twin, at the most similar candidate."""
+    # A query without candidates takes those of another one at the same place, or mined ones.
+    if truth.pose is None:
+        return Panel(query=query, truth=truth, at_truth=None, at_decoy=None)
+    size, cell_m = query.evidence.shape[0], query.evidence.cell_size_m
+
+    def view(pose: Pose) -> Evidence:
+        return _only(state.view(pose, size_cells=size, cell_size_m=cell_m), query.evidence.classes)
+
+    at_truth = view(truth.pose)
+    if TWIN_EAST in truth.measured:
+        easting_m = truth.pose.easting_m + truth.measured[TWIN_EAST]
+        northing_m = truth.pose.northing_m + truth.measured[TWIN_NORTH]
+        twin = view(replace(truth.pose, easting_m=easting_m, northing_m=northing_m))
+        return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=twin, rival=TWIN)
+    near = _others(query, truth) or rivals.get(truth.pose, ())
+    places = [(pose.easting_m, pose.northing_m) for pose in near]
+    if not places:
+        center_m, side_m = (truth.pose.easting_m, truth.pose.northing_m), size * cell_m
+        mined = mine(describe(state, side_m=side_m, clear_m=side_m * float(np.sqrt(0.5))), center_m, count=1).points_m
+        places = [(float(x), float(y)) for x, y in mined]
+    views = [view(replace(truth.pose, easting_m=x, northing_m=y)) for x, y in places]
+    hardest = min(views, key=lambda other: changed_share(_drawn(at_truth), _drawn(other)), default=None)
+    return Panel(query=query, truth=truth, at_truth=at_truth, at_decoy=hardest)
+
+
+def _drawn(evidence: Evidence) -> Evidence:
+    """Return roads, buildings and water without the ground cover that fills most of a view."""
+    return _only(evidence, [name for name in evidence.classes if name in load_taxonomy().having("compared")])
+
+
+def _only(evidence: Evidence, classes: Sequence[str]) -> Evidence:
+    cells = evidence.cells[[evidence.classes.index(name) for name in classes]]
+    return Evidence(classes=tuple(classes), cells=cells, cell_size_m=evidence.cell_size_m)
+
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+TRUE: Final = "#111111"
+RECKONED: Final = "#d6006c"
+PRIOR: Final = "#1f5fbf"
+LOST: Final = "#7b2fa0"
+OFF_MAP: Final = "#ffc928"
+COPY: Final = "#00796b"
+_FLIGHT_COLUMNS: Final = ("query_id", "increment", "prior_easting_m", "prior_northing_m", "prior_radius_m")
+_PANEL_INCHES: Final = 3.4
+_ONE_INCHES: Final = 8.0  # of a flight that is drawn alone
+_DRAWN_CELLS: Final = 900
+_PALE: Final = 0.6  # of the map's colours that is white
+_IN_A_ROW: Final = "Flights of a row are of one site. "
+_RANK: Final = {"control": 0, "stress": 1, "falsifier": 2}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class FlightPanel:
+    """One flight of N views: what its truths and queries say.
+
+    `increments` are right, up and turn of the steps to each view but the first, NaN where the odometer says nothing.
+    `prior_m` is the disc of the start (easting, northing, radius), None if it may be anywhere.
+    """
+
+    flight: str
+    truth: Truth  # of the first view
+    place_m: Floats  # (N, 2)
+    yaw_deg: Floats
+    is_seen: Bools
+    is_on_map: Bools
+    copy_m: Floats  # (N, 2), where the map shows the same; NaN where it does not
+    increments: Floats  # (N - 1, 3)
+    prior_m: tuple[float, float, float] | None
+
+    @property
+    def is_copied(self) -> Bools:
+        """Return which views the map shows a second time."""
+        return np.asarray(~np.isnan(self.copy_m[:, 0]))
+
+    @property
+    def reckoned_m(self) -> Floats:
+        """Return where the odometer alone would lead from the true start, shape (N, 2); it stays where it is lost."""
+        return reckon(self.place_m[0], float(self.yaw_deg[0]), self.increments)
+
+    @property
+    def lost(self) -> NDArray[np.int64]:
+        """Return the views to which the odometer lost its way."""
+        return np.flatnonzero(np.isnan(self.increments[:, 0])) + 1
+
+    @property
+    def carried_to(self) -> int | None:
+        """Return the view to which the drone was carried, the one after its longest step; None if it was not."""
+        if "carried_m" not in self.truth.measured:
+            return None
+        return int(np.argmax(np.hypot(*np.diff(self.place_m, axis=0).T))) + 1
+
+
+def flight_panels(task: Task, *, count: int = 12, flight: str | None = None) -> tuple[FlightPanel, ...]:
+    """Choose the flights of as many whole sites as `count` panels hold, one site at least; a site's control first.
+
+    With `flight`, only the one whose id begins so.
+
+    Raises
+    ------
+    StoreError
+        If a file is missing or damaged, or the truths are those of other queries.
+    ConfigError
+        If there is no such flight.
+    """
+    truths: dict[str, list[Truth]] = {}
+    for truth in task.truths:
+        truths.setdefault(flight_id(truth.query_id), []).append(truth)
+    if flight is None:
+        chosen = _of_sites(truths, count)
+    else:
+        chosen = [name for name in truths if name.startswith(flight)][:1]
+        if not chosen:
+            raise ConfigError(
+                f"{task.folder} holds no flight {flight!r}: it has {counted(len(truths), 'flight')}, as "
+                f"{', '.join(list(truths)[:3])}"
+            )
+    rows: dict[str, list[dict[str, Any]]] = {name: [] for name in chosen}
+    for batch in read_batches(task.folder / QUERIES, _FLIGHT_COLUMNS):
+        for row in batch.to_pylist():
+            rows.get(flight_id(row["query_id"]), []).append(row)
+    for name in chosen:
+        if [row["query_id"] for row in rows[name]] != [truth.query_id for truth in truths[name]]:
+            raise StoreError(f"{task.truth} does not hold the truths of {task.folder}: make the queries again")
+    return tuple(_flight_panel(name, truths[name], rows[name]) for name in chosen)
+
+
+def _of_sites(truths: Mapping[str, Sequence[Truth]], count: int) -> list[str]:
+    sites: dict[str, list[str]] = {}
+    for name, (first, *_) in sorted(truths.items(), key=lambda item: item[1][0].pair_id):
+        sites.setdefault(first.pair_id, []).append(name)
+    most = max(map(len, sites.values()), default=1)
+    chosen = list(sites.values())[: max(1, count // most)]
+    return [name for names in chosen for name in sorted(names, key=lambda name: _order(truths[name][0]))]
+
+
+def _order(truth: Truth) -> tuple[int, float, str, str]:
+    return (_RANK[truth.role], truth.strength, truth.kind, truth.detector)
+
+
+def _flight_panel(name: str, truths: Sequence[Truth], rows: Sequence[Mapping[str, Any]]) -> FlightPanel:
+    poses = [truth.pose for truth in truths if truth.pose is not None]
+    place_m = np.array([(pose.easting_m, pose.northing_m) for pose in poses])
+    first = rows[0]
+    disc = tuple(first[f"prior_{item}_m"] for item in ("easting", "northing", "radius"))
+    return FlightPanel(
+        flight=name,
+        truth=truths[0],
+        place_m=place_m,
+        yaw_deg=np.array([pose.yaw_deg for pose in poses]),
+        is_seen=np.array([truth.measured.get("is_seen", 1.0) > 0 for truth in truths]),
+        is_on_map=np.array([truth.is_present for truth in truths]),
+        copy_m=place_m
+        + np.array([[truth.measured.get(name, np.nan) for name in (TWIN_EAST, TWIN_NORTH)] for truth in truths]),
+        increments=np.array([row["increment"] or [np.nan] * 3 for row in rows[1:]], dtype=np.float64).reshape(-1, 3),
+        prior_m=None if disc[2] is None else disc,
+    )
+
+
+def write_flight_sheet(path: Path, task: Task, shown: Sequence[FlightPanel]) -> None:
+    """Write the maps of flights of a task as PNG, a row for each site.
+
+    Raise `StoreError` if the map has been rebuilt since the queries were drawn.
+    """
+    about, manifest = task.manifest, region_files.read_manifest(task.region)
+    if not about.is_of_map(manifest):
+        raise StoreError(built_anew(about.region))
+    places = list(_places(shown))
+    row_is_site = len({panel.truth.pair_id for panel in shown}) < len(shown)
+    across = 1 + max((column for _, column in places), default=0)
+    inches = _ONE_INCHES if len(shown) == 1 else _PANEL_INCHES
+    sheet = Page(
+        title=f"{about.title}: {about.region}",
+        facts=f"{about.what} {_IN_A_ROW if row_is_site else ''}Number of a stress: {about.strength_unit}.",
+        note="North is up. inspect --query ID draws one flight alone, or the sheet of one view by its whole id.",
+        data=ATTRIBUTION,
+        rows=1 + max((row for row, _ in places), default=0),
+        columns=across,
+        panel_inches=(inches, inches),
+        keys=flight_keys(shown),
+    )
+    with page(path, sheet) as charts:
+        for _ in panels(charts, 0):
+            pass
+        grounds: dict[str, Ground] = {}
+        for (row, column), panel in zip(places, shown, strict=True):
+            charts[row][column].set_visible(True)
+            site = panel.truth.pair_id
+            if site not in grounds:
+                bounds_m = bounds_of_m([other for other in shown if other.truth.pair_id == site])
+                grounds = {site: Ground.of(task.region, manifest, bounds_m)}
+            draw_flight(charts[row][column], panel, grounds[site])
+            charts[row][column].set_title("\n".join(_words(panel)))
+
+
+def _places(shown: Sequence[FlightPanel]) -> Iterator[tuple[int, int]]:
+    """Yield row and column of each panel: a site begins a row, and takes a second one if it has many variants."""
+    # Where each site has one panel alone, rows are filled.
+    sizes: dict[str, int] = {}
+    for panel in shown:
+        sizes[panel.truth.pair_id] = sizes.get(panel.truth.pair_id, 0) + 1
+    if len(sizes) == len(shown):
+        yield from (divmod(at, 3) for at in range(len(shown)))  # panels, where each site has one
+        return
+    begin = 0
+    for size in sizes.values():
+        lines = -(-size // 4)  # panels; a site with more variants takes two rows
+        across = -(-size // lines)
+        yield from ((begin + at // across, at % across) for at in range(size))
+        begin += lines
+
+
+def bounds_of_m(shown: Sequence[FlightPanel]) -> tuple[float, float, float, float]:
+    """Return the square that the panels of a site show: west, east, south, north."""
+    true = np.concatenate([panel.place_m for panel in shown] + [panel.copy_m[panel.is_copied] for panel in shown])
+    low, high = true.min(axis=0), true.max(axis=0)
+    # 0.35 of the extent of the true paths, by which reckoned ones may widen a panel
+    reach_m = 0.35 * float((high - low).max())
+    reckoned = np.clip(np.concatenate([panel.reckoned_m for panel in shown]), low - reach_m, high + reach_m)
+    low, high = np.minimum(low, reckoned.min(axis=0)), np.maximum(high, reckoned.max(axis=0))
+    # 0.12 of the extent of the paths, left free around them
+    half_m = max(300.0, (0.5 + 0.12) * float((high - low).max()))  # 300 m: half a panel
+    east_m, north_m = ((low + high) / 2).tolist()
+    return (east_m - half_m, east_m + half_m, north_m - half_m, north_m + half_m)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Ground:
+    """The pale map under the panels of a site: west, east, south and north of it, and of the panels."""
+
+    picture: Floats
+    extent_m: tuple[float, float, float, float]
+    bounds_m: tuple[float, float, float, float]
+
+    @classmethod
+    def of(cls, folder: Path, manifest: Manifest, bounds_m: tuple[float, float, float, float]) -> Self:
+        """Read the map below the panels; where it is large, as coarsely as it is drawn."""
+        west, south, east, north = manifest.bounds_m
+        cell_m, path = manifest.cell_size_m, folder / region_files.LAYERS
+        left, right = (int(np.clip((at - west) // cell_m, 0, manifest.cols)) for at in bounds_m[:2])
+        bottom, top = (int(np.clip((north - at) // cell_m, 0, manifest.rows)) for at in bounds_m[2:])
+        # 3000 cells on a side of a panel, up to which the map is read as it is
+        if max(right - left, bottom - top) > 3000:
+            # 4000 cells of the whole map, where it is not
+            layers, extent_m = read_overview(path, longest_cells=4000), (west, east, south, north)
+        else:
+            layers = read_layers(path, window=(top, left, bottom - top, right - left))
+            extent_m = (west + left * cell_m, west + right * cell_m, north - bottom * cell_m, north - top * cell_m)
+        step = max(1, max(layers.shape[1:]) // _DRAWN_CELLS)
+        picture = _PALE + (1 - _PALE) * paint_overview(manifest, layers[:, ::step, ::step])
+        return cls(picture=picture, extent_m=extent_m, bounds_m=bounds_m)
+
+
+def draw_flight(chart: Axes, panel: FlightPanel, ground: Ground) -> None:
+    """Draw one flight over its map: the true path and views, and where the odometer alone would lead."""
+    chart.imshow(ground.picture, extent=ground.extent_m, interpolation="antialiased")
+    if panel.prior_m is not None:
+        chart.add_patch(Circle(panel.prior_m[:2], panel.prior_m[2], fill=False, ec=PRIOR, lw=1.2, ls=(0, (4, 2))))
+    reckoned, place, jump = panel.reckoned_m, panel.place_m, panel.carried_to
+    for part in np.split(np.arange(len(place)), [] if jump is None else [jump]):
+        chart.plot(*place[part].T, color="white", lw=3.2, zorder=2)
+        chart.plot(*place[part].T, color=TRUE, lw=1.1, zorder=3.6)  # above the odometer, which may be without errors
+    if jump is not None:
+        ahead = {"arrowstyle": "-|>", "color": LOST, "lw": 1.4, "ls": "--", "shrinkA": 0, "shrinkB": 0}
+        chart.annotate("", place[jump], place[jump - 1], arrowprops=ahead, zorder=6)
+    # 120 views: their dots are smaller
+    chart.plot(*place[panel.is_seen].T, ".", ms=3.5 if len(place) < 120 else 2.0, color=TRUE, zorder=4)
+    chart.plot(*panel.copy_m.T, color="white", lw=3.2, zorder=2)
+    chart.plot(*panel.copy_m.T, ".-", color=COPY, lw=1.1, ms=4, zorder=3)
+    chart.plot(*place[~panel.is_on_map].T, "D", ms=3.8, mfc=OFF_MAP, mec=TRUE, mew=0.7, zorder=5)
+    chart.plot(*place[~panel.is_seen].T, "o", ms=3.6, mfc="white", mec=TRUE, mew=0.7, zorder=5)
+    chart.plot(*reckoned.T, color="white", lw=2.4, zorder=3.4)
+    chart.plot(*reckoned.T, color=RECKONED, lw=1.2, zorder=3.5)
+    chart.plot(*reckoned[-1], "s", ms=5, mfc=RECKONED, mec="white", mew=0.8, zorder=6)
+    chart.plot(*place[panel.lost].T, "x", ms=7, mew=2, color=LOST, zorder=7)
+    chart.plot(*place[0], "^", ms=7, mfc=TRUE, mec="white", mew=0.9, zorder=7)
+    chart.plot(*place[-1], "s", ms=5.5, mfc=TRUE, mec="white", mew=0.9, zorder=5.5)
+    chart.set(xlim=ground.bounds_m[:2], ylim=ground.bounds_m[2:], aspect="equal", facecolor="#e8e8e8")
+    without_ticks(chart)
+    # Draw a bar of a round length in the lower left corner
+    west, east, south, _ = ground.bounds_m
+    length_m = max(step for step in (100, 200, 500, 1000, 2000, 5000) if step <= max(100.0, (east - west) / 4))
+    left_m, bottom_m = west + 0.04 * (east - west), south + 0.04 * (east - west)
+    chart.plot([left_m, left_m + length_m], [bottom_m] * 2, color="white", lw=5, solid_capstyle="butt", zorder=8)
+    chart.plot([left_m, left_m + length_m], [bottom_m] * 2, color="black", lw=2.2, solid_capstyle="butt", zorder=9)
+    box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.0}
+    text = f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m} m"  # metres in a kilometre
+    middle_m = (left_m + length_m / 2, bottom_m + 0.02 * (east - west))
+    chart.text(*middle_m, text, ha="center", va="bottom", fontsize=7.5, bbox=box, zorder=9)
+
+
+def _words(panel: FlightPanel) -> tuple[str, ...]:
+    """Return the title of a panel: what the flight is, how long, and how far off reckoning ends."""
+    truth = panel.truth
+    age_years = truth.measured.get("age_years", 0.0)
+    step = f", map {age_years:.1f} years old" if age_years else f": {truth.strength:g}"
+    steps_m = np.hypot(*np.diff(panel.place_m, axis=0).T)
+    length_km = (steps_m.sum() - truth.measured.get("carried_m", 0.0)) / 1000
+    unseen = int((~panel.is_seen).sum())
+    facts = [f"{length_km:.1f} km", f"{len(panel.place_m)} views"]
+    facts += [f"{unseen} see nothing"] if unseen else []
+    copied = int(panel.is_copied.sum())
+    facts += [f"{copied} that the map shows twice"] if copied else []
+    facts += [f"{(~panel.is_on_map).sum()} off the map"] if not panel.is_on_map.all() else []
+    facts += [f"carried {truth.measured['carried_m']:.0f} m"] if "carried_m" in truth.measured else []
+    off_m = float(np.hypot(*(panel.reckoned_m[-1] - panel.place_m[-1])))
+    return (
+        f"{truth.role}: {truth.kind}{step if truth.role == 'stress' else ''}"
+        + (f", detector {truth.detector}" if truth.detector != PUBLISHED else ""),
+        ", ".join(facts),
+        f"odometer alone ends {off_m:.0f} m off",
+        f"flight {panel.flight}",
+    )
+
+
+def flight_keys(shown: Sequence[FlightPanel]) -> list[Artist]:
+    """Return the handles of the legend, of what is drawn."""
+    kinds: list[tuple[bool, str, dict[str, Any]]] = [
+        (True, "true path and views", {"color": TRUE, "lw": 1.2, "marker": ".", "ms": 5}),
+        (True, "start", {"color": "none", "marker": "^", "mfc": TRUE, "mec": "white", "ms": 8}),
+        (True, "end", {"color": "none", "marker": "s", "mfc": TRUE, "mec": "white", "ms": 7}),
+        (
+            any(not panel.is_seen.all() for panel in shown),
+            "view that sees nothing",
+            {"color": "none", "marker": "o", "mfc": "white", "mec": TRUE, "ms": 5},
+        ),
+        (
+            any(not panel.is_on_map.all() for panel in shown),
+            "view off the map",
+            {"color": "none", "marker": "D", "mfc": OFF_MAP, "mec": TRUE, "ms": 5},
+        ),
+        (
+            any(panel.is_copied.any() for panel in shown),
+            "the map shows the same here",
+            {"color": COPY, "lw": 1.2, "marker": ".", "ms": 5},
+        ),
+        (True, "odometer from the true start", {"color": RECKONED, "lw": 1.4, "marker": "s", "ms": 5}),
+        (
+            any(len(panel.lost) for panel in shown),
+            "odometer lost on the way here",
+            {"color": "none", "marker": "x", "mec": LOST, "mew": 2, "ms": 7},
+        ),
+        (any(panel.carried_to for panel in shown), "carried", {"color": LOST, "lw": 1.4, "ls": "--"}),
+        (
+            any(panel.prior_m is not None for panel in shown),
+            "disc of the start (prior)",
+            {"color": PRIOR, "lw": 1.2, "ls": "--"},
+        ),
+    ]
+    return [Line2D([], [], label=label, **style) for is_drawn, label, style in kinds if is_drawn]

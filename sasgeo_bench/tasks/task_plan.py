@@ -18,9 +18,9 @@ from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.private_seed import PrivateSeed, Seed
 from sasgeo_bench.tasks.query import PriorGroup
 from sasgeo_bench.tasks.split import Split, find_split_file, list_split_files, make_split, read_split_file
+from sasgeo_bench.tasks.suites.ages import AGES_YEARS, DAYS_PER_YEAR
 from sasgeo_bench.tasks.suites.all_suites import find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Suite
-from sasgeo_bench.tasks.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
 
 PRIVATE_ROOT: Final = "private"  # below the root of public queries, so that no folder holds both
 

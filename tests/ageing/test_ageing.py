@@ -15,15 +15,18 @@ from hypothesis import strategies as st
 from sasgeo_bench.ageing import measure
 from sasgeo_bench.ageing.files import read_ageing, summary_text, write_ageing
 from sasgeo_bench.ageing.measure import DTYPES as COLUMNS
-from sasgeo_bench.ageing.measure import bootstrap_rate, loss_rate, measure_ageing, seeded_rng
-from sasgeo_bench.ageing.pairing import (
+from sasgeo_bench.ageing.measure import (
+    bootstrap_rate,
     compare_areas,
     compare_pieces,
     covered_share,
     cut_to,
+    loss_rate,
     make_areas,
     make_pieces,
+    measure_ageing,
     polygons_of,
+    seeded_rng,
 )
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.osm.history import History, Lifecycle, ObjectKey, Span, State

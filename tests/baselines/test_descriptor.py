@@ -11,7 +11,7 @@ from sasgeo_baselines.raster import REACH_M, THIN
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import UNKNOWN, LayerBits, observe
-from sasgeo_bench.search.chart import Chart
+from sasgeo_bench.search.view import Chart
 
 PLACES = arrays(np.float64, st.tuples(st.integers(0, 9), st.just(2)), elements=st.floats(-40, 40))
 REACH = 120.0

@@ -24,8 +24,7 @@ from sasgeo_baselines.rejectors.ks_gate import KsGate
 from scipy import special
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import check_p_false
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction, check_p_false
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.search.plan import Disc
 from tests.baselines.worlds import PRIOR, things

@@ -28,9 +28,8 @@ from sasgeo_baselines.rejectors.sue import SLOPES, UNTAUGHT, Sue
 from sklearn.isotonic import IsotonicRegression
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.matcher import check_p_false
+from sasgeo_bench.matching.matcher import Prediction, check_p_false
 from sasgeo_bench.matching.plugins import load_rejector
-from sasgeo_bench.matching.results import Prediction
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "baselines" / "pyproject.toml").read_text(encoding="utf-8"))
 REGISTERED = PROJECT["project"]["entry-points"]["sasgeo_bench.rejectors"]

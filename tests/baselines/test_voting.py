@@ -9,9 +9,8 @@ from hypothesis.extra.numpy import arrays
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, LayerBits, observe
-from sasgeo_bench.search.chart import Chart, fade
-from sasgeo_bench.search.view import Patch, View
-from sasgeo_bench.search.votes import ByPlanes, ByRows, VoteGains, make_template
+from sasgeo_bench.search.view import Chart, Patch, View, fade
+from sasgeo_bench.search.vote_search import ByPlanes, ByRows, VoteGains, make_template
 
 POSITIVE = arrays(np.float64, 3, elements=st.floats(0, 10))
 GAINS = st.builds(VoteGains, agree=POSITIVE, extra=POSITIVE, missed=POSITIVE)

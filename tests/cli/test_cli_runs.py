@@ -12,9 +12,9 @@ import pytest
 
 from sasgeo_bench.cli.console import CONTESTANT_FAILED
 from sasgeo_bench.files.plugins import MATCHERS
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.testing import TOWN, check_matcher
 from sasgeo_bench.tasks import task_files
 

@@ -3,8 +3,7 @@
 
 import pytest
 
-from sasgeo_bench.matching.scaffold import write_plugin
-from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
+from sasgeo_bench.matching.scaffold import segmenter_files, write_plugin
 
 
 def test_segmenters_are_listed_with_the_control(program) -> None:

@@ -15,8 +15,7 @@ from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.experiments import board_queries
 from sasgeo_bench.experiments.board_queries import BoardRequest, asked_tasks, draw_board
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.submission import Card, example_card
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release

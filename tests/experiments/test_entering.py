@@ -18,8 +18,7 @@ from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.experiments import board_queries, entering, entry_cost
 from sasgeo_bench.experiments.board_queries import asked_tasks, same_queries
 from sasgeo_bench.experiments.entering import EntryRequest, check_entry, cost_lines, enter, plan_entry
-from sasgeo_bench.experiments.pipeline import ask, draw_all, run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline, plan_runs
+from sasgeo_bench.experiments.pipeline import ask, draw_all, plan_pipeline, plan_runs, run_pipeline
 from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.matching.controls.blind import PriorCentre
@@ -29,8 +28,7 @@ from sasgeo_bench.publishing import submissions
 from sasgeo_bench.publishing.submissions import beside_stored, hold_submission, with_submissions
 from sasgeo_bench.regions.region import DATA_VERSION
 from sasgeo_bench.scoring.submission_files import read_submission
-from sasgeo_bench.tasks.openings import SealedPlace
-from sasgeo_bench.tasks.private_seed import PrivateSeed
+from sasgeo_bench.tasks.private_seed import PrivateSeed, SealedPlace
 from sasgeo_bench.tasks.query import TASK_VERSION
 from sasgeo_bench.tasks.task_plan import Request
 from tests.experiments.test_pipeline import TEXT as PIPELINE

@@ -14,7 +14,7 @@ from sasgeo_bench.experiments import head_start
 from sasgeo_bench.experiments.head_start import unpack_head_start
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec, PipelineFile
 from sasgeo_bench.progress import reporting
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 
 RUN = "runs/random/abc/clean/one"
 PART = f"{RUN}/part-{1:020d}-7.parquet"

@@ -8,9 +8,8 @@ import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.experiments import pipeline_plan
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.progress import reporting
 from tests.handmade import split_file
@@ -120,9 +119,9 @@ def test_without_learning_train_places_are_left_out_in_one_line(plan_of):
 
 
 def test_controls_are_drawn_where_nothing_trains(plan_of, tmp_path, monkeypatch):
-    monkeypatch.setattr(pipeline_plan, "CONTROL_REGIONS", ("town-riverside", TRAIN))
+    monkeypatch.setattr(pipeline, "CONTROL_REGIONS", ("town-riverside", TRAIN))
     assert {item.region.id for item in plan_of().controls} == {"town-riverside"}
-    monkeypatch.setattr(pipeline_plan, "CONTROL_REGIONS", (TRAIN,))
+    monkeypatch.setattr(pipeline, "CONTROL_REGIONS", (TRAIN,))
     (control,) = plan_of().controls
     assert control.region.id.startswith("town-")
     assert control.region.id != TRAIN

@@ -12,9 +12,8 @@ from sasgeo_baselines.rejectors.margin import Margin
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, MatchError
-from sasgeo_bench.experiments import pipeline, pipeline_plan
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import is_asked, plan_pipeline
+from sasgeo_bench.experiments import pipeline
+from sasgeo_bench.experiments.pipeline import is_asked, plan_pipeline, run_pipeline
 from sasgeo_bench.leaderboard.pipeline_spec import (
     PipelineFile,
     find_pipeline_file,
@@ -675,14 +674,14 @@ def test_a_matcher_that_cannot_be_made_costs_nobody_the_board(made, tmp_path, mo
 
 def test_a_mistake_of_ours_about_one_matcher_leaves_the_others(made, monkeypatch):
     plan, board, _ = made
-    work = pipeline_plan.plan_run
+    work = pipeline.plan_run
 
     def broken(request):
         if request.spec == "random":
             raise KeyError("a mistake of ours")
         return work(request)
 
-    monkeypatch.setattr(pipeline_plan, "plan_run", broken)
+    monkeypatch.setattr(pipeline, "plan_run", broken)
     beside = run_pipeline(plan)
     assert set(beside.scores) == set(board.scores) - {"random"}
     assert [item.verdict for item in beside.board.findings] == ["not decided: random failed"]

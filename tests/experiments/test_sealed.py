@@ -11,10 +11,8 @@ import pytest
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.experiments import sealed
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.experiments.pipeline import TrainingGroups, plan_pipeline, run_pipeline
 from sasgeo_bench.experiments.sealed import open_seal
-from sasgeo_bench.experiments.training_groups import TrainingGroups
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.manifests import BoardManifest
 from sasgeo_bench.leaderboard.pipeline_spec import LearningSpec, PipelineFile
@@ -22,15 +20,15 @@ from sasgeo_bench.leaderboard.private_board import sealed_lines
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import ensure_tasks
-from sasgeo_bench.tasks.openings import (
+from sasgeo_bench.tasks.private_seed import (
     Opening,
+    PrivateSeed,
     SealedPlace,
     joined_openings,
     openings_file,
     read_openings,
     record_openings,
 )
-from sasgeo_bench.tasks.private_seed import PrivateSeed
 from sasgeo_bench.tasks.split import find_split
 from tests.handmade import split_file
 

@@ -8,11 +8,9 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files import code_hash, plugin_files
-from sasgeo_bench.files.code_hash import digest_of
-from sasgeo_bench.files.plugin_files import ships
-from sasgeo_bench.files.plugins import MATCHERS
-from sasgeo_bench.running.code_hash import SEGMENTER_TOOLS, TOOLS, matcher_code, segmenter_code
+from sasgeo_bench.files import plugins
+from sasgeo_bench.files.plugins import MATCHERS, digest_of, ships
+from sasgeo_bench.running.plan import SEGMENTER_TOOLS, TOOLS, matcher_code, segmenter_code
 
 MODULE = '''
 """What it is."""
@@ -139,8 +137,8 @@ def test_whatever_way_a_module_beside_it_is_imported_it_counts(lay, spec, own, n
 
 def test_what_is_installed_for_editing_counts_as_code_of_ones_own(lay, tmp_path, monkeypatch):
     sites = tmp_path / "lib/site-packages"
-    monkeypatch.setattr(plugin_files, "_sites", lambda: [sites])
-    monkeypatch.setattr(plugin_files, "_bases", lambda: (sites, tmp_path / "src"))  # by a .pth file
+    monkeypatch.setattr(plugins, "_sites", lambda: [sites])
+    monkeypatch.setattr(plugins, "_bases", lambda: (sites, tmp_path / "src"))  # by a .pth file
     monkeypatch.setattr(sys, "path", [str(sites), str(tmp_path / "src"), *sys.path])
     for folder, counts in (("src", True), ("lib/site-packages", False)):
         files = {f"{folder}/{folder[:3]}_plugin.py": f"import helper\n{MODULE}", f"{folder}/helper.py": "x = 1"}
@@ -182,15 +180,15 @@ def test_the_tools_that_it_imports_count_by_whatever_name(lay, monkeypatch):
         "import sasgeo_bench as sgb\ny = sgb.Chart",
         "def later():\n    from sasgeo_bench import VotePlan",
     )
-    alone = code_hash._rooms([], TOOLS)
+    alone = plugins._rooms([], TOOLS)
     for text in texts:
         lay({"plugin.py": text})
-        assert code_hash._rooms([Path("plugin.py")], TOOLS) >= {"search"}, text
+        assert plugins._rooms([Path("plugin.py")], TOOLS) >= {"search"}, text
     lay({"plugin.py": "import sasgeo_bench as sgb\ny = sgb.Grid"})
-    assert code_hash._rooms([Path("plugin.py")], TOOLS) == alone
+    assert plugins._rooms([Path("plugin.py")], TOOLS) == alone
     before = lay({"plugin.py": texts[0], "changed.py": "beam = 1"})
-    files = code_hash._room_files
-    monkeypatch.setattr(code_hash, "_room_files", lambda room: [*files(room)][: -1 if room == "search" else None])
+    files = plugins._room_files
+    monkeypatch.setattr(plugins, "_room_files", lambda room: [*files(room)][: -1 if room == "search" else None])
     assert lay({}) != before
 
 
@@ -220,22 +218,22 @@ def test_code_that_ships_may_move_and_is_the_same_code(tmp_path, monkeypatch):
     for path, text in zip((old, new, other), texts, strict=True):
         path.write_text(f"{text}\nx = 1")
     assert digest_of({"a.py": old}) != digest_of({"a.py": new})
-    monkeypatch.setattr(code_hash, "ships", lambda path: path.parent == tmp_path)
-    code_hash._read.cache_clear()
+    monkeypatch.setattr(plugins, "ships", lambda path: path.parent == tmp_path)
+    plugins._read_code.cache_clear()
     assert digest_of({"room/a.py": old}) == digest_of({"hall/b.py": new}) != digest_of({"hall/b.py": other})
     data = tmp_path / "weights.npz"
     data.write_bytes(b"1")
     renamed = data.with_name("others.npz")
     renamed.write_bytes(b"1")
     assert digest_of({"room/w": data}) == digest_of({"hall/w": data}) != digest_of({"hall/w": renamed})
-    code_hash._read.cache_clear()
+    plugins._read_code.cache_clear()
 
 
 def test_in_a_checkout_of_ours_a_plugin_has_the_hash_that_it_has_elsewhere(lay, tmp_path, monkeypatch):
     text = "from sasgeo_bench.search.find import score_at\n" + MODULE
     elsewhere = lay({"plugin.py": text})
-    root_of = code_hash._root_of
-    monkeypatch.setattr(code_hash, "_root_of", lambda one: tmp_path if ships(one.path) else root_of(one))
+    root_of = plugins._root_of
+    monkeypatch.setattr(plugins, "_root_of", lambda one: tmp_path if ships(one.path) else root_of(one))
     assert lay({}) == elsewhere
 
 
@@ -244,4 +242,4 @@ def test_what_ships_has_a_hash_by_its_folder_and_the_rooms_that_count_are_there(
     assert segmenter_code("colour_thresholds") != matcher_code("raster_uniform")
     rooms = (*TOOLS, *SEGMENTER_TOOLS)
     assert all(find_spec(f"sasgeo_bench.{tool}") for tool in rooms), "a file that moved would drop out of the hash"
-    assert all(code_hash._room_files(tool) for tool in rooms)
+    assert all(plugins._room_files(tool) for tool in rooms)

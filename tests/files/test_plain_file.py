@@ -20,7 +20,7 @@ from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.flights.drift_profile import read_drift_profile
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
 from sasgeo_bench.leaderboard.pipeline_spec import ArchiveSpec
-from sasgeo_bench.matching.learned_file import read_learned
+from sasgeo_bench.matching.cards import read_learned
 from sasgeo_bench.regions.layers import read_bits, read_layers, read_overview
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.photos import read_photo

@@ -8,11 +8,11 @@ import sys
 
 import pytest
 
-from sasgeo_bench.files.scratch import PREFIX, _sweep_once, scratch_folder, sweep
+from sasgeo_bench.files.folders import PREFIX, _sweep_once, scratch_folder, sweep
 
 KILLED = """
 import os, signal
-from sasgeo_bench.files.scratch import scratch_folder
+from sasgeo_bench.files.folders import scratch_folder
 with scratch_folder("matcher") as folder:
     (folder / "index.npy").write_bytes(bytes(100))
     os.kill(os.getpid(), signal.SIGKILL)

@@ -9,10 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights.axes import in_axes
 from sasgeo_bench.flights.drift import measure_drift, pair_run
-from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.flights.tum import read_tum
+from sasgeo_bench.flights.trajectory import Trajectory, in_axes, read_tum
 
 PATH = Path("run.txt")
 AT_M = np.linspace(0, 1000, 501)

@@ -12,12 +12,17 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.errors import ConfigError, FlightError
-from sasgeo_bench.flights.drift import measure_drift, pair_run, poisson_interval, segment_errors
-from sasgeo_bench.flights.drift_fit import fit_profile, law_figures
+from sasgeo_bench.flights.drift import (
+    fit_profile,
+    law_figures,
+    measure_drift,
+    pair_run,
+    poisson_interval,
+    segment_errors,
+)
 from sasgeo_bench.flights.drift_profile import Dropouts, HeadingDrift, Resets, ScaleDrift, load_profile
 from sasgeo_bench.flights.odometry import dead_reckon, draw_odometry
-from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.flights.tum import read_tum
+from sasgeo_bench.flights.trajectory import Trajectory, read_tum
 
 LENGTHS_M = (50.0, 100.0, 200.0)
 

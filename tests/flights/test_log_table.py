@@ -11,9 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights.log_clock import Clock
 from sasgeo_bench.flights.log_formats import FORMATS, NAMES, QUANTITIES
 from sasgeo_bench.flights.log_points import FlightLog, LogSource, steps_m
+from sasgeo_bench.flights.log_table import Clock
 from sasgeo_bench.flights.log_units import UNITS, WORDS, LogFacts
 from sasgeo_bench.flights.logs import read_log
 

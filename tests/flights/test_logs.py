@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights import log_points, log_xml
+from sasgeo_bench.flights import log_points
 from sasgeo_bench.flights.log_units import LogFacts
 from sasgeo_bench.flights.logs import read_flight, read_log
 from sasgeo_bench.flights.plans import flight_area
@@ -270,7 +270,7 @@ def test_points_before_the_first_fix_and_of_one_time_or_place_are_left_out_with_
 
 
 def test_more_elements_than_a_track_has_and_a_log_of_days_are_refused(written, monkeypatch, region) -> None:
-    monkeypatch.setattr(log_xml, "_MOST_ELEMENTS", 8)
+    monkeypatch.setattr(log_points, "_MOST_ELEMENTS", 8)
     assert "more than 8 elements" in _refused(written("a.gpx", "<gpx>" + "<a/>" * 8))
     path = written("a.csv", _csv("time_s,lat,lon", "0,48.05,11.05", "300000,48.05,11.06"))
     with pytest.raises(FlightError, match=r"lasts 300000 s, more than 1000000 steps of 0\.2 s: cut it"):

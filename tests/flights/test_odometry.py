@@ -17,8 +17,16 @@ from sasgeo_bench.flights.drift_profile import (
     read_drift_profile,
     write_drift_profile,
 )
-from sasgeo_bench.flights.odometry import LOST_M, Odometry, dead_reckon, draw_odometry
-from sasgeo_bench.flights.processes import draw_gauss_markov, heading_law, lattice_covariance, mean_variance
+from sasgeo_bench.flights.odometry import (
+    LOST_M,
+    Odometry,
+    dead_reckon,
+    draw_gauss_markov,
+    draw_odometry,
+    heading_law,
+    lattice_covariance,
+    mean_variance,
+)
 from sasgeo_bench.flights.trajectory import Trajectory
 from sasgeo_bench.geometry.pose import wrap_deg
 from tests.slow import rest_slow

@@ -14,9 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights.corridors import Corridors
 from sasgeo_bench.flights.kinematics import Limits, length_m
-from sasgeo_bench.flights.plans import KINDS, flight_area, plan_flight
+from sasgeo_bench.flights.plans import KINDS, Corridors, flight_area, plan_flight
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 

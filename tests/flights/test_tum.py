@@ -10,9 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import FlightError
-from sasgeo_bench.flights import tum
-from sasgeo_bench.flights.trajectory import Trajectory
-from sasgeo_bench.flights.tum import read_tum, write_tum
+from sasgeo_bench.flights import trajectory
+from sasgeo_bench.flights.trajectory import Trajectory, read_tum, write_tum
 
 POSE = "0 0 80 0 0 0 1"
 TEXT = f"# time x y z qx qy qz qw\n\n0.0 {POSE}\n0.5\t5 0 80 0 0 0 1\n  # a note\n1e0 10 0 80 0 0 0 1\r\n"
@@ -84,10 +83,10 @@ def test_no_file_a_folder_a_pipe_and_a_file_over_the_limits_are_refused(lay, tmp
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(FlightError, match="it is a pipe, a plain file is needed"):
         read_tum(tmp_path / "pipe")
-    monkeypatch.setattr(tum, "MOST_POSES", 2)
+    monkeypatch.setattr(trajectory, "MOST_POSES", 2)
     with pytest.raises(FlightError, match="line 6: more than 2 poses"):
         read_tum(lay(TEXT))
-    monkeypatch.setattr(tum, "MOST_BYTES", 1000)
+    monkeypatch.setattr(trajectory, "MOST_BYTES", 1000)
     with pytest.raises(FlightError, match="more than 1000 bytes of text"):
         read_tum(lay(gzip.compress(b"#" * 1_000_000, mtime=0)))
 

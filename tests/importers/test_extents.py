@@ -8,8 +8,8 @@ import pytest
 import shapely
 
 from sasgeo_bench.errors import DatasetError
-from sasgeo_bench.importers.extents import find_extents, regional_extracts
 from sasgeo_bench.importers.kinds import read_dataset
+from sasgeo_bench.importers.reader import find_extents, regional_extracts
 from tests.importers import writers
 
 REGION = """

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import DatasetError
 from sasgeo_bench.importers.items import Attitude, Box, Dataset, Item, Position, UtmPlaces
 from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
-from sasgeo_bench.importers.map_tiles import MapSheet, cut_tiles
+from sasgeo_bench.importers.reader import MapSheet, cut_tiles
 from sasgeo_bench.importers.retrieval import geodesic_m
 from tests.importers import writers
 

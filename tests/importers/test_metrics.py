@@ -15,8 +15,8 @@ from sasgeo_bench.errors import DatasetError, StoreError
 from sasgeo_bench.importers import retrieval
 from sasgeo_bench.importers.items import Dataset, Item, Position
 from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
-from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
+from sasgeo_bench.importers.retrieval import read_ranking
 from tests.importers import writers
 
 

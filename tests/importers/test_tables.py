@@ -13,8 +13,8 @@ from sasgeo_bench.errors import DatasetError, StoreError
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.importers.items import Item, Position, UtmPlaces
 from sasgeo_bench.importers.kinds import IMPORTERS, read_dataset
-from sasgeo_bench.importers.rankings import read_ranking
 from sasgeo_bench.importers.reports import score_ranking
+from sasgeo_bench.importers.retrieval import read_ranking
 from sasgeo_bench.importers.tables import ITEM_SCHEMA, import_folder, items_table, write_items, write_reports
 from tests.importers import writers
 

@@ -9,27 +9,29 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.canvas import page
-from sasgeo_bench.leaderboard import board_figures
+from sasgeo_bench.leaderboard import build
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.board_figures import figures_extra
-from sasgeo_bench.leaderboard.board_plots import BoardPage, draw_bars
-from sasgeo_bench.leaderboard.plot_tables import (
+from sasgeo_bench.leaderboard.build import figures_extra
+from sasgeo_bench.leaderboard.plots import (
     BEYOND_M,
     MOST_MATCHERS,
+    BoardPage,
     ages_frame,
+    draw_board_bars,
+    draw_steps,
     reliability_frame,
     risk_frame,
     shown_matchers,
     stanford_areas,
     stanford_cells,
 )
-from sasgeo_bench.leaderboard.plots import draw_steps
 from sasgeo_bench.leaderboard.scored import Scored
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.sasgeo.conformal import level_name
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.contrasts import Contrast, by_place, hold_contrasts
 from sasgeo_bench.scoring.decisions import calibration_error
 from sasgeo_bench.scoring.metrics import primary_of
@@ -37,7 +39,6 @@ from sasgeo_bench.scoring.protection import protection_frame, protection_levels
 from sasgeo_bench.scoring.rejection_rows import answers_of
 from sasgeo_bench.scoring.strata import queries_of, steps_frame
 from sasgeo_bench.scoring.tables import leaderboard
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
 from tests.handmade import about_of
 from tests.scoring.test_tables import scores
 
@@ -307,7 +308,7 @@ def test_a_stanford_figure_is_of_few_matchers_those_of_contrasts_first(board, mo
         return {matcher for matcher, _ in drawn.keywords["levels"]}
 
     assert rows() == {"raster", "graph"}
-    monkeypatch.setattr(board_figures, "MOST_STANFORD", 1)
+    monkeypatch.setattr(build, "MOST_STANFORD", 1)
     assert rows() == {CONTRASTS[0].second}
 
 
@@ -329,5 +330,5 @@ def test_a_contrast_at_one_place_is_that_of_a_board_of_the_place(board, contrast
 def test_the_widest_names_leave_room_for_their_bars(tmp_path, name):
     mine = pd.DataFrame({"matcher": [name, "sasgeo"], "value": [0.3, 0.5], "lo": [0.1, 0.2], "hi": [0.5, 0.8]})
     with page(tmp_path / "bars.svg", BoardPage(title="Bars", panel_inches=(3.0, 0.8))) as ((chart,),):
-        draw_bars(chart, mine, [name, "sasgeo"])
+        draw_board_bars(chart, mine, [name, "sasgeo"])
     assert chart.bbox.width / chart.get_figure(root=True).dpi > 2.9  # inches

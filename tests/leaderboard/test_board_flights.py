@@ -11,11 +11,11 @@ import pytest
 from sasgeo_bench.cli.boards import score
 from sasgeo_bench.leaderboard.board_files import read_leaderboard, read_scores
 from sasgeo_bench.leaderboard.board_pictures import FLIGHT_BYTES
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.run_manifest import RunManifest
-from sasgeo_bench.tasks import flight_choice, task_files
+from sasgeo_bench.running.prediction_files import RunManifest
+from sasgeo_bench.tasks import flight_sampling, task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
@@ -56,7 +56,7 @@ def out(tmp_path_factory, lay_towns):
     root = lay_towns(tmp_path_factory.mktemp("flights") / "out", REGION)
     wanted = Wanted(suites=(SUITE,), regions=(REGION,), split="crossfit", count=2, seed=0, out=root, may_be_fewer=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
+        patch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
         for request in plan_requests(wanted):
             make_tasks(request)
     run(root, "near", off_m=3.0, accepts=lambda _: True)

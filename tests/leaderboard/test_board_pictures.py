@@ -23,15 +23,14 @@ from sasgeo_bench.leaderboard.board_pictures import (
     pictures_extra,
 )
 from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.case_plot import case_pixels, fitted
-from sasgeo_bench.leaderboard.cases import words_of
+from sasgeo_bench.leaderboard.cases import case_pixels, fitted, words_of
 from sasgeo_bench.leaderboard.run_cases import Case, facts_of, read_picture
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split
 from tests.plain_boards import plain_boards

@@ -11,11 +11,11 @@ import pytest
 from sasgeo_bench.leaderboard.board_pictures import STRIP_BYTES, pictures_extra
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.build import publish
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.sensing.tiny_images import tiny_images
 from sasgeo_bench.tasks import task_files

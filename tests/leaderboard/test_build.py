@@ -22,20 +22,19 @@ from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.leaderboard import score as boards
 from sasgeo_bench.leaderboard.board_files import Extra, read_board_manifest, read_leaderboard
 from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.matching.matcher import RejectorCard
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.leaderboard.tables import marks_of
+from sasgeo_bench.matching.matcher import Prediction, RejectorCard
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.failures import Failures
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest, mark_packed
+from sasgeo_bench.running.prediction_files import RunManifest, mark_packed
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.scoring import contestants, tables
+from sasgeo_bench.scoring import entries, tables
 from sasgeo_bench.scoring.contrasts import Contrast
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.entries import find_entries
@@ -884,7 +883,7 @@ def test_a_file_without_a_row_misses_everything_and_costs_nobody_else(out, both,
 def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out, both, split, monkeypatch):
     asked = {"split": split, "rejectors": (f"{__name__}:Doubt",)}
     whole = board_of(out, out / "runs", *both, **asked)
-    monkeypatch.setattr(contestants, "_MOST_KEPT_BYTES", 0)
+    monkeypatch.setattr(entries, "_MOST_KEPT_BYTES", 0)
     board = board_of(out, out / "runs", *both, **asked)
     pd.testing.assert_frame_equal(board.board.leaderboard, whole.board.leaderboard)
     pd.testing.assert_frame_equal(board.judged["good", "doubt"], whole.judged["good", "doubt"])
@@ -893,7 +892,7 @@ def test_answers_that_find_no_room_in_memory_are_read_again_and_score_alike(out,
 
 def fails_with(monkeypatch, name, is_bad):
     """A mistake of ours that only what one contestant says brings about."""
-    room = {"_scored": contestants, "hold_controls": contestants, "leaderboard": tables}.get(name, boards)
+    room = {"_scored": entries, "hold_controls": entries, "leaderboard": tables}.get(name, boards)
     work = getattr(room, name)
 
     def broken(*words, **more):
@@ -986,7 +985,7 @@ def test_a_disk_that_is_full_stops_everything(out, both, monkeypatch):
     def full(*_, **__):
         raise StoreError("cannot be written") from OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(contestants, "_scored", full)
+    monkeypatch.setattr(entries, "_scored", full)
     with pytest.raises(StoreError, match="cannot be written"):
         board_of(out, *both)
     assert not (out / "boards" / "mine").exists()

@@ -8,16 +8,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.leaderboard.pooled_plots import draw_prices, draw_recall
-from sasgeo_bench.leaderboard.pooled_tables import (
+from sasgeo_bench.leaderboard.pooled_plots import (
     ablation_frame,
     cost_frame,
+    draw_prices,
+    draw_recall,
     errors_frame,
     front_of,
     price_frame,
     recall_frame,
 )
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running.prediction_files import StoredAnswers
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.decisions import COST_RATIOS

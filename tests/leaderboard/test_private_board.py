@@ -12,16 +12,15 @@ import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.experiments.pipeline import plan_pipeline
 from sasgeo_bench.leaderboard.board_files import read_board_manifest
+from sasgeo_bench.leaderboard.board_tables import seed_table
 from sasgeo_bench.leaderboard.build import make_board
-from sasgeo_bench.leaderboard.columns import marks_of
 from sasgeo_bench.leaderboard.manifests import BoardEntry, PipelineRecord, SeedResult
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.leaderboard.private_board import OnPrivate, compare_seeds, result_of, seed_lines
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.leaderboard.tables import Cell, text_of
-from sasgeo_bench.leaderboard.validity_tables import seed_table
+from sasgeo_bench.leaderboard.tables import Cell, marks_of, text_of
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import pack_board, request_of, score_all
 from sasgeo_bench.publishing.build import publish

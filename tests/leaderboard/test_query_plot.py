@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 import sasgeo_bench as sgb
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.leaderboard.case_plot import TRUE
+from sasgeo_bench.leaderboard.cases import TRUE
 
 
 def first_of(tiny, track):

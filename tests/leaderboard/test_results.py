@@ -13,8 +13,7 @@ import pytest
 from sasgeo_bench.leaderboard.pipeline_spec import find_pipeline_file, read_pipeline_file
 from sasgeo_bench.publishing.archive import stored_settings
 from sasgeo_bench.publishing.archive_file import MOST_BYTES
-from sasgeo_bench.scoring.segmenter_board import SegmenterBoard
-from sasgeo_bench.scoring.segmenter_tables import page_tables, with_tables
+from sasgeo_bench.scoring.segmenter_board import SegmenterBoard, page_tables, with_tables
 from sasgeo_bench.tasks.query import PUBLISHED
 
 RESULTS = Path(__file__).parents[2] / "docs" / "results"

@@ -11,7 +11,7 @@ from matplotlib.text import Text
 
 import sasgeo_bench as sgb
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.leaderboard.plot_tables import ranked_matchers
+from sasgeo_bench.leaderboard.plots import ranked_matchers
 from sasgeo_bench.scoring.rows import is_unranked
 
 TOWNS = Path(__file__).parents[2] / "docs" / "results" / "towns"

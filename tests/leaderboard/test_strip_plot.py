@@ -10,7 +10,7 @@ import pytest
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard import strip_plot
-from sasgeo_bench.leaderboard.case_plot import CasePicture, MapPart
+from sasgeo_bench.leaderboard.cases import CasePicture, MapPart
 from sasgeo_bench.leaderboard.strip_plot import Strip, best_on_pictures, pictured_tasks, strip_of, strip_pixels
 from sasgeo_bench.regions.evidence import Evidence
 from sasgeo_bench.tasks.segmented import NOTHING, Segmented

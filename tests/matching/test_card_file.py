@@ -6,7 +6,7 @@ import os
 import pytest
 
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
-from sasgeo_bench.matching.card_file import read_card, read_card_file
+from sasgeo_bench.matching.cards import read_card, read_card_file
 from sasgeo_bench.matching.submission import example_card
 
 MORE = 'authors = ["A. Author"]\ncontact = "a@example.org"\ncode = "https://example.org/mine"\n'

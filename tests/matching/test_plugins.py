@@ -9,9 +9,16 @@ from importlib.metadata import distribution
 import pytest
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.files import plugin_files
-from sasgeo_bench.files.plugin_files import SHIPPED, find_module, home_of
-from sasgeo_bench.files.plugins import MATCHERS, check_card_name, check_names, list_entry_points
+from sasgeo_bench.files import plugins
+from sasgeo_bench.files.plugins import (
+    MATCHERS,
+    SHIPPED,
+    check_card_name,
+    check_names,
+    find_module,
+    home_of,
+    list_entry_points,
+)
 from sasgeo_bench.matching.matcher import MatcherCard
 from sasgeo_bench.matching.plugins import load_matcher
 from sasgeo_bench.matching.submission import example_card
@@ -100,12 +107,12 @@ def install(tmp_path, monkeypatch):
 
     With a name of ours it is installed as they are, unless it is but called so (`is_installed`).
     """
-    modules, bases = set(sys.modules), plugin_files._bases()
+    modules, bases = set(sys.modules), plugins._bases()
 
     def put(name: str, points: dict[str, str], *, is_installed: bool = True, **sources: str) -> None:
         folder = tmp_path / name
         if name in SHIPPED and is_installed:
-            monkeypatch.setattr(plugin_files, "_bases", lambda: (*bases, folder))
+            monkeypatch.setattr(plugins, "_bases", lambda: (*bases, folder))
         about = folder / f"{name.replace('-', '_')}-1.0.dist-info"
         about.mkdir(parents=True)
         (about / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import MatchError
-from sasgeo_bench.matching.matcher import Rejector, RejectorCard, check_p_false
+from sasgeo_bench.matching.matcher import Prediction, Rejector, RejectorCard, check_p_false
 from sasgeo_bench.matching.plugins import load_rejector
-from sasgeo_bench.matching.results import Prediction
 
 SAID = {"name": "half", "version": "1", "title": "Half", "source": "original", "ours": "all", "licence": "MIT"}
 BAD_LINES = ("two\nlines", "\x1b[31mred", "x" * 4001)

@@ -14,14 +14,11 @@ import pytest
 
 import sasgeo_bench
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugin_files import SHIPPED
-from sasgeo_bench.files.plugins import MATCHERS, SEGMENTERS, TRACKERS, list_entry_points
+from sasgeo_bench.files.plugins import MATCHERS, SEGMENTERS, SHIPPED, TRACKERS, list_entry_points
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match
-from sasgeo_bench.matching.scaffold import plugin_files, write_plugin
+from sasgeo_bench.matching.scaffold import plugin_files, segmenter_files, tracker_files, write_plugin
 from sasgeo_bench.matching.segmenter import ImageTraining
-from sasgeo_bench.matching.segmenter_scaffold import segmenter_files
-from sasgeo_bench.matching.tracker_scaffold import tracker_files
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.running.segmenter_testing import check_segmenter
 from sasgeo_bench.running.testing import check_matcher

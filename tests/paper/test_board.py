@@ -10,8 +10,7 @@ import sasgeo_paper
 from sasgeo_paper.board import extra
 
 from sasgeo_bench.config import parse_toml
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import board_folder, plan_pipeline
+from sasgeo_bench.experiments.pipeline import board_folder, plan_pipeline, run_pipeline
 from sasgeo_bench.leaderboard.board_files import check_board
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.progress import reporting

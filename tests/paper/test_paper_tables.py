@@ -16,7 +16,7 @@ from sasgeo_paper.tables import (
 )
 
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.intervals import wilson
 from sasgeo_bench.scoring.score import COLUMNS

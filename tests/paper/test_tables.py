@@ -46,8 +46,8 @@ from sasgeo_bench.regions.layers import OUTSIDE
 from sasgeo_bench.regions.region import DATA_VERSION, SCHEMA_VERSION
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import check_task
-from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import TASK_VERSION, PriorGroup
+from sasgeo_bench.tasks.sheet import panels_of
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import Seeds
 
@@ -289,7 +289,7 @@ def test_another_reading_is_up_to_date_by_itself(out, reading):
     assert found == out / "tasks" / f"paper-poc-crop-{crop}" / "paper-poc-42"
     assert check_task(task_files.Task.open(found)) == []
     assert made_paper_task(seed=42, out=out) is not None  # whose region was made again, the same to the byte
-    assert len(panels(task_files.Task.open(found), count=2)) == 2
+    assert len(panels_of(task_files.Task.open(found), count=2)) == 2
 
 
 def test_the_request_of_the_experiment_has_the_hash_that_it_had_before_there_were_readings(out):
@@ -561,7 +561,7 @@ def test_strata_are_filled(pairs):
 
 def test_a_contact_sheet_shows_the_five_layers(out):
     folder = out / "tasks" / "paper-poc" / "paper-poc-42"
-    found = panels(task_files.Task.open(folder), count=3)
+    found = panels_of(task_files.Task.open(folder), count=3)
     assert len(found) == 3
     assert all(panel.at_truth.classes == panel.at_decoy.classes == CLASSES for panel in found)
 

@@ -14,14 +14,13 @@ import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.experiments.pipeline import run_pipeline
-from sasgeo_bench.experiments.pipeline_plan import plan_pipeline
+from sasgeo_bench.experiments.pipeline import plan_pipeline, run_pipeline
 from sasgeo_bench.files import folders
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard import build, score
-from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
+from sasgeo_bench.leaderboard.build import figures_extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.progress import reporting
@@ -29,8 +28,8 @@ from sasgeo_bench.publishing import archive, archive_file
 from sasgeo_bench.publishing.archive import laid_out, pack_board, score_all, stored_settings
 from sasgeo_bench.publishing.archive_file import read_pack, read_stored_predictions, unpack, unpack_tasks
 from sasgeo_bench.publishing.build import publish
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA
 from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA
 from sasgeo_bench.tasks.query import base_of
 from tests.threaded import threaded
 

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from sasgeo_bench.publishing.site_plots import COASTS
+from sasgeo_bench.publishing.site_pages import COASTS
 
 
 def test_every_coastline_is_a_line_on_the_globe():

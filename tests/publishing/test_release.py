@@ -38,16 +38,14 @@ from sasgeo_bench.publishing import release as release_module
 from sasgeo_bench.publishing.release import ReleaseRequest, make_release
 from sasgeo_bench.publishing.release_files import Release, open_release
 from sasgeo_bench.publishing.release_metadata import footprint
-from sasgeo_bench.regions.imagery import ORTHO, OrthoRecord
-from sasgeo_bench.regions.imagery_files import ImageryEntry
+from sasgeo_bench.regions.imagery import ORTHO, ImageryEntry, OrthoRecord
 from sasgeo_bench.regions.layers import read_overview
 from sasgeo_bench.regions.ortho import check_picture, ortho_grid, write_ortho
 from sasgeo_bench.regions.preview import write_preview
 from sasgeo_bench.regions.region import ATTRIBUTION
 from sasgeo_bench.regions.region_files import read_manifest, write_manifest
 from sasgeo_bench.running.plan import RunRequest, reach_of
-from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.intrinsics import Intrinsics
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import put_task
 from sasgeo_bench.tasks.frames import FRAME, Frame, frame_row

@@ -16,8 +16,17 @@ from sasgeo_bench.ageing.ratebook import load_ratebook
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.leaderboard.board import Board
 from sasgeo_bench.leaderboard.board_files import TABLES
-from sasgeo_bench.leaderboard.board_tables import SHOWN_COSTS, Book, cost_table, sections_of, suite_table
-from sasgeo_bench.leaderboard.columns import MEANINGS
+from sasgeo_bench.leaderboard.board_tables import (
+    SHOWN_COSTS,
+    Book,
+    cost_table,
+    rejection_tables,
+    risk_tables,
+    risk_tables_by_suite,
+    sections_of,
+    suite_table,
+    summary,
+)
 from sasgeo_bench.leaderboard.manifests import (
     BoardTask,
     Elsewhere,
@@ -26,18 +35,21 @@ from sasgeo_bench.leaderboard.manifests import (
     PicturesManifest,
     RegionMap,
 )
-from sasgeo_bench.leaderboard.overview import summary
-from sasgeo_bench.leaderboard.rejection_tables import rejection_tables, risk_tables, risk_tables_by_suite
-from sasgeo_bench.leaderboard.tables import file_stem, page_names, text_of, ties_of
-from sasgeo_bench.publishing import site_maps
+from sasgeo_bench.leaderboard.tables import MEANINGS, file_stem, page_names, text_of, ties_of
+from sasgeo_bench.publishing import site_pages as pages
 from sasgeo_bench.publishing.site import contrasts_of, site_pages
-from sasgeo_bench.publishing.site_maps import place_maps
-from sasgeo_bench.publishing.site_pages import matchers_of, places_on_map, regions_of
-from sasgeo_bench.publishing.site_plots import draw_places, draw_rates
+from sasgeo_bench.publishing.site_pages import (
+    draw_places,
+    draw_rates,
+    matchers_of,
+    place_maps,
+    places_on_map,
+    regions_of,
+)
 from sasgeo_bench.publishing.site_source import SiteSource, Spot
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.scoring.controls import FALSIFIER_SCHEMA, Falsifier
 from sasgeo_bench.scoring.rows import ALL_SUITES, FIGURE_SCHEMA, Row
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
 from tests.handmade import BOUNDS_M, HOSTILE, MARKUP, about_of, answers_of, card_of, entry_of, many_rows
 
 FINDING = Finding(
@@ -427,11 +439,11 @@ def test_what_was_not_asked_is_no_failure_on_a_map():
     answers = answers_of(["graph"]).assign(status="not applicable", failure="")
     ((_, script),) = place_maps(source(answers=answers, pictures=PicturesManifest(regions=[item]))).items()
     said = json.loads(script.partition(", ")[2].removesuffix(");\n"))
-    number = list(site_maps.OUTCOMES).index("not applicable")
+    number = list(pages.OUTCOMES).index("not applicable")
     assert {row[1] for row in said["answers"][0][1]} == {number}
-    script = (Path(site_maps.__file__).parent / "templates" / "map.js").read_text(encoding="utf-8")
+    script = (Path(pages.__file__).parent / "templates" / "map.js").read_text(encoding="utf-8")
     assert f"const NOT_ASKED = {number};" in script
-    assert len(re.search(r"COLOURS = \[(.*)\]", script)[1].split(",")) == len(site_maps.OUTCOMES)
+    assert len(re.search(r"COLOURS = \[(.*)\]", script)[1].split(",")) == len(pages.OUTCOMES)
 
 
 def test_costs_are_sorted_by_the_first_of_them():
@@ -458,7 +470,7 @@ def test_of_many_answers_a_share_is_drawn_those_with_a_picture_first_and_the_pag
     ((place, whole),) = place_maps(given).items()
     assert (place.queries, place.drawn) == (300, 300)
     assert "Every query of a place" in site_pages(given)["map.html"]
-    monkeypatch.setattr(site_maps, "MOST_BYTES", len(whole) // 4)
+    monkeypatch.setattr(pages, "MOST_BYTES", len(whole) // 4)
     ((place, script),) = place_maps(given).items()
     assert place.queries == 300
     assert 40 < place.drawn < 90

@@ -20,7 +20,7 @@ from sasgeo_bench.leaderboard.board_files import read_board_manifest, read_leade
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import Card, example_card
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.archive import laid_tasks, pack_board
@@ -37,8 +37,7 @@ from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import PREDICTION_SCHEMA, prediction_row
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.scoring.contestants import check_submitted
-from sasgeo_bench.scoring.entries import find_entries
+from sasgeo_bench.scoring.entries import check_submitted, find_entries
 from sasgeo_bench.scoring.submission_files import list_submissions, read_submission
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import find_split

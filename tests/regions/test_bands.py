@@ -13,8 +13,7 @@ from scipy import ndimage
 
 from sasgeo_bench.errors import ImageryError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.regions.imagery import read_window
-from sasgeo_bench.regions.imagery_files import ImageryEntry
+from sasgeo_bench.regions.imagery import ImageryEntry, read_window
 from sasgeo_bench.regions.ortho import check_picture, is_empty, ortho_grid, write_ortho
 
 SIDE = 48

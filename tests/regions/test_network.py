@@ -10,7 +10,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sasgeo_bench.regions.network import RAIL, ROAD, WATER, find_crossings, find_meetings, make_chains, make_network
+from sasgeo_bench.regions.graph import RAIL, ROAD, WATER, find_crossings, find_meetings, make_chains, make_network
 
 corners = st.tuples(st.integers(0, 6), st.integers(0, 6))
 paths = st.lists(st.lists(corners, min_size=2, max_size=5, unique=True), min_size=1, max_size=8)

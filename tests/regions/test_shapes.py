@@ -7,7 +7,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sasgeo_bench.regions.shapes import delaunay_pairs, find_bends, groups_within, long_sides, touching_pairs
+from sasgeo_bench.regions.layers import delaunay_pairs, find_bends, groups_within, long_sides, touching_pairs
 
 RULES = {"step_m": 10.0, "smoothing_m": 60.0, "window_m": 120.0, "turn_deg": 45.0}
 cells = st.lists(st.tuples(st.integers(0, 9), st.integers(0, 9)), max_size=12, unique=True)

@@ -13,10 +13,9 @@ from sasgeo_bench import progress
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.running import prediction_files, runner
-from sasgeo_bench.running.answers import pool_costs
-from sasgeo_bench.running.patience import Patience
+from sasgeo_bench.running.answers import Patience, pool_costs
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.tasks import task_files

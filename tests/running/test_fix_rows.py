@@ -8,7 +8,7 @@ import pytest
 
 from sasgeo_bench.config import parse_toml
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.matching.submission import AnsweredTask, Card, Submission, example_card
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.prediction_files import FLOWN_SCHEMA, prediction_row, row_faults

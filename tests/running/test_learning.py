@@ -18,11 +18,11 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.matching.matcher import check_learned
 from sasgeo_bench.running import prediction_files, sandbox, training
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.training_tasks import Lessons, _Pair, check_apart, plan_training, spread
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.scoring.validate import set_aside, validate
+from sasgeo_bench.scoring.submission_files import set_aside, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.split import SplitFile, make_split
 

@@ -13,7 +13,7 @@ from sasgeo_bench.progress import Lines
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.oracle import right_answer
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.tasks import task_files
 

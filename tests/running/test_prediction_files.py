@@ -11,10 +11,9 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.running.prediction_files import Answers, StoredAnswers
-from sasgeo_bench.running.run_manifest import RUN, CardRecord, RunManifest
+from sasgeo_bench.running.prediction_files import RUN, Answers, CardRecord, RunManifest, StoredAnswers
 from sasgeo_bench.tasks.task_files import POSE_FIELDS
 from sasgeo_bench.texts import json_text
 

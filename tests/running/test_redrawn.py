@@ -11,7 +11,7 @@ from sasgeo_bench.errors import StoreError
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.scoring.validate import set_aside, validate
+from sasgeo_bench.scoring.submission_files import set_aside, validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.query import PriorGroup
 from tests import world

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
-from sasgeo_bench.scoring.validate import validate
+from sasgeo_bench.scoring.submission_files import validate
 from sasgeo_bench.sensing.reference_imagery import Look, render_imagery
 from sasgeo_bench.tasks.suites.base import Choice
 from sasgeo_bench.tasks.task_files import Task

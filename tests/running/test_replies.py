@@ -15,7 +15,7 @@ from sasgeo_bench.errors import MatchError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match, check_match
 from sasgeo_bench.running import wire
-from sasgeo_bench.running.replies import read_reply
+from sasgeo_bench.running.worker import read_reply
 from sasgeo_bench.tasks.query import Head
 from sasgeo_bench.texts import MOST_MESSAGE
 

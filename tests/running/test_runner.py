@@ -16,14 +16,14 @@ import pytest
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.leaderboard.build import make_board
 from sasgeo_bench.leaderboard.scored import ScoreRequest
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import answers, prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.sandbox import PROMISES
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.scoring.validate import validate
+from sasgeo_bench.scoring.submission_files import validate
 from sasgeo_bench.tasks import task_files
 
 PATIENT = Limits(match_s=600.0)  # what answers is never late, however busy the machine is

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.running import kernel, root, sandbox
+from sasgeo_bench.running import kernel, sandbox
 
 HAS_SPACES = subprocess.run(["unshare", "-Urm", "true"], capture_output=True, check=False).returncode == 0  # noqa: S607
 HAS_LANDLOCK = sandbox.landlock_version() >= kernel.SCOPE_SINCE
@@ -346,13 +346,13 @@ def test_the_root_holds_what_is_needed_alone(tmp_path, stack, mode):
     listing = "import json, os; print(json.dumps([os.listdir(path) for path in ('/', '/dev')]))"
     _, printed = shut_in(place, MODES[mode], ["-c", listing])
     found, devices = json.loads(printed)
-    system = {path.split("/")[1] for path in (*root.SYSTEM, *code, "/dev")}
+    system = {path.split("/")[1] for path in (*sandbox.SYSTEM, *code, "/dev")}
     assert set(found) <= system
     assert (
-        {Path(path).name for path in root.DEVICES}
+        {Path(path).name for path in sandbox.DEVICES}
         < set(devices)
         <= {
-            *(Path(path).name for path in root.DEVICES),
+            *(Path(path).name for path in sandbox.DEVICES),
             *("shm", "fd", "stdin", "stdout", "stderr"),
         }
     )

@@ -17,9 +17,9 @@ from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.running.plan import RunRequest, plan_run
 from sasgeo_bench.running.prediction_files import read_predictions
-from sasgeo_bench.running.recalibration import recalibrated, shares_within
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.segment_tasks import FOLDER, SegmentTasks, segment_tasks
+from sasgeo_bench.running.training import recalibrated, shares_within
 from sasgeo_bench.running.worker import Limits
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.sensing.tiny_images import tiny_images

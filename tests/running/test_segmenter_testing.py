@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench.running import sandbox, segmenter_testing
-from sasgeo_bench.running.checks import LEARNS
 from sasgeo_bench.running.segmenter_testing import check_segmenter
+from sasgeo_bench.running.testing import LEARNS
 from sasgeo_bench.sensing.tiny_images import tiny_images
 
 ROWS = (

@@ -14,8 +14,7 @@ from sasgeo_bench.files.plugins import ORACLE_SEGMENTER
 from sasgeo_bench.running import sandbox
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.sensing.image import LabelledImage
-from sasgeo_bench.sensing.image_bytes import LabelledFiles, write_labelled
+from sasgeo_bench.sensing.image import LabelledFiles, LabelledImage, write_labelled
 from sasgeo_bench.sensing.tiny_images import tiny_images, with_picture
 
 PATIENT = Limits(match_s=600.0, memory_bytes=2 * 10**9)

@@ -15,7 +15,7 @@ from sasgeo_bench.files.folders import locked
 from sasgeo_bench.progress import Lines, reporting
 from sasgeo_bench.running import answers, prediction_files, runner, sandbox
 from sasgeo_bench.running.plan import RunRequest, by_map, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
 

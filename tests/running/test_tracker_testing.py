@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.matching.scaffold import write_plugin
+from sasgeo_bench.matching.scaffold import tracker_files, write_plugin
 from sasgeo_bench.matching.tracker import check_fix
-from sasgeo_bench.matching.tracker_scaffold import tracker_files
 from sasgeo_bench.running import tracker_testing
 from sasgeo_bench.running.tracker_testing import TinyFlights, check_tracker, odd_flights, tiny_flights
 

@@ -11,10 +11,10 @@ import pytest
 from sasgeo_bench.matching import follower
 from sasgeo_bench.running import prediction_files
 from sasgeo_bench.running.plan import RunRequest, plan_run
-from sasgeo_bench.running.run_manifest import RunManifest
+from sasgeo_bench.running.prediction_files import RunManifest
 from sasgeo_bench.running.runner import run
 from sasgeo_bench.running.worker import Limits
-from sasgeo_bench.tasks import flight_choice, task_files
+from sasgeo_bench.tasks import flight_sampling, task_files
 from sasgeo_bench.tasks.query import flight_id
 from tests.slow import rest_slow
 from tests.world import drawn
@@ -29,7 +29,7 @@ def flown(tmp_path_factory, lay_towns):
     root = tmp_path_factory.mktemp("flights")
     lay_towns(root / "out", TOWN)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
+        patch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
         drawn(root / "out", "flight-overconfident", TOWN, seed=4, may_be_fewer=True)
     shutil.copy(Path(__file__).with_name("wayward.py"), root / "wayward.py")
     return root

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
-from sasgeo_bench.sasgeo.by_hand import map_by_hand, view_by_hand
+from sasgeo_bench.sasgeo.variants import map_by_hand, view_by_hand
 from sasgeo_bench.search.find import score_at
 
 

@@ -13,15 +13,14 @@ from sasgeo_bench.geometry.pose import Pose, inverse
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.sasgeo.graph import GraphScore, verify
-from sasgeo_bench.sasgeo.graph_rules import GraphRules, by_area, by_arms, by_degree
+from sasgeo_bench.sasgeo.graph import GraphRules, GraphScore, by_area, by_arms, by_degree, verify
 from sasgeo_bench.sasgeo.mapped import MappedGraph
 from sasgeo_bench.sasgeo.nodes import NODE_KINDS
 from sasgeo_bench.sasgeo.observed import ObservedGraph
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, warped
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.local_warp import bent
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
+from sasgeo_bench.tasks.suites.views import bent
 from sasgeo_bench.tasks.vectors import as_features, vector_table
 
 WAYS = (

@@ -11,7 +11,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.matching.matcher import Learner, Matcher, Training, check_match
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.sasgeo.conformal import PROTECTION
-from sasgeo_bench.sasgeo.graph_rules import GraphRules
+from sasgeo_bench.sasgeo.graph import GraphRules
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
 from sasgeo_bench.sasgeo.learning import _pose
 from sasgeo_bench.sasgeo.scorer_model import ScorerModel

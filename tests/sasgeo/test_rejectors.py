@@ -11,13 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sasgeo_bench.matching.matcher import check_p_false, remark_of
+from sasgeo_bench.matching.matcher import Prediction, check_p_false, remark_of
 from sasgeo_bench.matching.plugins import load_rejector
-from sasgeo_bench.matching.results import Prediction
 from sasgeo_bench.sasgeo.integrity import EVIDENCE_NAMES
 from sasgeo_bench.sasgeo.rejectors import FEW, Counted, SasgeoBoosted, SasgeoLogistic, features, lead, upper_rate
-from sasgeo_bench.scoring.decisions import Fixes, calibration_error
-from sasgeo_bench.scoring.integrity_metric import aurc
+from sasgeo_bench.scoring.decisions import Fixes, aurc, calibration_error
 from tests.sasgeo.simulated import simulate
 
 PROJECT = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text(encoding="utf-8"))

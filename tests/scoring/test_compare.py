@@ -19,8 +19,7 @@ from sasgeo_bench.scoring.compare import (
     mcnemar_exact,
     rank_intervals,
 )
-from sasgeo_bench.scoring.draws import ClusterDraws
-from sasgeo_bench.scoring.intervals import bootstrap_means
+from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_means
 
 PAIRS = st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=30)
 

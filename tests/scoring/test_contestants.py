@@ -5,7 +5,7 @@ import pickle
 from pathlib import Path
 
 from sasgeo_bench.running.prediction_files import Answers
-from sasgeo_bench.scoring.contestants import _Room, _Shard
+from sasgeo_bench.scoring.entries import _Room, _Shard
 
 
 def test_answers_that_are_kept_in_memory_go_to_other_processes():

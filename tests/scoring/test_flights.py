@@ -12,11 +12,10 @@ import pytest
 from sasgeo_bench.errors import ConfigError, MetricError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.leaderboard.text import warnings_of
-from sasgeo_bench.matching.results import Prediction
-from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
+from sasgeo_bench.matching.matcher import Prediction
+from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts, hold_contrasts
 from sasgeo_bench.scoring.flights import FLIGHT_COLUMNS, score_flights
 from sasgeo_bench.scoring.metrics import means_of, primary_of, quantiles_of
-from sasgeo_bench.scoring.registration import Pilot, check_contrasts
 from sasgeo_bench.scoring.score import COLUMNS, MISSING
 from sasgeo_bench.scoring.tables import leaderboard
 from sasgeo_bench.tasks.query import Head, Truth, view_id

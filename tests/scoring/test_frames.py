@@ -11,10 +11,10 @@ import pytest
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard.board_files import SCHEMAS
+from sasgeo_bench.scoring.compare import CONTRAST_SCHEMA, Finding
 from sasgeo_bench.scoring.controls import CONTROL_SCHEMA, Verdict
 from sasgeo_bench.scoring.frames import Schema, Shown, row_columns
 from sasgeo_bench.scoring.intervals import Interval
-from sasgeo_bench.scoring.verdicts import CONTRAST_SCHEMA, Finding
 
 STORED = Path(__file__).parents[2] / "docs" / "results" / "towns"
 

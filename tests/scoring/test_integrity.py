@@ -8,10 +8,8 @@ import pytest
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.scoring import rejection
-from sasgeo_bench.scoring.decisions import COST_RATIOS
-from sasgeo_bench.scoring.draws import ClusterDraws
-from sasgeo_bench.scoring.integrity_metric import aurc
-from sasgeo_bench.scoring.intervals import bootstrap_statistic, percentile_interval, wilson
+from sasgeo_bench.scoring.decisions import COST_RATIOS, aurc
+from sasgeo_bench.scoring.intervals import ClusterDraws, bootstrap_statistic, percentile_interval, wilson
 from sasgeo_bench.scoring.rejection import OWN, own_confidence, turns, why_not
 from sasgeo_bench.scoring.rejection_rows import answers_of, integrity_rows
 from sasgeo_bench.scoring.rows import FIGURE_SCHEMA

@@ -13,15 +13,17 @@ from sklearn.metrics import roc_auc_score
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.scoring.base import check_weights, weighted_mean
-from sasgeo_bench.scoring.decisions import Fixes, accept, presence_weights
-from sasgeo_bench.scoring.integrity_metric import (
+from sasgeo_bench.scoring.decisions import (
     Curve,
+    Fixes,
+    accept,
     augrc,
     aurc,
     choose_threshold,
     drawn_areas,
     excess_aurc,
     false_fix_rate,
+    presence_weights,
     risk_coverage,
 )
 

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest, bootstrap
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.scoring import draws
-from sasgeo_bench.scoring.draws import ClusterDraws
+from sasgeo_bench.scoring import intervals
 from sasgeo_bench.scoring.intervals import (
     BoardDraws,
+    ClusterDraws,
     Interval,
     bootstrap_means,
     bootstrap_statistic,
@@ -99,7 +99,7 @@ def test_the_same_seed_gives_the_same_draws_and_another_seed_others(monkeypatch)
     assert bootstrap_means(values, one).tolist() == bootstrap_means(values, same).tolist()
     assert bootstrap_means(values, one).tolist() == bootstrap_means(values, one).tolist()
     assert bootstrap_means(values, one).tolist() != bootstrap_means(values, other).tolist()
-    monkeypatch.setattr(draws, "_CHUNK_CELLS", 6 * 8)
+    monkeypatch.setattr(intervals, "_CHUNK_CELLS", 6 * 8)
     chunks = list(one.weights())
     assert [len(chunk) for chunk in chunks] == [8] * 6 + [2]
     assert not np.array_equal(chunks[0], chunks[1])

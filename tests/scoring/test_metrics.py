@@ -6,8 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from sasgeo_bench.scoring.decisions import Fixes
-from sasgeo_bench.scoring.integrity_metric import augrc, aurc, excess_aurc
+from sasgeo_bench.scoring.decisions import Fixes, augrc, aurc, excess_aurc
 from sasgeo_bench.scoring.metric import MeanMetric
 from sasgeo_bench.scoring.metrics import METRICS, REJECTION, means_of, primary_of, quantiles_of
 from tests.scoring.test_tables import scores

@@ -9,7 +9,7 @@ import pytest
 from sasgeo_bench.errors import ConfigError, MetricError
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.scoring.perception_profile import measure_profile
-from sasgeo_bench.scoring.segmentation_counts import PixelCounts
+from sasgeo_bench.scoring.segmentation import PixelCounts
 from sasgeo_bench.sensing.image import LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.sensing.tiny_images import with_picture

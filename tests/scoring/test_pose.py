@@ -12,7 +12,7 @@ from scipy.integrate import trapezoid
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose, inverse, wrap_deg
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.base import weighted_mean, weighted_quantile
 from sasgeo_bench.scoring.pose import (
     MISS,

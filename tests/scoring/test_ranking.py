@@ -12,7 +12,7 @@ from sklearn.metrics import label_ranking_average_precision_score, top_k_accurac
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.base import weighted_mean
 from sasgeo_bench.scoring.pose import (
     MISS,

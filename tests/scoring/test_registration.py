@@ -10,8 +10,7 @@ import pytest
 from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.scoring.compare import detectable_difference
-from sasgeo_bench.scoring.contrasts import Contrast
-from sasgeo_bench.scoring.registration import Pilot, check_contrasts, registered
+from sasgeo_bench.scoring.contrasts import Contrast, Pilot, check_contrasts, registered
 from tests.scoring.test_tables import scores
 
 ABSENT = Contrast(name="rejection", first="a x b", second="a x c", suites=("occlusion",), metric="aurc", min_effect=0.2)

@@ -5,10 +5,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from sasgeo_bench.leaderboard.board_tables import Book
-from sasgeo_bench.leaderboard.scene_tables import scene_tables
-from sasgeo_bench.scoring.scenes import AS_USED, scene_frame
-from sasgeo_bench.scoring.tables import leaderboard
+from sasgeo_bench.leaderboard.board_tables import Book, scene_tables
+from sasgeo_bench.scoring.tables import AS_USED, leaderboard, scene_frame
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from tests.scoring.test_tables import scores
 

@@ -9,7 +9,7 @@ import pytest
 
 from sasgeo_bench.errors import MetricError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.scoring.score import COLUMNS, score_task, settle_not_applicable
 from sasgeo_bench.tasks.query import Head, Truth
 

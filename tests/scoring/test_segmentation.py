@@ -11,8 +11,14 @@ from sasgeo_bench.errors import MetricError, StoreError
 from sasgeo_bench.files.parquet import write_frame
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.scoring import segmentation as scoring
-from sasgeo_bench.scoring.segmentation import error_over_coverage, reliability, segmentation_scores
-from sasgeo_bench.scoring.segmentation_counts import PixelCounts, read_counts, write_counts
+from sasgeo_bench.scoring.segmentation import (
+    PixelCounts,
+    error_over_coverage,
+    read_counts,
+    reliability,
+    segmentation_scores,
+    write_counts,
+)
 from sasgeo_bench.sensing.image import LabelledImage
 from sasgeo_bench.sensing.segmentation import CERTAIN, SILENT, Segmentation
 from sasgeo_bench.sensing.tiny_images import with_picture

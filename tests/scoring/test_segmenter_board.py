@@ -9,9 +9,8 @@ import pytest
 
 from sasgeo_bench.errors import MetricError, StoreError
 from sasgeo_bench.files.parquet import write_frame
-from sasgeo_bench.scoring.segmentation_counts import PixelCounts
-from sasgeo_bench.scoring.segmenter_board import SegmenterBoard, SegmenterTrial, write_board
-from sasgeo_bench.scoring.segmenter_tables import page_tables, with_tables
+from sasgeo_bench.scoring.segmentation import PixelCounts
+from sasgeo_bench.scoring.segmenter_board import SegmenterBoard, SegmenterTrial, page_tables, with_tables, write_board
 from sasgeo_bench.sensing.image import LabelledImage
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.sensing.tiny_images import with_picture

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from sasgeo_bench.scoring.segmenter_board import SegmenterBoard, write_board
-from sasgeo_bench.sensing.image_bytes import LabelledFiles
+from sasgeo_bench.sensing.image import LabelledFiles
 from tests.regions.imagery_place import make_hamlet
 
 PROGRAM = Path(__file__).parents[2] / "benchmarks" / "segmenters.py"

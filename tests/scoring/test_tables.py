@@ -9,11 +9,11 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.errors import MetricError
-from sasgeo_bench.leaderboard.board_tables import Book
+from sasgeo_bench.leaderboard.board_tables import Book, summary
 from sasgeo_bench.leaderboard.manifests import BoardManifest
-from sasgeo_bench.leaderboard.overview import summary
 from sasgeo_bench.leaderboard.tables import text_of
 from sasgeo_bench.leaderboard.text import board_latex, board_markdown, tables_of, warnings_of
+from sasgeo_bench.scoring.compare import LEAST_BLOCKS
 from sasgeo_bench.scoring.contrasts import Contrast, hold_contrasts
 from sasgeo_bench.scoring.controls import Verdict
 from sasgeo_bench.scoring.cost import Costs
@@ -24,7 +24,6 @@ from sasgeo_bench.scoring.rows import FIGURE_SCHEMA, EntryLabel, with_entry_labe
 from sasgeo_bench.scoring.score import COLUMNS as SCORED
 from sasgeo_bench.scoring.strata import strata
 from sasgeo_bench.scoring.tables import cost_figures, leaderboard
-from sasgeo_bench.scoring.verdicts import LEAST_BLOCKS
 from sasgeo_bench.texts import markdown
 
 ABOUT = BoardManifest(

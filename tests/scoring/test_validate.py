@@ -10,9 +10,9 @@ import pytest
 
 from sasgeo_bench.errors import StoreError
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.matching.results import Prediction
+from sasgeo_bench.matching.matcher import Prediction
 from sasgeo_bench.running import prediction_files
-from sasgeo_bench.scoring.validate import validate
+from sasgeo_bench.scoring.submission_files import validate
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.build import make_tasks
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from sasgeo_bench.geometry.pose import Pose, Prior
-from sasgeo_bench.search.chart import Chart
 from sasgeo_bench.search.shifts import Overlaps, ShiftPlan, ShiftSearch
+from sasgeo_bench.search.view import Chart
 from tests.made_up import region_of, textured, view_of
 
 CELLS = arrays(np.float32, (2, 3, 3), elements=st.floats(-2, 2, width=32))

@@ -9,10 +9,9 @@ import pytest
 from sasgeo_bench.errors import PoseError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.search.dense import LevelView
+from sasgeo_bench.search.dense import LevelView, surface
 from sasgeo_bench.search.field import FULL, Field, Template
 from sasgeo_bench.search.find import score_at
-from sasgeo_bench.search.surface import surface
 
 SIDE = 160
 GRID = Grid(epsg=32632, west_m=1000.0, north_m=2000.0, cell_size_m=2.0, rows=SIDE, cols=SIDE)

@@ -13,11 +13,11 @@ from sasgeo_bench.errors import ConfigError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose, Prior, wrap_deg
 from sasgeo_bench.search import plan as plan_module
-from sasgeo_bench.search import torch_coarse, torch_modes, torch_search
-from sasgeo_bench.search.correlation import Correlation
+from sasgeo_bench.search import torch_search
 from sasgeo_bench.search.field import FULL, Field, Template, between, pooled, warped
 from sasgeo_bench.search.find import Search, score_at, search
 from sasgeo_bench.search.plan import Found, Null, Plan
+from sasgeo_bench.search.shifts import Correlation
 from sasgeo_bench.search.torch_search import BatchSearch, search_batch
 
 ANYWHERE = Prior(center_m=None, radius_m=None, yaw_deg=None, yaw_sigma_deg=None, scale_sigma=0.0)
@@ -155,18 +155,18 @@ def test_scores_of_a_level_are_those_of_the_correlation(town):
     template = replace(view, weights=view.weights * np.float32([1, 1, 0])[:, None, None])
     job = Search(field=town, template=template, prior=ANYWHERE, plan=Plan())
     level, (tile,) = town.level(job.factor), job.tiles
-    views = torch_coarse.Views.of([template], "cpu")
+    views = torch_search.Views.of([template], "cpu")
     assert views.active == [0, 1, 3]
     for pool in (1, 3):
         bands, frame = views.pooled(level, pool)
         wanted, wanted_frame = pooled(template, level, pool)
         np.testing.assert_allclose(bands[0], wanted, rtol=1e-5, atol=1e-5)
         assert frame == wanted_frame
-    cells = torch_modes.torch.tensor(level.cells[..., views.active] / FULL, dtype=torch_modes.torch.float32).permute(
+    cells = torch_search.torch.tensor(level.cells[..., views.active] / FULL, dtype=torch_search.torch.float32).permute(
         2, 0, 1
     )
-    coarse = torch_coarse.Coarse.of(cells=cells, level=level, views=views, turns=job.turns, most_bytes=2**24)
-    lay, board = coarse.lay(job.turns.bases), torch_coarse.Board.of(coarse, tile)
+    coarse = torch_search.Coarse.of(cells=cells, level=level, views=views, turns=job.turns, most_bytes=2**24)
+    lay, board = coarse.lay(job.turns.bases), torch_search.Board.of(coarse, tile)
     scores = board.scores(lay.laid(coarse.bands))[:, 0].transpose(0, 1)[..., : tile.allowed.shape[1]] / board.size
     votes = Correlation.of(level, template, [tile], job.turns)
     for base in job.turns.bases[::5]:
@@ -224,7 +224,7 @@ def test_of_ranked_items_the_first_stays(torch):
     rng = np.random.default_rng(0)
     at, valid = rng.uniform(0, 10, (5, 60)), rng.random((5, 60)) < 0.9
     near = np.abs(at[:, :, None] - at[:, None]) < 0.4
-    kept = torch_modes.first_come(torch.tensor(near), torch.tensor(valid)).numpy()
+    kept = torch_search.first_come(torch.tensor(near), torch.tensor(valid)).numpy()
     for beside, is_valid, mine in zip(near, valid, kept, strict=True):
         chosen = []
         for index in np.flatnonzero(is_valid):
@@ -236,7 +236,7 @@ def test_of_ranked_items_the_first_stays(torch):
 @needs_torch
 def test_the_examples_of_the_docstrings_hold():
     ran = 0
-    for module in (torch_search, torch_modes):
+    for module in (torch_search, torch_search):
         for case in doctest.DocTestFinder(exclude_empty=True).find(module, globs=vars(module).copy()):
             for example in case.examples:
                 example.options.clear()  # they are skipped where they are collected, since PyTorch may be missing

@@ -13,9 +13,8 @@ from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.birdseye import BirdsEye, Reading, SoftView, rectify, see_ground, to_evidence
-from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Dem, Plane
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 
 LENS = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=400, height_px=400)
 FLAT = Reading(widths_m={}, standing_m={})

@@ -11,9 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from sasgeo_bench.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
+from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
 from sasgeo_bench.sensing.ground import Dem, Plane
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 
 WIDE = Intrinsics.from_field_of_view(horizontal_deg=90.0, width_px=800, height_px=600)
 BENT = Intrinsics.from_field_of_view(

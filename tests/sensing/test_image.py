@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from sasgeo_bench.errors import ImageError
-from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.image import AerialImage, LabelledImage, decode_image
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 
 RED, GREEN, BLUE = (250, 0, 0), (0, 250, 0), (0, 0, 250)
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from sasgeo_bench.errors import ImageError, StoreError
-from sasgeo_bench.sensing.image_bytes import (
+from sasgeo_bench.sensing.image import (
     LabelledFiles,
     image_bytes,
     image_from,

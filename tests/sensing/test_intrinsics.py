@@ -8,7 +8,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from sasgeo_bench.errors import CameraError
-from sasgeo_bench.sensing.intrinsics import Intrinsics
+from sasgeo_bench.sensing.camera import Intrinsics
 
 LENS = (-0.12, 0.03, 0.001, -0.0005, -0.004)
 

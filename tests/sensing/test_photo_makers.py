@@ -16,8 +16,7 @@ from PIL.TiffImagePlugin import IFDRational
 from sasgeo_bench.errors import CameraError, ImageError
 from sasgeo_bench.sensing.ground import Plane
 from sasgeo_bench.sensing.image import decode_image
-from sasgeo_bench.sensing.photo_lens import Lens
-from sasgeo_bench.sensing.photos import read_photo
+from sasgeo_bench.sensing.photos import Lens, read_photo
 
 RDF = "http://www.w3.org/1999/02/22-rdf-syntax-ns#"
 PACKET = '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="{rdf}">{parts}</rdf:RDF></x:xmpmeta>'

@@ -12,7 +12,7 @@ import shapely
 from sasgeo_bench.errors import ImageryError
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.sensing.region_views import part_bounds_m, region_views, split_bounds
+from sasgeo_bench.sensing.reference_imagery import part_bounds_m, region_views, split_bounds
 from tests import world
 from tests.regions.imagery_place import EPSG, GSD_M, SIDE_M, SOUTH, WEST, make_hamlet
 

@@ -16,18 +16,16 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import CameraError, ConfigError, ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
-from sasgeo_bench.sensing.camera import Camera
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.rendering.buildings import estimate_storeys
-from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, draw_conditions, sun_at
+from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, cast_shadows, draw_conditions, expose, sun_at
 from sasgeo_bench.sensing.rendering.ground import WOOD, green_kinds
-from sasgeo_bench.sensing.rendering.light import cast_shadows, expose
 from sasgeo_bench.sensing.rendering.palettes import PALETTES
+from sasgeo_bench.sensing.rendering.plan import HeightPyramid, trace
 from sasgeo_bench.sensing.rendering.scene import Scene, make_scene, paint
 from sasgeo_bench.sensing.rendering.seasons import SEASONS
 from sasgeo_bench.sensing.rendering.texture import fractal, grain, noise
-from sasgeo_bench.sensing.rendering.trace import HeightPyramid, trace
 from sasgeo_bench.sensing.rendering.view import labels, render, render_labelled, render_ortho
 from tests.drawn_features import features_of
 

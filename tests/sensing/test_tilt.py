@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from benchmarks.road_tilt import SCENES, trial
 from sasgeo_bench.errors import CameraError
-from sasgeo_bench.sensing.camera import Attitude, Camera
+from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics
 from sasgeo_bench.sensing.ground import Plane
-from sasgeo_bench.sensing.intrinsics import Intrinsics
 from sasgeo_bench.sensing.tilt import join_parallel, refine_tilt, road_borders
 
 LENS = Intrinsics.from_field_of_view(horizontal_deg=70.0, width_px=768, height_px=768)

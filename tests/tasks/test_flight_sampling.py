@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import ConfigError, PoseError, StoreError
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
-from sasgeo_bench.tasks import build, flight_choice, task_files
-from sasgeo_bench.tasks.flight_choice import Airspace
-from sasgeo_bench.tasks.flight_sampling import FlightDrawer
+from sasgeo_bench.tasks import build, flight_sampling, task_files
+from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer
 from sasgeo_bench.tasks.query import Step, flight_id, view_id
 from sasgeo_bench.tasks.split import Place, SplitFile, blocks_of, find_split, make_split
 from sasgeo_bench.tasks.state import State
@@ -69,7 +68,7 @@ def airspace(towns) -> Airspace:
 @pytest.fixture
 def short(monkeypatch) -> None:
     """Flights of one kilometre alone."""
-    monkeypatch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
+    monkeypatch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
 
 
 def make(out: Path, suite: str = "flight-overconfident", **changes):
@@ -189,7 +188,7 @@ def test_all_that_the_views_of_a_flight_may_show_is_mapped_and_the_longest_fligh
 def test_a_loiter_makes_few_laps_where_other_kinds_fly_far(airspace, monkeypatch):
     kinds = {}
     for kind in ("loiter", "waypoints"):
-        monkeypatch.setattr(flight_choice, "KINDS", (kind,))
+        monkeypatch.setattr(flight_sampling, "KINDS", (kind,))
         kinds[kind] = airspace.choose(count=1, may_be_fewer=False)[0].length_m
     assert kinds["loiter"] <= LOITER_M < kinds["waypoints"]
 
@@ -229,7 +228,7 @@ def test_a_gap_that_is_too_long_is_left_out_and_where_none_fits_its_control_too(
     suite = find_suite("flight-gap")
     left = {}
     for length_m in (1000.0, 2000.0):
-        monkeypatch.setattr(flight_choice, "LENGTHS_M", (length_m,))
+        monkeypatch.setattr(flight_sampling, "LENGTHS_M", (length_m,))
         over = replace(airspace, suite=suite)
         flights = over.choose(count=1, may_be_fewer=False)
         drawer = FlightDrawer(airspace=over, flights=flights)
@@ -239,7 +238,7 @@ def test_a_gap_that_is_too_long_is_left_out_and_where_none_fits_its_control_too(
 
 
 def test_a_drone_that_cannot_be_carried_so_far_is_left_out_with_its_control(airspace, monkeypatch):
-    monkeypatch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
+    monkeypatch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
     suite = find_suite("flight-kidnap")
     far = tuple(replace(item, strength=5000.0) if item.role == "stress" else item for item in suite.variants)
     over = replace(airspace, suite=replace(suite, variants=far))
@@ -275,7 +274,7 @@ def test_the_same_request_makes_the_same_bytes_and_more_sites_change_none_of_the
 
 
 def test_where_no_flight_fits_the_request_gets_one_line_and_writes_nothing(own_out, monkeypatch):
-    monkeypatch.setattr(flight_choice, "LENGTHS_M", (10_000.0,))
+    monkeypatch.setattr(flight_sampling, "LENGTHS_M", (10_000.0,))
     with pytest.raises(ConfigError, match="town-grid has room for 0 of 1 flights of suite 'flight-overconfident'"):
         make(own_out)
     assert not (own_out / "tasks").exists()

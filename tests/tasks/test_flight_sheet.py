@@ -18,10 +18,10 @@ from PIL import Image
 from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.geometry.pose import reckon, wrap_deg
 from sasgeo_bench.regions.region import ATTRIBUTION
-from sasgeo_bench.tasks import flight_choice
+from sasgeo_bench.tasks import flight_sampling
 from sasgeo_bench.tasks.build import make_tasks
-from sasgeo_bench.tasks.flight_sheet import flight_panels, write_flight_sheet
 from sasgeo_bench.tasks.query import SEQUENCE_DIGITS, flight_id
+from sasgeo_bench.tasks.sheet import flight_panels, write_flight_sheet
 from sasgeo_bench.tasks.task_files import Task, read_queries
 from sasgeo_bench.tasks.task_plan import Wanted, plan_requests
 
@@ -34,7 +34,7 @@ def made(towns, tmp_path_factory) -> Path:
     out = Path(shutil.copytree(towns, tmp_path_factory.mktemp("flights") / "out"))
     wanted = Wanted(suites=("flight-kidnap",), regions=("town-grid",), split="crossfit", count=2, seed=0, out=out)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(flight_choice, "LENGTHS_M", (1000.0,))
+        patch.setattr(flight_sampling, "LENGTHS_M", (1000.0,))
         for request in plan_requests(wanted):
             make_tasks(request)
     return out

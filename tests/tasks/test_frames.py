@@ -10,8 +10,7 @@ from sasgeo_bench.errors import CameraError, ImageError, ShapeError, StoreError
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.accumulation import steps_between
-from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.intrinsics import Intrinsics
+from sasgeo_bench.sensing.camera import Camera, Intrinsics
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks import task_files
 from sasgeo_bench.tasks.frame_evidence import evidence_of, poses_before

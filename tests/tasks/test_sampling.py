@@ -23,7 +23,7 @@ from sasgeo_bench.tasks.query import RADII_M, SCALE_SIGMAS, YAW_SIGMA_DEG, Prior
 from sasgeo_bench.tasks.sampling import CANDIDATES, LEAST_CANDIDATES, Drawer, Job, away, make_prior
 from sasgeo_bench.tasks.split import SplitFile, make_split
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites import alias, clean
+from sasgeo_bench.tasks.suites import twins, views
 from sasgeo_bench.tasks.suites.base import Scene, Seeds, Variant
 from sasgeo_bench.tasks.suites.mining import STRIDE_M, min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
@@ -218,8 +218,8 @@ def wide(tmp_path_factory) -> Drawer:
     region = region_files.read_region(plan.folder)
     state = State.of(region)
     scene = Scene(map=state, world=state, blocks=split.blocks_in("wide"), view_reach_m=360.0, scenes=("urban",))
-    views = tuple(Variant(role="control", kind="control", view_cells=cells) for cells in (96, 192))
-    suite = replace(clean.SUITE, card=replace(clean.SUITE.card, tracks=("retrieval",)), variants=views)
+    sizes = tuple(Variant(role="control", kind="control", view_cells=cells) for cells in (96, 192))
+    suite = replace(views.CLEAN, card=replace(views.CLEAN.card, tracks=("retrieval",)), variants=sizes)
     return Drawer(
         suite=suite, scene=scene, seeds=Seeds(root=1, names=("wide", "x")), group=suite.card.group, split=split
     )
@@ -385,9 +385,9 @@ def test_a_localization_query_has_a_disc_and_no_candidates(wide, sites):
 
 
 def test_there_are_as_many_candidates_with_the_truth_and_twins_as_without_them(wide, sites):
-    kinds = {variant.kind[:2]: variant for variant in alias.SUITE.variants if not variant.kind.startswith("R2")}
-    twins = {site.index: ((site.pose.easting_m + 700.0, site.pose.northing_m),) for site in sites}
-    drawer = replace(wide, suite=alias.SUITE, scene=replace(wide.scene, twins=twins), windows={}, mined={})
+    kinds = {variant.kind[:2]: variant for variant in twins.ALIAS.variants if not variant.kind.startswith("R2")}
+    copies = {site.index: ((site.pose.easting_m + 700.0, site.pose.northing_m),) for site in sites}
+    drawer = replace(wide, suite=twins.ALIAS, scene=replace(wide.scene, twins=copies), windows={}, mined={})
     seen = set()
     for site in sites[:9]:
         jobs = {
@@ -401,15 +401,15 @@ def test_there_are_as_many_candidates_with_the_truth_and_twins_as_without_them(w
         assert {kind: truth.candidate >= 0 for kind, (_, truth) in answers.items()} == {"no": 1, "R1": 0, "R4": 1}
         assert not answers["R1"][1].is_present
         for kind, (query, _) in answers.items():
-            is_near = np.hypot(*(points_of(query) - twins[site.index]).T) < STRIDE_M
+            is_near = np.hypot(*(points_of(query) - copies[site.index]).T) < STRIDE_M
             assert is_near.sum() == (kind != "no")
         seen.add(count)
     assert len(seen) > 1
 
 
 def test_in_a_cluster_of_neighbours_any_of_them_may_be_the_true_one(wide, sites):
-    variant = next(item for item in alias.SUITE.variants if item.kind.startswith("R2"))
-    drawer = replace(wide, suite=alias.SUITE, windows={}, mined={})
+    variant = next(item for item in twins.ALIAS.variants if item.kind.startswith("R2"))
+    drawer = replace(wide, suite=twins.ALIAS, windows={}, mined={})
     offsets = []
     for site in sites:
         job = Job(query_id="q", site=site, variant=variant, track="retrieval")

@@ -13,7 +13,7 @@ from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_spec import find_region_file, list_region_files, read_region_file
 from sasgeo_bench.tasks.split import find_split_file, make_split, read_split_file
-from sasgeo_bench.tasks.suites.real_age import AGES_YEARS, DAYS_PER_YEAR
+from sasgeo_bench.tasks.suites.ages import AGES_YEARS, DAYS_PER_YEAR
 from sasgeo_bench.tasks.task_plan import Wanted, aged_dates, check_count, check_roots, plan_requests, wrong_place
 
 RIVERSIDE = "town-riverside"

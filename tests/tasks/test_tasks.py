@@ -23,8 +23,8 @@ from sasgeo_bench.files.folders import locked
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions import region_files
 from sasgeo_bench.tasks.build import check_task, is_of_region, make_tasks
-from sasgeo_bench.tasks.panels import panels
 from sasgeo_bench.tasks.query import PriorGroup
+from sasgeo_bench.tasks.sheet import panels_of
 from sasgeo_bench.tasks.task_files import (
     QUERIES,
     TASK,
@@ -446,14 +446,14 @@ def test_without_truths_a_task_can_be_checked_but_not_shown(copied):
     assert check_task(Task.open(folder)) == []
     assert not Task.open(folder).has_truths
     with pytest.raises(StoreError, match=r"truth.parquet cannot be read .*: make the queries again"):
-        panels(Task.open(folder))
+        panels_of(Task.open(folder))
 
 
 def test_the_truths_of_another_task_are_not_shown(copied):
     folder = copied / "tasks/clean" / RIVERSIDE
     shutil.copy(truth_of(copied / "tasks/absent" / RIVERSIDE) / TRUTH, truth_of(folder) / TRUTH)
     with pytest.raises(StoreError, match="does not hold the truths of"):
-        panels(Task.open(folder))
+        panels_of(Task.open(folder))
 
 
 def test_a_task_on_a_map_that_was_built_anew_is_not_shown(copied):
@@ -462,12 +462,12 @@ def test_a_task_on_a_map_that_was_built_anew_is_not_shown(copied):
     said = json.loads(manifest.read_text(encoding="utf-8"))
     manifest.write_text(json.dumps(said | {"fingerprint": "0"}), encoding="utf-8")
     with pytest.raises(StoreError, match="was built anew since: make the queries again"):
-        panels(Task.open(folder))
+        panels_of(Task.open(folder))
 
 
 def test_a_sheet_shows_every_variant_of_a_task_before_it_shows_one_twice(tasks):
     folder = tasks / "tasks/clean" / RIVERSIDE
-    shown = panels(Task.open(folder), count=6)
+    shown = panels_of(Task.open(folder), count=6)
     variants = [(item.truth.kind, item.truth.strength) for item in shown[:5]]
     assert len(set(variants)) == 5
     assert all(item.at_truth is not None for item in shown)
@@ -475,7 +475,7 @@ def test_a_sheet_shows_every_variant_of_a_task_before_it_shows_one_twice(tasks):
 
 def test_a_perfect_view_is_what_the_map_shows_at_the_truth(tasks):
     folder = tasks / "tasks/clean" / RIVERSIDE
-    perfect = [item for item in panels(Task.open(folder), count=60) if item.truth.role == "control"]
+    perfect = [item for item in panels_of(Task.open(folder), count=60) if item.truth.role == "control"]
     assert perfect
     for item in perfect:
         np.testing.assert_array_equal(item.query.evidence.cells, item.at_truth.cells)
@@ -484,10 +484,10 @@ def test_a_perfect_view_is_what_the_map_shows_at_the_truth(tasks):
 def test_one_query_is_found_by_the_beginning_of_its_id_and_an_unknown_one_is_told(tasks):
     folder = tasks / "tasks/absent" / RIVERSIDE
     name = next(read_queries(folder)).query_id
-    (shown,) = panels(Task.open(folder), query_id=name[:10])
+    (shown,) = panels_of(Task.open(folder), query_id=name[:10])
     assert shown.query.query_id == name
     with pytest.raises(ConfigError, match="holds no query 'zzz'"):
-        panels(Task.open(folder), query_id="zzz")
+        panels_of(Task.open(folder), query_id="zzz")
 
 
 @pytest.mark.parametrize(

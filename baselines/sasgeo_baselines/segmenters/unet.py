@@ -171,7 +171,7 @@ class UNet:
     """Probability of each class at a pixel, from what surrounds it within a hundred metres.
 
     `weights`, in a class of your own, names a file that the encoder begins with: a learned text of `unet`, or an `.npz`
-    of its arrays (`network.encoder_shapes`). `most_crops` bounds the time of learning.
+    of its arrays (`graph.encoder_shapes`). `most_crops` bounds the time of learning.
 
     >>> UNet().card.name
     'unet'

@@ -12,11 +12,9 @@ from sasgeo_bench.matching.controls.blind import is_blind, ranked_candidates
 from sasgeo_bench.matching.matcher import WITHHELD, Match, MatcherCard
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.regions.region import Region
-from sasgeo_bench.search.chart import Chart
 from sasgeo_bench.search.plan import Mode
-from sasgeo_bench.search.view import View
-from sasgeo_bench.search.vote_search import VotePlan, VoteSearch, ranked
-from sasgeo_bench.search.votes import VoteGains, make_template
+from sasgeo_bench.search.view import Chart, View
+from sasgeo_bench.search.vote_search import VoteGains, VotePlan, VoteSearch, make_template, ranked
 from sasgeo_bench.tasks.query import Query
 
 
@@ -72,7 +70,7 @@ class DenseMatcher(ABC):
 
     @abstractmethod
     def template(self, evidence: Evidence) -> NDArray[np.float64]:
-        """Return the factors of the map, for all classes of the view: see `votes.make_template`."""
+        """Return the factors of the map, for all classes of the view: see `vote_search.make_template`."""
 
     def prepare(self, region: Region, learned: str | None) -> None:
         """Read the map."""

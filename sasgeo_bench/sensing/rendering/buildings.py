@@ -13,8 +13,8 @@ import shapely
 from numpy.typing import NDArray
 
 from sasgeo_bench.sensing.rendering.palettes import Cover, Palette, Roofing
-from sasgeo_bench.sensing.rendering.plan import Mask, Plan, Shapes
-from sasgeo_bench.sensing.rendering.texture import Numbers, bell, draw, seed_of
+from sasgeo_bench.sensing.rendering.plan import ROOF, Canvas, Mask, Plan, Shapes, burn_numbers, inside_m
+from sasgeo_bench.sensing.rendering.texture import Field, Numbers, bell, draw, fractal, grain, noise, seed_of
 
 FLAT, GABLE, HIP = range(3)
 COVERS: Final[tuple[Cover, ...]] = ("tiles", "slates", "sheets", "membrane", "gravel", "thatch")
@@ -154,3 +154,165 @@ def _preferred(palette: Palette, place: str, roofings: tuple[Roofing, ...]) -> N
     """Return the weights of kinds of roof at a place: some villages are red, some grey."""
     taste = draw(seed_of(palette.family, place, "taste"), np.arange(len(roofings)))
     return np.array([roofing.weight for roofing in roofings]) * (0.25 + 1.75 * taste)
+
+
+_RUST: Final = np.array([128.0, 74.0, 50.0])
+_MOSS: Final = np.array([86.0, 88.0, 62.0])
+_PANEL: Final = np.array([34.0, 42.0, 64.0])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Cells:
+    """The N cells under roofs: where they are, whose they are, and where they lie on the building.
+
+    `u_m` runs along the ridge and `v_m` across, from the middle; `edge_m` is the distance to the outline.
+    """
+
+    rows: NDArray[np.int64]
+    cols: NDArray[np.int64]
+    owner: NDArray[np.int64]
+    key: NDArray[np.int64]
+    u_m: Numbers
+    v_m: Numbers
+    edge_m: Numbers
+
+
+def paint_buildings(canvas: Canvas, buildings: Buildings) -> None:
+    """Paint all buildings on a canvas and set their heights."""
+    numbers = burn_numbers(buildings.shapes.geometry, canvas.grid)
+    if not numbers.any():
+        return
+    canvas.owner[...] = numbers
+    inner = numbers > 0
+    for axis in (0, 1):  # the line between two houses of a row is an edge of both
+        inner &= (numbers == np.roll(numbers, 1, axis=axis)) | (numbers == 0)
+    edge_m = inside_m(inner, canvas.grid)
+    for (strip, _), part in zip(canvas.strips(), canvas.parts(), strict=True):
+        _paint_part(part, buildings, edge_m[strip])
+
+
+def _paint_part(canvas: Canvas, buildings: Buildings, edge_m: Field) -> None:
+    """Paint the roofs of one strip; `edge_m` is the distance of each cell to the outline of its building."""
+    rows, cols = np.nonzero(canvas.owner)
+    if not len(rows):
+        return
+    cells = _cells(canvas, buildings, edge_m, rows, cols)
+    canvas.kind[rows, cols] = ROOF
+    colour = buildings.roof[cells.owner]
+    # Height of each roof cell: a gable falls from its ridge, a hip rises from its outline
+    own, form = cells.owner, buildings.form[cells.owner]
+    half = buildings.half_m[own, 1]
+    inward = np.where(form == HIP, np.minimum(cells.edge_m, half), np.clip(half - np.abs(cells.v_m), 0, None))
+    height_m = buildings.eave_m[own] + buildings.pitch[own] * inward
+    parapet = (form == FLAT) & (cells.edge_m < 0.45) & (buildings.half_m[own, 1] > 3)
+    has = draw(17, cells.key) < 0.75
+    height_m = np.asarray(height_m + np.where(parapet & has, 0.12 * np.minimum(buildings.eave_m[own], 5.0), 0.0))
+    colour *= _weather(canvas, buildings, cells)[:, None]
+    colour = _aged(canvas, buildings, cells, colour)
+    _add_panels(canvas, buildings, cells, colour)
+    height_m += _add_plant(buildings, cells, colour)
+    height_m += _add_chimneys(canvas, buildings, cells, colour)
+    canvas.colour[rows, cols] = np.clip(colour, 0, 255).astype(np.uint8)
+    canvas.height_m[rows, cols] = height_m
+
+
+def _cells(
+    canvas: Canvas, buildings: Buildings, edge_m: Field, rows: NDArray[np.int64], cols: NDArray[np.int64]
+) -> _Cells:
+    owner = canvas.owner[rows, cols].astype(np.int64) - 1
+    at = canvas.grid.to_centres_m(np.stack([rows, cols], axis=1)) - buildings.centre_m[owner]
+    axis_u = buildings.axis[owner]
+    return _Cells(
+        rows=rows,
+        cols=cols,
+        owner=owner,
+        key=buildings.shapes.key[owner],
+        u_m=at[:, 0] * axis_u[:, 0] + at[:, 1] * axis_u[:, 1],
+        v_m=at[:, 1] * axis_u[:, 0] - at[:, 0] * axis_u[:, 1],
+        edge_m=edge_m[rows, cols].astype(np.float64),
+    )
+
+
+def _weather(canvas: Canvas, buildings: Buildings, cells: _Cells) -> Numbers:
+    """Return the brightness of each cell: courses or sheets, stains by patches, darker gutters, brighter ridges."""
+    rough = canvas.plan.palette.unevenness
+    cover = buildings.cover[cells.owner]
+    at = (cells.rows, cells.cols)
+    patches = fractal(canvas.grid, 5.0, canvas.plan.seed("stains"))[at]
+    fine = noise(canvas.grid, 0.9, canvas.plan.seed("fine"))[at]
+    # Sheets of metal lie in strips down the slope, each with its own age; tiles in courses along it.
+    strip = bell(3, cells.key, np.floor(cells.u_m / 1.05).astype(np.int64), np.floor(cells.v_m / 3.2).astype(np.int64))
+    course = bell(5, cells.key, np.floor(cells.v_m / 0.6).astype(np.int64))
+    lumps = bell(6, np.floor(cells.u_m / 0.7).astype(np.int64), np.floor(cells.v_m / 0.7).astype(np.int64), cells.key)
+    is_sheet = cover == COVERS.index("sheets")
+    is_tile = (cover == COVERS.index("tiles")) | (cover == COVERS.index("slates"))
+    pattern = np.where(is_sheet, 0.045 * strip, np.where(is_tile, 0.03 * course + 0.03 * lumps, 0.025 * lumps))
+    stained = (
+        (0.08 + 0.1 * draw(29, cells.key)) * patches
+        + 0.05 * fine
+        + 0.045 * grain(canvas.grid, 1 + canvas.plan.salt)[at]
+    )
+    edge = np.where(cells.edge_m < 0.4, np.where(buildings.form[cells.owner] == FLAT, 0.1, -0.12), 0.0)
+    return np.asarray(1 + rough * (pattern + stained) + edge)
+
+
+def _aged(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
+    """Mix rust into sheets, one by one and in streaks, and moss into tiles."""
+    cover, at = buildings.cover[cells.owner], (cells.rows, cells.cols)
+    streaks = fractal(canvas.grid, 3.0, canvas.plan.seed("rust"))[at]
+    rust = buildings.rust[cells.owner]
+    whole = draw(9, cells.key, np.floor(cells.u_m / 2.1).astype(np.int64), (cells.v_m > 0).astype(np.int64))
+    share = np.where(whole < rust * 0.7, 0.75 + 0.25 * streaks, np.clip(streaks * 1.6 + 2.2 * rust - 1.5, 0, 0.8))
+    share = np.where(cover == COVERS.index("sheets"), np.clip(share, 0, 1) * (rust > 0), 0.0)
+    colour = colour + share[:, None] * (_RUST - colour)
+    moss = np.where(cover == COVERS.index("tiles"), np.clip(streaks + 0.8 * draw(31, cells.key) - 0.5, 0, 0.45), 0.0)
+    return np.asarray(colour + moss[:, None] * (_MOSS - colour))
+
+
+def _add_panels(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Numbers) -> None:
+    """Lay solar panels and roof windows on one side of some roofs."""
+    half = buildings.half_m[cells.owner]
+    has = (draw(41, cells.key) < 0.14 / canvas.plan.palette.unevenness) & (cells.edge_m > 0.9)
+    start = -half[:, 0] * (0.2 + 0.6 * draw(43, cells.key))
+    end = start + half[:, 0] * (0.5 + draw(47, cells.key))
+    inside = (cells.u_m > start) & (cells.u_m < end) & (cells.v_m > 0.12 * half[:, 1]) & (cells.v_m < 0.72 * half[:, 1])
+    seam = (np.mod(cells.u_m, 1.05) < 0.22) | (np.mod(cells.v_m, 1.7) < 0.2)
+    colour[has & inside] = _PANEL
+    colour[has & inside & seam] = _PANEL * 1.7
+    lot_u, lot_v = np.floor(cells.u_m / 3.1).astype(np.int64), np.floor(cells.v_m / 2.6).astype(np.int64)
+    is_window = (draw(53, cells.key) < 0.4) & (draw(59, cells.key, lot_u, lot_v) < 0.22) & (cells.edge_m > 1)
+    is_window &= (np.mod(cells.u_m, 3.1) < 0.9) & (np.mod(cells.v_m, 2.6) < 1.2) & ~(has & inside)
+    colour[is_window] = (62, 70, 80)
+
+
+def _lots(cells: _Cells, size_m: float, seed: int) -> tuple[Mask, Numbers]:
+    lots = np.floor(cells.u_m / size_m).astype(np.int64), np.floor(cells.v_m / size_m).astype(np.int64)
+    middle = [0.5 + 0.35 * (draw(seed + part, cells.key, *lots) - 0.5) for part in (1, 2)]
+    half = [0.1 + 0.2 * draw(seed + part, cells.key, *lots) for part in (3, 4)]
+    off_u = np.abs(np.mod(cells.u_m / size_m, 1) - middle[0])
+    off_v = np.abs(np.mod(cells.v_m / size_m, 1) - middle[1])
+    return (off_u < half[0]) & (off_v < half[1]), draw(seed, cells.key, *lots)
+
+
+def _add_plant(buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
+    """Put machines, skylights and stairheads on flat roofs; return how much higher each cell becomes."""
+    is_flat = (buildings.form[cells.owner] == FLAT) & (cells.edge_m > 1.2) & (buildings.half_m[cells.owner, 1] > 3.5)
+    inside, luck = _lots(cells, 6.5, 71)
+    chosen = is_flat & inside & (luck < 0.35 * draw(73, cells.key))
+    tone = 95 + 140 * draw(79, cells.key, np.floor(cells.u_m / 6.5).astype(np.int64))
+    colour[chosen] = tone[chosen, None]
+    stairs, luck = _lots(cells, 13.0, 83)
+    stairs &= is_flat & (luck < 0.3) & (buildings.eave_m[cells.owner] > 5)
+    colour[stairs] = buildings.wall[cells.owner[stairs]] * 0.95
+    stands = np.minimum(buildings.eave_m[cells.owner], 3.0) / 3.0
+    return np.asarray(np.where(stairs, 2.4, np.where(chosen, 0.4 + luck * 2.5, 0.0)) * stands)
+
+
+def _add_chimneys(canvas: Canvas, buildings: Buildings, cells: _Cells, colour: Numbers) -> Numbers:
+    """Put a chimney beside the ridge of most pitched roofs; return how much higher each cell becomes."""
+    half = buildings.half_m[cells.owner]
+    at_u, at_v = half[:, 0] * (1.2 * draw(89, cells.key) - 0.6), half[:, 1] * (0.5 * draw(97, cells.key) - 0.25)
+    has = (draw(101, cells.key) < 0.8 / canvas.plan.palette.unevenness**2) & (buildings.form[cells.owner] != FLAT)
+    has &= (half[:, 1] > 2.5) & (np.abs(cells.u_m - at_u) < 0.4) & (np.abs(cells.v_m - at_v) < 0.35)
+    colour[has] = buildings.wall[cells.owner[has]] * 0.7
+    return np.where(has & (buildings.eave_m[cells.owner] > 0.5), 1.1, 0.0)

@@ -14,11 +14,9 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import ShapeError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.layers import burn, burn_class, make_paint
-from sasgeo_bench.sensing.rendering.buildings import Buildings, style_buildings
-from sasgeo_bench.sensing.rendering.cars import paint_cars
-from sasgeo_bench.sensing.rendering.conditions import Sun
+from sasgeo_bench.sensing.rendering.buildings import Buildings, paint_buildings, style_buildings
+from sasgeo_bench.sensing.rendering.conditions import Light, Sun, cast_light
 from sasgeo_bench.sensing.rendering.ground import PARK, ROUGH, WOOD, Cover, paint_ground
-from sasgeo_bench.sensing.rendering.light import Light, cast_light
 from sasgeo_bench.sensing.rendering.palettes import PALETTES, Family
 from sasgeo_bench.sensing.rendering.plan import (
     GROUND,
@@ -27,6 +25,7 @@ from sasgeo_bench.sensing.rendering.plan import (
     WATER,
     Canvas,
     Cells,
+    HeightPyramid,
     Mask,
     Picture,
     Plan,
@@ -34,11 +33,9 @@ from sasgeo_bench.sensing.rendering.plan import (
     inside_m,
     shapes_of,
 )
-from sasgeo_bench.sensing.rendering.roads import paint_barriers, paint_roads
-from sasgeo_bench.sensing.rendering.roofs import paint_buildings
+from sasgeo_bench.sensing.rendering.roads import paint_barriers, paint_cars, paint_roads
 from sasgeo_bench.sensing.rendering.seasons import GROWTH, Season
 from sasgeo_bench.sensing.rendering.texture import Numbers, draw, fractal, noise, seed_of
-from sasgeo_bench.sensing.rendering.trace import HeightPyramid
 from sasgeo_bench.sensing.rendering.trees import hedge_trees, make_trees, paint_trees, scatter
 
 if TYPE_CHECKING:

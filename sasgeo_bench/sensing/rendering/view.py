@@ -15,14 +15,11 @@ from sasgeo_bench.errors import CameraError
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN
 from sasgeo_bench.sensing.camera import Camera
-from sasgeo_bench.sensing.rendering.conditions import Conditions
-from sasgeo_bench.sensing.rendering.light import Exposure, Light, expose
-from sasgeo_bench.sensing.rendering.plan import CROWN, ROOF, WATER, Mask, Picture
+from sasgeo_bench.sensing.rendering.conditions import Conditions, Exposure, Light, expose, expose_sensor
+from sasgeo_bench.sensing.rendering.plan import CROWN, ROOF, WATER, Hits, Mask, Picture, strips, trace, trace_down
 from sasgeo_bench.sensing.rendering.scene import Painting, Scene
 from sasgeo_bench.sensing.rendering.seasons import Season
-from sasgeo_bench.sensing.rendering.sensor import expose_sensor
 from sasgeo_bench.sensing.rendering.texture import Field, draw
-from sasgeo_bench.sensing.rendering.trace import Hits, strips, trace, trace_down
 
 _GLASS: Final = np.array([54, 62, 70], dtype=np.float32)
 _WAVES: Final = 256  # cells of a tile of rippled water

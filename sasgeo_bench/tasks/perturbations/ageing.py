@@ -16,9 +16,16 @@ from numpy.typing import NDArray
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
-from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
-from sasgeo_bench.tasks.perturbations.fields import NoisePool, dilated, shifted
-from sasgeo_bench.tasks.perturbations.objects import Objects, find_objects
+from sasgeo_bench.tasks.perturbations.base import (
+    Mask,
+    NoisePool,
+    Objects,
+    check_ranges,
+    dilated,
+    find_objects,
+    shifted,
+    with_cells,
+)
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
 _TRIES: Final = 12  # to find a free place for a new object

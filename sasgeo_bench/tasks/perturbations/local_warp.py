@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sasgeo_bench.regions.evidence import Evidence
-from sasgeo_bench.tasks.perturbations.base import check_ranges
-from sasgeo_bench.tasks.perturbations.fields import centres, resample
+from sasgeo_bench.tasks.perturbations.base import centres, check_ranges, resample
 
 _WAVELENGTH_M: Final = 90.0
 _WAVES: Final = 16

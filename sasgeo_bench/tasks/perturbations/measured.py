@@ -16,9 +16,18 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.osm.taxonomy import MeasuredErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
-from sasgeo_bench.tasks.perturbations.fields import SIGMA, Field, NoisePool, dilated, disc, highest_within
-from sasgeo_bench.tasks.perturbations.objects import find_objects
+from sasgeo_bench.tasks.perturbations.base import (
+    SIGMA,
+    Field,
+    Mask,
+    NoisePool,
+    check_ranges,
+    dilated,
+    disc,
+    find_objects,
+    highest_within,
+    with_cells,
+)
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
 MEASURED: Final[Mapping[str, MeasuredErrors]] = {item.name: item.measured for item in load_taxonomy().classes}

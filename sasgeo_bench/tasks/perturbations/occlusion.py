@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from sasgeo_bench.geometry.pose import rotation
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.base import Mask, Occlusion
-from sasgeo_bench.tasks.perturbations.fields import (
+from sasgeo_bench.tasks.perturbations.base import (
     Field,
+    Mask,
     NoisePool,
+    Occlusion,
     centres,
     dilated,
     highest,

@@ -5,7 +5,7 @@ Errors are correlated in space, as a network's are; no cell is flipped independe
 score that the detector reaches on each class.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 from typing import Final
@@ -14,20 +14,28 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sasgeo_bench.errors import ConfigError
 from sasgeo_bench.osm.taxonomy import ClassErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
-from sasgeo_bench.tasks.perturbations.fields import (
+from sasgeo_bench.tasks.perturbations.base import (
     SIGMA,
     Field,
+    Mask,
     NoisePool,
+    Perturbation,
+    check_ranges,
     dilated,
     eroded,
+    find_objects,
     highest_within,
+    pick_up_to,
     smooth_noise,
+    with_cells,
 )
-from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to
+from sasgeo_bench.tasks.perturbations.measured import MeasuredPerception
+from sasgeo_bench.tasks.perturbations.perception_profile import PerceptionProfile
 from sasgeo_bench.tasks.perturbations.streams import Streams
+from sasgeo_bench.tasks.query import PROFILE, Detector
 
 TOLERANCE_CELLS: Final = 1.5  # the eight neighbours
 EDGE_M: Final = 4.0  # width of ragged edges
@@ -269,3 +277,34 @@ def _bent_lines(begins: NDArray[np.float64], length_cells: float, rng: np.random
     steps = np.stack((np.cos(angles), np.sin(angles)), axis=2) * half
     corners = np.concatenate((begins[:, None], begins[:, None] + np.cumsum(steps, axis=1)), axis=1)
     return np.asarray(corners.round(), dtype=np.int32)
+
+
+NO_PROFILE: Final = "detector 'profile' needs a perception profile: name its file with make-queries --profile FILE"
+
+
+def _published(error_factor: float) -> Perturbation:
+    return Perception(error_factor=error_factor)
+
+
+def _measured(error_factor: float) -> Perturbation:
+    return MeasuredPerception(error_factor=error_factor)
+
+
+DETECTORS: Final[Mapping[Detector, Callable[[float], Perturbation]]] = {"published": _published, "measured": _measured}
+
+
+def perception_of(
+    detector: Detector, *, error_factor: float = 1.0, profile: PerceptionProfile | None = None
+) -> Perturbation:
+    """Return the errors of a detector, or of a segmenter's profile for the detector "profile".
+
+    Raise `ConfigError` if that detector has no profile.
+
+    >>> perception_of("measured", error_factor=2.0)
+    MeasuredPerception(error_factor=2.0)
+    """
+    if detector != PROFILE:
+        return DETECTORS[detector](error_factor)
+    if profile is None:
+        raise ConfigError(NO_PROFILE)
+    return MeasuredPerception(error_factor=error_factor, errors=profile.errors())

@@ -12,9 +12,17 @@ from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.osm.taxonomy import Season as Kind
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.base import Mask, check_ranges, with_cells
-from sasgeo_bench.tasks.perturbations.fields import Field, dilated, highest, smooth_noise, top_share
-from sasgeo_bench.tasks.perturbations.objects import find_objects
+from sasgeo_bench.tasks.perturbations.base import (
+    Field,
+    Mask,
+    check_ranges,
+    dilated,
+    find_objects,
+    highest,
+    smooth_noise,
+    top_share,
+    with_cells,
+)
 from sasgeo_bench.tasks.perturbations.streams import Streams
 
 Layers = dict[str, NDArray[np.uint8]]

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Suites, one file each: they draw queries and truths from a region, sites and a seed."""
+"""Suites, by family: they draw queries and truths from a region, sites and a seed."""

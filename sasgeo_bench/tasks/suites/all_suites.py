@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All suites by name: ours, each a file of its own and a line here, and those of installed packages."""
+"""All suites by name: ours by family, a line here for each, and those of installed packages."""
 
 import os
 import re
@@ -8,46 +8,10 @@ from functools import lru_cache
 from typing import Final
 
 from sasgeo_bench.errors import ConfigError, MatchError
-from sasgeo_bench.files.code_hash import plugin_code
 from sasgeo_bench.files.plugins import SUITES as GROUP
-from sasgeo_bench.files.plugins import find_plugin, list_entry_points, made, unknown
+from sasgeo_bench.files.plugins import find_plugin, list_entry_points, made, plugin_code, unknown
 from sasgeo_bench.tasks.query import BY
-from sasgeo_bench.tasks.suites import (
-    absent,
-    accumulated,
-    aerial,
-    alias,
-    board_controls,
-    clean,
-    false_unknown,
-    flight_alias,
-    flight_clean,
-    flight_gap,
-    flight_image,
-    flight_kidnap,
-    flight_off_map,
-    flight_overconfident,
-    flight_real_age,
-    flight_start,
-    grade_separation,
-    growth,
-    instance_twins,
-    light,
-    local_warp,
-    no_priors,
-    oblique,
-    occlusion,
-    real_age,
-    real_image,
-    relief,
-    season,
-    season_image,
-    stable_not_distinctive,
-    synthetic_age,
-    telemetry,
-    topology_twins,
-    volatile_lure,
-)
+from sasgeo_bench.tasks.suites import ages, board_controls, flights, pictures, twins, views
 from sasgeo_bench.tasks.suites.base import Suite
 from sasgeo_bench.tasks.suites.flights import FlightSuite
 
@@ -56,51 +20,51 @@ _NAME: Final = re.compile(r"[a-z][a-z0-9]*(?:[-_][a-z0-9]+)*")  # of a suite: it
 SUITES: Final[dict[str, Suite]] = {
     suite.card.name: suite
     for suite in (
-        clean.SUITE,
-        occlusion.SUITE,
-        false_unknown.SUITE,
-        local_warp.SUITE,
-        topology_twins.SUITE,
-        instance_twins.SUITE,
-        grade_separation.SUITE,
-        no_priors.SUITE,
-        real_age.SUITE,
-        synthetic_age.SUITE,
-        volatile_lure.SUITE,
-        growth.SUITE,
-        season.SUITE,
-        stable_not_distinctive.SUITE,
-        alias.SUITE,
-        absent.SUITE,
-        telemetry.SUITE,
+        views.CLEAN,
+        views.OCCLUSION,
+        views.FALSE_UNKNOWN,
+        views.LOCAL_WARP,
+        twins.TOPOLOGY_TWINS,
+        twins.INSTANCE_TWINS,
+        twins.GRADE_SEPARATION,
+        views.NO_PRIORS,
+        ages.REAL_AGE,
+        ages.SYNTHETIC_AGE,
+        ages.VOLATILE_LURE,
+        ages.GROWTH,
+        views.SEASON,
+        twins.STABLE_NOT_DISTINCTIVE,
+        twins.ALIAS,
+        views.ABSENT,
+        views.TELEMETRY,
     )
 }
 # Queries of these are pictures, of which a segmenter makes evidence; they are drawn where they are named.
 PICTURE_SUITES: Final[dict[str, Suite]] = {
     suite.card.name: suite
     for suite in (
-        aerial.SUITE,
-        oblique.SUITE,
-        relief.SUITE,
-        light.SUITE,
-        season_image.SUITE,
-        accumulated.SUITE,
-        real_image.SUITE,
+        pictures.AERIAL,
+        pictures.OBLIQUE,
+        pictures.RELIEF,
+        pictures.LIGHT,
+        pictures.SEASON_IMAGE,
+        pictures.ACCUMULATED,
+        pictures.REAL_IMAGE,
     )
 }
 # Queries of these are the views of a flight in order; they are drawn where they are named.
 FLIGHT_SUITES: Final[dict[str, FlightSuite]] = {
     suite.card.name: suite
     for suite in (
-        flight_clean.SUITE,
-        flight_real_age.SUITE,
-        flight_start.SUITE,
-        flight_gap.SUITE,
-        flight_kidnap.SUITE,
-        flight_overconfident.SUITE,
-        flight_alias.SUITE,
-        flight_off_map.SUITE,
-        flight_image.SUITE,
+        flights.FLIGHT_CLEAN,
+        flights.FLIGHT_REAL_AGE,
+        flights.FLIGHT_START,
+        flights.FLIGHT_GAP,
+        flights.FLIGHT_KIDNAP,
+        flights.FLIGHT_OVERCONFIDENT,
+        flights.FLIGHT_ALIAS,
+        flights.FLIGHT_OFF_MAP,
+        flights.FLIGHT_IMAGE,
     )
 }
 # With the controls, which every board draws in addition to its experiment.

@@ -17,7 +17,7 @@ from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.tasks.frames import Frame, FrameLabels
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
-from sasgeo_bench.tasks.perturbations.detectors import NO_PROFILE, perception_of
+from sasgeo_bench.tasks.perturbations.perception import NO_PROFILE, perception_of
 from sasgeo_bench.tasks.perturbations.perception_profile import PerceptionProfile
 from sasgeo_bench.tasks.private_seed import Seed
 from sasgeo_bench.tasks.query import PERCEIVED, PROFILE, PUBLISHED, Detector, PriorGroup, Role, Track

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.osm.taxonomy import load_taxonomy
-from sasgeo_bench.regions.network import LAYERS
+from sasgeo_bench.regions.graph import LAYERS
 from sasgeo_bench.tasks.state import DRAWN_CLASSES, State
 
 if TYPE_CHECKING:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Base of suites whose queries begin as pictures: the flight, the rendered frames, and what is believed of cameras."""
+"""Suites whose queries are pictures: aerial, accumulated, light, oblique, real-image, relief and season-image."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -7,22 +7,25 @@ from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TYPE_CHECKING, Final
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.geometry.pose import Pose
-from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
+from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
+from sasgeo_bench.regions.imagery import Imagery
 from sasgeo_bench.sensing.accumulation import Errors, believed_steps, steps_between
-from sasgeo_bench.sensing.camera import Attitude, Camera, Mount
-from sasgeo_bench.sensing.intrinsics import Intrinsics
-from sasgeo_bench.sensing.rendering.conditions import Conditions, draw_conditions
+from sasgeo_bench.sensing.camera import Attitude, Camera, Intrinsics, Mount
+from sasgeo_bench.sensing.rendering.conditions import Conditions, Sun, draw_conditions
 from sasgeo_bench.sensing.rendering.scene import Scene as Painted
 from sasgeo_bench.sensing.rendering.scene import make_scene
+from sasgeo_bench.sensing.rendering.seasons import Season
 from sasgeo_bench.sensing.rendering.view import labels, render
 from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
-from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, Detector
-from sasgeo_bench.tasks.suites.base import Draft, Shot, Suite, Variant
+from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, REAL, Detector, Role
+from sasgeo_bench.tasks.suites.base import MAIN_VIEW_CELLS, Draft, Scene, Shot, Suite, SuiteCard, Variant
 
 if TYPE_CHECKING:
     from sasgeo_bench.sensing.rendering.palettes import Family
@@ -230,3 +233,349 @@ def _painted(shot: Shot, flight: Flight) -> Painted:
         # 0.75 of the flight's height: whoever flies there flies above everything
         scene.painted[key] = replace(made, below_m=0.75 * flight.height_m)
     return scene.painted[key]
+
+
+HEIGHTS_M: Final = {80.0: 96, 160.0: MAIN_VIEW_CELLS, 320.0: 384, 500.0: 384}  # and the cells of their views
+
+
+def _aerial_flight(variant: Variant) -> Flight:
+    return Flight(height_m=variant.strength or HEIGHT_M)
+
+
+AERIAL: Final = PictureSuite(
+    card=SuiteCard(
+        name="aerial",
+        version=1,
+        title="Pictures from straight above (P1)",
+        what="A stabilized camera looks straight down from 80, 160, 320 or 500 m; a segmenter makes the evidence.",
+        separates="Segmenters, and matchers that bear their errors, by what a pixel still resolves.",
+        falsifier="Another picture from the control's height: scores as in the control.",
+        strength_unit="m above the ground",
+    ),
+    variants=(
+        Variant(role="control", kind="control"),
+        *(
+            Variant(role="stress", kind="P1 height", strength=height_m, view_cells=cells)
+            for height_m, cells in HEIGHTS_M.items()
+            if height_m != HEIGHT_M
+        ),
+        Variant(role="falsifier", kind="same height"),
+    ),
+    flight=_aerial_flight,
+)
+
+
+FRAMES: Final = (3.0, 9.0)
+FRAME, DRIFT = "P6 frames", "P6 drift"
+_STANDING: Final = "standing still"
+
+
+def _accumulated_flight(variant: Variant) -> Flight:
+    count, plain = int(variant.strength) or 1, Flight(height_m=80.0)
+    if variant.kind == _STANDING:
+        return replace(plain, stops_m=((0.0, 0.0),) * len(STOPS_M))
+    bad = 5.0 if variant.kind == DRIFT else 1.0  # 5 times the drift
+    return replace(
+        plain,
+        stops_m=STOPS_M[-count:],
+        odometry=Errors(position_share=bad * ODOMETRY.position_share, yaw_deg_per_km=bad * ODOMETRY.yaw_deg_per_km),
+    )
+
+
+ACCUMULATED: Final = PictureSuite(
+    card=SuiteCard(
+        name="accumulated",
+        version=1,
+        title="Accumulated frames (P6)",
+        what="One frame from 80 m shows a quarter of the view; 3 and 9 frames around it are laid together by odometry "
+        "that drifts by 1 % and 2 deg per km (P6 frames), or by one five times as bad (P6 drift).",
+        separates="What more frames give back from what their drift takes.",
+        falsifier="Nine frames from one place: no more ground is seen than in the control.",
+        strength_unit="frames",
+    ),
+    variants=(
+        Variant(role="control", kind="one frame"),
+        *(Variant(role="stress", kind=kind, strength=count) for kind in (FRAME, DRIFT) for count in FRAMES),
+        Variant(role="falsifier", kind=_STANDING),
+    ),
+    flight=_accumulated_flight,
+)
+
+
+STRENGTHS: Final = (0.3, 0.6, 1.0)
+SUN, HAZE, DUSK = "P4 sun", "P4 haze", "P4 dusk"
+_CLEAR: Final = Conditions(sun=Sun(elevation_deg=50.0, azimuth_deg=160.0))
+_LOWEST_DEG, _DARKEST_DEG, _THICKEST_M, _THINNEST_M = 5.0, -8.0, 500.0, 30_000.0
+
+
+def _light_flight(variant: Variant) -> Flight:
+    return Flight(conditions=lambda ordinary: _lit(ordinary, variant))
+
+
+def _lit(ordinary: Conditions, variant: Variant) -> Conditions:
+    """Return clear weather with a high sun, or what a kind makes of it; the rest as on the site."""
+    high, share = _CLEAR.sun.elevation_deg, variant.strength
+    lowest = {SUN: _LOWEST_DEG, DUSK: _DARKEST_DEG}.get(variant.kind, high)
+    sun = replace(_CLEAR.sun, elevation_deg=high + share * (lowest - high))
+    if variant.kind == DUSK:  # all of the ladder is around sunset
+        sun = replace(_CLEAR.sun, elevation_deg=_LOWEST_DEG + share * (_DARKEST_DEG - _LOWEST_DEG))
+    thick_m = _THICKEST_M if variant.kind == HAZE else _THINNEST_M
+    visibility_m = _THINNEST_M * (thick_m / _THINNEST_M) ** share
+    return replace(ordinary, sun=sun, cloud=0.0, visibility_m=visibility_m)
+
+
+LIGHT: Final = PictureSuite(
+    card=SuiteCard(
+        name="light",
+        version=1,
+        title="Light and air (P4)",
+        what="A low sun with long shadows (P4 sun), haze (P4 haze), and dusk to night (P4 dusk).",
+        separates="Segmenters by the light in which they still see.",
+        falsifier="Another picture in the control's light: scores as in the control.",
+        strength_unit="share of the way to the worst",
+    ),
+    variants=(
+        Variant(role="control", kind="control"),
+        *(Variant(role="stress", kind=kind, strength=share) for kind in (SUN, HAZE, DUSK) for share in STRENGTHS),
+        Variant(role="falsifier", kind="same light"),
+    ),
+    flight=_light_flight,
+)
+
+
+TILTS_DEG: Final = (15.0, 30.0, 50.0)
+TILT, BODY = "P2 tilt", "P2 body"
+
+
+def _oblique_flight(variant: Variant) -> Flight:
+    if variant.kind == BODY:
+        return Flight(is_fixed=True)
+    return Flight(tilt_deg=variant.strength)
+
+
+OBLIQUE: Final = PictureSuite(
+    card=SuiteCard(
+        name="oblique",
+        version=1,
+        title="Oblique pictures (P2)",
+        what="The camera's mount tilts by 15, 30 or 50 deg ahead (P2 tilt), or the camera is fixed to a body that "
+        "rolls and pitches as measured in flight (P2 body).",
+        separates="What bears relief, hidden ground and an error of attitude of 1 deg from what needs to look down.",
+        falsifier="Another picture without tilt: scores as in the control.",
+        strength_unit="deg of tilt",
+    ),
+    variants=(
+        Variant(role="control", kind="control"),
+        *(Variant(role="stress", kind=TILT, strength=tilt_deg) for tilt_deg in TILTS_DEG),
+        Variant(role="stress", kind=BODY, strength=BODY_SIGMA_DEG),
+        Variant(role="falsifier", kind="no tilt"),
+    ),
+    flight=_oblique_flight,
+)
+
+
+CELL_M: Final = 0.5
+SIDES_M: Final = (128.0, 96.0, 64.0)
+DEGRADED: Final = "R2 degraded map"
+_REAL_VIEW: Final = "R1 view"
+_TURNED: Final = "turned picture"
+_PICTURE: Final = 1.25  # times the view's side is what a picture shows
+_MOST_PX: Final = 768
+_REAL_HEIGHT_M: Final = 2000.0  # of the camera that a mosaic stands for: from there nothing leans
+_UNKNOWN_BIT: Final = np.uint32(1 << 31)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RealImageSuite(Suite):
+    """Views out of the imagery of a region: turned, scaled, at the resolution of the mosaic or a coarser one."""
+
+    @property
+    def is_pictured(self) -> bool:
+        """Return True."""
+        return True
+
+    @property
+    def detectors(self) -> tuple[Detector, ...]:
+        """Return that pictures are real."""
+        return (REAL,)
+
+    def lack(self, scene: Scene) -> str | None:
+        """Return that there is no imagery, or what any suite lacks."""
+        if scene.imagery is None:
+            return "no real imagery ([[imagery]] in its region file)"
+        return super().lack(scene)
+
+    def spacing_m(self, scene: Scene) -> float:  # noqa: ARG002
+        """Return the diagonal of the largest view: views of two sites share no ground, however they are turned."""
+        return float(np.sqrt(2)) * max(variant.side_m for variant in self.variants)
+
+    def usable(self, scene: Scene) -> tuple[Variant, ...]:  # noqa: ARG002
+        """Return the variants, each once, where a region allows small views alone."""
+        control_m = max(variant.side_m for variant in self.variants)
+        sides = [replace(item, strength=item.side_m) if item.role == "stress" else item for item in self.variants]
+        return tuple(item for item in dict.fromkeys(sides) if item.kind != _REAL_VIEW or item.side_m < control_m)
+
+    def map_region(self, scene: Scene, variant: Variant) -> str:
+        """Return the degraded map for its variants."""
+        return scene.others[0].region if variant.kind == DEGRADED else scene.map.region
+
+    def draw(self, shot: Shot) -> Draft:
+        """Cut the picture of a shot; its evidence is unknown until a segmenter has seen it."""
+        variant, state, imagery = shot.variant, shot.scene.world, shot.scene.imagery
+        if imagery is None:
+            raise ValueError(f"{state.region} has no imagery")
+        pose = _pose(shot)
+        width_px = min(_MOST_PX, round(_PICTURE * variant.side_m / imagery.record.gsd_m))
+        pixel_m = _PICTURE * variant.side_m / width_px
+        # Easting and northing of each pixel, shape (H, W, 2)
+        right = (np.arange(width_px) + 0.5 - width_px / 2) * pixel_m
+        across, ahead = np.meshgrid(right, -right)
+        ground_m = pose.to_map(np.stack((across.ravel(), ahead.ravel()), axis=1)).reshape(width_px, width_px, 2)
+        picture, is_known = _cut(imagery, ground_m)
+        # What the map says of each pixel, shape (C, H, W): UNKNOWN beyond its ground or the imagery
+        row, col = state.grid.to_cells(ground_m.reshape(-1, 2)).T
+        inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
+        bits = np.full(len(row), _UNKNOWN_BIT)
+        bits[inside] = state.bits.bits[row[inside], col[inside]]
+        states = [(bits >> np.uint32(at) & np.uint32(1)).astype(np.uint8) for at in range(len(state.classes))]
+        found = np.stack(states).reshape(-1, *is_known.shape)
+        found[:, ((bits & _UNKNOWN_BIT) > 0).reshape(is_known.shape) | ~is_known] = UNKNOWN
+        cells = np.full((len(state.classes), variant.view_cells, variant.view_cells), UNKNOWN, dtype=np.uint8)
+        frame = Frame(
+            picture=encode_webp(picture),
+            camera=_real_camera(pixel_m, width_px),
+            height_sigma_m=round(_REAL_HEIGHT_M * self.card.group.scale_sigma, 2),
+        )
+        return Draft(
+            evidence=Evidence(classes=state.classes, cells=cells, cell_size_m=variant.cell_size_m),
+            frames=(frame,),
+            labels=(FrameLabels.of(state.classes, found),),
+            pose=pose if pose is not shot.site.pose else None,
+            measured={
+                "gsd_m": round(pixel_m, 3),
+                "pictured_share": round(float(is_known.mean()), 4),
+                "building_share": round(float((found == PRESENT).any(axis=0).mean()), 4),
+            },
+        )
+
+
+def _pose(shot: Shot) -> Pose:
+    """Return where the picture of a shot is taken: the falsifier's is turned by a quarter to three quarters."""
+    site = shot.site.pose
+    if shot.variant.kind != _TURNED:
+        return site
+    turn_deg = float(shot.seeds.rng("turn").uniform(90.0, 270.0))
+    return Pose(
+        easting_m=site.easting_m,
+        northing_m=site.northing_m,
+        yaw_deg=(site.yaw_deg + turn_deg) % 360,
+        scale=site.scale,
+    )
+
+
+def _real_camera(pixel_m: float, width_px: int) -> Camera:
+    focal_px, centre_px = _REAL_HEIGHT_M / pixel_m, width_px / 2
+    return Camera.mounted(
+        intrinsics=Intrinsics(
+            width_px=width_px,
+            height_px=width_px,
+            focal_px=(focal_px, focal_px),
+            centre_px=(centre_px, centre_px),
+        ),
+        east_m=0.0,
+        north_m=0.0,
+        height_m=_REAL_HEIGHT_M,
+        body=Attitude(roll_deg=0.0, pitch_deg=0.0, yaw_deg=0.0),
+        mount=Mount(),
+    )
+
+
+def _cut(imagery: Imagery, ground_m: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+    """Return the picture of some ground, shape (H, W, 3), and where the imagery shows it, shape (H, W)."""
+    pixel_m = float(np.hypot(*(ground_m[0, 1] - ground_m[0, 0])))
+    low, high = ground_m.min(axis=(0, 1)) - 2 * pixel_m, ground_m.max(axis=(0, 1)) + 2 * pixel_m
+    bounds_m = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+    window = imagery.read(bounds_m, gsd_m=max(pixel_m, imagery.record.gsd_m))
+    uv = (window.grid.to_uv(ground_m.reshape(-1, 2)) - 0.5).astype(np.float32).reshape(ground_m.shape)
+    picture = cv2.remap(window.rgb, uv[..., 0], uv[..., 1], cv2.INTER_LINEAR)
+    known = cv2.remap(window.is_known.view(np.uint8), uv[..., 0], uv[..., 1], cv2.INTER_NEAREST)
+    return np.asarray(picture, dtype=np.uint8), np.asarray(known > 0)
+
+
+def _variant(role: Role, kind: str, side_m: float) -> Variant:
+    return Variant(role=role, kind=kind, view_cells=round(side_m / CELL_M), cell_size_m=CELL_M)
+
+
+REAL_IMAGE: Final = RealImageSuite(
+    card=SuiteCard(
+        name="real-image",
+        version=1,
+        title="Real pictures (R)",
+        what="Views of 128, 96 and 64 m cut out of the imagery of a region, turned and scaled, against its map as it "
+        "is (R1) and without 20 % of its roofs, the others 1.5 m off (R2); a segmenter makes the evidence.",
+        separates="What is learned from rendered pictures from what real ones need.",
+        falsifier="The picture turned by 90 to 270 deg: scores as in the control.",
+        strength_unit="m, the side of the view",
+        needs=("imagery", "degraded map"),
+    ),
+    variants=(
+        _variant("control", "control", SIDES_M[0]),
+        *(_variant("stress", _REAL_VIEW, side_m) for side_m in SIDES_M[1:]),
+        *(_variant("stress", DEGRADED, side_m) for side_m in SIDES_M),
+        _variant("falsifier", _TURNED, SIDES_M[0]),
+    ),
+)
+
+
+RELIEFS: Final = (1.0, 2.0, 4.0)
+
+
+def _relief_flight(variant: Variant) -> Flight:
+    return Flight(relief=variant.strength)
+
+
+RELIEF: Final = PictureSuite(
+    card=SuiteCard(
+        name="relief",
+        version=1,
+        title="Relief (P3)",
+        what="Buildings as high as they are, twice and four times as high, from 160 m: roofs lean away from the middle "
+        "and hide ground.",
+        separates="Matchers that bear roofs beside their footprints.",
+        falsifier="Buildings flattened again: scores as in the control, where they are flat, too.",
+        strength_unit="times the height of buildings",
+    ),
+    variants=(
+        Variant(role="control", kind="flat"),
+        *(Variant(role="stress", kind="P3 relief", strength=relief) for relief in RELIEFS),
+        Variant(role="falsifier", kind="flattened"),
+    ),
+    flight=_relief_flight,
+)
+
+
+SEASONS: Final[tuple[Season, ...]] = ("spring", "autumn", "winter", "snow")
+
+
+def _season_image_flight(variant: Variant) -> Flight:
+    season: Season = next((name for name in SEASONS if variant.kind.endswith(name)), "summer")
+    return Flight(conditions=lambda ordinary: replace(ordinary, season=season))
+
+
+SEASON_IMAGE: Final = PictureSuite(
+    card=SuiteCard(
+        name="season-image",
+        version=1,
+        title="Seasons in pictures (P5)",
+        what="The same place in spring, autumn, winter without leaves, and under snow; the map is that of summer.",
+        separates="Segmenters by the seasons in which they still see; the query does not say the season.",
+        falsifier="Another picture in summer: scores as in the control.",
+        strength_unit="share of the season",
+    ),
+    variants=(
+        Variant(role="control", kind="control"),
+        *(Variant(role="stress", kind=f"P5 {season}", strength=1.0) for season in SEASONS),
+        Variant(role="falsifier", kind="summer again"),
+    ),
+    flight=_season_image_flight,
+)

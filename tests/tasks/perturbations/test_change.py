@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.errors import PerturbError
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, UNKNOWN, Evidence
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates
-from sasgeo_bench.tasks.perturbations.fields import shifted
-from sasgeo_bench.tasks.perturbations.objects import find_objects, pick_up_to
+from sasgeo_bench.tasks.perturbations.base import find_objects, pick_up_to, shifted
 from sasgeo_bench.tasks.perturbations.season import Season
 
 

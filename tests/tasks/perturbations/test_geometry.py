@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN, Evidence
-from sasgeo_bench.tasks.perturbations.fields import resample
+from sasgeo_bench.tasks.perturbations.base import resample
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, RowJitter, Tilt, folded_share, moved, warped
 
 

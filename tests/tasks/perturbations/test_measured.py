@@ -8,9 +8,8 @@ import pytest
 
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
-from sasgeo_bench.tasks.perturbations.fields import dilated
+from sasgeo_bench.tasks.perturbations.base import dilated, find_objects
 from sasgeo_bench.tasks.perturbations.measured import MEASURED, YARD_M, MeasuredPerception
-from sasgeo_bench.tasks.perturbations.objects import find_objects
 from sasgeo_bench.tasks.perturbations.perception import TOLERANCE_CELLS, Perception
 
 BUILT = ("road_major", "road_minor", "building", "parking")

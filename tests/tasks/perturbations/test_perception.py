@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from sasgeo_bench.osm.taxonomy import ClassErrors, load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, Evidence
 from sasgeo_bench.tasks.perturbations import perception
-from sasgeo_bench.tasks.perturbations.fields import dilated, eroded
-from sasgeo_bench.tasks.perturbations.objects import find_objects
+from sasgeo_bench.tasks.perturbations.base import dilated, eroded, find_objects
 from sasgeo_bench.tasks.perturbations.perception import ERRORS, TOLERANCE_CELLS, Perception
 
 

@@ -17,17 +17,15 @@ from sasgeo_bench.regions.layers import burn_layers, make_paint
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_files import read_region
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
-from sasgeo_bench.tasks import flight_choice
-from sasgeo_bench.tasks.flight_choice import Airspace, Flight, rows
-from sasgeo_bench.tasks.flight_sampling import FlightDrawer
+from sasgeo_bench.tasks import flight_sampling
+from sasgeo_bench.tasks.flight_sampling import Airspace, Flight, FlightDrawer, rows
 from sasgeo_bench.tasks.perturbations.ageing import Ageing, Rates, rates_by_hand
 from sasgeo_bench.tasks.query import Query, Truth
 from sasgeo_bench.tasks.split import blocks_of, find_split
 from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES
 from sasgeo_bench.tasks.suites.base import Draft, Edit, Scene, Seeds, Shot, Site, Suite, Variant
-from sasgeo_bench.tasks.suites.flight_image import FlightImageSuite
-from sasgeo_bench.tasks.suites.flight_plots import ChangedMapSuite, changed, changes_of
+from sasgeo_bench.tasks.suites.flights import ChangedMapSuite, FlightImageSuite, changed, changes_of
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.twin import paste
 
@@ -257,9 +255,9 @@ def flown(scene, town, edited) -> Callable[..., Flown]:
         airspace = Airspace(
             region=town(where), scene=over, suite=suite, split=split, seeds=seeds, group=suite.card.group
         )
-        lengths_m = flight_choice.LENGTHS_M if name == "flight-gap" else (1000.0,)  # gaps of every length need room
+        lengths_m = flight_sampling.LENGTHS_M if name == "flight-gap" else (1000.0,)  # gaps of every length need room
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(flight_choice, "LENGTHS_M", lengths_m)
+            patch.setattr(flight_sampling, "LENGTHS_M", lengths_m)
             flights = airspace.choose(count=1, may_be_fewer=False)
         if suite.is_pictured:
             flights = {0: replace(flights[0], views=rows(flights[0].views, slice(0, PICTURES)))}

@@ -12,13 +12,13 @@ from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.tasks.perturbations.perception import Perception
 from sasgeo_bench.tasks.state import DRAWN_CLASSES
+from sasgeo_bench.tasks.suites.ages import after, ageing_of
 from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import Shot
-from sasgeo_bench.tasks.suites.local_warp import bent
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
-from sasgeo_bench.tasks.suites.stable_not_distinctive import VOLATILE, straight_places
-from sasgeo_bench.tasks.suites.synthetic_age import after, ageing_of
+from sasgeo_bench.tasks.suites.twins import VOLATILE, straight_places
+from sasgeo_bench.tasks.suites.views import bent
 from tests.tasks.suites.conftest import ROOTS
 
 # What is measured of a stress, and grows with its strength.

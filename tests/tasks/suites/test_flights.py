@@ -9,7 +9,7 @@ import pytest
 from sasgeo_bench.geometry.pose import wrap_deg
 from sasgeo_bench.regions.evidence import UNKNOWN
 from sasgeo_bench.tasks.query import CONTROLS, flight_id, view_id
-from sasgeo_bench.tasks.suites import flight_clean, flight_gap, flight_kidnap, flight_start
+from sasgeo_bench.tasks.suites import flights
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE, FLIGHT_SUITES, SUITES
 from sasgeo_bench.tasks.suites.flights import SPACING_M, START, UNEVEN
 
@@ -121,7 +121,7 @@ def test_what_an_odometer_says_is_the_true_way_but_for_its_drift(flown, name):
     for variant, pairs in flown(name).views.items():
         said, true = steps(pairs)[1:], true_steps(pairs)
         is_own = ~np.isnan(said[:, 0])
-        if variant.kind == flight_kidnap.UNTOLD:
+        if variant.kind == flights.UNTOLD:
             is_own[len(pairs) // 2 - 1] = False
         off = np.hypot(*(said - true)[is_own, :2].T) / np.hypot(*true[is_own, :2].T)
         if name == "flight-clean" and variant.role != "stress":
@@ -142,7 +142,7 @@ def test_views_are_so_unevenly_spaced_that_knowing_it_tells_no_odometers_scale(f
 def test_odometers_of_flight_clean_have_the_drift_of_their_profiles(flown, root):
     made = flown("flight-clean", root)
     kinds = [variant.kind for variant in sorted(made.views, key=lambda item: item.strength) if variant.role == "stress"]
-    assert kinds == [f"F1 {name}" for name in flight_clean.PROFILES]
+    assert kinds == [f"F1 {name}" for name in flights.PROFILES]
     spreads = [np.median(covariances(made.of("stress", kind))[1:, 8]) for kind in kinds]
     assert min(spreads) > 1e4 * np.median(covariances(made.of("control"))[1:, 8])
     assert len(set(spreads)) == len(kinds)
@@ -153,7 +153,7 @@ def test_a_gap_hides_exactly_the_views_within_it_and_the_falsifier_as_many_that_
     control = made.of("control")
     assert seen(control).all()
     distance_m = made.flight.views.distance_m
-    for gap_m in flight_gap.GAPS_M:
+    for gap_m in flights.GAPS_M:
         pairs = made.of("stress", strength=gap_m)
         within = np.abs(distance_m - distance_m[-1] / 2) <= gap_m / 2
         np.testing.assert_array_equal(~seen(pairs), within)
@@ -174,7 +174,7 @@ def test_a_gap_hides_exactly_the_views_within_it_and_the_falsifier_as_many_that_
 def test_a_carried_drone_comes_from_as_far_as_said_and_goes_on_as_the_control(flown, root):
     made = flown("flight-kidnap", root)
     control, middle = made.of("control"), made.flight.middle
-    for kind in (flight_kidnap.TOLD, flight_kidnap.UNTOLD):
+    for kind in (flights.TOLD, flights.UNTOLD):
         pairs = made.of("stress", kind)
         np.testing.assert_array_equal(poses(pairs)[middle:], poses(control)[middle:])
         np.testing.assert_array_equal(cells(pairs)[middle:], cells(control)[middle:])
@@ -187,14 +187,14 @@ def test_a_carried_drone_comes_from_as_far_as_said_and_goes_on_as_the_control(fl
         flown_m = np.diff([truth.measured["distance_m"] for _, truth in pairs])
         assert flown_m[middle - 1] == 0
         assert np.delete(flown_m, middle - 1).min() > 0
-    told, untold = (steps(made.of("stress", kind)) for kind in (flight_kidnap.TOLD, flight_kidnap.UNTOLD))
+    told, untold = (steps(made.of("stress", kind)) for kind in (flights.TOLD, flights.UNTOLD))
     assert np.isnan(told[middle]).all()
     np.testing.assert_array_equal(np.delete(told, middle, axis=0), np.delete(untold, middle, axis=0))
 
 
 def test_an_odometer_that_is_unaware_of_the_carrying_says_the_step_of_the_control(flown, root):
     made = flown("flight-kidnap", root)
-    untold, control = (steps(made.of(*which)) for which in (("stress", flight_kidnap.UNTOLD), ("control",)))
+    untold, control = (steps(made.of(*which)) for which in (("stress", flights.UNTOLD), ("control",)))
     np.testing.assert_array_equal(untold[made.flight.middle], control[made.flight.middle])
     assert not np.isnan(untold[1:]).any()
 
@@ -220,10 +220,10 @@ def test_less_and_less_is_known_of_a_start_and_the_rest_of_the_flight_is_the_sam
     control, falsifier = made.of("control"), made.of("falsifier")
     assert control[0][0].prior == falsifier[0][0].prior
     assert (control[0][0].prior.radius_m, control[0][0].prior.yaw_sigma_deg) == (100.0, 5.0)
-    for radius_m in flight_start.RADII_M:
+    for radius_m in flights.START_RADII_M:
         first, _ = made.of("stress", strength=radius_m)[0]
         assert (first.prior.radius_m, first.prior.yaw_sigma_deg) == (radius_m, 20.0)
-    anywhere = made.of("stress", flight_start.ANYWHERE)
+    anywhere = made.of("stress", flights.ANYWHERE)
     assert anywhere[0][0].prior.center_m is None
     for variant, pairs in made.views.items():
         assert (np.nan_to_num(steps(pairs)) == np.nan_to_num(steps(control))).all() == (variant.role != "falsifier")

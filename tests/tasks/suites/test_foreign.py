@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.matching.suite_scaffold import suite_files
+from sasgeo_bench.matching.scaffold import suite_files
 from sasgeo_bench.running.suite_testing import check_suite
 from sasgeo_bench.tasks.build import made_tasks, make_tasks
 from sasgeo_bench.tasks.suites.all_suites import _foreign, find_suite, known_suite, suite_code

@@ -11,8 +11,13 @@ from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.tasks.query import PUBLISHED
 from sasgeo_bench.tasks.suites.base import Shot
-from sasgeo_bench.tasks.suites.measured_vectors import MeasuredVectorNoise, perceive_coarsely
-from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors, site_vectors
+from sasgeo_bench.tasks.suites.vectors import (
+    MeasuredVectorNoise,
+    VectorNoise,
+    perceive_coarsely,
+    perceive_vectors,
+    site_vectors,
+)
 from sasgeo_bench.tasks.vectors import VECTOR_CLASSES, as_features
 from tests.tasks.suites.test_vectors import EAST, NORTH, row, table
 

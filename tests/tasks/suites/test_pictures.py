@@ -11,7 +11,7 @@ from sasgeo_bench.regions.evidence import PRESENT, UNKNOWN
 from sasgeo_bench.sensing.rendering.conditions import Conditions
 from sasgeo_bench.sensing.segmentation import Segmentation
 from sasgeo_bench.tasks.frame_evidence import evidence_of
-from sasgeo_bench.tasks.suites import light, oblique
+from sasgeo_bench.tasks.suites import pictures
 from sasgeo_bench.tasks.suites.all_suites import PICTURE_SUITES, SUITES, find_suite
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Choice, Seeds, Shot, Site, Variant
 from sasgeo_bench.tasks.suites.pictures import STOPS_M, Flight, PictureSuite, stands_of
@@ -82,21 +82,21 @@ def test_every_suite_has_a_control_a_ladder_and_a_falsifier_that_flies_as_the_co
 def test_the_sun_sinks_and_the_air_thickens_along_the_ladder():
     def of(kind, share):
         variant = Variant(role="stress", kind=kind, strength=share)
-        return light.SUITE.flight(variant).conditions(Conditions())
+        return pictures.LIGHT.flight(variant).conditions(Conditions())
 
-    suns = [of(light.SUN, share).sun.elevation_deg for share in light.STRENGTHS]
+    suns = [of(pictures.SUN, share).sun.elevation_deg for share in pictures.STRENGTHS]
     assert suns == sorted(suns, reverse=True)
     assert suns[-1] == 5.0
-    assert of(light.DUSK, 1.0).sun.elevation_deg == -8.0
-    assert of(light.HAZE, 1.0).visibility_m == pytest.approx(500.0)
+    assert of(pictures.DUSK, 1.0).sun.elevation_deg == -8.0
+    assert of(pictures.HAZE, 1.0).visibility_m == pytest.approx(500.0)
 
 
 def test_a_camera_fixed_to_the_body_tilts_as_was_measured(place):
-    variant = next(item for item in oblique.SUITE.variants if item.kind == oblique.BODY)
+    variant = next(item for item in pictures.OBLIQUE.variants if item.kind == pictures.BODY)
     tilts = []
     for index in range(400):
         shot = replace(shot_of(place, variant), seeds=Seeds(root=1, names=("here", str(index))))
-        tilts.append(stands_of(shot, oblique.SUITE.flight(variant))[0].believed.tilt_deg)
+        tilts.append(stands_of(shot, pictures.OBLIQUE.flight(variant))[0].believed.tilt_deg)
     median, high = np.quantile(tilts, (0.5, 0.95))
     assert abs(median - 9.6) < 1.0
     assert abs(high - 20.5) < 2.5

@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 import pytest
 
+from sasgeo_bench.tasks.suites.ages import age_years, has_age, map_of_age
 from sasgeo_bench.tasks.suites.all_suites import SUITES
 from sasgeo_bench.tasks.suites.base import Seeds, changed_share
-from sasgeo_bench.tasks.suites.real_age import age_years, has_age, map_of_age
 from sasgeo_bench.tasks.suites.sites import choose_sites
 
 SUITE = SUITES["real-age"]

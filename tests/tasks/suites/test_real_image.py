@@ -17,7 +17,7 @@ from sasgeo_bench.tasks.frame_evidence import evidence_of
 from sasgeo_bench.tasks.frames import read_labels
 from sasgeo_bench.tasks.split import SplitFile, make_split
 from sasgeo_bench.tasks.state import State
-from sasgeo_bench.tasks.suites.real_image import DEGRADED, SUITE
+from sasgeo_bench.tasks.suites.pictures import DEGRADED, REAL_IMAGE
 from sasgeo_bench.tasks.task_files import read_queries, read_truths
 from sasgeo_bench.tasks.task_plan import Request
 from tests.regions.imagery_place import make_hamlet
@@ -32,7 +32,7 @@ def request_of(spec, out: Path, folder: Path | None = None) -> Request:
     split = SplitFile(id="own", title="own", kind="crossfit", buffer_m=100.0, place=places)
     known = {name: read_region_file(path) for name, path in list_region_files().items()} | {spec.id: spec}
     return Request(
-        suite=SUITE.card.name,
+        suite=REAL_IMAGE.card.name,
         region=spec,
         split=make_split(split, {name: item.grid() for name, item in known.items()}),
         count=2,

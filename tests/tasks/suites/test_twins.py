@@ -10,13 +10,12 @@ import shapely
 from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.tasks.query import CEILING
+from sasgeo_bench.tasks.suites.ages import STABLE, VOLATILE
 from sasgeo_bench.tasks.suites.base import Seeds, Shot, changed_share
 from sasgeo_bench.tasks.suites.mining import min_distance_m
 from sasgeo_bench.tasks.suites.sites import choose_sites
-from sasgeo_bench.tasks.suites.topology_twins import either
-from sasgeo_bench.tasks.suites.twins import OFF_M, Room, find_targets
+from sasgeo_bench.tasks.suites.twins import OFF_M, Room, either, find_targets
 from sasgeo_bench.tasks.suites.vectors import VectorNoise, perceive_vectors
-from sasgeo_bench.tasks.suites.volatile_lure import STABLE, VOLATILE
 from sasgeo_bench.tasks.twin import around, paste
 from sasgeo_bench.tasks.vectors import as_features
 from tests.slow import rest_slow

@@ -16,8 +16,8 @@ from sasgeo_bench.osm.features import DTYPES, make_features
 from sasgeo_bench.regions.evidence import ABSENT, PRESENT, Evidence, cell_offsets_m
 from sasgeo_bench.regions.graph import build_graph
 from sasgeo_bench.tasks.perturbations.local_warp import LocalWarp, folded_share, warped
-from sasgeo_bench.tasks.suites.local_warp import bent
 from sasgeo_bench.tasks.suites.vectors import VECTOR_CLASSES, VectorNoise, perceive_vectors, smooth_shift
+from sasgeo_bench.tasks.suites.views import bent
 from sasgeo_bench.tasks.vectors import as_features, instances_of_mask, vector_table
 from tests.made_up import query_of
 

@@ -27,9 +27,9 @@ class ScoreRequest:
     """A request for a board, written to the folder `board`.
 
     `predictions` are folders of runs, with runs at any depth, and files of predictions; `submissions` are folders that
-    are scored as files are, with more checks (`submission_files.submission_faults`). `tasks` are task folders; without any,
-    those that the runs and files answer. A matcher that was asked nothing of one of them has no figures on its suite.
-    `root` holds tasks/ and truth/, `truth` is the folder of the truths where it is another one.
+    are scored as files are, with more checks (`submission_files.submission_faults`). `tasks` are task folders; without
+    any, those that the runs and files answer. A matcher that was asked nothing of one of them has no figures on its
+    suite. `root` holds tasks/ and truth/, `truth` is the folder of the truths where it is another one.
 
     `split` assigns blocks to places, and names those that calibrate; rejectors (names, or module:Class) need it.
     `contrasts` are the registered ones. `draws` counts those of the bootstrap; suites in `by_region` are resampled by

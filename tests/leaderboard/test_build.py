@@ -475,7 +475,7 @@ def test_a_file_that_validate_refuses_is_not_scored(out, tmp_path):
     submission(out, tmp_path / "mine.parquet")
     table = pq.read_table(tmp_path / "mine.parquet")
     pq.write_table(pa.concat_tables([table, table.slice(0, 1)]), tmp_path / "mine.parquet")
-    with pytest.raises(ConfigError, match=r"holds 1 fault: .*each query once.*'validate' lists all"):
+    with pytest.raises(ConfigError, match=r"holds 1 fault: .*each query once.*'verify' lists all"):
         board_of(out, tmp_path / "mine.parquet")
     assert not (out / "boards").exists()
 

@@ -80,7 +80,7 @@ def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_ar
 @pytest.mark.parametrize("name", ["query_id", "confidence"])
 def test_a_column_that_is_there_twice_is_refused(rows, write, name):
     path = write(rows.append_column(name, rows[name]))
-    assert f"({name}: found 2 columns, expected {rows.schema.field(name).type}): 'validate'" in refusal(
+    assert f"({name}: found 2 columns, expected {rows.schema.field(name).type}): 'verify'" in refusal(
         everything, path
     )
     same = pa.array([[]] * 2, type=pa.list_(pa.struct([*rows.schema.field("candidates").type.value_type] * 2)))
@@ -130,7 +130,7 @@ def test_a_row_that_is_no_prediction_is_named(tmp_path, rows, name, value, words
     told = refusal(everything, tmp_path / "mine.parquet")
     assert "mine.parquet, row 1, is no prediction (" in told
     assert words in told
-    assert told.endswith("'validate' says all that is wrong")
+    assert told.endswith("'verify' says all that is wrong")
 
 
 @pytest.mark.parametrize(

@@ -80,9 +80,7 @@ def test_a_column_that_is_missing_or_of_another_kind_is_refused_wherever_rows_ar
 @pytest.mark.parametrize("name", ["query_id", "confidence"])
 def test_a_column_that_is_there_twice_is_refused(rows, write, name):
     path = write(rows.append_column(name, rows[name]))
-    assert f"({name}: found 2 columns, expected {rows.schema.field(name).type}): 'verify'" in refusal(
-        everything, path
-    )
+    assert f"({name}: found 2 columns, expected {rows.schema.field(name).type}): 'verify'" in refusal(everything, path)
     same = pa.array([[]] * 2, type=pa.list_(pa.struct([*rows.schema.field("candidates").type.value_type] * 2)))
     assert "(candidates: found list<" in refusal(everything, write(with_column(rows, "candidates", same)))
 

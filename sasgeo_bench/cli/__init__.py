@@ -4,7 +4,7 @@
 import os
 import sys
 
-from sasgeo_bench.cli.program import exit_interrupted, interrupted_by_signals, is_interrupt
+from sasgeo_bench.cli.interrupts import exit_interrupted, interrupted_by_signals, is_interrupt
 
 
 def main() -> None:

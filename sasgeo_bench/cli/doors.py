@@ -55,14 +55,14 @@ _DOORS: Final = {
     "tracker": _Door(
         TRACKERS,
         "matching.plugins:load_tracker",
-        "matching.tracker_scaffold:tracker_files",
+        "matching.scaffold:tracker_files",
         "running.tracker_testing:check_tracker",
         ORACLE,
     ),
     "segmenter": _Door(
         SEGMENTERS,
         "matching.plugins:load_segmenter",
-        "matching.segmenter_scaffold:segmenter_files",
+        "matching.scaffold:segmenter_files",
         "running.segmenter_testing:check_segmenter",
         ORACLE_SEGMENTER,
     ),
@@ -70,7 +70,7 @@ _DOORS: Final = {
     "suite": _Door(
         SUITES,
         "tasks.suites.all_suites:find_suite",
-        "matching.suite_scaffold:suite_files",
+        "matching.scaffold:suite_files",
         "running.suite_testing:check_suite",
     ),
 }

@@ -3,69 +3,24 @@
 
 import ast
 import inspect
-import signal
 import sys
 import traceback
 import warnings
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from importlib import import_module, metadata, resources
 from pathlib import Path
-from types import FrameType
 from typing import Annotated, Any, Final, TextIO
 
 import typer
 from typer.core import TyperGroup
 
 from sasgeo_bench.cli.console import EXIT_USER, LOG, complain, heartbeat, note, open_outlets, outlets, say
+from sasgeo_bench.cli.interrupts import EXIT_INTERRUPTED, exit_interrupted, is_interrupt
 from sasgeo_bench.cli.options import with_flags
 from sasgeo_bench.errors import SasgeoError
 from sasgeo_bench.progress import QUIET, tell
 from sasgeo_bench.texts import one_line
-
-EXIT_INTERRUPTED: Final = 128 + signal.SIGINT
-_OTHERS: Final = (signal.SIGTERM, signal.SIGHUP)  # which else end a program without a word, and leave what it began
-_received: list[int] = []  # of these, in this process: whoever catches a KeyboardInterrupt does not tell which it was
-
-
-@contextmanager
-def interrupted_by_signals() -> Iterator[None]:
-    """Let the signals of a system that stops end the program as Ctrl-C does; one that is ignored (`nohup`) stays so."""
-
-    def stop(number: int, _: FrameType | None) -> None:
-        """Do as Ctrl-C does, and remember who asked."""
-        _received.append(number)
-        raise KeyboardInterrupt
-
-    taken = [number for number in _OTHERS if signal.getsignal(number) is signal.SIG_DFL]
-    for number in taken:
-        signal.signal(number, stop)
-    try:
-        yield
-    finally:
-        _received.clear()
-        for number in taken:
-            signal.signal(number, signal.SIG_DFL)
-
-
-def exit_interrupted() -> int:
-    """Return the exit status of an interrupted program: 130 after Ctrl-C, 143 after SIGTERM, 129 after SIGHUP."""
-    return 128 + _received[-1] if _received else EXIT_INTERRUPTED
-
-
-def is_interrupt(error: BaseException | None) -> bool:
-    """Return whether an error is Ctrl-C, or what a library made of it while it was being imported.
-
-    >>> error = RuntimeError("cannot be imported")
-    >>> error.__cause__ = KeyboardInterrupt()
-    >>> is_interrupt(error)
-    True
-    """
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
-
 
 HELP: Final = (
     "Build regions from OpenStreetMap extracts, draw queries, run matchers, score them, publish boards. Results go to "

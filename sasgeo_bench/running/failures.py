@@ -67,6 +67,7 @@ def log_beside(board: Path) -> Path:
 class Failures:
     """Failed entries by name, with the cause of each as one line, which is told; tracebacks are appended to `log`.
 
+    >>> from sasgeo_bench.progress import reporting
     >>> failures = Failures(Path("failures.log"))
     >>> with reporting(print), failures.of("graph"):
     ...     raise SasgeoError("it has no card")

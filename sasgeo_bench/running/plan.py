@@ -38,11 +38,11 @@ from sasgeo_bench.texts import MOST_CANDIDATES
 
 # Modules of this package that answers depend on, if a plugin imports them: after a change there, it is asked anew.
 TOOLS: Final = (
-    *("matching.controls", "matching.follower", "osm.taxonomy", "regions.evidence", "regions.graph", "regions.network"),
+    *("matching.controls", "matching.follower", "osm.taxonomy", "regions.evidence", "regions.graph"),
     *("search", "sasgeo", "tasks.vectors"),
 )
 # The same of segmentations; whoever segments looks at pictures by all of them.
-SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera", "sensing.intrinsics")
+SEGMENTER_TOOLS: Final = ("sensing.segmentation", "sensing.image", "sensing.camera")
 
 
 def matcher_code(spec: str) -> str:

@@ -23,7 +23,7 @@ from sasgeo_bench.progress import tell
 from sasgeo_bench.regions.region_files import read_manifest
 from sasgeo_bench.running.plan import RunPlan, RunRequest, plan_run, reach_of
 from sasgeo_bench.running.runner import map_bytes
-from sasgeo_bench.running.testing import EnergyMeter, clock_mhz, hottest_celsius, processor_name
+from sasgeo_bench.running.sensors import EnergyMeter, clock_mhz, hottest_celsius, processor_name
 from sasgeo_bench.running.training import trained
 from sasgeo_bench.running.worker import Limits, Worker
 

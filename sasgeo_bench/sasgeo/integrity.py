@@ -154,6 +154,9 @@ class Modes:
         return np.asarray(np.hypot(*(self.positions_m - self.positions_m[0]).T))
 
 
+RIVAL_SHARE: Final = 0.05  # least mass of a rival, relative to the chosen mode
+
+
 def evidence_of(modes: Modes, *, null: Null | None = None, **given: float | None) -> dict[str, float]:
     """Return the `EVIDENCE` of an answer that is available: finite numbers by name, in its order.
 
@@ -178,7 +181,7 @@ def evidence_of(modes: Modes, *, null: Null | None = None, **given: float | None
     found: dict[str, float | None] = {
         "margin_nats": modes.scores[0] - against,
         "posterior_entropy_nats": -(modes.masses * np.log(np.maximum(modes.masses, np.finfo(float).tiny))).sum(),
-        "modes_above": 1 + (modes.masses[rivals] >= 0.05 * modes.masses[0]).sum(),
+        "modes_above": 1 + (modes.masses[rivals] >= RIVAL_SHARE * modes.masses[0]).sum(),
         "spread_m": np.sqrt(modes.shares @ ((modes.positions_m - middle_m) ** 2).sum(axis=1)),
         "null_z": None if null is None or not null.deviation > 0 else (null.best - null.mean) / null.deviation,
         "class_agreement": _agreement(modes.by_class[0] - (0.0 if rival is None else modes.by_class[rival])),

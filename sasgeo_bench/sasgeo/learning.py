@@ -110,6 +110,9 @@ def around_views(
     return found, ChainMap(parts, regions)  # type: ignore[arg-type] # neither is written to
 
 
+_MARGIN_M: Final = 72.0  # of a part of a map, beyond what any view there shows
+
+
 def _box(query: Query, truth: Truth, grid: Grid) -> tuple[int, int, int, int]:
     """Return the cells around all places that a view may have, and around the true one: row, column, rows, columns."""
     pose = _pose(truth)
@@ -119,7 +122,7 @@ def _box(query: Query, truth: Truth, grid: Grid) -> tuple[int, int, int, int]:
     low, high = [], []
     for (row, col), radius_m in zip(grid.to_cells(middles_m).tolist(), reach_m, strict=True):
         # 72 m: margin of a part of a map, beyond what any view there shows
-        reach = math.ceil((radius_m + view_m + RINGS_M[-1] + 72.0) / grid.cell_size_m)
+        reach = math.ceil((radius_m + view_m + RINGS_M[-1] + _MARGIN_M) / grid.cell_size_m)
         low.append((row - reach, col - reach))
         high.append((row + reach, col + reach))
     (top, left), (bottom, right) = np.min(low, axis=0) // _UNIT * _UNIT, np.max(high, axis=0) // _UNIT * _UNIT + _UNIT
@@ -326,13 +329,16 @@ def _searched(
     return [one for one in lists if len(one.by_class) > 1]
 
 
+WRONG_M: Final = 25.0  # a mode this far from the truth is a wrong place
+
+
 def _list(query: Query, pose: Pose, reader: Reader, plan: Plan, classes: tuple[str, ...]) -> _ScoredModes:
     """Score the true pose of a view and the wrong modes that a search finds; 0 in classes that the map lacks."""
     reading = reader.read(query)
     modes = search(reader.field, reading.template, query.prior, plan, count=16).modes  # of each training search
     here = (pose.easting_m, pose.northing_m)
     # 25 m: a mode this far from the truth is a wrong place
-    wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > 25.0]
+    wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
     poses = [pose, *wrong]
     by_class = np.zeros((len(poses), len(classes)))
     by_class[:, [classes.index(name) for name in reader.region.classes]] = reading.by_class(poses)

@@ -99,6 +99,9 @@ CROWD_M: Final = 150.0  # around a node, where its like are counted
 _APART_M: Final = 1e4  # much more than any gate
 
 
+PAIRED_M: Final = (20.0, 230.0)  # of two junctions, on the ground
+
+
 @dataclass(frozen=True, kw_only=True)
 class MappedGraph:
     """Nodes of a map (easting, northing) as vectors and as masks show them.
@@ -153,7 +156,7 @@ class MappedGraph:
     def junction_pairs(self) -> dict[int, tuple[JunctionPairs, JunctionPairs]]:
         """Return pairs of junctions of each kind, once from either end."""
         # Of two junctions, on the ground
-        found = {kind: JunctionPairs.of(self.nodes, kind, range_m=(20.0, 230.0)) for kind in JUNCTIONS}
+        found = {kind: JunctionPairs.of(self.nodes, kind, range_m=PAIRED_M) for kind in JUNCTIONS}
         return {kind: (pairs, pairs.turned()) for kind, pairs in found.items()}
 
     def around(self, place_m: Floats, radius_m: float) -> Ints:

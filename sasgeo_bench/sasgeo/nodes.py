@@ -236,10 +236,13 @@ def nodes_of(graph: MapGraph, features: gpd.GeoDataFrame, drawing: Drawing) -> N
     return _blurred(found) if drawing == "mask" else found
 
 
+BLUR_M: Final = 8.0  # junctions nearer than this are one in a mask: a road's width
+
+
 def _blurred(nodes: Nodes) -> Nodes:
     """Merge nodes of one kind within a road's width."""
     # 8 m: junctions nearer than this are one in a mask: a road's width
-    near = cKDTree(nodes.places_m).query_pairs(8.0, output_type="ndarray") if len(nodes) else nodes.pairs
+    near = cKDTree(nodes.places_m).query_pairs(BLUR_M, output_type="ndarray") if len(nodes) else nodes.pairs
     near = near[nodes.kind[near[:, 0]] == nodes.kind[near[:, 1]]]
     links = coo_array((np.ones(len(near)), near.T), shape=(len(nodes), len(nodes)))
     group = nodes.kind
@@ -290,6 +293,9 @@ def _by_row(row: Ints, bearing: Floats, count: int) -> Floats:
     return table
 
 
+ARM_M: Final = 12.0  # along a road to where its direction is measured: past the curbs of a junction
+
+
 def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
     """Return bearings of the roads that leave places where a road begins, ends or forks.
 
@@ -323,7 +329,7 @@ def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
     line = np.repeat(np.arange(len(chains.length_m)), np.diff(chains.first))
     ways = shapely.linestrings(chains.en_m, indices=line)
     # 12 m: arm along a road to where its direction is measured: past the curbs of a junction
-    along_m = np.minimum(12.0, chains.length_m / 2)
+    along_m = np.minimum(ARM_M, chains.length_m / 2)
     points = (
         shapely.line_interpolate_point(ways, along_m),
         shapely.line_interpolate_point(ways, chains.length_m - along_m),
@@ -333,6 +339,9 @@ def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
     # The last row is for places that are no vertex.
     table = _by_row(vertex, bearing_deg(*away_m.T), len(network.vertices) + 1)
     return np.asarray(table[network.lookup(places_m)])
+
+
+TOUCH_M: Final = 0.5  # outlines nearer than this are one patch in a mask
 
 
 def patches_of(features: gpd.GeoDataFrame) -> Nodes:
@@ -354,7 +363,7 @@ def patches_of(features: gpd.GeoDataFrame) -> Nodes:
         if not len(chosen):
             continue
         shapes = all_shapes[chosen]
-        group = groups_within(shapes, 0.5)  # m: outlines nearer than this are one patch in a mask
+        group = groups_within(shapes, TOUCH_M)
         area_m2: Floats = np.bincount(group, weights=shapely.area(shapes)).astype(np.float64)
         weight = shapely.area(shapes) / area_m2[group]
         parts_m = [np.bincount(group, weights=weight * part) for part in centroids(shapes).T]

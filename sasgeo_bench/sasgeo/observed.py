@@ -50,6 +50,9 @@ def lines_of_mask(evidence: Evidence) -> gpd.GeoDataFrame:
     return vector_table(rows)
 
 
+_ROUGH_CELLS: Final = 0.75  # tolerance of the simplification of stairs
+
+
 def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.object_]:
     """Return the centre lines of a mask in (right, up) from its middle, metres; they end at forks."""
     closed = cv2.morphologyEx(present.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), dtype=np.uint8))
@@ -61,7 +64,7 @@ def middle_lines(present: NDArray[np.bool_], cell_size_m: float) -> NDArray[np.o
     lines = _merged(shapely.linestrings(places_m[ends]))
     lines = _merged(lines[~_is_spur(lines)])
     # 0.75 cells: tolerance of the simplification of stairs
-    return np.asarray(shapely.simplify(lines, 0.75 * cell_size_m), dtype=object)
+    return np.asarray(shapely.simplify(lines, _ROUGH_CELLS * cell_size_m), dtype=object)
 
 
 def _links(thin: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -86,13 +89,16 @@ def _merged(lines: NDArray[np.object_]) -> NDArray[np.object_]:
     return np.asarray(shapely.get_parts(shapely.line_merge(shapely.multilinestrings(lines))), dtype=object)
 
 
+SPUR_M: Final = 8.0  # shorter branches are corners of a broad line
+
+
 def _is_spur(lines: NDArray[np.object_]) -> NDArray[np.bool_]:
     tips_m = np.stack([shapely.get_coordinates(shapely.get_point(lines, at)) for at in (0, -1)], axis=1)
     _, tip = np.unique(tips_m.reshape(-1, 2), axis=0, return_inverse=True)
     tip = tip.reshape(-1, 2)
     ends = np.sort(np.bincount(tip.ravel())[tip], axis=1)
     # 8 m: shorter branches are corners of a broad line
-    return np.asarray((shapely.length(lines) < 8.0) & (ends[:, 0] == 1) & (ends[:, 1] >= _FORK))
+    return np.asarray((shapely.length(lines) < SPUR_M) & (ends[:, 0] == 1) & (ends[:, 1] >= _FORK))
 
 
 NEAR_M: Final = 80.0  # neighbours whose relative places are compared
@@ -184,6 +190,9 @@ def _from_vectors(vectors: gpd.GeoDataFrame, evidence: Evidence) -> Nodes:
     return nodes.taken(~is_house | is_whole[nodes.feature])
 
 
+LEAST_M2: Final = 12.0  # smaller patches are noise
+
+
 def _from_mask(evidence: Evidence, *, without: set[str]) -> Nodes:
     lines = lines_of_mask(evidence)
     ways = as_features(lines[~lines["class"].isin(without).to_numpy()])
@@ -193,9 +202,12 @@ def _from_mask(evidence: Evidence, *, without: set[str]) -> Nodes:
         (str(name), 0, False, shape)
         for table in shapes
         for name, shape in zip(table["class"], table.geometry, strict=True)
-        if shape.area >= 12.0  # m2: smaller patches are noise
+        if shape.area >= LEAST_M2
     ]
     return Nodes.joined([nodes_of(build_graph(ways), ways, "mask"), patches_of(as_features(vector_table(rows)))])
+
+
+BRIDGED_M: Final = 7.0  # facing ends of roads within this distance are one road: as far as a street is wide
 
 
 def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
@@ -208,7 +220,7 @@ def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     if len(free) < 2:  # a join has two ends
         return vectors
     # 7 m: facing ends of roads within this distance are one road: as far as a street is wide
-    pairs = cKDTree(places_m).query_pairs(7.0, output_type="ndarray")
+    pairs = cKDTree(places_m).query_pairs(BRIDGED_M, output_type="ndarray")
     ahead_deg = bearing_deg(*(places_m[pairs[:, 1]] - places_m[pairs[:, 0]]).T)
     off_deg = np.abs(
         np.stack((wrap_deg(arm_deg[pairs[:, 0]] + 180 - ahead_deg), wrap_deg(arm_deg[pairs[:, 1]] - ahead_deg)))
@@ -233,11 +245,14 @@ def _asked(evidence: Evidence, names: set[str], drawn: set[str]) -> Bools:
     return np.array(found)
 
 
+MARGIN_M: Final = 8.0  # along the border of known cells, where objects may be cut
+
+
 def _visible(evidence: Evidence) -> Bools:
     """Return where nearly all cells around are known in each set of classes; absent sets are known nowhere."""
     sights = np.zeros((len(_SIGHTS), *evidence.shape), dtype=bool)
     # 8 m: margin along the border of known cells, where objects may be cut
-    size = 2 * max(1, round(8.0 / evidence.cell_size_m)) + 1
+    size = 2 * max(1, round(MARGIN_M / evidence.cell_size_m)) + 1
     for into, classes in zip(sights, _SIGHTS, strict=True):
         layers = [evidence.layer(name) != UNKNOWN for name in classes if name in evidence.classes]
         if layers:

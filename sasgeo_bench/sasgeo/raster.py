@@ -40,8 +40,11 @@ _FIELD_VERSION: Final = 1  # raised whenever the same map and settings give othe
 CELL_M: Final = 2.0  # cells of a search: finer ones cost more and find no more
 
 
+REACH_M: Final = 4.0  # the paper's tau, by hand: OSM lines lie a few metres off
+
+
 # 4 m: the paper's tau, by hand: OSM lines lie a few metres off
-def likeness_by_hand(classes: Sequence[str], *, reach_m: float = 4.0) -> NDArray[np.float64]:
+def likeness_by_hand(classes: Sequence[str], *, reach_m: float = REACH_M) -> NDArray[np.float64]:
     """Return the likeness of cells near a class to cells on it, shape (C, FAR + 1): exp(-D^2 / 2 tau^2) for lines.
 
     Examples
@@ -152,6 +155,9 @@ def _share(
     return np.asarray(cv2.resize(marked, (grid.cols, grid.rows), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
+DOUBT_M: Final = 8.0  # around a seen line: a mapped line there may be the same
+
+
 def doubted(evidence: Evidence) -> Evidence:
     """Return a view with absent cells near a seen line as unknown: a line mapped there may be the same.
 
@@ -162,7 +168,7 @@ def doubted(evidence: Evidence) -> Evidence:
         if name in load_taxonomy().lines and (layer == PRESENT).any():
             off = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
             # 8 m: doubt around a seen line: a mapped line there may be the same
-            layer[(layer == ABSENT) & (off * evidence.cell_size_m <= 8.0)] = UNKNOWN
+            layer[(layer == ABSENT) & (off * evidence.cell_size_m <= DOUBT_M)] = UNKNOWN
     return Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
 
 

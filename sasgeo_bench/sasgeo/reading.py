@@ -203,6 +203,9 @@ class Reader:
         return Reading(reader=self, query=query)
 
 
+LEAST_SIGMA_M: Final = 1.0  # of a refined position: half a cell of the search
+
+
 @dataclass(frozen=True, kw_only=True)
 class Reading:
     """A view on a map, with its template, graph and scores."""
@@ -290,7 +293,7 @@ class Reading:
         here, east, west, north, south = (self.by_class(poses) * self.reader.model.scaling).sum(axis=1).tolist()
         bend = min(2 * here - east - west, 2 * here - north - south) / _STEP_M**2
         # 1 m: least sigma of a refined position: half a cell of the search
-        return float(np.clip(1 / math.sqrt(bend), 1.0, MOST_SIGMA_M)) if bend > 0 else MOST_SIGMA_M
+        return float(np.clip(1 / math.sqrt(bend), LEAST_SIGMA_M, MOST_SIGMA_M)) if bend > 0 else MOST_SIGMA_M
 
     @cached_property
     def information_nats(self) -> float:

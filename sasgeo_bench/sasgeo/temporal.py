@@ -142,6 +142,9 @@ class _Rival:
     views: int = 0
 
 
+_USUAL_M: Final = 50.0  # between two views, where no odometer says it
+
+
 class SasgeoTrack:
     """The scorer's raster over time, with the parts that `switches` and `over_time` select.
 
@@ -214,7 +217,7 @@ class SasgeoTrack:
 
     def _way_m(self, step: Step) -> float:
         if not self.over_time.has_odometry:
-            return 50.0  # m between two views, where no odometer says it
+            return _USUAL_M
         return math.inf if step.increment is None else math.hypot(*step.increment[:2])
 
     def _moved(self, belief: GridBelief, step: Step) -> GridBelief:
@@ -280,6 +283,9 @@ class SasgeoTrack:
         return weighed
 
 
+_AROUND_M: Final = 450.0  # radius of the places that a view is held against
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Scored:
     """A view, to be scored at poses of a map: log-likelihood ratios times a weight."""
@@ -303,7 +309,7 @@ class _Scored:
                 self.field,
                 self.template,
                 center_m=center_m,
-                radius_m=450.0,  # radius of the places that a view is held against
+                radius_m=_AROUND_M,
                 yaws_deg=np.arange(0.0, 360.0, _AROUND_DEG),
                 factor=4,
                 scale=self.scale,

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from sasgeo_baselines.segmenters import crops, network, unet
+from sasgeo_baselines.segmenters import network, unet
 from sasgeo_baselines.segmenters.unet import UNet
 from sklearn.metrics import roc_auc_score
 
@@ -122,10 +122,10 @@ def test_a_crop_holds_the_labels_of_what_it_shows():
     rgb = np.zeros((300, 300, 3), dtype=np.uint8)
     rgb[100:200, 120:260] = 200
     labels = (rgb[None, :, :, 0] > 0).astype(np.uint8)
-    picture = crops.LearningPicture(rgb=rgb, labels=labels, sample=rgb.reshape(-1, 3)[::20])
+    picture = unet.LearningPicture(rgb=rgb, labels=labels, sample=rgb.reshape(-1, 3)[::20])
     for seed in range(5):
-        planes, found = crops.Crops(pictures=[picture], classes=(0,)).batch(2, RNG(seed), is_by_class=True)
-        assert planes.shape == (2, network.BANDS, crops.CROP_PX, crops.CROP_PX)
+        planes, found = unet.Crops(pictures=[picture], classes=(0,)).batch(2, RNG(seed), is_by_class=True)
+        assert planes.shape == (2, network.BANDS, unet.CROP_PX, unet.CROP_PX)
         bright, truth = planes[1, 0], found[1, 0]
         assert (truth == sgb.PRESENT).any()
         known = truth != sgb.UNKNOWN
@@ -134,8 +134,8 @@ def test_a_crop_holds_the_labels_of_what_it_shows():
 
 def test_beyond_a_picture_nothing_is_labelled():
     rgb = np.full((20, 20, 3), 90, dtype=np.uint8)
-    picture = crops.LearningPicture(rgb=rgb, labels=np.zeros((1, 20, 20), dtype=np.uint8), sample=rgb[0])
-    _, found = crops.Crops(pictures=[picture], classes=(0,)).batch(4, RNG(0), is_by_class=False)
+    picture = unet.LearningPicture(rgb=rgb, labels=np.zeros((1, 20, 20), dtype=np.uint8), sample=rgb[0])
+    _, found = unet.Crops(pictures=[picture], classes=(0,)).batch(4, RNG(0), is_by_class=False)
     assert (found == sgb.UNKNOWN).mean() > 0.9
     assert (found == sgb.ABSENT).any()
 
@@ -143,7 +143,7 @@ def test_beyond_a_picture_nothing_is_labelled():
 def test_of_many_or_large_pictures_a_part_is_kept():
     large = with_picture(np.zeros((700, 900, 3), dtype=np.uint8))
     labelled = sgb.LabelledImage(image=large, classes=("water",), labels=np.zeros((1, 700, 900), np.uint8), place="x")
-    kept = crops.LearningPicture.of(labelled, most_px=50, rng=RNG(0))
+    kept = unet.LearningPicture.of(labelled, most_px=50, rng=RNG(0))
     assert kept.rgb.shape[:2] == kept.labels.shape[1:] == (50, 50)
     assert len(kept.sample) == 4000  # of the whole picture
 

@@ -29,18 +29,18 @@ CODE = Path(sasgeo_bench.__file__).parent
 READS = {"read_bytes", "read_text"}
 OPENERS = {"rasterio.open", "Image.open", "tarfile.open", "gzip.open", "pq.ParquetFile", "np.load", "open_memmap"}
 # Files of the kernel; and reads of what ships with the package, or what the same function has just written.
-APART = {f"running/{name}.py" for name in ("kernel", "memory", "root", "sandbox", "sensors")}
+APART = {f"running/{name}.py" for name in ("kernel", "memory", "sandbox", "sensors")}
 OWN = {
     ("config.py", "path.read_text"),  # which looks by itself: folders stand below it
     ("experiments/head_start.py", "tarfile.open"),  # of bytes
     ("flights/drift_profile.py", "file.read_text"),
     ("matching/follower.py", "Path(module).read_bytes"),
-    ("files/plugin_files.py", "found.read_text"),  # of what is installed
+    ("files/plugins.py", "found.read_text"),  # of what is installed
     ("publishing/site.py", "vendor.joinpath(name).read_text"),
     ("publishing/site_files.py", "path.read_text"),
     ("regions/ortho.py", "rasterio.open"),  # a view of a file that is open, in memory
-    ("files/code_hash.py", "(_PACKAGE / '__init__.pyi').read_bytes"),
-    ("running/recalibration.py", "path.read_bytes"),
+    ("files/plugins.py", "(_PACKAGE / '__init__.pyi').read_bytes"),
+    ("running/training.py", "path.read_bytes"),
     ("sensing/image.py", "Image.open"),
 }
 

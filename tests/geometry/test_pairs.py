@@ -19,10 +19,10 @@ CODE = Path(sasgeo_bench.__file__).parent
 # How many trees are asked otherwise: for what is near single places, a tile or the sides of a box, or the nearest
 # alone; or about what was looked at by `overlapping` when its region was built.
 APART = {
-    "geometry/pairs.py": 1,
-    **dict.fromkeys(("osm/box_cut.py", "osm/mapped.py", "osm/synthetic/sketch.py", "regions/offset.py"), 1),
-    **dict.fromkeys(("ageing/pairing.py", "sasgeo/nodes.py"), 1),
-    **{f"tasks/suites/{name}.py": 1 for name in ("twins", "measured_vectors", "volatile_lure", "mining")},
+    "geometry/pose.py": 1,
+    **dict.fromkeys(("osm/read.py", "osm/mapped.py", "osm/synthetic/sketch.py", "regions/build.py"), 1),
+    **dict.fromkeys(("ageing/measure.py", "sasgeo/nodes.py"), 1),
+    **{f"tasks/suites/{name}.py": 1 for name in ("twins", "vectors", "ages", "mining")},
 }
 
 

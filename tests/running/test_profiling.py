@@ -14,9 +14,9 @@ import pytest
 from sasgeo_bench.errors import ConfigError, MatchError, StoreError
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.publishing.profile_page import FIGURE, PAGE, RECORD, facts, write_profile
-from sasgeo_bench.running import profiling, testing
+from sasgeo_bench.running import profiling, sensors
 from sasgeo_bench.running.profiling import Fix, Profile, ProfileRequest, Reading, profile
-from sasgeo_bench.running.testing import EnergyMeter, hottest_celsius, processor_name
+from sasgeo_bench.running.sensors import EnergyMeter, hottest_celsius, processor_name
 from sasgeo_bench.tasks.task_files import read_queries
 
 BASE = {"matcher": "mine", "version": "2", "region": "vaduz", "km2": 16.0, "suites": ("clean",), "queries": 7}
@@ -198,4 +198,4 @@ def test_the_kernel_is_read_where_it_tells_something(tmp_path):
     (tmp_path / "cpuinfo").write_text("processor : 0\nmodel name\t: A Small One\n")
     assert processor_name(tmp_path / "cpuinfo") == "A Small One"
     assert processor_name(tmp_path / "none")
-    assert testing.clock_mhz() is None or testing.clock_mhz() > 0
+    assert sensors.clock_mhz() is None or sensors.clock_mhz() > 0

@@ -25,7 +25,6 @@ PROGRAM = """
 import json, os, sys
 sys.path.append(sys.argv[1])
 from sasgeo_bench.running import kernel
-from sasgeo_bench.running import root
 from sasgeo_bench.running import sandbox
 def refused(*given):
     raise OSError(1, "not here")

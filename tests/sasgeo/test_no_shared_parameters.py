@@ -31,12 +31,12 @@ ARGUED: Mapping[str, str] = {
     "class_weights.py:AGES_YEARS = 5": "rows of a printed table; no weight depends on them",
     "class_weights.py:AGES_YEARS = 10": "rows of a printed table; no weight depends on them",
     "graph.py:_SLACK_M = 1": "rounds a search radius up; changes no score",
-    "graph_rules.py:gate_m = 12": "starting value: two of place_sigma_m; replaced on train places",
-    "graph_rules.py:place_sigma_m = 6": "starting value: how far roads of OSM are off; replaced on train places",
-    "graph_rules.py:shift_m = 20": "starting value: three of place_sigma_m, rounded; replaced on train places",
-    "graph_rules.py:stretch_m = 35": "starting value: nodes farther apart share no shift; replaced on train places",
-    "graph_rules.py:edge_sigma_m = 2": "starting value: a cell of the search; replaced on train places",
-    "graph_rules.py:arm_sigma_deg = 15": "starting value of the angle of a road; the other is the tilt of a camera",
+    "graph.py:gate_m = 12": "starting value: two of place_sigma_m; replaced on train places",
+    "graph.py:place_sigma_m = 6": "starting value: how far roads of OSM are off; replaced on train places",
+    "graph.py:shift_m = 20": "starting value: three of place_sigma_m, rounded; replaced on train places",
+    "graph.py:stretch_m = 35": "starting value: nodes farther apart share no shift; replaced on train places",
+    "graph.py:edge_sigma_m = 2": "starting value: a cell of the search; replaced on train places",
+    "graph.py:arm_sigma_deg = 15": "starting value of the angle of a road; the other is the tilt of a camera",
     "observed.py:NEAR_M = 80": "reach of a node's surroundings; the other is the height of a flight",
     "observed.py:_FACING_DEG = 30": "between a road and a border; the other is the tilt of a camera",
     "integrity.py:APART_M = 25": "the widest tolerance of the benchmark's success",
@@ -62,7 +62,7 @@ ARGUED: Mapping[str, str] = {
     "reading.py:LEAST_SIGMA_M = 1": "half a cell of the search",
     "reading.py:MOST_SIGMA_M = 25": "the widest tolerance of the benchmark's success",
     "reading.py:_STEP_M = 4": "two cells of the search",
-    "rule_fitting.py:_LEAST_SHARE = 0.01": "keeps logarithms finite",
+    "rejectors.py:_LEAST_SHARE = 0.01": "keeps logarithms finite",
 }
 
 

@@ -62,6 +62,9 @@ def rates_by_hand() -> dict[str, Rates]:
     }
 
 
+_LARGEST_SHARE: Final = 0.1  # of the view, for an object to be copied
+
+
 @dataclass(frozen=True, kw_only=True)
 class Ageing:
     """Let years pass between the map and the view.
@@ -156,7 +159,7 @@ class Ageing:
         """Add new objects in place, and clear the ground cover below them."""
         found = growth.objects
         # 0.1: largest share of the view, for an object to be copied
-        usable = np.flatnonzero(found.areas_cells <= 0.1 * found.labels.size)
+        usable = np.flatnonzero(found.areas_cells <= _LARGEST_SHARE * found.labels.size)
         mean = np.expm1(self.rates[name].appear_per_year * self.years) * len(found.areas_cells)
         count = _MOST_NEW if growth.cells is not None else min(int(rng.poisson(mean)), _MOST_NEW)
         if not count or not len(usable):
@@ -255,6 +258,9 @@ def _turned(footprint: Mask, rng: np.random.Generator) -> Mask:
     return np.rot90(footprint[:, ::-1] if mirrored else footprint, quarters)
 
 
+_NEAR_M: Final = 60.0  # largest distance of a new object from the one it copies
+
+
 def _free_window(
     footprint: Mask, box: tuple[slice, ...], taken: Mask, cell_size_m: float, rng: np.random.Generator
 ) -> tuple[slice, slice] | None:
@@ -263,7 +269,7 @@ def _free_window(
     size = np.array(footprint.shape)
     middle = np.array([(part.start + part.stop) / 2 for part in box])
     # 60 m: largest distance of a new object from the one it copies
-    away = size.max() + rng.uniform(0, 60.0 / cell_size_m, size=(_TRIES, 1))
+    away = size.max() + rng.uniform(0, _NEAR_M / cell_size_m, size=(_TRIES, 1))
     heading = rng.uniform(0, 2 * np.pi, size=_TRIES)
     corners = middle + away * np.column_stack((np.sin(heading), np.cos(heading))) - size / 2
     for row, col in corners.astype(int).tolist():

@@ -21,6 +21,8 @@ _ROW_WAVES: Final = 6  # of the shake of a camera
 _ALONG_SHARE: Final = 0.2  # of the mean square shift
 
 Floats = NDArray[np.float64]
+_ACROSS_M: Final = (40.0, 120.0)  # its wavelengths on the ground: shifts along a row shear and never fold
+_ALONG_M: Final = (150.0, 400.0)  # shifts across the rows squeeze the view, so they change slowly
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,7 +104,7 @@ class RowJitter(Warp):
         shakes = []
         # Its wavelengths on the ground: shifts along a row shear and never fold
         # Shifts across the rows squeeze the view, so they change slowly
-        for lengths_m, share in zip(((40.0, 120.0), (150.0, 400.0)), shares, strict=True):
+        for lengths_m, share in zip((_ACROSS_M, _ALONG_M), shares, strict=True):
             phase = rng.uniform(0, 2 * np.pi, _ROW_WAVES)
             shake = np.sin(2 * np.pi * up_m / rng.uniform(*lengths_m, _ROW_WAVES) + phase).sum(axis=1, keepdims=True)
             shake -= shake.mean()

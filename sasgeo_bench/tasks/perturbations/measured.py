@@ -92,6 +92,18 @@ def _spread(classes: Sequence[str], streams: Streams) -> NDArray[np.float64]:
     return whole * np.array(own)
 
 
+OUTLINE_M: Final = 25.0  # length of the stretches over which outlines bulge or shrink
+
+
+HIDDEN_M: Final = 30.0  # length of hidden stretches of lines
+
+
+ALARM_M2: Final = 30.0  # median area of a false building
+
+
+_ROUNDED_M: Final = 0.8  # corners are rounded by a blur of this deviation
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _View:
     """One clean view; `ground` is where no class, or bare ground, is; `yards` the part beside roads and buildings."""
@@ -132,7 +144,7 @@ class _View:
         """Return the noise of a class's outline: it bulges where this is high, and shrinks where it is low."""
         if name not in self.outlines:
             # 25 m: length of the stretches over which outlines bulge or shrink
-            self.outlines[name] = self.noise(25.0, rng)
+            self.outlines[name] = self.noise(OUTLINE_M, rng)
         return self.outlines[name]
 
     def any_of(self, names: tuple[str, ...]) -> Mask:
@@ -159,10 +171,10 @@ class _View:
         limit = errors.small_share * max(budget, 1.0)
         kept &= ~self._small(kept, errors.small_m2, min(factor, 1.0), limit, rng)
         if name in load_taxonomy().lines:
-            score = self.noise(30.0, rng)  # m: length of hidden stretches of lines
+            score = self.noise(HIDDEN_M, rng)
         else:
             # 0.8 m: corners are rounded by a blur of this deviation
-            kept &= _rounded(mask, 0.8 * min(factor, 2.0) / self.cell_m)
+            kept &= _rounded(mask, _ROUNDED_M * min(factor, 2.0) / self.cell_m)
             score = -errors.bulge_m * self.outline(name, rng) - self._depth_m(mask)
         rest = lost * total - (total - np.count_nonzero(kept))
         return kept & (score < highest_within(score, kept, rest, rng)) if rest > 0 else kept
@@ -238,7 +250,7 @@ class _View:
 
     def _add_blocks(self, seen: Mask, free: Mask, budget: float, rng: np.random.Generator) -> None:
         """Add false buildings, of any direction and smaller than most houses."""
-        median = 30.0 / self.cell_m**2  # 30 m2: median area of a false building
+        median = ALARM_M2 / self.cell_m**2
         tries = int(_TRIES * budget / median) + 1
         areas = median * rng.lognormal(0.0, 0.7, size=tries)
         slim = rng.uniform(0.7, 1.0, size=tries)

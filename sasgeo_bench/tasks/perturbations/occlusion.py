@@ -132,6 +132,9 @@ HIDDEN: Final = tuple(name for name in load_taxonomy().lines if name in load_tax
 _SHADOW_M: Final = 8.0  # length of a building's shadow
 
 
+_PATCH_M: Final = 8.0  # width of a crown, or of a gap between crowns
+
+
 class CanopyAndShadow(Occlusion):
     """Make lines unknown under trees and in shadows; `share` is that of the shaded cells.
 
@@ -143,9 +146,12 @@ class CanopyAndShadow(Occlusion):
         """Return the part of the shade where the noise is strongest, for the line classes."""
         shade = shaded(evidence, rng.uniform(0, 360))
         # 8 m: width of a crown, or of a gap between crowns
-        noise = smooth_noise(evidence.shape, 8.0 / evidence.cell_size_m, rng)
+        noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
         hidden = shade & (noise >= highest(noise[shade], self.share * np.count_nonzero(shade)))
         return np.asarray(hidden & np.isin(evidence.classes, HIDDEN)[:, None, None])
+
+
+_OVERHANG_M: Final = 4.0  # of crowns over the edge of green
 
 
 def shaded(evidence: Evidence, sun_deg: float) -> Mask:
@@ -153,7 +159,7 @@ def shaded(evidence: Evidence, sun_deg: float) -> Mask:
     shade = np.zeros(evidence.shape, dtype=bool)
     if "green" in evidence.classes:
         # 4 m: overhang of crowns over the edge of green
-        shade |= dilated(evidence.layer("green") == PRESENT, 4.0 / evidence.cell_size_m)
+        shade |= dilated(evidence.layer("green") == PRESENT, _OVERHANG_M / evidence.cell_size_m)
     if "building" in evidence.classes and evidence.cell_size_m <= _SHADOW_M:
         building = evidence.layer("building") == PRESENT
         shade |= shadow(building, sun_deg, _SHADOW_M / evidence.cell_size_m)

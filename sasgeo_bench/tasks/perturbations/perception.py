@@ -118,6 +118,12 @@ class Perception:
         ]
 
 
+GAP_M: Final = 12.0  # width of gaps along lines
+
+
+STUB_M: Final = 25.0  # mean length of a false line
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Look:
     """One class in one view, and the errors that the detector makes on it."""
@@ -164,7 +170,7 @@ class _Look:
 
     def _lose_line(self, mask: Mask, budget_cells: float, rng: np.random.Generator) -> tuple[Mask, Mask]:
         """Cut gaps, then move the rest by a cell here and there; return what is left and the gaps."""
-        noise = self.noise(12.0, rng)  # m: width of gaps along lines
+        noise = self.noise(GAP_M, rng)
         # A gap counts only where no line is left within the tolerance, so its ends do not: rank the weakest noise
         # around each cell instead of its own.
         around = cv2.erode(np.ascontiguousarray(noise), np.ones((3, 3), dtype=np.uint8))
@@ -210,7 +216,7 @@ class _Look:
         # OpenCV draws thickness 1 one cell wide and even thicknesses one cell wider, diagonals included.
         thickness = max(1, 2 * int(self.errors.width_m / self.cell_size_m / 2 + 0.25))
         width_cells = thickness + (thickness > 1)
-        length_cells = 25.0 / self.cell_size_m  # m: mean length of a false line
+        length_cells = STUB_M / self.cell_size_m
         # 0.85 of the cells of a false line; the others are present already or outside the view
         per_stub = 0.85 * (length_cells + width_cells / 2) * width_cells
         count = int(budget_cells / per_stub + rng.random())  # random rounding, so that the mean is the budget

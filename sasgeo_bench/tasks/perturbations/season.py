@@ -31,6 +31,12 @@ Layers = dict[str, NDArray[np.uint8]]
 CHANGED: Final[dict[Kind, tuple[str, ...]]] = {kind: load_taxonomy().touched_by(kind) for kind in get_args(Kind)}
 
 
+_PATCH_M: Final = 25.0  # width of the patches that change; fields change as a whole
+
+
+_RETREAT_M: Final = 12.0  # of the waterline at strength 1, from a gentle bank
+
+
 @dataclass(frozen=True, kw_only=True)
 class Season:
     """See the ground in a season that the map does not know.
@@ -58,7 +64,7 @@ class Season:
         cells = evidence.cells.copy()
         layers = dict(zip(evidence.classes, cells, strict=True))
         # 25 m: width of the patches that change; fields change as a whole
-        noise = smooth_noise(evidence.shape, 25.0 / evidence.cell_size_m, rng)
+        noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
         if self.kind == "leaf_on":
             _clear(layers, CHANGED[self.kind], _strongest(noise, _of(layers, "green"), self.strength))
         elif self.kind == "snow":
@@ -75,7 +81,7 @@ class Season:
                 from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * evidence.cell_size_m
                 gentle = np.clip(1 + noise / 2, 0.2, 2.0)
                 # The waterline retreats by 12 m at strength 1, from a gentle bank
-                _clear(layers, ("water",), water & (from_bank_m <= self.strength * 12.0 * gentle))
+                _clear(layers, ("water",), water & (from_bank_m <= self.strength * _RETREAT_M * gentle))
             # A line within a lake or broad river does not fall dry before the water around it.
             _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
         else:

@@ -219,10 +219,13 @@ def _frame(evidence: Evidence) -> shapely.Polygon:
     return shapely.box(-width_m / 2, -height_m / 2, width_m / 2, height_m / 2)
 
 
+ARM_WIDTH_M: Final = 4.0  # of that road, where cells are made of it
+
+
 def _drawn(evidence: Evidence, lines: Sequence[shapely.Geometry]) -> Evidence:
     cells = np.full(evidence.cells.shape, UNKNOWN, dtype=np.uint8)
     if lines and "road_minor" in evidence.classes:
-        near = shapely.union_all(lines).buffer(4.0 / 2)  # 4 m: arm width of that road, where cells are made of it
+        near = shapely.union_all(lines).buffer(ARM_WIDTH_M / 2)
         middles_m = cell_offsets_m(evidence.shape, evidence.cell_size_m)
         is_road = shapely.contains_xy(near, middles_m[:, 0], middles_m[:, 1]).reshape(evidence.shape)
         cells[evidence.classes.index("road_minor"), is_road] = PRESENT

@@ -247,14 +247,20 @@ VOLATILE: Final = tuple(item.name for item in load_taxonomy().classes if item.vo
 STABLE: Final = tuple(item.name for item in load_taxonomy().classes if not item.volatile)
 
 
+_NEAR_M: Final = 40.0
+
+
 def _mixed(scene: Scene) -> NDArray[np.float64]:
     """Return centres of buildings near something stable: a lure needs both."""
     features = scene.map.features[scene.map.features["is_visible"].to_numpy()]
     shapes = features.geometry.to_numpy()
     centres = shapely.centroid(shapes[(features["class"] == "building").to_numpy()])
     stable = shapely.STRtree(shapes[features["class"].isin(STABLE).to_numpy()])
-    near = np.unique(stable.query(centres, predicate="dwithin", distance=40.0)[0])
+    near = np.unique(stable.query(centres, predicate="dwithin", distance=_NEAR_M)[0])
     return np.asarray(shapely.get_coordinates(centres[near])).reshape(-1, 2)
+
+
+CHANGED_M: Final = 60.0  # radius of what differs: a third of a view; the rest is the same at both places
 
 
 class VolatileLure(TwinSuite):
@@ -273,7 +279,7 @@ class VolatileLure(TwinSuite):
         """
         plain = super().edit(scene, sites, seeds)
         # 60 m: radius of what differs: a third of a view; the rest is the same at both places
-        middle = partial(mirror, within_m=60.0)
+        middle = partial(mirror, within_m=CHANGED_M)
         lures = [
             replace(item, change=partial(middle, classes=(*VOLATILE, *STABLE), center_m=item.source_m))
             for item in plain.map_pastes

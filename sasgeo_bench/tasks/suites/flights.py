@@ -345,6 +345,9 @@ FLIGHT_OFF_MAP: Final = FlightOffMapSuite(
 _RIM_M: Final = 8.0  # copied beyond what views show: cells at the rim of a copy may differ
 
 
+_ON_PATH_M: Final = 1.0  # nearer to the stretch, a view sees what was copied
+
+
 class FlightAliasSuite(ChangedMapSuite):
     """One map shows the ground of the first stretch a second time, the other one shows it there as in a mirror."""
 
@@ -366,7 +369,7 @@ class FlightAliasSuite(ChangedMapSuite):
             return None
         for stretch_m in stretches_m(float(flown_m[-1])):
             # 1 m: nearer to the stretch, a view sees what was copied
-            hull = shapely.MultiPoint(place_m[flown_m <= stretch_m]).convex_hull.buffer(1.0)
+            hull = shapely.MultiPoint(place_m[flown_m <= stretch_m]).convex_hull.buffer(_ON_PATH_M)
             area = hull.buffer(ground.reach_m + _RIM_M)
             # 1.25 of the stretch, at most, is flown over the copied ground: who comes back knows it by then
             is_left = lengths_within(hull, place_m, flown_m).sum() <= 1.25 * stretch_m
@@ -519,6 +522,12 @@ def _flight(variant: Variant) -> Flight:
     return Flight(conditions=lambda ordinary: replace(ordinary, season=season))
 
 
+EVERY_M: Final = (80.0, 120.0)  # flown between two pictures, on average: rendering takes most of the time
+
+
+LONGEST_M: Final = 2000.0
+
+
 FLIGHT_IMAGE: Final = FlightImageSuite(
     card=SuiteCard(
         name="flight-image",
@@ -542,8 +551,8 @@ FLIGHT_IMAGE: Final = FlightImageSuite(
         Variant(role="falsifier", kind="summer again"),
     ),
     flight=_flight,
-    every_m=(80.0, 120.0),  # flown between two pictures, on average: rendering takes most of the time
-    longest_m=2000.0,
+    every_m=EVERY_M,
+    longest_m=LONGEST_M,
 )
 
 

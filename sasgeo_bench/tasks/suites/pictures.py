@@ -157,6 +157,9 @@ def _unseen(classes: tuple[str, ...], size_cells: int, cell_size_m: float) -> Ev
     return Evidence(classes=classes, cells=cells, cell_size_m=cell_size_m)
 
 
+_MOST_TILT_DEG: Final = 60.0  # of optical axes: the middle of a view must be seen
+
+
 def stands_of(shot: Shot, flight: Flight) -> list[Stand]:
     """Return where the cameras of a shot stood, and where they are believed to have stood, oldest first."""
     flown = [Pose(easting_m=right_m, northing_m=ahead_m, yaw_deg=0.0) for right_m, ahead_m in flight.stops_m]
@@ -167,7 +170,7 @@ def stands_of(shot: Shot, flight: Flight) -> list[Stand]:
     for stop, place, drawn in zip(flown, said, angles_deg, strict=True):
         body = BODY_SIGMA_DEG * drawn[:2] if flight.is_fixed else np.zeros(2)
         # 60 degrees of tilt of optical axes: the middle of a view must be seen
-        tilt_deg, roll_deg = min(flight.tilt_deg + float(body[0]), 60.0), float(body[1])
+        tilt_deg, roll_deg = min(flight.tilt_deg + float(body[0]), _MOST_TILT_DEG), float(body[1])
         off = (ATTITUDE_SIGMA_DEG * drawn[2:]).tolist()
         distance_m = math.hypot(stop.easting_m, stop.northing_m)
         found.append(
@@ -270,8 +273,11 @@ FRAME, DRIFT = "P6 frames", "P6 drift"
 _STANDING: Final = "standing still"
 
 
+_HEIGHT_M: Final = 80.0
+
+
 def _accumulated_flight(variant: Variant) -> Flight:
-    count, plain = int(variant.strength) or 1, Flight(height_m=80.0)
+    count, plain = int(variant.strength) or 1, Flight(height_m=_HEIGHT_M)
     if variant.kind == _STANDING:
         return replace(plain, stops_m=((0.0, 0.0),) * len(STOPS_M))
     bad = 5.0 if variant.kind == DRIFT else 1.0  # 5 times the drift

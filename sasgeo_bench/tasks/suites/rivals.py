@@ -36,6 +36,7 @@ MODES: Final = 20
 NEAR_M: Final = 25.0  # from a place to the mode that stands for it
 
 Place = tuple[float, float]
+_MARGIN_M: Final = 32.0  # around the largest view, for cells of the coarsest level
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +121,7 @@ def plain_modes(state: State, seen: Evidence, prior: Prior) -> tuple[Mode, ...]:
     template = Template(weights=bands[:-1], known=bands[-1], cell_size_m=frame.cell_size_m)
     # 32 m: margin around the largest view, for cells of the coarsest level
     # 2.5: standard deviations of the scale that the search tries (`search.plan.Plan.spread`)
-    reach_m = template.reach_m * (1 + 2.5 * prior.scale_sigma) + 32.0
+    reach_m = template.reach_m * (1 + 2.5 * prior.scale_sigma) + _MARGIN_M
     return search(field_of(state, seen.classes, prior, reach_m=reach_m), template, prior, count=MODES).modes
 
 

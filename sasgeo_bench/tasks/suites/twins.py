@@ -235,9 +235,12 @@ _SEEN_M: Final = 90.0
 _FEWEST_X: Final = 2
 
 
+_PAIR_M: Final = 125.0  # between two junctions that one view shows
+
+
 def _junctions(scene: Scene) -> NDArray[np.float64]:
     # 125 m between two junctions that one view shows
-    return with_neighbours(places_of(nodes_of(scene, ["intersection"], least_degree=3)), within_m=125.0)
+    return with_neighbours(places_of(nodes_of(scene, ["intersection"], least_degree=3)), within_m=_PAIR_M)
 
 
 def _near(scene: Scene, site: Site, *, least_degree: int) -> NDArray[np.float64]:
@@ -245,15 +248,21 @@ def _near(scene: Scene, site: Site, *, least_degree: int) -> NDArray[np.float64]
     return np.asarray(places[np.hypot(*(places - site.en_m).T) < _SEEN_M])
 
 
+GAP_M: Final = 2.0  # one or two cells: perception's own gaps are as wide
+
+
+OFFSET_M: Final = 5.0  # between two T-junctions: less than the width of a road
+
+
 def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
     """Split X-junctions into two T-junctions at half of the sites that have some; open gaps at all others."""
     crossings = _near(scene, site, least_degree=4)
     if len(crossings) >= _FEWEST_X and rng.random() < 0.5:  # half of them
         # 5 m between two T-junctions: less than the width of a road
-        return lambda piece: stagger(piece, crossings, offset_m=5.0, rng=rng)
+        return lambda piece: stagger(piece, crossings, offset_m=OFFSET_M, rng=rng)
     near = _near(scene, site, least_degree=3)
     # 2 m: one or two cells: perception's own gaps are as wide
-    return lambda piece: open_gaps(piece, near, gap_m=2.0, rng=rng)
+    return lambda piece: open_gaps(piece, near, gap_m=GAP_M, rng=rng)
 
 
 class TopologyTwins(TwinSuite):
@@ -271,12 +280,15 @@ class TopologyTwins(TwinSuite):
         return shot.perceived(either(shot.clean(), other, shot.rng("junctions")))
 
 
+_ONE_PATCH_CELLS: Final = 4  # differing cells within this distance belong to one junction
+
+
 def either(own: Evidence, other: Evidence, rng: np.random.Generator) -> Evidence:
     """Take each patch of differing cells from one of two views, by lot."""
     differ = (own.cells != other.cells).any(axis=0)
     square = np.ones((3, 3), dtype=bool)
     # Differing cells within this distance belong to one junction
-    near = scipy.ndimage.binary_dilation(differ, structure=square, iterations=4 // 2)
+    near = scipy.ndimage.binary_dilation(differ, structure=square, iterations=_ONE_PATCH_CELLS // 2)
     patch, count = scipy.ndimage.label(near, structure=square)
     is_other = np.concatenate(([False], rng.random(count) < 0.5))[patch]  # half of them
     return own.replace(np.where(is_other, other.cells, own.cells))
@@ -401,12 +413,15 @@ GRADE_SEPARATION: Final = GradeSeparation(
 LEAST_AREA_M2: Final = 160.0
 
 
+_NEAR_M: Final = 70.0
+
+
 def _halls(scene: Scene) -> NDArray[np.float64]:
     features = scene.map.features
     chosen = features[(features["class"] == "building").to_numpy() & features["is_visible"].to_numpy()]
     shapes = chosen.geometry.to_numpy()
     large = shapes[shapely.area(shapes) >= LEAST_AREA_M2]
-    return with_neighbours(shapely.get_coordinates(shapely.centroid(large)).reshape(-1, 2), within_m=70.0)
+    return with_neighbours(shapely.get_coordinates(shapely.centroid(large)).reshape(-1, 2), within_m=_NEAR_M)
 
 
 class InstanceTwins(TwinSuite):
@@ -418,6 +433,9 @@ class InstanceTwins(TwinSuite):
         if shot.variant.role != "falsifier":
             return draft
         return replace(draft, vectors=instances_of_mask(draft.evidence))
+
+
+HOUSE_M: Final = 7.0
 
 
 INSTANCE_TWINS: Final = InstanceTwins(
@@ -436,7 +454,7 @@ INSTANCE_TWINS: Final = InstanceTwins(
     ),
     variants=pair("no vectors", "G3", "instances of the mask"),
     change_of=lambda scene, site, rng: (  # noqa: ARG005 - the same at every site
-        lambda piece: split_long(piece, piece_m=7.0, least_area_m2=LEAST_AREA_M2)
+        lambda piece: split_long(piece, piece_m=HOUSE_M, least_area_m2=LEAST_AREA_M2)
     ),
     find=_halls,
     needs="no two buildings of at least 160 m2 near each other",

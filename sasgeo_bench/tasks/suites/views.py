@@ -256,13 +256,16 @@ class LocalWarpSuite(Suite):
         )
 
 
+_STRAIGHT_M: Final = 0.3  # tolerance of simplification after bending: finer than the noise of the vectors
+
+
 def bent(vectors: "gpd.GeoDataFrame", field_m: NDArray[np.float64], cell_size_m: float) -> "gpd.GeoDataFrame":
     """Move the vectors of a view as a warp moves its cells."""
     # 8 m: step between vertices before a line is bent: an eighth of the shortest wave
     dense = shapely.segmentize(vectors.geometry.to_numpy(), 8.0)
     shapes = shapely.transform(dense, lambda at: moved(at, field_m, cell_size_m))
     # 0.3 m: tolerance of simplification after bending: finer than the noise of the vectors
-    return round_vectors(vectors, shapely.simplify(shapes, 0.3))
+    return round_vectors(vectors, shapely.simplify(shapes, _STRAIGHT_M))
 
 
 LOCAL_WARP: Final = LocalWarpSuite(

@@ -43,12 +43,19 @@ class AgeingOptions(Options):
         Path | None, typer.Option(help="with --compare: also write the rates of the places into this TOML file")
     ] = None
     out: Annotated[
-        Path | None, typer.Option(help="folder to write; with --compare, the Markdown file (ageing-summary.md)")
+        Path | None,
+        typer.Option(
+            envvar="SASGEO_OUT",
+            help="folder to write (out); with --compare, the Markdown file, or the folder of ageing-summary.md",
+        ),
     ] = None
 
 
 def measure_ageing_command(options: AgeingOptions) -> None:
-    """Measure what vanished and appeared between dated extracts: OUT/ageing.parquet, ageing.md and ageing.svg."""
+    """Measure what vanished and appeared between dated extracts: OUT/ageing.parquet, ageing.md and ageing.svg.
+
+    With --compare, put the rates of several places that were measured before side by side.
+    """
     if options.compare:
         _compare(options)
         return
@@ -68,10 +75,20 @@ def measure_ageing_command(options: AgeingOptions) -> None:
 
 
 def _compare(options: AgeingOptions) -> None:
-    if options.extract:
-        raise ConfigError("--compare reads folders that were written before: leave out --extract")
+    """Put the measured rates of several places side by side."""
+    measuring = {
+        "--extract": options.extract,
+        "--at": options.at,
+        "--place": options.place,
+        "--bounds": options.bounds,
+        "--margin-m": options.margin_m != MARGIN_M,
+    }
+    given = [flag for flag, value in measuring.items() if value]
+    if given:
+        raise ConfigError(f"--compare reads folders that were written before: leave out {' and '.join(given)}")
+    out = options.out or Path()
     places, controls = ([read_ageing(item) for item in items or ()] for items in (options.compare, options.control))
-    say(write_summary(options.out or Path("ageing-summary.md"), places, controls))
+    say(write_summary(out / "ageing-summary.md" if out.is_dir() or not out.suffix else out, places, controls))
     if options.rates is not None:
         say(write_ratebook(options.rates, places))
 

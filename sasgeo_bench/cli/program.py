@@ -117,7 +117,7 @@ class _Group(TyperGroup):
         """Write the commands in the groups of the work."""
         for group, names in COMMANDS.items():
             with formatter.section(group):
-                formatter.write_dl([(name, self.commands[name].help or "") for name in names])
+                formatter.write_dl([(name, (self.commands[name].help or "").partition("\n\n")[0]) for name in names])
 
 
 def spelled_out(words: Sequence[str], params: Sequence[Any]) -> list[str]:

@@ -45,13 +45,15 @@ def verify_command(
     out: Out = Path("out"),
 ) -> None:
     """Check a region or task against its hashes, answers against tasks, and a split for ground that its parts share."""
-    target = target or predictions
-    if target is None:
-        raise ConfigError("verify needs a target: name a region, a task, a split, a run, a submission or predictions")
+    if (target is None) == (predictions is None):
+        raise ConfigError("verify needs one target: name a region, a task, a split, a run, a submission or predictions")
+    target = target or predictions or ""
     if is_submission(Path(target)):
         _verify_submission(Path(target), tasks or [])
         return
     task_folder, region_folder = find_task(target, out), find_built(target, out)
+    if tasks and (task_folder is not None or region_folder is not None or is_split(target)):
+        raise ConfigError(f"{target} holds no answers, and --tasks is what answers are held against: leave it out")
     if task_folder is not None:
         task = Task.open(task_folder, out)
         with_truths = "every query has its truth" if task.has_truths else "its truths are not here"

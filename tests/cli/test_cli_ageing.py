@@ -69,4 +69,25 @@ def test_a_mistake_gets_one_line_and_exit_2(words, told, mistake, towns, tmp_pat
 
 
 def test_a_folder_that_holds_nothing_measured_is_told(mistake):
-    assert "run measure-ageing with --out nowhere first" in mistake("measure-ageing", "--compare", "nowhere")
+    for words in (("measure-ageing", "--compare", "nowhere"), ("compare-ageing", "nowhere")):
+        assert "run measure-ageing with --out nowhere first" in mistake(*words)
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        ((), "measure-ageing needs --extract, or --compare"),
+        (("--extract", "a.osm", "--rates", "r.toml"), "--control and --rates go with --compare"),
+        (("--compare", "a", "--at", "2014-01-01", "--margin-m", "5"), "leave out --at and --margin-m"),
+        (("--compare", "a", "--extract", "b.osm", "--bounds", "1,1,2,2"), "leave out --extract and --bounds"),
+    ],
+)
+def test_a_flag_of_the_other_task_is_refused_and_not_passed_over(words, told, mistake):
+    assert told in mistake("measure-ageing", *words)
+
+
+def test_the_folder_of_all_output_is_taken_from_the_environment(program, towns, tmp_path, monkeypatch):
+    monkeypatch.setenv("SASGEO_OUT", "all")
+    assert program("measure-ageing", *extracts(towns[::2]))[0] == 0
+    assert (tmp_path / "all" / "ageing.parquet").is_file()
+    assert program("measure-ageing", "--compare", "all")[1].strip() == "all/ageing-summary.md"

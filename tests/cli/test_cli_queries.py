@@ -287,6 +287,13 @@ def test_faults_of_a_task_are_listed_and_make_exit_2(program, out):
     assert "stray.txt: not part of a task" in told
 
 
+def test_one_target_is_verified_and_tasks_are_for_answers_alone(mistake, out):
+    for words in ((), (CLEAN, "--predictions", CLEAN)):
+        assert "verify needs one target: name a region, a task, a split, a run" in mistake("verify", *words)
+    for target in (CLEAN, RIVERSIDE, "crossfit"):
+        assert f"{target} holds no answers, and --tasks is" in mistake("verify", target, "--for", CLEAN, "--out", out)
+
+
 @pytest.mark.parametrize("name", ["holdout", "crossfit"])
 def test_the_towns_of_the_shipped_splits_share_no_ground(name, program, towns):
     code, told, err = program("verify", name, "--out", towns)

@@ -241,15 +241,7 @@ def draw_odometry(
     steps_m = path_steps_m(flown)
     step, law = _true_steps(flown), _Law(profile=profile, steps_m=steps_m)
     drift = law.draw(rng)
-    # Draw which steps are lost: any that touches a dropout
-    ends = np.cumsum(steps_m)
-    begins = np.sort(rng.uniform(0, ends[-1], size=rng.poisson(profile.dropouts.per_km * ends[-1] / _M_PER_KM)))
-    lengths = rng.exponential(profile.dropouts.length_m, size=len(begins))
-    first, after = np.searchsorted(ends, begins, side="right"), np.searchsorted(ends - steps_m, begins + lengths)
-    edges = np.zeros(len(steps_m) + 1, dtype=np.int64)
-    np.add.at(edges, first, 1)
-    np.add.at(edges, after, -1)
-    is_lost = np.asarray(np.cumsum(edges[:-1]) > 0)
+    is_lost = _draw_lost(steps_m, profile, rng)
     moved = step * np.exp(drift.log_length - 1j * drift.course_rad) + drift.jump_m
     # Of what the odometer takes for its way: covariances of the true steps would tell their length.
     believed = _Law(profile=profile, steps_m=np.abs(moved))
@@ -264,6 +256,18 @@ def draw_odometry(
         covariance=covariance,
         is_lost=is_lost,
     )
+
+
+def _draw_lost(steps_m: Floats, profile: DriftProfile, rng: np.random.Generator) -> Bools:
+    """Draw which steps are lost: any that touches a dropout."""
+    ends = np.cumsum(steps_m)
+    begins = np.sort(rng.uniform(0, ends[-1], size=rng.poisson(profile.dropouts.per_km * ends[-1] / _M_PER_KM)))
+    lengths = rng.exponential(profile.dropouts.length_m, size=len(begins))
+    first, after = np.searchsorted(ends, begins, side="right"), np.searchsorted(ends - steps_m, begins + lengths)
+    edges = np.zeros(len(steps_m) + 1, dtype=np.int64)
+    np.add.at(edges, first, 1)
+    np.add.at(edges, after, -1)
+    return np.asarray(np.cumsum(edges[:-1]) > 0)
 
 
 def dead_reckon(flown: Trajectory, steps: Odometry) -> Trajectory:

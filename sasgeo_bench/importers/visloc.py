@@ -3,7 +3,7 @@
 
 import datetime as dt
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -131,18 +131,22 @@ def _measured(reader: FolderReader, corners: _Corners) -> MapSheet:
     relative = _file_of(corners)
     parts = {} if reader.has(relative) else _parts(reader, corners)
     if parts:
-        # Width and height of a grid of parts; raise `DatasetError` if one is missing or does not fit
-        rows, cols = (range(1, max(at[axis] for at in parts) + 1) for axis in (0, 1))
-        grid = [(row, col) for row in rows for col in cols]
-        lacking = [f"_{row:02}-{col:02}" for row, col in grid if (row, col) not in parts]
-        if lacking:
-            raise DatasetError(f"{relative} is in parts, and {named(lacking, 'part')} is missing: copy all of them")
-        if any(parts[at][0] != parts[1, at[1]][0] or parts[at][1] != parts[at[0], 1][1] for at in grid):
-            raise DatasetError(f"{relative} is in parts of sizes that make no grid: copy them again")
-        width_px, height_px = sum(parts[1, col][0] for col in cols), sum(parts[row, 1][1] for row in rows)
+        width_px, height_px = _mosaic_px(parts, relative)
     else:
         width_px, height_px = read_size_px(reader.file(relative), shown=relative)
     return MapSheet(name=corners.name, flight=corners.flight, box=corners.box, width_px=width_px, height_px=height_px)
+
+
+def _mosaic_px(parts: Mapping[tuple[int, int], tuple[int, int]], relative: str) -> tuple[int, int]:
+    """Return width and height of a grid of parts; raise `DatasetError` if one is missing or does not fit."""
+    rows, cols = (range(1, max(at[axis] for at in parts) + 1) for axis in (0, 1))
+    grid = [(row, col) for row in rows for col in cols]
+    lacking = [f"_{row:02}-{col:02}" for row, col in grid if (row, col) not in parts]
+    if lacking:
+        raise DatasetError(f"{relative} is in parts, and {named(lacking, 'part')} is missing: copy all of them")
+    if any(parts[at][0] != parts[1, at[1]][0] or parts[at][1] != parts[at[0], 1][1] for at in grid):
+        raise DatasetError(f"{relative} is in parts of sizes that make no grid: copy them again")
+    return sum(parts[1, col][0] for col in cols), sum(parts[row, 1][1] for row in rows)
 
 
 def _parts(reader: FolderReader, corners: _Corners) -> dict[tuple[int, int], tuple[int, int]]:

@@ -53,14 +53,7 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
     links = _links(lines, mapped, edge)
     faces = shapely.get_parts(shapely.polygonize([shapely.unary_union([*lines, *links, edge])]))
     faces = faces[shapely.intersects(shapely.point_on_surface(faces), mapped)]
-    # Metres of coast that each face has on the right and on the left of the line
-    start, end = _segments(lines, edge)
-    ahead = end - start
-    length_m = np.hypot(*ahead.T)
-    to_right = np.column_stack((ahead[:, 1], -ahead[:, 0])) / length_m[:, None] * _OFFSET_M
-
-    middle = start + ahead / 2
-    right_m, left_m = _length_in(faces, middle + to_right, length_m), _length_in(faces, middle - to_right, length_m)
+    right_m, left_m = _coast_m(lines, faces, edge)
     # 0.01 of a face's coast: less of the other side is a loop of a badly drawn line
     slip_m = 0.01 * (right_m + left_m)
     is_wet, is_dry = right_m > slip_m, left_m > slip_m
@@ -76,6 +69,17 @@ def find_shore(coast: Sequence[shapely.Geometry] | Geometries, mapped: shapely.G
     return Shore(
         sea=_without(faces[is_wet & ~is_dry], doubt), land=_without(faces[is_dry & ~is_wet], doubt), unknown=unknown
     )
+
+
+def _coast_m(lines: Geometries, faces: Geometries, edge: shapely.Geometry) -> tuple[Floats, Floats]:
+    """Return the metres of coast that each face has on the right and on the left of the line."""
+    start, end = _segments(lines, edge)
+    ahead = end - start
+    length_m = np.hypot(*ahead.T)
+    to_right = np.column_stack((ahead[:, 1], -ahead[:, 0])) / length_m[:, None] * _OFFSET_M
+
+    middle = start + ahead / 2
+    return _length_in(faces, middle + to_right, length_m), _length_in(faces, middle - to_right, length_m)
 
 
 def _without(faces: Geometries, doubt: shapely.Geometry) -> Geometries:

@@ -16,7 +16,7 @@ from sasgeo_bench.files.paths import plain_file
 from sasgeo_bench.matching.cards import write_learned
 from sasgeo_bench.matching.segmenter import check_text
 from sasgeo_bench.progress import reporting, spread, tell
-from sasgeo_bench.regions.evidence import UNKNOWN
+from sasgeo_bench.regions.evidence import UNKNOWN, Evidence
 from sasgeo_bench.regions.region_files import read_manifest, read_region
 from sasgeo_bench.running.segmenting import LoadedSegmenter, SegmenterRun, SegmentRequest, load_card, train_segmenter
 from sasgeo_bench.running.training import Said, recalibrated
@@ -350,24 +350,30 @@ def _with_evidence(
     if query.frames:
         size_cells, cell_size_m = evidence.shape[0], evidence.cell_size_m
         found = evidence_of(query.frames, seen, size_cells=size_cells, cell_size_m=cell_size_m)
-        # Evidence for the classes of a map, in their order: unknown where a segmenter tells nothing of one
-        cells = np.full(evidence.cells.shape, UNKNOWN, dtype=np.uint8)
-        confidence = np.zeros(evidence.cells.shape, dtype=np.uint8)
-        for index, name in enumerate(evidence.classes):
-            if found is not None and found.confidence is not None and name in found.classes:
-                at = found.classes.index(name)
-                cells[index], confidence[index] = found.cells[at], found.confidence[at]
-        evidence = evidence.replace(cells, confidence)
-    # Query with an id that follows from its own and the segmenter; views of a flight keep their order
-    step = query.step
-    old = query.query_id if step is None else step.sequence_id
-    new = hashlib.sha256(f"{old}/{segmenter}".encode()).hexdigest()[: len(old)]
-    asked = (
-        replace(query, query_id=new)
-        if step is None
-        else replace(query, query_id=view_id(new, step.frame), step=replace(step, sequence_id=new))
-    )
+        evidence = _for_classes(found, evidence)
+    asked = _renamed(query, segmenter)
     return (
         replace(asked, suite=suite, evidence=evidence),
         replace(truth, query_id=asked.query_id, unknown_share=evidence.unknown_share),
     )
+
+
+def _for_classes(found: Evidence | None, empty: Evidence) -> Evidence:
+    """Return evidence for the classes of a map, in their order: unknown where a segmenter tells nothing of one."""
+    cells = np.full(empty.cells.shape, UNKNOWN, dtype=np.uint8)
+    confidence = np.zeros(empty.cells.shape, dtype=np.uint8)
+    for index, name in enumerate(empty.classes):
+        if found is not None and found.confidence is not None and name in found.classes:
+            at = found.classes.index(name)
+            cells[index], confidence[index] = found.cells[at], found.confidence[at]
+    return empty.replace(cells, confidence)
+
+
+def _renamed(query: Query, segmenter: str) -> Query:
+    """Return a query with an id that follows from its own and the segmenter; views of a flight keep their order."""
+    step = query.step
+    old = query.query_id if step is None else step.sequence_id
+    new = hashlib.sha256(f"{old}/{segmenter}".encode()).hexdigest()[: len(old)]
+    if step is None:
+        return replace(query, query_id=new)
+    return replace(query, query_id=view_id(new, step.frame), step=replace(step, sequence_id=new))

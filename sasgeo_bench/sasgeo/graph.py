@@ -277,8 +277,9 @@ class _Judge:
 
     def matching(self, pose: Pose) -> Matching:
         stage = self._stage(pose)
-        # What matched nodes share, and counts
-        pairs = self._matched(stage)
+        return self._shown(stage, self._matched(stage))
+
+    def _shown(self, stage: _Stage, pairs: _Pairs) -> Matching:
         ours, theirs = self.seen.nodes, self.mapped.nodes
         own = _IS_DRAWN[ours.kind[pairs.seen]]
         seen, mapped = ours.degree[pairs.seen[own]], theirs.degree[stage.around[pairs.mapped[own]]]

@@ -121,7 +121,6 @@ def _box(query: Query, truth: Truth, grid: Grid) -> tuple[int, int, int, int]:
     view_m = math.hypot(*query.evidence.size_m) / 2 * (1 + 3 * query.prior.scale_sigma)
     low, high = [], []
     for (row, col), radius_m in zip(grid.to_cells(middles_m).tolist(), reach_m, strict=True):
-        # 72 m: margin of a part of a map, beyond what any view there shows
         reach = math.ceil((radius_m + view_m + RINGS_M[-1] + _MARGIN_M) / grid.cell_size_m)
         low.append((row - reach, col - reach))
         high.append((row + reach, col + reach))
@@ -337,7 +336,6 @@ def _list(query: Query, pose: Pose, reader: Reader, plan: Plan, classes: tuple[s
     reading = reader.read(query)
     modes = search(reader.field, reading.template, query.prior, plan, count=16).modes  # of each training search
     here = (pose.easting_m, pose.northing_m)
-    # 25 m: a mode this far from the truth is a wrong place
     wrong = [mode.pose for mode in modes if math.dist((mode.pose.easting_m, mode.pose.northing_m), here) > WRONG_M]
     poses = [pose, *wrong]
     by_class = np.zeros((len(poses), len(classes)))

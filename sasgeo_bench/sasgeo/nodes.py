@@ -241,7 +241,6 @@ BLUR_M: Final = 8.0  # junctions nearer than this are one in a mask: a road's wi
 
 def _blurred(nodes: Nodes) -> Nodes:
     """Merge nodes of one kind within a road's width."""
-    # 8 m: junctions nearer than this are one in a mask: a road's width
     near = cKDTree(nodes.places_m).query_pairs(BLUR_M, output_type="ndarray") if len(nodes) else nodes.pairs
     near = near[nodes.kind[near[:, 0]] == nodes.kind[near[:, 1]]]
     links = coo_array((np.ones(len(near)), near.T), shape=(len(nodes), len(nodes)))
@@ -328,7 +327,6 @@ def arms_of(features: gpd.GeoDataFrame, places_m: Floats) -> Floats:
         return arms
     line = np.repeat(np.arange(len(chains.length_m)), np.diff(chains.first))
     ways = shapely.linestrings(chains.en_m, indices=line)
-    # 12 m: arm along a road to where its direction is measured: past the curbs of a junction
     along_m = np.minimum(ARM_M, chains.length_m / 2)
     points = (
         shapely.line_interpolate_point(ways, along_m),

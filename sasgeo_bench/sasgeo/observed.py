@@ -97,7 +97,6 @@ def _is_spur(lines: NDArray[np.object_]) -> NDArray[np.bool_]:
     _, tip = np.unique(tips_m.reshape(-1, 2), axis=0, return_inverse=True)
     tip = tip.reshape(-1, 2)
     ends = np.sort(np.bincount(tip.ravel())[tip], axis=1)
-    # 8 m: shorter branches are corners of a broad line
     return np.asarray((shapely.length(lines) < SPUR_M) & (ends[:, 0] == 1) & (ends[:, 1] >= _FORK))
 
 
@@ -219,7 +218,6 @@ def bridged(vectors: gpd.GeoDataFrame) -> gpd.GeoDataFrame:
     arm_deg = arms_of(features, places_m)[:, 0]
     if len(free) < 2:  # a join has two ends
         return vectors
-    # 7 m: facing ends of roads within this distance are one road: as far as a street is wide
     pairs = cKDTree(places_m).query_pairs(BRIDGED_M, output_type="ndarray")
     ahead_deg = bearing_deg(*(places_m[pairs[:, 1]] - places_m[pairs[:, 0]]).T)
     off_deg = np.abs(
@@ -251,7 +249,6 @@ MARGIN_M: Final = 8.0  # along the border of known cells, where objects may be c
 def _visible(evidence: Evidence) -> Bools:
     """Return where nearly all cells around are known in each set of classes; absent sets are known nowhere."""
     sights = np.zeros((len(_SIGHTS), *evidence.shape), dtype=bool)
-    # 8 m: margin along the border of known cells, where objects may be cut
     size = 2 * max(1, round(MARGIN_M / evidence.cell_size_m)) + 1
     for into, classes in zip(sights, _SIGHTS, strict=True):
         layers = [evidence.layer(name) != UNKNOWN for name in classes if name in evidence.classes]

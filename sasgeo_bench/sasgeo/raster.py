@@ -167,7 +167,6 @@ def doubted(evidence: Evidence) -> Evidence:
     for name, layer in zip(evidence.classes, cells, strict=True):
         if name in load_taxonomy().lines and (layer == PRESENT).any():
             off = cv2.distanceTransform((layer != PRESENT).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-            # 8 m: doubt around a seen line: a mapped line there may be the same
             layer[(layer == ABSENT) & (off * evidence.cell_size_m <= DOUBT_M)] = UNKNOWN
     return Evidence(classes=evidence.classes, cells=cells, cell_size_m=evidence.cell_size_m)
 

@@ -116,15 +116,7 @@ def _similarities(
 
 def _counted(cast: Floats, count: int) -> list[Proposal]:
     """Return poses with the most votes, best first, no two for one place and heading."""
-    # Votes as points, shape (V, 5): those for one pose lie within 1 of each other, and headings wrap around
-    turn = np.radians(cast[:, 2:3])
-    at = np.column_stack(
-        (
-            cast[:, :2] / _PLACE_M,
-            np.concatenate((np.cos(turn), np.sin(turn)), axis=1) / math.radians(_YAW_DEG),
-            np.log(cast[:, 3]) / _LOG_SCALE,
-        )
-    )
+    at = _spread(cast)
     tree = cKDTree(at)
     # 10 cells of votes tried for each requested pose
     found = [_gathered(cast, at, tree, start) for start in _crowded(cast, at, 10 * count)]
@@ -133,6 +125,18 @@ def _counted(cast: Floats, count: int) -> list[Proposal]:
         if all(np.linalg.norm(place - other) > 2 * _REACH for _, other in kept):
             kept.append((proposal, place))
     return [proposal for proposal, _ in kept[:count]]
+
+
+def _spread(cast: Floats) -> Floats:
+    """Return votes as points, shape (V, 5): those for one pose lie within 1 of each other, and headings wrap around."""
+    turn = np.radians(cast[:, 2:3])
+    return np.column_stack(
+        (
+            cast[:, :2] / _PLACE_M,
+            np.concatenate((np.cos(turn), np.sin(turn)), axis=1) / math.radians(_YAW_DEG),
+            np.log(cast[:, 3]) / _LOG_SCALE,
+        )
+    )
 
 
 def _crowded(cast: Floats, at: Floats, most: int) -> Floats:
@@ -292,7 +296,6 @@ class Reading:
         ]
         here, east, west, north, south = (self.by_class(poses) * self.reader.model.scaling).sum(axis=1).tolist()
         bend = min(2 * here - east - west, 2 * here - north - south) / _STEP_M**2
-        # 1 m: least sigma of a refined position: half a cell of the search
         return float(np.clip(1 / math.sqrt(bend), LEAST_SIGMA_M, MOST_SIGMA_M)) if bend > 0 else MOST_SIGMA_M
 
     @cached_property

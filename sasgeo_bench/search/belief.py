@@ -333,16 +333,7 @@ def _spread(belief: GridBelief, covariance: Matrix) -> GridBelief:
     mass = belief.mass
     step = belief.yaw_step_deg
     if covariance[2, 2] > _TINY * step**2:
-        # Probabilities from each heading to each, for a variance in steps2, shape (count, count)
-        count = len(mass)
-        variance = covariance[2, 2] / step**2
-        share = min(1.0, variance / _SMALL)
-        away = np.arange(count)
-        away = np.minimum(away, count - away)
-        kernel = np.exp(-(away**2) * share / (2 * variance))
-        kernel = share * kernel / kernel.sum()
-        kernel[0] += 1 - share
-        circle = np.asarray(kernel[(np.arange(count)[:, None] - np.arange(count)) % count], dtype=np.float32)
+        circle = _turning(len(mass), covariance[2, 2] / step**2)
         mass = (circle @ mass.reshape(len(mass), -1)).reshape(mass.shape)
     planar = covariance[:2, :2] / belief.grid.cell_size_m**2
     widest = float(np.linalg.eigvalsh(planar)[-1])
@@ -354,6 +345,17 @@ def _spread(belief: GridBelief, covariance: Matrix) -> GridBelief:
                 # 5: standard deviation in cells from which a Gaussian is three boxes one after the other
                 layer[:] = _boxed(layer, np.trace(planar) / 2) if widest > 5.0**2 else _blurred(layer, turned)
     return replace(belief, mass=mass)
+
+
+def _turning(count: int, variance: float) -> Floats:
+    """Return the probabilities from each heading to each, for a variance in steps2, shape (count, count)."""
+    share = min(1.0, variance / _SMALL)
+    away = np.arange(count)
+    away = np.minimum(away, count - away)
+    kernel = np.exp(-(away**2) * share / (2 * variance))
+    kernel = share * kernel / kernel.sum()
+    kernel[0] += 1 - share
+    return np.asarray(kernel[(np.arange(count)[:, None] - np.arange(count)) % count], dtype=np.float32)
 
 
 def _blurred(layer: Floats, covariance: Matrix) -> Floats:

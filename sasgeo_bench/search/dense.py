@@ -106,14 +106,7 @@ def surface(
     ((4, 17, 17), Pose(easting_m=25.5, northing_m=28.5, yaw_deg=90.0, scale=1.0))
     """
     yaws = np.atleast_1d(normalize_deg(yaws_deg))
-    if not (yaws.ndim == 1 and len(yaws) and np.isfinite(yaws).all()):
-        raise PoseError(f"yaws_deg must be at least one finite heading in a row, got an array of shape {yaws.shape}")
-    is_finite = all(map(math.isfinite, (*center_m, radius_m, scale)))
-    if not (is_finite and radius_m >= 0 and scale > 0):
-        raise PoseError(
-            "center_m must be finite, radius_m at least 0 and scale positive, "
-            f"got {center_m!r}, {radius_m!r} and {scale!r}"
-        )
+    _check(center_m, radius_m, yaws, scale)
     level = field.level(factor)
     tiles = tiles_of(level.grid, field.grid, Disc(center_m=center_m, radius_m=radius_m))
     if not tiles:
@@ -134,6 +127,17 @@ def surface(
                     _part(scores[yaw], tiles[0], tile)[:] = votes.score(spectra, at, quarter)
     scores.flags.writeable = False
     return Surface(grid=grid, yaws_deg=yaws, scores=scores)
+
+
+def _check(center_m: tuple[float, float], radius_m: float, yaws: NDArray[np.float64], scale: float) -> None:
+    if not (yaws.ndim == 1 and len(yaws) and np.isfinite(yaws).all()):
+        raise PoseError(f"yaws_deg must be at least one finite heading in a row, got an array of shape {yaws.shape}")
+    is_finite = all(map(math.isfinite, (*center_m, radius_m, scale)))
+    if not (is_finite and radius_m >= 0 and scale > 0):
+        raise PoseError(
+            "center_m must be finite, radius_m at least 0 and scale positive, "
+            f"got {center_m!r}, {radius_m!r} and {scale!r}"
+        )
 
 
 def _sides(tiles: Sequence[Tile], axis: int) -> list[tuple[int, int]]:

@@ -143,13 +143,7 @@ def accumulate(
     >>> round(float(accumulate([frame, frame], [still]).probabilities[0, 2, 2]), 3)
     0.864
     """
-    if not frames or len(steps) != len(frames) - 1:
-        raise ShapeError(f"n frames, at least one, have n - 1 steps between them, got {len(frames)} and {len(steps)}")
-    kinds = {(frame.classes, frame.probabilities.shape, frame.cell_size_m) for frame in frames}
-    if len(kinds) > 1:
-        raise ShapeError(f"frames have one lattice and the same classes, got {len(kinds)} kinds of them")
-    if not 0 <= correlation <= 1 or not 0 <= caution < math.inf:
-        raise CameraError(f"correlation is 0 to 1 and caution not negative, got {correlation!r} and {caution!r}")
+    _check(frames, steps, correlation, caution)
     errors = errors or Errors()
     last = frames[-1]
     # 0.3826: mean distance of the points of a square from its middle, in sides
@@ -174,6 +168,16 @@ def accumulate(
     log_odds = total / (1 + np.maximum(count - 1, 0) * correlation)
     probabilities = np.where(count > 0, expit(log_odds), np.nan).astype(np.float32)
     return SoftView(classes=last.classes, probabilities=probabilities, cell_size_m=last.cell_size_m)
+
+
+def _check(frames: Sequence[SoftView], steps: Sequence[Pose], correlation: float, caution: float) -> None:
+    if not frames or len(steps) != len(frames) - 1:
+        raise ShapeError(f"n frames, at least one, have n - 1 steps between them, got {len(frames)} and {len(steps)}")
+    kinds = {(frame.classes, frame.probabilities.shape, frame.cell_size_m) for frame in frames}
+    if len(kinds) > 1:
+        raise ShapeError(f"frames have one lattice and the same classes, got {len(kinds)} kinds of them")
+    if not 0 <= correlation <= 1 or not 0 <= caution < math.inf:
+        raise CameraError(f"correlation is 0 to 1 and caution not negative, got {correlation!r} and {caution!r}")
 
 
 def _seen_from(pose: Pose, other: Pose) -> Pose:

@@ -82,7 +82,6 @@ def degrade(features: "gpd.GeoDataFrame", grid: Grid, rng: np.random.Generator) 
 def warp_field(grid: Grid, rng: np.random.Generator) -> NDArray[np.float32]:
     """Draw how far ground is off, east and north, shape (2, rows, cols) of a lattice of 4 m; metres."""
     shape = tuple(max(2, round(cells * grid.cell_size_m / _LATTICE_M)) for cells in grid.shape)
-    # 60 m: ground that is off by about the same: a few houses
     parts = [smooth_noise((shape[0], shape[1]), 60.0 / _LATTICE_M, rng) for _ in range(2)]
     return np.asarray(np.stack(parts) * (WARP_M / SIGMA / np.sqrt(2)), dtype=np.float32)
 

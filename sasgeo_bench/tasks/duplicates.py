@@ -61,7 +61,6 @@ def constellations(features: gpd.GeoDataFrame) -> Constellations:
         return Constellations(en_m=np.zeros((0, 2)), keys=np.zeros(0, dtype=np.uint64))
     distances_m, nearest = (np.asarray(found) for found in KDTree(en_m).query(en_m, k=NEIGHBOURS + 1))
     areas = np.log(shapely.area(shapes)) / 0.1  # resolution of the area's logarithm
-    # 1 m: resolution of distances
     described = np.column_stack((areas, distances_m[:, 1:] / 1.0, areas[nearest[:, 1:]]))
     is_near = distances_m[:, -1] < 250.0  # 250 m: largest distance of neighbours
     return Constellations(en_m=en_m[is_near], keys=_keys(np.floor(described[is_near]).astype(np.int64)))
@@ -142,7 +141,6 @@ def _rare(keys: NDArray[np.uint64]) -> NDArray[np.int64]:
 def _alike(one: Points, two: Points, at: int, other: int) -> NDArray[np.int64]:
     """Return the matches that agree with the move and rotation given by two of them."""
     a, b = (complex(*(side[other] - side[at])) for side in (one, two))
-    # 20 m: least distance of the two buildings that define a placement
     if abs(a) < 20.0 or abs(abs(a) - abs(b)) > _WITHIN_M:
         return np.zeros(0, dtype=np.int64)
     turn = b / a / abs(b / a)

@@ -161,17 +161,7 @@ class Airspace:
                 continue
             shape = rows(views, slice(0, flight.middle))
             for _ in range(24):  # tried for each shape
-                # Turn and move a path so that it ends about `carried_m` from a place, in any direction
-                # 1.25: most that a distance carried is more or less than asked for, as a factor
-                middle_m = flight.views.position_m[flight.middle, :2]
-                far_m = carried_m * 1.25 ** rng.uniform(-1, 1)
-                bearing, turn_deg = rng.uniform(0, 2 * np.pi), float(rng.uniform(0, 360))
-                position_m = shape.position_m.copy()
-                end_m = middle_m + far_m * np.array([np.sin(bearing), np.cos(bearing)])
-                position_m[:, :2] = end_m + (position_m[:, :2] - position_m[-1, :2]) @ rotation(turn_deg).T
-                half = Trajectory.of_angles(
-                    time_s=shape.time_s, position_m=position_m, yaw_deg=shape.yaw_deg + turn_deg
-                )
+                half = _placed(shape, flight.views.position_m[flight.middle, :2], carried_m, rng)
                 is_over = bool(area.covers(shapely.MultiPoint(half.position_m[:, :2])))
                 if is_over and self._is_in_one_part(half, flight.views) and self._is_drawn(half, flight.scale):
                     return half
@@ -213,6 +203,17 @@ class Airspace:
         poses = [pose_of(views, frame, scale) for frame in range(len(views))]
         means = [np.mean([drawn_share(state, pose, variant) for pose in poses]) for state in maps]
         return float(min(means)) >= self.suite.card.min_density
+
+
+def _placed(shape: Trajectory, middle_m: Floats, carried_m: float, rng: np.random.Generator) -> Trajectory:
+    """Turn and move a path so that it ends about `carried_m` from a place, in any direction."""
+    # 1.25: most that a distance carried is more or less than asked for, as a factor
+    far_m = carried_m * 1.25 ** rng.uniform(-1, 1)
+    bearing, turn_deg = rng.uniform(0, 2 * np.pi), float(rng.uniform(0, 360))
+    position_m = shape.position_m.copy()
+    end_m = middle_m + far_m * np.array([np.sin(bearing), np.cos(bearing)])
+    position_m[:, :2] = end_m + (position_m[:, :2] - position_m[-1, :2]) @ rotation(turn_deg).T
+    return Trajectory.of_angles(time_s=shape.time_s, position_m=position_m, yaw_deg=shape.yaw_deg + turn_deg)
 
 
 def rows(views: Trajectory, which: slice) -> Trajectory:

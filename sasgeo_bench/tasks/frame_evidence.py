@@ -82,7 +82,6 @@ def _errors(frames: Sequence[Frame]) -> Errors:
     far_m = [
         math.hypot(one.camera.east_m - last.camera.east_m, one.camera.north_m - last.camera.north_m) for one in frames
     ]
-    # 1 m: nearer frames tell nothing of drift
     moved = [(frame, distance_m) for frame, distance_m in zip(frames, far_m, strict=True) if distance_m > 1.0]
     return Errors(
         attitude_deg=last.attitude_sigma_deg,

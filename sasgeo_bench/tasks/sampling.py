@@ -298,18 +298,7 @@ def make_prior(
         center_m = _around(pose, reach_m * radius_share, turn)
         if rivals_m:
             places_m = np.array([(pose.easting_m, pose.northing_m), *rivals_m])
-            # Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre
-            low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
-            # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
-            # 1024 points drawn for a centre, of which one at least should fit
-            points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (1024, 2))
-            off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
-            fit = points[(off_m <= reach_m).all(axis=1)]
-            if len(fit) == 0:
-                raise ConfigError(
-                    f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior"
-                )
-            center_m = (round(float(fit[0, 0]), 1), round(float(fit[0, 1]), 1))
+            center_m = _holding(places_m, reach_m, rng=rng)
     sigma_deg = YAW_SIGMA_DEG[group.yaw]
     yaw_deg = None if sigma_deg is None else round(round(float(pose.yaw_deg + sigma_deg * yaw_noise), 1) % 360, 1)
     return Prior(
@@ -319,6 +308,19 @@ def make_prior(
         yaw_sigma_deg=sigma_deg,
         scale_sigma=group.scale_sigma,
     )
+
+
+def _holding(places_m: NDArray[np.float64], reach_m: float, *, rng: np.random.Generator) -> tuple[float, float]:
+    """Draw a point uniformly from those within reach of all places, shape (N, 2); to a decimetre."""
+    low, high = places_m.max(axis=0) - reach_m, places_m.min(axis=0) + reach_m
+    # Drawn from the smallest square that holds them all, which does not depend on the order of the places.
+    # 1024 points drawn for a centre, of which one at least should fit
+    points = rng.uniform(np.minimum(low, high), np.maximum(low, high), (1024, 2))
+    off_m = np.hypot(*(points[:, None] - places_m).transpose(2, 0, 1))
+    fit = points[(off_m <= reach_m).all(axis=1)]
+    if len(fit) == 0:
+        raise ConfigError(f"no disc of {reach_m + _ROUNDED_M:g} m holds a place and all its twins: use a wider prior")
+    return (round(float(fit[0, 0]), 1), round(float(fit[0, 1]), 1))
 
 
 def away(

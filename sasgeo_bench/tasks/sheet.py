@@ -604,8 +604,11 @@ def draw_flight(chart: Axes, panel: FlightPanel, ground: Ground) -> None:
     chart.plot(*place[-1], "s", ms=5.5, mfc=TRUE, mec="white", mew=0.9, zorder=5.5)
     chart.set(xlim=ground.bounds_m[:2], ylim=ground.bounds_m[2:], aspect="equal", facecolor="#e8e8e8")
     without_ticks(chart)
-    # Draw a bar of a round length in the lower left corner
-    west, east, south, _ = ground.bounds_m
+    _draw_bar(chart, ground.bounds_m)
+
+
+def _draw_bar(chart: Axes, bounds_m: tuple[float, float, float, float]) -> None:
+    west, east, south, _ = bounds_m
     length_m = max(step for step in (100, 200, 500, 1000, 2000, 5000) if step <= max(100.0, (east - west) / 4))
     left_m, bottom_m = west + 0.04 * (east - west), south + 0.04 * (east - west)
     chart.plot([left_m, left_m + length_m], [bottom_m] * 2, color="white", lw=5, solid_capstyle="butt", zorder=8)

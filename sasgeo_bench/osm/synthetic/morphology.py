@@ -98,15 +98,7 @@ def _old_town(sketch: Sketch) -> None:
         sketch.street(wobble(curve([*inner, clipped], step_m=25.0), 2.5, rng), **tags)
     wall = affinity.scale(shapely.Point(0, 0).buffer(0.78 * half), 1.0, 1.0)
     sketch.line(shapely.get_coordinates(wall.exterior)[:52], barrier="city_wall")
-    radius_m = 0.14 * half
-    nave = affinity.rotate(shapely.box(-0.3 * radius_m, -0.14 * radius_m, 0.3 * radius_m, 0.14 * radius_m), 20)
-    choir = affinity.translate(
-        shapely.Point(0, 0).buffer(0.14 * radius_m, quad_segs=4), 0.28 * radius_m, 0.1 * radius_m
-    )
-    sketch.ground(nave.union(choir), is_free=False, building="church")
-    square = shapely.Point(0, 0).buffer(0.7 * radius_m, quad_segs=5)
-    sketch.ground(square, is_free=False, highway="pedestrian", area="yes")
-    sketch.keep_free(square)
+    _market_square(sketch, 0.14 * half)
     streets = shapely.union_all([shapely.linestrings(way.line) for way in sketch.ways if "highway" in way.tags])
     faces = shapely.get_parts(shapely.polygonize(shapely.get_parts(shapely.node(streets)).tolist()))
     for face in sorted(faces, key=lambda face: (round(face.centroid.x, 1), round(face.centroid.y, 1))):
@@ -116,6 +108,17 @@ def _old_town(sketch: Sketch) -> None:
         sketch,
         curve([(-half, -0.93 * half), (-0.3 * half, -0.9 * half), (0.4 * half, -0.96 * half), (half, -0.9 * half)]),
     )
+
+
+def _market_square(sketch: Sketch, radius_m: float) -> None:
+    nave = affinity.rotate(shapely.box(-0.3 * radius_m, -0.14 * radius_m, 0.3 * radius_m, 0.14 * radius_m), 20)
+    choir = affinity.translate(
+        shapely.Point(0, 0).buffer(0.14 * radius_m, quad_segs=4), 0.28 * radius_m, 0.1 * radius_m
+    )
+    sketch.ground(nave.union(choir), is_free=False, building="church")
+    square = shapely.Point(0, 0).buffer(0.7 * radius_m, quad_segs=5)
+    sketch.ground(square, is_free=False, highway="pedestrian", area="yes")
+    sketch.keep_free(square)
 
 
 def _perimeter_block(sketch: Sketch, block: shapely.Geometry) -> None:
@@ -202,15 +205,18 @@ def _suburb(sketch: Sketch) -> None:
     for line in streets:
         sketch.houses_along(line, spacing_m=23.0, setback_m=9.0, size_m=(12.5, 10.0), kind="house")
         sketch.houses_along(line, spacing_m=31.0, setback_m=30.0, size_m=(6.0, 4.5), kind="garage", chance=0.45)
-    # Draw a hedge at every fifth house, where nothing is in the way
+    _hedges_between(sketch, 14.0)
+    _school(sketch, (0.7 * half, -0.45 * half))
+
+
+def _hedges_between(sketch: Sketch, reach_m: float) -> None:
     houses = [way for way in sketch.ways if way.tags.get("building") == "house"]
     for way in houses[::5]:
         box = shapely.Polygon(way.line).minimum_rotated_rectangle
-        corners = shapely.get_coordinates(affinity.scale(box, 1 + 14.0 / 12, 1 + 14.0 / 14))
+        corners = shapely.get_coordinates(affinity.scale(box, 1 + reach_m / 12, 1 + reach_m / 14))
         hedge = shapely.LineString(corners[:3])
         if not sketch.is_taken(hedge):
             sketch.line(corners[:3], barrier="hedge")
-    _school(sketch, (0.7 * half, -0.45 * half))
 
 
 def _school(sketch: Sketch, centre: tuple[float, float]) -> None:

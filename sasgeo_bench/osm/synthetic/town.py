@@ -221,16 +221,7 @@ def _write(elements: list[_Element], plan: TownPlan, path: Path) -> None:
     half_m = plan.size_m / 2
     unique = list({element[:2]: element for element in reversed(elements)}.values())[::-1]
     corners = [(-half_m, -half_m), (half_m, half_m)]
-    # Longitude and latitude of places in metres from the centre, rounded as OSM stores them
-    longitude_deg, latitude_deg = plan.center_lonlat
-    crs = pyproj.CRS.from_proj4(
-        f"+proj=tmerc +lat_0={latitude_deg} +lon_0={longitude_deg} +k=1 +x_0=0 +y_0=0 +datum=WGS84"
-    )
-    to_degrees = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True)
-    lon_deg, lat_deg = to_degrees.transform(*np.array([*corners, *(one.xy_m for one in unique if one.rank == 0)]).T)
-    (west, south), (east, north), *places = [
-        (round(lon, 7), round(lat, 7)) for lon, lat in zip(lon_deg.tolist(), lat_deg.tolist(), strict=True)
-    ]
+    (west, south), (east, north), *places = _lonlat(plan, [*corners, *(one.xy_m for one in unique if one.rank == 0)])
     header = osmium.io.Header()
     header.set("generator", "sasgeo-bench embedded town")
     header.set("sorting", "Type_then_ID")
@@ -240,6 +231,17 @@ def _write(elements: list[_Element], plan: TownPlan, path: Path) -> None:
     with osmium.SimpleWriter(target, header=header) as writer:
         for element, place in zip_longest(unique, places):  # nodes come first
             _add(writer, element, place)
+
+
+def _lonlat(plan: TownPlan, places_m: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return longitude and latitude of places in metres from the centre, rounded as OSM stores them."""
+    longitude_deg, latitude_deg = plan.center_lonlat
+    crs = pyproj.CRS.from_proj4(
+        f"+proj=tmerc +lat_0={latitude_deg} +lon_0={longitude_deg} +k=1 +x_0=0 +y_0=0 +datum=WGS84"
+    )
+    to_degrees = pyproj.Transformer.from_crs(crs, WGS84, always_xy=True)
+    lon_deg, lat_deg = to_degrees.transform(*np.array(places_m).T)
+    return [(round(lon, 7), round(lat, 7)) for lon, lat in zip(lon_deg.tolist(), lat_deg.tolist(), strict=True)]
 
 
 def _add(writer: osmium.SimpleWriter, element: _Element, place: tuple[float, float] | None) -> None:

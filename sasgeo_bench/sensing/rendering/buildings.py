@@ -199,14 +199,7 @@ def _paint_part(canvas: Canvas, buildings: Buildings, edge_m: Field) -> None:
     cells = _cells(canvas, buildings, edge_m, rows, cols)
     canvas.kind[rows, cols] = ROOF
     colour = buildings.roof[cells.owner]
-    # Height of each roof cell: a gable falls from its ridge, a hip rises from its outline
-    own, form = cells.owner, buildings.form[cells.owner]
-    half = buildings.half_m[own, 1]
-    inward = np.where(form == HIP, np.minimum(cells.edge_m, half), np.clip(half - np.abs(cells.v_m), 0, None))
-    height_m = buildings.eave_m[own] + buildings.pitch[own] * inward
-    parapet = (form == FLAT) & (cells.edge_m < 0.45) & (buildings.half_m[own, 1] > 3)
-    has = draw(17, cells.key) < 0.75
-    height_m = np.asarray(height_m + np.where(parapet & has, 0.12 * np.minimum(buildings.eave_m[own], 5.0), 0.0))
+    height_m = _heights(buildings, cells)
     colour *= _weather(canvas, buildings, cells)[:, None]
     colour = _aged(canvas, buildings, cells, colour)
     _add_panels(canvas, buildings, cells, colour)
@@ -214,6 +207,17 @@ def _paint_part(canvas: Canvas, buildings: Buildings, edge_m: Field) -> None:
     height_m += _add_chimneys(canvas, buildings, cells, colour)
     canvas.colour[rows, cols] = np.clip(colour, 0, 255).astype(np.uint8)
     canvas.height_m[rows, cols] = height_m
+
+
+def _heights(buildings: Buildings, cells: _Cells) -> Numbers:
+    """Return the height of each roof cell: a gable falls from its ridge, a hip rises from its outline."""
+    own, form = cells.owner, buildings.form[cells.owner]
+    half = buildings.half_m[own, 1]
+    inward = np.where(form == HIP, np.minimum(cells.edge_m, half), np.clip(half - np.abs(cells.v_m), 0, None))
+    height_m = buildings.eave_m[own] + buildings.pitch[own] * inward
+    parapet = (form == FLAT) & (cells.edge_m < 0.45) & (buildings.half_m[own, 1] > 3)
+    has = draw(17, cells.key) < 0.75
+    return np.asarray(height_m + np.where(parapet & has, 0.12 * np.minimum(buildings.eave_m[own], 5.0), 0.0))
 
 
 def _cells(

@@ -176,14 +176,7 @@ def cast_light(height_m: Field, cell_size_m: float, sun: Sun) -> Light:
     shade_m = cast_shadows(height_m, cell_size_m, sun)
     lit = (height_m >= shade_m - _EPS_M).astype(np.float32)
     lit = np.asarray(cv2.GaussianBlur(lit, (0, 0), max(0.3 / cell_size_m, 0.4)), dtype=np.float32)
-    # Cosine between the sun and the surface of each cell, not below 0
-    east, north, up = (np.float32(part) for part in sun.direction)
-    scale = 1 / (8 * cell_size_m)
-    slope_e = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 1, 0, scale=scale), -_STEEPEST, _STEEPEST)
-    slope_n = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 0, 1, scale=-scale), -_STEEPEST, _STEEPEST)
-    facing = up - east * slope_e - north * slope_n
-    facing /= np.sqrt(1 + slope_e * slope_e + slope_n * slope_n)
-    lit *= np.asarray(np.maximum(facing, 0), dtype=np.float32)
+    lit *= _facing(height_m, cell_size_m, sun)
     shares = np.empty((*height_m.shape, 2), dtype=np.uint8)
     shares[..., 0] = np.clip(lit * 255, 0, 255)
     # Share of the sky seen from each cell, 0-255, from how far the surroundings rise above it
@@ -193,6 +186,17 @@ def cast_light(height_m: Field, cell_size_m: float, sun: Sun) -> Light:
     above = np.maximum(around - height_m, 0)
     shares[..., 1] = np.asarray(255 * (0.35 + 0.65 / (1 + 0.45 * above)), dtype=np.uint8)
     return Light(sun=sun, shares=shares, shade_m=shade_m)
+
+
+def _facing(height_m: Field, cell_size_m: float, sun: Sun) -> Field:
+    """Return the cosine between the sun and the surface of each cell, not below 0."""
+    east, north, up = (np.float32(part) for part in sun.direction)
+    scale = 1 / (8 * cell_size_m)
+    slope_e = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 1, 0, scale=scale), -_STEEPEST, _STEEPEST)
+    slope_n = np.clip(cv2.Sobel(height_m, cv2.CV_32F, 0, 1, scale=-scale), -_STEEPEST, _STEEPEST)
+    facing = up - east * slope_e - north * slope_n
+    facing /= np.sqrt(1 + slope_e * slope_e + slope_n * slope_n)
+    return np.asarray(np.maximum(facing, 0), dtype=np.float32)
 
 
 def cast_shadows(height_m: Field, cell_size_m: float, sun: Sun) -> Field:

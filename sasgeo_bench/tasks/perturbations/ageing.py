@@ -268,7 +268,6 @@ def _free_window(
     height, width = footprint.shape
     size = np.array(footprint.shape)
     middle = np.array([(part.start + part.stop) / 2 for part in box])
-    # 60 m: largest distance of a new object from the one it copies
     away = size.max() + rng.uniform(0, _NEAR_M / cell_size_m, size=(_TRIES, 1))
     heading = rng.uniform(0, 2 * np.pi, size=_TRIES)
     corners = middle + away * np.column_stack((np.sin(heading), np.cos(heading))) - size / 2

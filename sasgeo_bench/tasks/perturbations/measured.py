@@ -143,7 +143,6 @@ class _View:
     def outline(self, name: str, rng: np.random.Generator) -> Field:
         """Return the noise of a class's outline: it bulges where this is high, and shrinks where it is low."""
         if name not in self.outlines:
-            # 25 m: length of the stretches over which outlines bulge or shrink
             self.outlines[name] = self.noise(OUTLINE_M, rng)
         return self.outlines[name]
 
@@ -173,7 +172,6 @@ class _View:
         if name in load_taxonomy().lines:
             score = self.noise(HIDDEN_M, rng)
         else:
-            # 0.8 m: corners are rounded by a blur of this deviation
             kept &= _rounded(mask, _ROUNDED_M * min(factor, 2.0) / self.cell_m)
             score = -errors.bulge_m * self.outline(name, rng) - self._depth_m(mask)
         rest = lost * total - (total - np.count_nonzero(kept))

@@ -145,7 +145,6 @@ class CanopyAndShadow(Occlusion):
     def mask(self, evidence: Evidence, rng: np.random.Generator) -> Mask:
         """Return the part of the shade where the noise is strongest, for the line classes."""
         shade = shaded(evidence, rng.uniform(0, 360))
-        # 8 m: width of a crown, or of a gap between crowns
         noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
         hidden = shade & (noise >= highest(noise[shade], self.share * np.count_nonzero(shade)))
         return np.asarray(hidden & np.isin(evidence.classes, HIDDEN)[:, None, None])
@@ -158,7 +157,6 @@ def shaded(evidence: Evidence, sun_deg: float) -> Mask:
     """Return where crowns and shadows can fall, shape (rows, cols); `sun_deg` is clockwise from the view's up."""
     shade = np.zeros(evidence.shape, dtype=bool)
     if "green" in evidence.classes:
-        # 4 m: overhang of crowns over the edge of green
         shade |= dilated(evidence.layer("green") == PRESENT, _OVERHANG_M / evidence.cell_size_m)
     if "building" in evidence.classes and evidence.cell_size_m <= _SHADOW_M:
         building = evidence.layer("building") == PRESENT

@@ -63,7 +63,6 @@ class Season:
             return evidence
         cells = evidence.cells.copy()
         layers = dict(zip(evidence.classes, cells, strict=True))
-        # 25 m: width of the patches that change; fields change as a whole
         noise = smooth_noise(evidence.shape, _PATCH_M / evidence.cell_size_m, rng)
         if self.kind == "leaf_on":
             _clear(layers, CHANGED[self.kind], _strongest(noise, _of(layers, "green"), self.strength))
@@ -74,19 +73,21 @@ class Season:
                 if name in layers:
                     layers[name][white] = UNKNOWN
         elif self.kind == "low_water":
-            # Move the waterline inwards, more where the noise is strong, as from a gentle bank
-            water = _of(layers, "water")
-            if water.any():
-                # Water continues outside the view, so the edge of the view is no bank.
-                from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * evidence.cell_size_m
-                gentle = np.clip(1 + noise / 2, 0.2, 2.0)
-                # The waterline retreats by 12 m at strength 1, from a gentle bank
-                _clear(layers, ("water",), water & (from_bank_m <= self.strength * _RETREAT_M * gentle))
-            # A line within a lake or broad river does not fall dry before the water around it.
-            _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
+            self._dry(layers, noise, evidence.cell_size_m)
         else:
             self._harvest(layers, noise, Streams(rng))
         return with_cells(evidence, cells)
+
+    def _dry(self, layers: Layers, noise: Field, cell_size_m: float) -> None:
+        """Move the waterline inwards, more where the noise is strong, as from a gentle bank."""
+        water = _of(layers, "water")
+        if water.any():
+            # Water continues outside the view, so the edge of the view is no bank.
+            from_bank_m = cv2.distanceTransform(water.view(np.uint8), cv2.DIST_L2, 3) * cell_size_m
+            gentle = np.clip(1 + noise / 2, 0.2, 2.0)
+            _clear(layers, ("water",), water & (from_bank_m <= self.strength * _RETREAT_M * gentle))
+        # A line within a lake or broad river does not fall dry before the water around it.
+        _clear(layers, ("waterway",), _strongest(noise, _of(layers, "waterway") & ~water, self.strength))
 
     def _harvest(self, layers: Layers, noise: Field, streams: Streams) -> None:
         """Exchange fields and green, each parcel as a whole, and remove the boundaries between them."""

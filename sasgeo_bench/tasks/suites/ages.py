@@ -278,7 +278,6 @@ class VolatileLure(TwinSuite):
         everything else as at the original.
         """
         plain = super().edit(scene, sites, seeds)
-        # 60 m: radius of what differs: a third of a view; the rest is the same at both places
         middle = partial(mirror, within_m=CHANGED_M)
         lures = [
             replace(item, change=partial(middle, classes=(*VOLATILE, *STABLE), center_m=item.source_m))

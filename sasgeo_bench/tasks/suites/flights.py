@@ -368,7 +368,6 @@ class FlightAliasSuite(ChangedMapSuite):
         if not ground.admits(place_m):
             return None
         for stretch_m in stretches_m(float(flown_m[-1])):
-            # 1 m: nearer to the stretch, a view sees what was copied
             hull = shapely.MultiPoint(place_m[flown_m <= stretch_m]).convex_hull.buffer(_ON_PATH_M)
             area = hull.buffer(ground.reach_m + _RIM_M)
             # 1.25 of the stretch, at most, is flown over the copied ground: who comes back knows it by then

@@ -25,6 +25,7 @@ from sasgeo_bench.sensing.rendering.view import labels, render
 from sasgeo_bench.tasks.frame_evidence import poses_before
 from sasgeo_bench.tasks.frames import Frame, FrameLabels, encode_webp
 from sasgeo_bench.tasks.query import PAINTED, PERCEIVED, REAL, Detector, Role
+from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.base import MAIN_VIEW_CELLS, Draft, Scene, Shot, Suite, SuiteCard, Variant
 
 if TYPE_CHECKING:
@@ -438,14 +439,7 @@ class RealImageSuite(Suite):
         across, ahead = np.meshgrid(right, -right)
         ground_m = pose.to_map(np.stack((across.ravel(), ahead.ravel()), axis=1)).reshape(width_px, width_px, 2)
         picture, is_known = _cut(imagery, ground_m)
-        # What the map says of each pixel, shape (C, H, W): UNKNOWN beyond its ground or the imagery
-        row, col = state.grid.to_cells(ground_m.reshape(-1, 2)).T
-        inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
-        bits = np.full(len(row), _UNKNOWN_BIT)
-        bits[inside] = state.bits.bits[row[inside], col[inside]]
-        states = [(bits >> np.uint32(at) & np.uint32(1)).astype(np.uint8) for at in range(len(state.classes))]
-        found = np.stack(states).reshape(-1, *is_known.shape)
-        found[:, ((bits & _UNKNOWN_BIT) > 0).reshape(is_known.shape) | ~is_known] = UNKNOWN
+        found = _labels(state, ground_m, is_known)
         cells = np.full((len(state.classes), variant.view_cells, variant.view_cells), UNKNOWN, dtype=np.uint8)
         frame = Frame(
             picture=encode_webp(picture),
@@ -463,6 +457,18 @@ class RealImageSuite(Suite):
                 "building_share": round(float((found == PRESENT).any(axis=0).mean()), 4),
             },
         )
+
+
+def _labels(state: State, ground_m: NDArray[np.float64], is_known: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """Return what the map says of each pixel, shape (C, H, W): UNKNOWN beyond its ground or the imagery."""
+    row, col = state.grid.to_cells(ground_m.reshape(-1, 2)).T
+    inside = (row >= 0) & (row < state.grid.rows) & (col >= 0) & (col < state.grid.cols)
+    bits = np.full(len(row), _UNKNOWN_BIT)
+    bits[inside] = state.bits.bits[row[inside], col[inside]]
+    states = [(bits >> np.uint32(at) & np.uint32(1)).astype(np.uint8) for at in range(len(state.classes))]
+    found = np.stack(states).reshape(-1, *is_known.shape)
+    found[:, ((bits & _UNKNOWN_BIT) > 0).reshape(is_known.shape) | ~is_known] = UNKNOWN
+    return found
 
 
 def _pose(shot: Shot) -> Pose:

@@ -119,7 +119,6 @@ def plain_modes(state: State, seen: Evidence, prior: Prior) -> tuple[Mode, ...]:
     weights, known = 2 * (present - absent) / counted, (absent - present).sum(axis=0) / counted
     bands, frame = squares(np.concatenate((weights, known[None])), pool, cell_size_m=seen.cell_size_m)
     template = Template(weights=bands[:-1], known=bands[-1], cell_size_m=frame.cell_size_m)
-    # 32 m: margin around the largest view, for cells of the coarsest level
     # 2.5: standard deviations of the scale that the search tries (`search.plan.Plan.spread`)
     reach_m = template.reach_m * (1 + 2.5 * prior.scale_sigma) + _MARGIN_M
     return search(field_of(state, seen.classes, prior, reach_m=reach_m), template, prior, count=MODES).modes

@@ -261,7 +261,6 @@ def _change(scene: Scene, site: Site, rng: np.random.Generator) -> Change:
         # 5 m between two T-junctions: less than the width of a road
         return lambda piece: stagger(piece, crossings, offset_m=OFFSET_M, rng=rng)
     near = _near(scene, site, least_degree=3)
-    # 2 m: one or two cells: perception's own gaps are as wide
     return lambda piece: open_gaps(piece, near, gap_m=GAP_M, rng=rng)
 
 

@@ -264,7 +264,6 @@ def bent(vectors: "gpd.GeoDataFrame", field_m: NDArray[np.float64], cell_size_m:
     # 8 m: step between vertices before a line is bent: an eighth of the shortest wave
     dense = shapely.segmentize(vectors.geometry.to_numpy(), 8.0)
     shapes = shapely.transform(dense, lambda at: moved(at, field_m, cell_size_m))
-    # 0.3 m: tolerance of simplification after bending: finer than the noise of the vectors
     return round_vectors(vectors, shapely.simplify(shapes, _STRAIGHT_M))
 
 

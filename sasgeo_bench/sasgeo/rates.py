@@ -23,6 +23,7 @@ _SHARES: Final = ("hit", "false_alarm", "missing", "mapped")
 _YEARLY: Final = ("vanish_per_year", "appear_per_year")
 _CELLS_PER_WITNESS: Final = 200.0  # a house or a piece of road is right or wrong as a whole
 _EDGE: Final = 1e-5  # least distance of probabilities from 0 and 1
+_SLACK_M: Final = 1e-3  # tolerance of a distance at the edge of a ring
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,7 +108,7 @@ def ring_of(is_there: NDArray[np.bool_], *, cell_size_m: float) -> NDArray[np.ui
     distance = cv2.distanceTransform((~is_there).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     beyond = np.zeros(is_there.shape, dtype=np.uint8)
     for edge_m in (0.0, *RINGS_M):
-        beyond += distance > (edge_m + 1e-3) / cell_size_m  # m: tolerance of a distance at the edge of a ring
+        beyond += distance > (edge_m + _SLACK_M) / cell_size_m  # m: tolerance of a distance at the edge of a ring
     return beyond
 
 

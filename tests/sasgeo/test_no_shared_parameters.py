@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Generator and scorer share no parameter: no constant with a unit has one value in both, and no comment quotes one.
 
-That neither imports the other is held by `tests/test_architecture.py`.
+A number without a name is not seen here, so every length, angle and share of either side has one. That neither imports
+the other is held by `tests/test_architecture.py`.
 """
 
 import ast

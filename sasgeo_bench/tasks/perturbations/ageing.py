@@ -229,12 +229,14 @@ def _sea(layers: Mapping[str, Mask]) -> Mask | None:
     return np.isin(bodies, np.setdiff1d(np.unique(bodies[dilated(coast, 1.5)]), [0])) if count else None
 
 
+_PIECE_M: Final = 40.0  # length of the pieces in which lines vanish, appear and are redrawn
+
+
 def _objects_of(name: str, mask: Mask, pool: NoisePool, cell_size_m: float, rng: np.random.Generator) -> Objects:
     """Return the components of an area class, or the pieces of a line class between sign changes of smooth noise."""
     if name not in load_taxonomy().lines:
         return find_objects(mask)
-    # 40 m: length of the pieces in which lines vanish, appear and are redrawn
-    hills = pool.take(40.0 / cell_size_m, rng) > 0
+    hills = pool.take(_PIECE_M / cell_size_m, rng) > 0
     high, low = find_objects(mask & hills), find_objects(mask & ~hills)
     labels = np.where(low.labels > 0, low.labels + len(high.areas_cells), high.labels)
     return Objects(

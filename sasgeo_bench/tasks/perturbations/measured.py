@@ -104,6 +104,9 @@ ALARM_M2: Final = 30.0  # median area of a false building
 _ROUNDED_M: Final = 0.8  # corners are rounded by a blur of this deviation
 
 
+PATCH_M: Final = 35.0  # width of false patches of area classes
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _View:
     """One clean view; `ground` is where no class, or bare ground, is; `yards` the part beside roads and buildings."""
@@ -233,7 +236,7 @@ class _View:
         elif name in load_taxonomy().lines and errors.alarms_on == "ground":
             self._add_bands(seen, free, left, errors.width_m, rng)
         else:
-            patch, beyond = self.noise(35.0, rng), free & ~seen  # m: width of false patches of area classes
+            patch, beyond = self.noise(PATCH_M, rng), free & ~seen
             seen |= beyond & (patch >= highest_within(patch, beyond, left, rng))
 
     def _alarms(self, errors: MeasuredErrors, count: int, factor: float) -> float:

@@ -101,6 +101,9 @@ def _of(name: str, things: Sequence[_Thing]) -> list[_Thing]:
     return [item for item in things if item.name == name]
 
 
+_STEP_M: Final = 3.0  # between the points of a line at which it is hidden or not
+
+
 def _lines(
     things: Sequence[_Thing], green: shapely.Geometry, noise: MeasuredVectorNoise, streams: Streams
 ) -> list[_Thing]:
@@ -111,8 +114,7 @@ def _lines(
     missed, under = streams.chances(names, 2)
     seen, is_missed = missed >= _missed(lengths, noise.short_m), under < noise.bridge_missed
     canopy, shift = _field(noise.canopy_m, 1, streams.view), _field(noise.shift_wave_m, 2, streams.view)
-    # 3 m: step between the points of a line at which it is hidden or not
-    points = [shapely.get_coordinates(shapely.segmentize(shape, 3.0)) for shape in shapes]
+    points = [shapely.get_coordinates(shapely.segmentize(shape, _STEP_M)) for shape in shapes]
     heights = _heights(points, canopy, green, noise.under_green)
     limits = {name: _limit(list(compress(heights, names == name)), noise) for name in set(names.tolist())}
     found = []

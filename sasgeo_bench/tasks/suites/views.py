@@ -259,10 +259,12 @@ class LocalWarpSuite(Suite):
 _STRAIGHT_M: Final = 0.3  # tolerance of simplification after bending: finer than the noise of the vectors
 
 
+_STEP_M: Final = 8.0  # between vertices before a line is bent: an eighth of the shortest wave
+
+
 def bent(vectors: "gpd.GeoDataFrame", field_m: NDArray[np.float64], cell_size_m: float) -> "gpd.GeoDataFrame":
     """Move the vectors of a view as a warp moves its cells."""
-    # 8 m: step between vertices before a line is bent: an eighth of the shortest wave
-    dense = shapely.segmentize(vectors.geometry.to_numpy(), 8.0)
+    dense = shapely.segmentize(vectors.geometry.to_numpy(), _STEP_M)
     shapes = shapely.transform(dense, lambda at: moved(at, field_m, cell_size_m))
     return round_vectors(vectors, shapely.simplify(shapes, _STRAIGHT_M))
 
@@ -385,6 +387,9 @@ NEEDS: Final[dict[Kind, tuple[str, ...]]] = {
 }
 
 
+_LEAST_SHARE: Final = 0.003  # of the mapped cells that the classes of a season cover
+
+
 class SeasonSuite(Suite):
     """The query gives the season; in the falsifier it does so without any change."""
 
@@ -403,7 +408,8 @@ class SeasonSuite(Suite):
         able = {
             kind
             for kind, names in NEEDS.items()
-            if shares.keys() & CHANGED[kind] and (not names or sum(shares.get(name, 0.0) for name in names) > 0.003)
+            if shares.keys() & CHANGED[kind]
+            and (not names or sum(shares.get(name, 0.0) for name in names) > _LEAST_SHARE)
         }
         return tuple(item for item in self.variants if item.role == "control" or item.kind in able)
 

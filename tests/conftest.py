@@ -22,8 +22,8 @@ from hypothesis import HealthCheck, settings
 from sasgeo_bench import cli, progress
 from sasgeo_bench.experiments import pipeline
 from sasgeo_bench.leaderboard import board_pictures, build
+from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.leaderboard.build import figures_extra
 from sasgeo_bench.regions.build import build_region, plan_build
 from sasgeo_bench.regions.region_spec import find_region_file, read_region_file
 from sasgeo_bench.running.testing import TinyPlace, tiny_place

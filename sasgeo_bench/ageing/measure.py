@@ -15,7 +15,7 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.geometry.pose import overlapping
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.history import History, Lifecycle, ObjectKey, State
 from sasgeo_bench.osm.taxonomy import Kind, load_taxonomy
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sasgeo_bench.errors import CoverageError, ExtractError
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import overlapping
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.coverage import FULL_SHARE, LONGEST_M, M_PER_DEG, choose_coverage
 from sasgeo_bench.osm.families import missing_families
 from sasgeo_bench.osm.features import DTYPES, SEA, check_features, make_features

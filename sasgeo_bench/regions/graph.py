@@ -11,7 +11,8 @@ import pandas as pd
 import shapely
 from numpy.typing import NDArray
 
-from sasgeo_bench.geometry.pose import bearing_deg, overlapping
+from sasgeo_bench.geometry.pairs import overlapping
+from sasgeo_bench.geometry.pose import bearing_deg
 from sasgeo_bench.osm.features import SEA, check_features
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.layers import (

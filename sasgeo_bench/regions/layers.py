@@ -30,7 +30,7 @@ from tifffile import TiffFile, TiffPage, TiffWriter
 from sasgeo_bench.errors import ImageryError, SasgeoError, StoreError
 from sasgeo_bench.files.geotiff import open_geotiff
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.geometry.pose import overlapping
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 from sasgeo_bench.regions.evidence import LayerBits
 from sasgeo_bench.regions.region import ATTRIBUTION, LICENCE

@@ -5,37 +5,30 @@ import datetime as dt
 import hashlib
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-import geopandas as gpd
 import numpy as np
-import shapely
-from numpy.typing import NDArray
-from scipy.ndimage import map_coordinates
 
 from sasgeo_bench.ageing.ratebook import load_ratebook, pool_rates
 from sasgeo_bench.errors import ConfigError, SasgeoError, StoreError, counted
 from sasgeo_bench.files.folders import fresh_folder, locked
-from sasgeo_bench.geometry.grid import Grid
 from sasgeo_bench.progress import reporting, spread, tell
 from sasgeo_bench.regions import region_files
-from sasgeo_bench.regions.build import build_edited, build_region, plan_build
-from sasgeo_bench.regions.evidence import LayerBits
-from sasgeo_bench.regions.graph import build_graph
-from sasgeo_bench.regions.layers import burn_layers, make_paint, read_bits
+from sasgeo_bench.regions.build import build_region, plan_build
+from sasgeo_bench.regions.layers import read_bits
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.regions.region_spec import RegionFile
 from sasgeo_bench.sensing.rendering.palettes import Family
 from sasgeo_bench.tasks import task_files
-from sasgeo_bench.tasks.flight_sampling import Airspace, Flight, FlightDrawer
+from sasgeo_bench.tasks.edited_maps import changed_maps, degraded_map, edit_maps, nothing_to_ask
+from sasgeo_bench.tasks.flight_sampling import Airspace, FlightDrawer
 from sasgeo_bench.tasks.frames import LABELS
 from sasgeo_bench.tasks.perturbations.ageing import Ageing
-from sasgeo_bench.tasks.perturbations.base import SIGMA, smooth_noise
 from sasgeo_bench.tasks.private_seed import seed_record
 from sasgeo_bench.tasks.query import TASK_VERSION, Query, Truth, base_of
 from sasgeo_bench.tasks.sampling import Drawer, Job
@@ -44,144 +37,10 @@ from sasgeo_bench.tasks.state import State
 from sasgeo_bench.tasks.suites.ages import ageing_of
 from sasgeo_bench.tasks.suites.all_suites import suite_code
 from sasgeo_bench.tasks.suites.base import EVERYTHING, Scene, Seeds, Site, Suite, no_larger
-from sasgeo_bench.tasks.suites.flights import MAPS, FlightSuite, changed, changes_of
+from sasgeo_bench.tasks.suites.flights import FlightSuite
 from sasgeo_bench.tasks.suites.sites import choose_sites, largest_scale
 from sasgeo_bench.tasks.task_files import Task, TaskOrigin, TruthManifest
 from sasgeo_bench.tasks.task_plan import Request, aged_dates, check_count, check_roots, check_separate
-from sasgeo_bench.tasks.twin import paste
-
-DROPPED: Final = 0.2  # of the buildings
-WARP_M: Final = 1.5  # root mean square of the distance by which things are off
-_LATTICE_M: Final = 4.0
-
-
-def degrade(features: "gpd.GeoDataFrame", grid: Grid, rng: np.random.Generator) -> "gpd.GeoDataFrame":
-    """Return features without every fifth building, and all of them moved by a smooth field.
-
-    Parameters
-    ----------
-    features : GeoDataFrame
-        Of a region, in its CRS.
-    grid : Grid
-        Of the region.
-    rng : numpy.random.Generator
-        Decides which buildings are dropped, and the field.
-
-    Returns
-    -------
-    GeoDataFrame
-        Exactly `DROPPED` of the buildings fewer, rounded; things are off by `WARP_M`, root mean square.
-    """
-    buildings = np.flatnonzero((features["class"] == "building").to_numpy())
-    dropped = rng.choice(buildings, round(DROPPED * len(buildings)), replace=False)
-    kept = features.drop(index=features.index[dropped])
-    field_m = warp_field(grid, rng)
-    return kept.set_geometry(shapely.transform(kept.geometry.to_numpy(), lambda at: _moved(at, field_m, grid)))
-
-
-def warp_field(grid: Grid, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Draw how far ground is off, east and north, shape (2, rows, cols) of a lattice of 4 m; metres."""
-    shape = tuple(max(2, round(cells * grid.cell_size_m / _LATTICE_M)) for cells in grid.shape)
-    parts = [smooth_noise((shape[0], shape[1]), 60.0 / _LATTICE_M, rng) for _ in range(2)]
-    return np.asarray(np.stack(parts) * (WARP_M / SIGMA / np.sqrt(2)), dtype=np.float32)
-
-
-def _moved(en_m: NDArray[np.float64], field_m: NDArray[np.float32], grid: Grid) -> NDArray[np.float64]:
-    """Return points (easting, northing), shape (N, 2), where the field puts them."""
-    rows, cols = field_m.shape[1:]
-    col, row = (grid.to_uv(en_m) * (cols / grid.cols, rows / grid.rows) - 0.5).T
-    by_m = [map_coordinates(part, (row, col), order=1, mode="nearest", output=np.float64) for part in field_m]
-    return np.asarray(en_m + np.column_stack(by_m))
-
-
-def degraded_map(request: Request, suite: Suite, base: Region) -> State:
-    """Return the region's map with the faults of worse mapping, which is built next to it."""
-    plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
-    rng = Seeds(root=request.seed, names=(request.region.id, suite.card.name)).rng("degraded map")
-    features = degrade(base.features, base.grid, rng)
-    note = f"degraded: {DROPPED:.0%} of the buildings dropped, the rest {WARP_M:g} m off, for suite {suite.card.name}"
-    folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
-    return State.read(folder)
-
-
-def edit_maps(
-    request: Request, drawer: Drawer, base: Region, sites: tuple[Site, ...]
-) -> tuple[Drawer, tuple[Site, ...]]:
-    """Apply the suite's edit to map and world; drop sites without a twin."""
-    suite, scene, seeds = drawer.suite, drawer.scene, drawer.seeds
-    edit = suite.edit(scene, sites, seeds)
-    # With many sites there may be no room for the copies of any.
-    while request.may_be_fewer and edit is not None and not edit.sites and len(sites) > 1:
-        sites = sites[: len(sites) // 2]
-        edit = suite.edit(scene, sites, seeds)
-    if edit is None:
-        return drawer, sites
-    if not edit.sites:
-        raise ConfigError(f"{request.region.id} has no room for a copy of a site, as suite {suite.card.name!r} needs")
-    if len(edit.sites) < request.count and not request.may_be_fewer:
-        raise ConfigError(
-            f"{request.region.id} has room for the copies of {len(edit.sites)} of {len(sites)} sites of suite "
-            f"{suite.card.name!r}: lower --n or pass --up-to"
-        )
-    # Tried on the unedited map, so that no edited map is written without a query to ask on it.
-    trial = replace(drawer, scene=replace(scene, twins=edit.twins))
-    reasons = Counter(map(trial.why_not, trial.jobs(edit.sites)))
-    if None not in reasons:
-        raise nothing_to_ask(request, suite, reasons)
-    plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
-    world = scene.world
-    if edit.world_pastes is not None:
-        world = _state_of(base, paste(base.features, edit.world_pastes))
-    if not edit.map_pastes:
-        return trial, edit.sites
-    features = paste(base.features, edit.map_pastes)
-    note = f"edited: {len(edit.map_pastes)} parts pasted for suite {suite.card.name}"
-    folder = build_edited(plan, base, features, suffix=suite.card.name, note=note)
-    edited = State.read(folder)
-    world = edited if edit.world_pastes is None else world
-    return replace(drawer, scene=replace(scene, map=edited, world=world, twins=edit.twins)), edit.sites
-
-
-def changed_maps(request: Request, base: Region, flights: Mapping[int, Flight]) -> tuple[State, ...]:
-    """Return the maps that are changed for flights, which are built next to the region's; none if none are needed."""
-    plots = [(site, flight.plot) for site, flight in flights.items() if flight.plot is not None]
-    plan = plan_build(request.region, out=request.out, extract_folders=request.extract_folders)
-    found = []
-    for number in range(MAPS if plots else 0):
-        changes = changes_of(plots, number)
-        features, coverage = changed(base.features, base.coverage, changes)
-        folder = build_edited(
-            plan,
-            base,
-            features,
-            suffix=f"{request.suite}-{number + 1}",
-            note=f"edited: {len(changes)} parts changed for suite {request.suite}",
-            coverage=None if coverage is base.coverage else coverage,
-        )
-        found.append(State.read(folder))
-    return tuple(found)
-
-
-def nothing_to_ask(request: Request, suite: Suite, reasons: Counter[str | None]) -> ConfigError:
-    """Return an error that gives the most frequent reason why no query can be asked."""
-    reason = reasons.most_common(1)[0][0]
-    return ConfigError(f"{request.region.id} is too small or too empty for suite {suite.card.name!r}: {reason}")
-
-
-def _state_of(base: Region, features: gpd.GeoDataFrame) -> State:
-    """Return a state that is seen and never searched: layers in memory, no graph."""
-    paint = make_paint(features, base.classes, base.coverage)
-    return State(
-        region=base.manifest.id,
-        date=base.manifest.extract.date,
-        grid=base.grid,
-        classes=base.classes,
-        bits=LayerBits.of(burn_layers(paint, base.grid)),
-        features=features,
-        graph=build_graph(features.iloc[:0]),
-        coverage=base.coverage,
-    )
-
 
 _SKIP: Final = " (--skip passes on to the next suite)"
 

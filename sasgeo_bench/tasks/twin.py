@@ -13,7 +13,7 @@ import shapely
 import shapely.affinity
 from numpy.typing import NDArray
 
-from sasgeo_bench.geometry.pose import overlapping
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm.features import check_features
 from sasgeo_bench.osm.taxonomy import load_taxonomy
 

@@ -10,8 +10,8 @@ import shapely
 
 import sasgeo_bench
 from sasgeo_bench.errors import ShapeError
-from sasgeo_bench.geometry import pose
-from sasgeo_bench.geometry.pose import overlapping
+from sasgeo_bench.geometry import pairs
+from sasgeo_bench.geometry.pairs import overlapping
 from sasgeo_bench.osm import read
 from sasgeo_bench.regions.layers import groups_within, touching_pairs
 
@@ -19,7 +19,7 @@ CODE = Path(sasgeo_bench.__file__).parent
 # How many trees are asked otherwise: for what is near single places, a tile or the sides of a box, or the nearest
 # alone; or about what was looked at by `overlapping` when its region was built.
 APART = {
-    "geometry/pose.py": 1,
+    "geometry/pairs.py": 1,
     **dict.fromkeys(("osm/read.py", "osm/mapped.py", "osm/synthetic/sketch.py", "regions/build.py"), 1),
     **dict.fromkeys(("ageing/measure.py", "sasgeo/nodes.py"), 1),
     **{f"tasks/suites/{name}.py": 1 for name in ("twins", "vectors", "ages", "mining")},
@@ -27,8 +27,8 @@ APART = {
 
 
 def test_one_shape_drawn_many_times_is_refused_with_a_count_and_many_that_overlap_few_are_not(monkeypatch):
-    monkeypatch.setattr(pose, "MOST_PAIRS", 1000)
-    monkeypatch.setattr(pose, "_AT_ONCE", 3000)  # several steps
+    monkeypatch.setattr(pairs, "MOST_PAIRS", 1000)
+    monkeypatch.setattr(pairs, "_AT_ONCE", 3000)  # several steps
     same = np.full(60, shapely.box(0, 0, 9, 9))
     row = shapely.box(np.arange(600) * 8.0, 0, np.arange(600) * 8.0 + 9, 9)
     for find in (touching_pairs, lambda given: groups_within(given, 1.0), lambda given: overlapping(given, given)):
@@ -50,7 +50,7 @@ def test_memory_for_shapes_that_overlap_grows_with_their_number_alone():
 
 
 def test_ends_of_ways_and_probes_in_many_areas_are_refused_too(monkeypatch):
-    monkeypatch.setattr(pose, "MOST_PAIRS", 1000)
+    monkeypatch.setattr(pairs, "MOST_PAIRS", 1000)
     same, box = np.full(60, shapely.box(0, 0, 1e5, 1e5)), shapely.box(0, 0, 1e5, 1e5)
     line = shapely.LineString([(2e4, 2e4), (5e4, 5e4)])
     ways = [(line, [shapely.get_point(line, 0), shapely.get_point(line, 1)])] * 30

@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from sasgeo_bench.canvas import page
-from sasgeo_bench.leaderboard import build
+from sasgeo_bench.leaderboard import board_figures
 from sasgeo_bench.leaderboard.board import Board
-from sasgeo_bench.leaderboard.build import figures_extra
+from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.plots import (
     BEYOND_M,
     MOST_MATCHERS,
@@ -308,7 +308,7 @@ def test_a_stanford_figure_is_of_few_matchers_those_of_contrasts_first(board, mo
         return {matcher for matcher, _ in drawn.keywords["levels"]}
 
     assert rows() == {"raster", "graph"}
-    monkeypatch.setattr(build, "MOST_STANFORD", 1)
+    monkeypatch.setattr(board_figures, "MOST_STANFORD", 1)
     assert rows() == {CONTRASTS[0].second}
 
 

@@ -19,8 +19,8 @@ from sasgeo_bench.files import folders
 from sasgeo_bench.files.folders import sha256_of
 from sasgeo_bench.files.parquet import read_frame
 from sasgeo_bench.leaderboard import build, score
+from sasgeo_bench.leaderboard.board_figures import figures_extra
 from sasgeo_bench.leaderboard.board_files import Extra
-from sasgeo_bench.leaderboard.build import figures_extra
 from sasgeo_bench.leaderboard.pipeline_spec import PipelineFile
 from sasgeo_bench.leaderboard.scored import ScoreRequest
 from sasgeo_bench.progress import reporting

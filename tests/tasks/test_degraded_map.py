@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from sasgeo_bench.geometry.grid import Grid
-from sasgeo_bench.tasks.build import WARP_M, degrade, warp_field
+from sasgeo_bench.tasks.degraded_map import WARP_M, degrade, warp_field
 
 GRID = Grid(epsg=32632, west_m=500_000.0, north_m=5_001_000.0, cell_size_m=1.0, rows=1000, cols=800)
 

@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The figures that a board has, by name: what there are data for is drawn, and of the rest a line says why not."""
+
+import re
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pandas as pd
+
+from sasgeo_bench.leaderboard.board_files import Extra
+from sasgeo_bench.leaderboard.flight_plots import (
+    distance_frame,
+    draw_distance,
+    draw_drift,
+    draw_intervals,
+    drift_frame,
+    interval_frame,
+    kinds_of,
+)
+from sasgeo_bench.leaderboard.plots import (
+    ages_frame,
+    draw_ages,
+    draw_bars,
+    draw_forest,
+    draw_reliability,
+    draw_risk,
+    draw_stanford,
+    draw_steps,
+    ranked_matchers,
+    reliability_frame,
+    risk_frame,
+    shown_matchers,
+    stress_frame,
+)
+from sasgeo_bench.leaderboard.pooled_plots import (
+    COSTS,
+    ablation_frame,
+    cost_frame,
+    draw_ablation,
+    draw_costs,
+    draw_errors,
+    draw_prices,
+    draw_recall,
+    errors_frame,
+    price_frame,
+    recall_frame,
+)
+from sasgeo_bench.leaderboard.scored import Scored
+from sasgeo_bench.progress import tell
+from sasgeo_bench.scoring.contrasts import Contrast, by_place
+from sasgeo_bench.scoring.protection import ProtectionLevels, protection_levels
+from sasgeo_bench.scoring.score import FIX_M, single_views
+from sasgeo_bench.scoring.strata import GROUP, queries_of, steps_frame
+from sasgeo_bench.tasks.split import Split
+
+Draw = Callable[[Path], object]
+Named = Iterator[tuple[str, Draw]]
+MOST_STANFORD: Final = 5  # matchers
+_PLAIN: Final = re.compile(r"[^A-Za-z0-9.]+")
+
+
+def figures_extra(scored: Scored, *, contrasts: Sequence[Contrast] = (), split: Split | None = None) -> Extra:
+    """Return the figures of a board, as SVG.
+
+    Report the kinds of figures that lack data. `contrasts` are the registered ones; `split` assigns the
+    places that calibrate conformal protection levels.
+    """
+    table, scores = scored.board.leaderboard, scored.scores
+    shown = shown_matchers(table, contrasts)
+    queries = queries_of(scores)
+    alone = {name: single_views(frame) for name, frame in scores.items()}
+    steps = steps_frame(table, queries, shown)
+    if steps.empty:  # a table without a row does not know its types, by which it is held against others
+        steps = steps.astype({name: queries[name].dtype for name in ("strength", "view_cells")})
+    ages = ages_frame(steps, queries, scored.measured)
+    # An age is no other strength: where maps have ages, those are the axis.
+    others = steps[~steps["suite"].isin(set(ages["suite"]))]
+    calibrated = _calibrated(table)
+    judged, groups = scored.judged, GROUP[1:]
+
+    def each(name: str, rows: pd.DataFrame, columns: Sequence[str], draw: Callable[..., object]) -> Named:
+        """Yield a figure for each group of rows; prior groups are never together."""
+        for key, part in rows.groupby(list(columns), sort=True):
+            yield _file_name(name, *map(str, key)), partial(draw, rows=part, shown=shown)
+
+    kinds: dict[str, Callable[[], Named]] = {
+        "success against the age of the map": lambda: each("age", ages, GROUP, draw_ages),
+        "success against strength": lambda: each("strength", others, GROUP, draw_steps),
+        "success under stress": lambda: each("stress", stress_frame(table, shown), groups, draw_bars),
+        "arms side by side": lambda: each("ablation", ablation_frame(scores, contrasts, shown), groups, draw_ablation),
+        "differences by place": lambda: _forests(scored, contrasts),
+        "recall against K": lambda: each(
+            "recall", recall_frame(alone, scored.predictions, scored.truths, shown), groups, draw_recall
+        ),
+        "the distribution of errors": lambda: each("errors", errors_frame(alone, table, shown), groups, draw_errors),
+        "success against cost": lambda: each("price", _priced(scored), groups, draw_prices),
+        "risk against coverage": lambda: each("risk", risk_frame(judged, shown), GROUP, draw_risk),
+        "reliability": lambda: each(
+            "reliability", reliability_frame(judged, calibrated, shown), groups, draw_reliability
+        ),
+        "the cost of decisions": lambda: each("cost", cost_frame(judged, calibrated, shown), groups, draw_costs),
+        "protection levels against errors": lambda: _stanfords(scored, shown, split),
+        "error along flights": lambda: each(
+            "distance", distance_frame(scored.views, scores, shown), GROUP, draw_distance
+        ),
+        "how far odometers carry fixes on flights": lambda: each(
+            "interval", interval_frame(table, kinds_of(scores), shown), GROUP, draw_intervals
+        ),
+        "success against the drift of odometers": lambda: each("drift", drift_frame(table, shown), groups, draw_drift),
+    }
+    drawn: dict[str, dict[str, Draw]] = {}
+    for kind, make in kinds.items():
+        with scored.failures.of(f"figures of {kind}"):
+            drawn[kind] = {f"{name}.svg": draw for name, draw in make()}
+    empty = [kind for kind, named in drawn.items() if not named]
+    if empty:
+        tell(f"figures left out, for nothing on this board is seen in them: {', '.join(empty)}")
+    return Extra(figures={name: draw for named in drawn.values() for name, draw in named.items()})
+
+
+def _file_name(*parts: str) -> str:
+    return _PLAIN.sub("-", "-".join(parts)).strip("-").lower()
+
+
+def _calibrated(table: pd.DataFrame) -> set[tuple[str, str]]:
+    """Return the matchers x rejectors that give probabilities."""
+    rows = table[table["metric"] == "ece"]
+    return set(zip(rows["matcher"], rows["rejector"], strict=True))
+
+
+def _priced(scored: Scored) -> pd.DataFrame:
+    """Return the ranked matchers with some known cost, for who is cheap need not be among the few that are shown."""
+    rows = price_frame(scored.board.leaderboard, scored.scores, ranked_matchers(scored.board.leaderboard))
+    known: pd.DataFrame = rows[np.isfinite(rows[list(COSTS.values())].to_numpy(float)).any(axis=1)]
+    return known
+
+
+def _forests(scored: Scored, contrasts: Sequence[Contrast]) -> Named:
+    for contrast, finding in zip(contrasts, scored.board.findings, strict=True):
+        places = by_place(contrast, scored.scores, scored.judged) if finding.n else ()
+        if places:
+            yield (
+                _file_name("contrast", contrast.name),
+                partial(draw_forest, contrast=contrast, finding=finding, places=places),
+            )
+
+
+def _stanfords(scored: Scored, shown: Sequence[str], split: Split | None) -> Named:
+    """Yield a panel for each matcher and method, of few matchers, those of contrasts first."""
+    found: dict[tuple[str, float], dict[tuple[str, str], ProtectionLevels]] = {}
+    for matcher in (name for name in shown if name in scored.scores):
+        for item in protection_levels(scored.scores[matcher], scored.predictions[matcher], split):
+            key = item.prior_group, item.risk
+            rows = {name for name, _ in found.get(key, ())} | {matcher}
+            if len(item.level_m) and len(rows) <= MOST_STANFORD:
+                found.setdefault(key, {})[matcher, item.method] = item
+    for (prior_group, risk), levels in sorted(found.items()):
+        yield (
+            _file_name("stanford", f"{risk:g}", prior_group),
+            partial(draw_stanford, levels=levels, limit_m=FIX_M),
+        )

@@ -18,7 +18,7 @@ import sasgeo_bench as sgb
 from docs.site import reference
 from sasgeo_bench.cli import program
 from sasgeo_bench.errors import PerturbError
-from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.matching.scaffold import package_files
 from tests.test_repository import markdown_links
 
 ROOT = Path(__file__).parents[1]
@@ -165,7 +165,9 @@ def test_the_readme_is_read_in_two_minutes():
 
 def test_the_matcher_of_the_readme_answers(tmp_path):
     (code,) = re.findall(r"^```python\n(.*?)^```$", read(ROOT / "README.md"), re.MULTILINE | re.DOTALL)
-    (tmp_path / "card.toml").write_text(plugin_files("my-matcher")["src/my_matcher/card.toml"], encoding="utf-8")
+    (tmp_path / "card.toml").write_text(
+        package_files("matcher", "my-matcher")["src/my_matcher/card.toml"], encoding="utf-8"
+    )
     made: dict[str, object] = {"__file__": str(tmp_path / "matcher.py")}
     exec(code, made)  # noqa: S102 - of our own documents
     matcher, place = made["MyMatcher"](), sgb.tiny_place(tmp_path)  # type: ignore[operator]

@@ -19,7 +19,7 @@ import typer
 from sasgeo_bench import cli
 from sasgeo_bench.cli import program
 from sasgeo_bench.leaderboard.manifests import PipelineRecord
-from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.publishing.archive import pack_board
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 from tests import world
@@ -254,7 +254,7 @@ def write_files(document: str, folder: Path) -> None:
 
 def write_plugin(folder: Path) -> None:
     """Make the package that the guide to a matcher ends with; other documents go on from there."""
-    for name, content in plugin_files("my-matcher").items():
+    for name, content in package_files("matcher", "my-matcher").items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(content, encoding="utf-8")
 

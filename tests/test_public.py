@@ -14,7 +14,7 @@ import sasgeo_baselines
 import sasgeo_bench as sgb
 from sasgeo_bench.cli.program import load
 from sasgeo_bench.errors import SasgeoError
-from sasgeo_bench.matching.scaffold import plugin_files
+from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.progress import reporting
 from sasgeo_bench.regions.region_files import read_region
 
@@ -49,7 +49,7 @@ def test_baselines_and_a_new_plugin_need_public_names_alone():
     assert [
         (path.name, found) for path in baselines if (found := inner_imports(path.read_text(encoding="utf-8")))
     ] == []
-    files = plugin_files("my-matcher")
+    files = package_files("matcher", "my-matcher")
     assert not [name for path, text in files.items() if path.endswith(".py") for name in inner_imports(text)]
     assert any("from sasgeo_bench import" in text for text in files.values())
 

@@ -39,7 +39,6 @@ class _Door(NamedTuple):
 
     group: str
     load: str
-    files: str | None = None  # of a new package
     check: str | None = None
     control: str | None = None  # the runner's own, which is no plugin
 
@@ -48,21 +47,18 @@ _DOORS: Final = {
     "matcher": _Door(
         MATCHERS,
         "matching.plugins:load_matcher",
-        "matching.scaffold:plugin_files",
         "running.testing:check_matcher",
         ORACLE,
     ),
     "tracker": _Door(
         TRACKERS,
         "matching.plugins:load_tracker",
-        "matching.scaffold:tracker_files",
         "running.tracker_testing:check_tracker",
         ORACLE,
     ),
     "segmenter": _Door(
         SEGMENTERS,
         "matching.plugins:load_segmenter",
-        "matching.scaffold:segmenter_files",
         "running.segmenter_testing:check_segmenter",
         ORACLE_SEGMENTER,
     ),
@@ -70,7 +66,6 @@ _DOORS: Final = {
     "suite": _Door(
         SUITES,
         "tasks.suites.all_suites:find_suite",
-        "matching.scaffold:suite_files",
         "running.suite_testing:check_suite",
     ),
 }
@@ -187,8 +182,9 @@ def new_command(
     folder: Annotated[Path | None, typer.Option("--into", help="an empty folder; default: one of that name")] = None,
 ) -> None:
     """Write a plugin package that passes `check` at once, for you to put your method into."""
-    door = _DOORS[kind]
-    lay_package(name, folder, _function(str(door.files))(name))
+    from sasgeo_bench.matching.scaffold import package_files  # noqa: PLC0415
+
+    lay_package(name, folder, package_files(kind, name))
     if kind is New.MATCHER:
         entry = f"sasgeo-bench enter docs/results/systems-objects --matcher {name}"
         tell(f"later: {entry} (docs/howto/matcher.md walks the path)")

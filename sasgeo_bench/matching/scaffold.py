@@ -4,13 +4,13 @@
 import keyword
 import re
 import sys
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from sasgeo_bench.errors import ConfigError, StoreError
-from sasgeo_bench.files.plugins import CARD_FILE, KINDS, MATCHERS, SEGMENTERS, SUITES, TRACKERS, shipped_names
+from sasgeo_bench.files.plugins import CARD_FILE, MATCHERS, SEGMENTERS, SUITES, TRACKERS, shipped_names
 from sasgeo_bench.matching.submission import EXAMPLE
 from sasgeo_bench.tasks.suites.all_suites import EVERY_SUITE
 
@@ -111,128 +111,6 @@ class {cls}:
         return float(agree.sum() / max(1, either.sum()))
 '''
 
-_TEST: Final = '''\
-"""The {kind} keeps to what every {kind} keeps to."""
-
-from sasgeo_bench import check_{kind}
-
-
-def test_it_conforms():
-    faults = [check for check in check_{kind}("{module}.{kind}:{attribute}") if check.outcome == "fail"]
-    assert not faults, faults
-'''
-
-_README: Final = """\
-# {title}
-
-A matcher for sasgeo-bench.
-
-```bash
-pip install -e .
-sasgeo-bench check {name}
-sasgeo-bench run --matcher {name} --tasks out/tasks/clean/town-riverside
-```
-
-Say in the card (`src/{module}/card.toml`) where the method comes from, what of it is yours, and what a query must
-tell for it to work; raise its version whenever answers change. Then enter a published board:
-
-```bash
-sasgeo-bench enter docs/results/systems-objects --matcher {name}
-```
-"""
-
-
-def plugin_files(name: str) -> dict[str, str]:
-    """Return the text of every file of a new package with a matcher, by its path.
-
-    `name` is that of the matcher; raise `ConfigError` if it is not allowed, or taken.
-    """
-    return package_files(name, group=MATCHERS, code=_MATCHER, readme=_README, card=EXAMPLE)
-
-
-def package_files(
-    name: str, *, group: str, code: str, readme: str, card: str | None = None, attribute: str | None = None
-) -> dict[str, str]:
-    """Return the text of every file of a new package with a plugin, by its path.
-
-    `group` is that of its entry point; `code`, `readme` and `card`, where it has one, are templates. `attribute` is
-    what the entry point names, if that is not the class. Raise `ConfigError` if the name is not allowed, or taken.
-    """
-    # Words of the import lines of a module, which its own class must not be called
-    imported_names = frozenset(re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", code, re.MULTILINE))))
-    words = _words_of(name, group=group, imported=imported_names)
-    words["attribute"] = attribute or words["cls"]
-    files = {
-        "pyproject.toml": _PYPROJECT,
-        "README.md": readme,
-        "src/{module}/__init__.py": '"""The package of the {kind} {name}."""\n',
-        "src/{module}/{kind}.py": code,
-        "tests/test_conforms.py": _TEST,
-    } | ({} if card is None else {f"src/{{module}}/{CARD_FILE}": card})
-    return {path.format(**words): text.format(**words) for path, text in files.items()}
-
-
-def _words_of(name: str, *, group: str, imported: Collection[str]) -> dict[str, str]:
-    """Return the words of a new package: its kind, group, name, distribution, module, class and title."""
-    # The class is called as none of the `imported` names is. Raise `ConfigError` if the name is not allowed, or taken.
-    kind = KINDS[group]
-    module = name.replace("-", "_")
-    if _NAME.fullmatch(name) and (keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST):
-        raise ConfigError(f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name")
-    if not _NAME.fullmatch(name):
-        raise ConfigError(
-            f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, a letter first, as in "
-            f"my-{kind}; got {name!r}"
-        )
-    if name in shipped_names(group):
-        raise ConfigError(
-            f"{name!r} is a {kind} of sasgeo-bench itself, which would be used instead of yours; choose another"
-        )
-    words = re.split(r"[-_]", name)
-    own = "".join(word.capitalize() for word in words)
-    return {
-        "kind": kind,
-        "group": group,
-        "name": name,
-        "distribution": name.replace("_", "-"),
-        "module": module,
-        "cls": f"{own}{kind.capitalize()}" if own in imported or keyword.iskeyword(own) else own,
-        "title": " ".join(words).capitalize(),
-    }
-
-
-def write_plugin(folder: Path, files: Mapping[str, str]) -> None:
-    """Write all files of a package, or none; raise `StoreError` if the folder is not empty or cannot be written."""
-    if not _is_free(folder):
-        raise StoreError(f"{folder} is there already and not empty: name another folder")
-    made: list[Path] = []
-    try:
-        for name, text in files.items():
-            target = folder / name
-            missing = [parent for parent in target.parents if not parent.exists()]
-            for parent in reversed(missing):
-                parent.mkdir()
-                made.append(parent)
-            made.append(target)
-            target.write_text(text, encoding="utf-8")
-    except OSError as error:
-        for path in reversed(made):
-            with suppress(OSError):
-                path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
-        raise StoreError(
-            f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
-        ) from error
-
-
-def _is_free(folder: Path) -> bool:
-    try:
-        return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
-    except OSError as error:
-        raise StoreError(
-            f"{folder} cannot be read ({error.strerror or error}): check your rights, or name another folder"
-        ) from error
-
-
 _SEGMENTER: Final = '''\
 """The segmenter {name}: here is where your method goes."""
 
@@ -288,32 +166,6 @@ def colours_of(learned: str) -> dict[str, np.ndarray]:
     return {{name: np.array(rows) for name, rows in json.loads(learned).items()}}
 '''
 
-_SEGMENTER_README: Final = """\
-# {title}
-
-A segmenter for sasgeo-bench.
-
-```bash
-pip install -e .
-sasgeo-bench check {name}
-```
-
-Say in the card (`src/{module}/segmenter.py`) where the method comes from and what of it is yours; raise its version
-whenever answers change.
-"""
-
-
-def segmenter_files(name: str) -> dict[str, str]:
-    """Return the text of every file of a new package with a segmenter, by its path.
-
-    `name` is that of the segmenter; raise `ConfigError` if it is not allowed, or taken.
-
-    >>> sorted(segmenter_files("my-segmenter"))[-1]
-    'tests/test_conforms.py'
-    """
-    return package_files(name, group=SEGMENTERS, code=_SEGMENTER, readme=_SEGMENTER_README)
-
-
 _SUITE: Final = '''\
 """The suite {name}: here is where your stress goes."""
 
@@ -359,38 +211,6 @@ SUITE = PlainSuite(
     change=change,
 )
 '''
-
-_SUITE_README: Final = """\
-# {title}
-
-A suite for sasgeo-bench: queries under a stress of your own.
-
-```bash
-pip install -e .
-sasgeo-bench check {name}
-sasgeo-bench make-queries --suite {name} --regions town-riverside --n 2
-sasgeo-bench inspect {name}/town-riverside --rows 6
-```
-
-Say in the card (`src/{module}/suite.py`) what should differ before you run anything. A pipeline file names the suite in
-a `[[task]]` as it does those of sasgeo-bench.
-"""
-
-
-def suite_files(name: str) -> dict[str, str]:
-    """Return the text of every file of a new package with a suite, by its path.
-
-    `name` is that of the suite; raise `ConfigError` if it is not allowed, or taken.
-
-    >>> sorted(suite_files("my-suite"))[-1]
-    'tests/test_conforms.py'
-    """
-    if name in EVERY_SUITE:
-        raise ConfigError(
-            f"{name!r} is a suite of sasgeo-bench itself, which would be used instead of yours; choose another"
-        )
-    return package_files(name, group=SUITES, code=_SUITE, readme=_SUITE_README, attribute="SUITE")
-
 
 _TRACKER: Final = '''\
 """The tracker {name}: here is where your method goes."""
@@ -479,7 +299,7 @@ class {cls}:
         self.taken, self.refused = self.taken + 1, 0
 '''
 
-_CARD: Final = (
+_TRACKER_CARD: Final = (
     EXAMPLE.replace('["retrieval", "localization"]', '["sequence"]')
     .replace(
         "looks at a coarse lattice of places, with the heading of the prior alone",
@@ -488,31 +308,176 @@ _CARD: Final = (
     .replace('needs = ["position"]', "needs = []")
 )
 
-_TRACKER_README: Final = """\
+_TEST: Final = '''\
+"""The {kind} keeps to what every {kind} keeps to."""
+
+from sasgeo_bench import check_{kind}
+
+
+def test_it_conforms():
+    faults = [check for check in check_{kind}("{module}.{kind}:{attribute}") if check.outcome == "fail"]
+    assert not faults, faults
+'''
+
+_README: Final = """\
 # {title}
 
-A tracker for sasgeo-bench.
+A {kind} for sasgeo-bench%(about)s.
 
 ```bash
 pip install -e .
 sasgeo-bench check {name}
+%(commands)s```
+
+Say in the card (`src/{module}/%(place)s`) %(words)s
+"""
+_WORDS: Final = """\
+where the method comes from and what of it is yours; raise its version
+whenever answers change."""
+
+
+def _readme(place: str, *, words: str = _WORDS, commands: str = "", about: str = "") -> str:
+    return _README % {"place": place, "words": words, "commands": commands, "about": about}
+
+
+class _Package(NamedTuple):
+    """Templates of a new package of one kind."""
+
+    group: str  # of its entry point
+    code: str
+    readme: str
+    card: str | None = None  # beside the code, where it is not in it
+    attribute: str = "{cls}"  # what the entry point names
+
+
+_PACKAGES: Final = {
+    "matcher": _Package(
+        MATCHERS,
+        _MATCHER,
+        _readme(
+            CARD_FILE,
+            words="""\
+where the method comes from, what of it is yours, and what a query must
+tell for it to work; raise its version whenever answers change. Then enter a published board:
+
+```bash
+sasgeo-bench enter docs/results/systems-objects --matcher {name}
+```""",
+            commands="sasgeo-bench run --matcher {name} --tasks out/tasks/clean/town-riverside\n",
+        ),
+        EXAMPLE,
+    ),
+    "tracker": _Package(
+        TRACKERS,
+        _TRACKER,
+        _readme(
+            CARD_FILE,
+            commands="""\
 sasgeo-bench make-queries --suite flight-clean --regions town-grid --n 1 --up-to
 sasgeo-bench run --matcher {name} --tasks out/tasks/flight-clean/town-grid
-```
+""",
+        ),
+        _TRACKER_CARD,
+    ),
+    "segmenter": _Package(SEGMENTERS, _SEGMENTER, _readme("segmenter.py")),
+    "suite": _Package(
+        SUITES,
+        _SUITE,
+        _readme(
+            "suite.py",
+            words="""\
+what should differ before you run anything. A pipeline file names the suite in
+a `[[task]]` as it does those of sasgeo-bench.""",
+            commands="""\
+sasgeo-bench make-queries --suite {name} --regions town-riverside --n 2
+sasgeo-bench inspect {name}/town-riverside --rows 6
+""",
+            about=": queries under a stress of your own",
+        ),
+        attribute="SUITE",
+    ),
+}
 
-Say in the card (`src/{module}/card.toml`) where the method comes from and what of it is yours; raise its version
-whenever answers change.
-"""
 
+def package_files(kind: str, name: str) -> dict[str, str]:
+    """Return the text of every file of a new package with a plugin of a kind, as in "matcher", by its path.
 
-def tracker_files(name: str) -> dict[str, str]:
-    """Return the text of every file of a new package with a tracker, by its path.
+    `name` is that of the plugin; raise `ConfigError` if it is not allowed, or taken.
 
-    `name` is that of the tracker; raise `ConfigError` if it is not allowed, or taken.
-
-    >>> sorted(tracker_files("my-tracker"))[-2:]
+    >>> sorted(package_files("tracker", "my-tracker"))[-2:]
     ['src/my_tracker/tracker.py', 'tests/test_conforms.py']
     """
-    if name in shipped_names(MATCHERS):
+    package = _PACKAGES[kind]
+    _check_name(kind, name, package.group)
+    parts = re.split(r"[-_]", name)
+    own = "".join(part.capitalize() for part in parts)
+    # Words of the import lines of the module, which its own class must not be called
+    imported = re.findall(r"\w+", " ".join(re.findall(r"^(?:from|import) .*$", package.code, re.MULTILINE)))
+    words = {
+        "kind": kind,
+        "group": package.group,
+        "name": name,
+        "distribution": name.replace("_", "-"),
+        "module": name.replace("-", "_"),
+        "cls": f"{own}{kind.capitalize()}" if own in imported or keyword.iskeyword(own) else own,
+        "title": " ".join(parts).capitalize(),
+    }
+    words["attribute"] = package.attribute.format(**words)
+    files = {
+        "pyproject.toml": _PYPROJECT,
+        "README.md": package.readme,
+        "src/{module}/__init__.py": '"""The package of the {kind} {name}."""\n',
+        "src/{module}/{kind}.py": package.code,
+        "tests/test_conforms.py": _TEST,
+    } | ({} if package.card is None else {f"src/{{module}}/{CARD_FILE}": package.card})
+    return {path.format(**words): text.format(**words) for path, text in files.items()}
+
+
+def _check_name(kind: str, name: str, group: str) -> None:
+    """Raise `ConfigError` if a new plugin cannot have a name."""
+    module = name.replace("-", "_")
+    if not _NAME.fullmatch(name):
+        raise ConfigError(
+            f"a {kind}'s name has lower-case letters, digits, hyphens and underscores, a letter first, as in "
+            f"my-{kind}; got {name!r}"
+        )
+    if keyword.iskeyword(module) or module in _TAKEN or len(name) > _LONGEST:
+        raise ConfigError(f"{name!r} cannot be a package: it is taken, a keyword, or too long; choose another name")
+    if name in shipped_names(group) or (group == SUITES and name in EVERY_SUITE):
+        raise ConfigError(
+            f"{name!r} is a {kind} of sasgeo-bench itself, which would be used instead of yours; choose another"
+        )
+    if group == TRACKERS and name in shipped_names(MATCHERS):
         raise ConfigError(f"{name!r} is a matcher of sasgeo-bench itself, which run would take instead; choose another")
-    return package_files(name, group=TRACKERS, code=_TRACKER, readme=_TRACKER_README, card=_CARD)
+
+
+def write_plugin(folder: Path, files: Mapping[str, str]) -> None:
+    """Write all files of a package, or none; raise `StoreError` if the folder is not empty or cannot be written."""
+    if not _is_free(folder):
+        raise StoreError(f"{folder} is there already and not empty: name another folder")
+    made: list[Path] = []
+    try:
+        for name, text in files.items():
+            target = folder / name
+            missing = [parent for parent in target.parents if not parent.exists()]
+            for parent in reversed(missing):
+                parent.mkdir()
+                made.append(parent)
+            made.append(target)
+            target.write_text(text, encoding="utf-8")
+    except OSError as error:
+        for path in reversed(made):
+            with suppress(OSError):
+                path.rmdir() if path.is_dir() else path.unlink(missing_ok=True)
+        raise StoreError(
+            f"{folder} cannot be written ({error.strerror or error}): check your rights and the free space"
+        ) from error
+
+
+def _is_free(folder: Path) -> bool:
+    try:
+        return not folder.exists() or (folder.is_dir() and not any(folder.iterdir()))
+    except OSError as error:
+        raise StoreError(
+            f"{folder} cannot be read ({error.strerror or error}): check your rights, or name another folder"
+        ) from error

@@ -3,7 +3,7 @@
 
 import pytest
 
-from sasgeo_bench.matching.scaffold import segmenter_files, write_plugin
+from sasgeo_bench.matching.scaffold import package_files, write_plugin
 
 
 def test_segmenters_are_listed_with_the_control(program) -> None:
@@ -24,7 +24,7 @@ def test_a_new_segmenter_is_written_and_the_next_step_is_told(program, tmp_path)
 
 @pytest.mark.usefixtures("in_threads")
 def test_a_check_prints_every_row_and_a_failed_one_is_the_users(program, tmp_path, monkeypatch) -> None:
-    files = segmenter_files("my-checked")
+    files = package_files("segmenter", "my-checked")
     write_plugin(tmp_path / "plugin", files)
     monkeypatch.syspath_prepend(str(tmp_path / "plugin" / "src"))
     code, told, err = program("check", "--kind", "segmenter", "my_checked.segmenter:MyChecked")

@@ -17,7 +17,7 @@ from sasgeo_bench.errors import ConfigError, StoreError
 from sasgeo_bench.files.plugins import MATCHERS, SEGMENTERS, SHIPPED, TRACKERS, list_entry_points
 from sasgeo_bench.geometry.pose import Pose
 from sasgeo_bench.matching.matcher import Match
-from sasgeo_bench.matching.scaffold import plugin_files, segmenter_files, tracker_files, write_plugin
+from sasgeo_bench.matching.scaffold import package_files, write_plugin
 from sasgeo_bench.matching.segmenter import ImageTraining
 from sasgeo_bench.regions.region import Region
 from sasgeo_bench.running.segmenter_testing import check_segmenter
@@ -48,7 +48,7 @@ REFUSED = (
 # Names that ship, by the kinds for which they are taken.
 TAKEN = dict.fromkeys(("fft_vote", "raster_uniform", "oracle_pose"), ("matcher", "tracker"))
 TAKEN |= {"dead_reckoning": ("tracker",), "oracle_segmenter": ("segmenter",)}
-MAKERS = {"matcher": plugin_files, "tracker": tracker_files, "segmenter": segmenter_files}
+KINDS = ("matcher", "tracker", "segmenter")
 GROUPS = {"matcher": MATCHERS, "tracker": TRACKERS, "segmenter": SEGMENTERS}
 # What a class needs, which a name like its own must not hide.
 NEEDED = {
@@ -59,13 +59,13 @@ NEEDED = {
 
 
 def write_under(folder: Path, name: str) -> Path:
-    write_plugin(folder / "plugin", plugin_files(name))
+    write_plugin(folder / "plugin", package_files("matcher", name))
     return folder / "plugin"
 
 
 @pytest.mark.parametrize(("kind", "name"), [(kind, name) for kind, names in ACCEPTED.items() for name in names])
 def test_a_package_is_complete_and_its_class_can_be_made_and_hides_nothing_that_it_needs(tmp_path, kind, name) -> None:
-    files, module = MAKERS[kind](name), name.replace("-", "_")
+    files, module = package_files(kind, name), name.replace("-", "_")
     card = {f"src/{module}/card.toml"} if kind != "segmenter" else set()
     package = {f"src/{module}/__init__.py", f"src/{module}/{kind}.py", *card}
     assert set(files) == {"pyproject.toml", "README.md", "tests/test_conforms.py", *package}
@@ -91,20 +91,20 @@ def test_a_package_is_complete_and_its_class_can_be_made_and_hides_nothing_that_
 
 
 @pytest.mark.parametrize("name", [*REFUSED, "dead_reckoning", "oracle_segmenter"])
-@pytest.mark.parametrize("kind", MAKERS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_what_is_no_name_for_a_package_or_taken_is_refused_in_one_line(kind, name) -> None:
     if name in TAKEN and kind not in TAKEN[name]:
-        assert MAKERS[kind](name)
+        assert package_files(kind, name)
         return
     with pytest.raises(ConfigError) as refused:
-        MAKERS[kind](name)
+        package_files(kind, name)
     assert "\n" not in str(refused.value)
     assert repr(name) in str(refused.value)
 
 
 def test_a_segmenter_that_is_written_learns_to_tell_roofs_from_the_rest() -> None:
     found: dict[str, object] = {}
-    exec(segmenter_files("my-segmenter")["src/my_segmenter/segmenter.py"], found)  # noqa: S102 - our own text
+    exec(package_files("segmenter", "my-segmenter")["src/my_segmenter/segmenter.py"], found)  # noqa: S102 - our own text
     *train, test = tiny_images()
     segmenter = found["MySegmenter"]()
     said = segmenter.segment(test.image, learned=segmenter.learn(ImageTraining(images=train)))
@@ -123,7 +123,7 @@ def test_no_package_hides_a_module_that_ours_imports() -> None:
     assert {"numpy", "pyarrow", "sasgeo_bench"} <= imported
     for name in imported - {"__future__"}:
         with pytest.raises(ConfigError):
-            plugin_files(name)
+            package_files("matcher", name)
 
 
 def test_a_name_that_would_lose_to_a_built_in_matcher_is_refused() -> None:
@@ -131,10 +131,10 @@ def test_a_name_that_would_lose_to_a_built_in_matcher_is_refused() -> None:
     assert {"fft_vote", "sasgeo"} <= {*listed}
     for name in listed:
         with pytest.raises(ConfigError):
-            plugin_files(name)
+            package_files("matcher", name)
     with pytest.raises(ConfigError, match="is a matcher of sasgeo-bench itself, which would be used instead of yours"):
-        plugin_files("fft_vote")
-    assert plugin_files("fft-vote-2")
+        package_files("matcher", "fft_vote")
+    assert package_files("matcher", "fft-vote-2")
 
 
 # --- writing --------------------------------------------------------------------------------------------------------
@@ -162,7 +162,7 @@ def test_a_folder_that_is_not_empty_or_a_file_in_the_way_is_refused_and_left_alo
 def test_a_file_above_the_folder_is_told_in_one_line(tmp_path) -> None:
     (tmp_path / "file").write_text("mine")
     with pytest.raises(StoreError, match="cannot be written") as told:
-        write_plugin(tmp_path / "file" / "plugin", plugin_files("my-matcher"))
+        write_plugin(tmp_path / "file" / "plugin", package_files("matcher", "my-matcher"))
     assert "\n" not in str(told.value)
     assert [item.name for item in tmp_path.iterdir()] == ["file"]
 
@@ -183,7 +183,7 @@ def test_nothing_half_written_is_left_on_a_full_disk(tmp_path, monkeypatch, is_t
 
     monkeypatch.setattr(Path, "write_text", some)
     with pytest.raises(StoreError, match=r"cannot be written \(No space left on device\)"):
-        write_plugin(folder, plugin_files("my-matcher"))
+        write_plugin(folder, package_files("matcher", "my-matcher"))
     monkeypatch.undo()
     assert list(tmp_path.iterdir()) == []
 
@@ -203,7 +203,7 @@ def test_a_folder_that_cannot_be_looked_into_is_told_in_one_line(tmp_path, monke
 @pytest.mark.usefixtures("in_threads")
 @pytest.mark.parametrize("kind", ["matcher", "segmenter"])  # test_tracker_testing flies a tracker
 def test_what_is_written_passes_the_kit_at_once(tiny, tmp_path, monkeypatch, kind) -> None:
-    write_plugin(tmp_path / "plugin", MAKERS[kind](f"my-new-{kind}"))
+    write_plugin(tmp_path / "plugin", package_files(kind, f"my-new-{kind}"))
     monkeypatch.syspath_prepend(str(tmp_path / "plugin" / "src"))
     spec = f"my_new_{kind}.{kind}:MyNew{kind.title()}"
     checks = list(check_matcher(spec, place=tiny) if kind == "matcher" else check_segmenter(spec))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sasgeo_bench.matching.scaffold import tracker_files, write_plugin
+from sasgeo_bench.matching.scaffold import package_files, write_plugin
 from sasgeo_bench.matching.tracker import check_fix
 from sasgeo_bench.running import tracker_testing
 from sasgeo_bench.running.tracker_testing import TinyFlights, check_tracker, odd_flights, tiny_flights
@@ -112,7 +112,7 @@ def test_a_tracker_of_ordinary_flights_alone_fails_at_each_odd_one(table) -> Non
 
 
 def test_what_new_tracker_writes_finds_its_way(made, tmp_path) -> None:
-    write_plugin(tmp_path / "plugin", tracker_files("my-tracker"))
+    write_plugin(tmp_path / "plugin", package_files("tracker", "my-tracker"))
     module = tmp_path / "plugin" / "src" / "my_tracker" / "tracker.py"
     found: dict[str, object] = {"__file__": str(module)}
     exec(module.read_text(), found)  # noqa: S102 - our own text

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from sasgeo_bench.errors import ConfigError
-from sasgeo_bench.matching.scaffold import suite_files
+from sasgeo_bench.matching.scaffold import package_files
 from sasgeo_bench.running.suite_testing import check_suite
 from sasgeo_bench.tasks.build import made_tasks, make_tasks
 from sasgeo_bench.tasks.suites.all_suites import _foreign, find_suite, known_suite, suite_code
@@ -23,7 +23,7 @@ def written(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
 
     def write(module, **words):
-        text = suite_files("my-rows")["src/my_rows/suite.py"]
+        text = package_files("suite", "my-rows")["src/my_rows/suite.py"]
         for old, new in words.values():
             assert old in text
             text = text.replace(old, new)
@@ -106,4 +106,4 @@ def test_what_is_no_suite_is_refused_in_one_line(written, name, words):
 @pytest.mark.parametrize("name", ["clean", "My_Suite", "numpy"])
 def test_a_name_that_a_suite_cannot_have_is_refused_before_anything_is_written(name):
     with pytest.raises(ConfigError, match=name):
-        suite_files(name)
+        package_files("suite", name)
